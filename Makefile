@@ -10,7 +10,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check liars test test-dashboard monitoring sim trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -42,6 +42,14 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 eval-tracks: setup ## tracks in generated traffic beside single vehicles and late fusion; table and drawing go into docs/
 	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
 	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/evaluation.md --svg docs/tracks.svg)
+
+# DIR holds copies of the repositories that docs/measurements.md names; all that is missing is told.
+eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI, WILDTRACK, CF, SP
+	@test -n "$(DIR)" || { echo "make eval-real DIR=... : a directory with the data that docs/measurements.md names"; exit 2; }
+	cargo build --release --locked --bin ecod-node --bin ecod-lab
+	cargo run --quiet --locked --example eval_real -- --program $(BUILD)/release/ecod-node --data "$(DIR)" --work $(BUILD)/eval-real
+	for set in CF CF_amt SP SP_amt; do cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node \
+	    --sets "$(DIR)/truth-inference-at-scale/data/active-crowd-toolkit/$$set" --work $(BUILD)/eval-real/labels || exit; done
 
 eval-tracks-check: PACKAGES += python3-venv
 eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics from PyPI

@@ -14,9 +14,11 @@ from collections import defaultdict
 
 import motmetrics
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from trackeval.metrics import CLEAR, HOTA, Identity
 
 MATCH_M, ZERO_M, REACH = 2.0, 4.0, 0.75
+CONFIDENCE_M = 1.5
 DISTANCES_M = [0.5, 1.0, 2.0, 4.0]
 TOLERANCE = 1e-6
 
@@ -120,6 +122,7 @@ def trackeval_figures(frames):
         "false_alarms": int(clear["CLR_FP"]),
         "misses": int(clear["CLR_FN"]),
         "id_switches": int(clear["IDSW"]),
+        "fragments": int(clear["Frag"]),
         "moda_pct": 100 * clear["MODA"],
         "mota_pct": 100 * clear["MOTA"],
         "motp_m": ZERO_M * (1 - clear["MOTP"]),
@@ -130,6 +133,21 @@ def trackeval_figures(frames):
         "assa_pct": 100 * float(np.mean(hota["AssA"])),
         "loca_pct": 100 * float(np.mean(hota["LocA"])),
     }
+
+
+def calibration_error(frames):
+    """Expected calibration error of the confidences in percent, matched by SciPy."""
+    bins = [[0, 0, 0.0] for _ in range(10)]
+    for here, said in frames:
+        far = np.array([[distance(true, s) for s in said] for true in here.values()], dtype=float)
+        worth = np.where(far <= CONFIDENCE_M, 2.0 - np.minimum(far, CONFIDENCE_M) / CONFIDENCE_M, 0.0).reshape(len(here), len(said))
+        right = {column for row, column in zip(*linear_sum_assignment(-worth)) if worth[row, column] > 0}
+        for column, object_ in enumerate(said):
+            bin_ = bins[min(int(object_[2] * 10), 9)]
+            bin_[0] += 1
+            bin_[1] += column in right
+            bin_[2] += object_[2]
+    return 100 * sum(abs(right - stated) for _, right, stated in bins) / sum(count for count, _, _ in bins)
 
 
 def motmetrics_figures(frames):
@@ -167,7 +185,10 @@ def main():
     for limit, found, expected in zip(DISTANCES_M, ours["ap_pct"], aps):
         check(f"AP@{limit}", found, expected)
     check("best F1", ours["best_f1_pct"], f1)
+    error = calibration_error(frames)
+    check("calibration error", ours["calibration"]["confidence"]["ece_pct"], error)
     expected = {"ap_pct": aps, "best_f1_pct": f1, "best_f1_threshold": threshold}
+    expected["calibration"] = {"confidence": {"ece_pct": error}}
     for name, level in [("at_best_f1", threshold), ("at_default", 0.5)]:
         kept = [(here, [s for s in said if s[2] >= level]) for here, said in frames]
         check(f"{name} threshold", ours[name]["threshold"], level)

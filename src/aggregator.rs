@@ -220,6 +220,12 @@ impl Aggregator {
         if self.rounds.tick(now) { self.close(now) } else { None }
     }
 
+    /// Closes the round, whether or not it is due.
+    pub fn close_early(&mut self, now: Timestamp) -> Option<Fused> {
+        self.rounds.close(now);
+        self.close(now)
+    }
+
     /// When the round closes without a further report.
     pub fn deadline(&self) -> Timestamp {
         self.rounds.deadline()

@@ -11,6 +11,7 @@
 //! - Memory is bounded by the cell, not by the recording.
 
 mod clock;
+mod flaw;
 mod journal;
 mod records;
 #[cfg(test)]
@@ -20,6 +21,8 @@ use std::collections::{BTreeMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+pub use clock::TimeUnit;
+pub use flaw::Flaw;
 pub use journal::{JournalEntry, JournalEvent, JournalReplay, JournalSummary};
 pub use records::FusedLine;
 
@@ -29,7 +32,7 @@ use crate::model::time::Timestamp;
 use crate::perception::landmark::{Landmark, LandmarkConfig};
 use crate::tracking::TracksLosses;
 use crate::vote::MAX_LABELS;
-use crate::wire::{Limits, ObjectReport, RejectReason, ReportKind};
+use crate::wire::{InvalidValue, Limits, ObjectReport, RejectReason, ReportKind};
 use clock::VirtualClock;
 use records::RecordedReport;
 
@@ -42,6 +45,9 @@ const MAX_LEARNT_LANDMARKS: usize = 4096;
 /// Default maximum number of locations that an open cell keeps for VOTE. It is large because a file is no attacker: labels
 /// are limited by [`MAX_LABELS`] only, the objects of a report by the length of its line.
 const MAX_VOTE_LANDMARKS: usize = 1_000_000;
+
+/// Maximum number of rejected lines of one reason whose flaws are kept.
+pub const EXAMPLES: usize = 3;
 
 /// A time longer than any recording, in seconds.
 const FOREVER_S: f64 = 1e12;
@@ -88,6 +94,8 @@ pub struct Summary {
     pub lines: u64,
     /// Rejected lines by reason.
     pub rejected: BTreeMap<RejectReason, Rejections>,
+    /// Unit that the times seem to be in, if it is not microseconds, by the first readable line.
+    pub unit: Option<TimeUnit>,
     /// Used lines with a time before that of an earlier line.
     pub late: u64,
     /// Objects of used lines that did not vote or whose votes were forgotten; see [`crate::vote`].
@@ -105,15 +113,21 @@ impl Summary {
     pub fn used(&self) -> u64 {
         self.lines - self.rejected.values().map(|rejections| rejections.lines).sum::<u64>()
     }
+
+    /// Number of rejected lines, but for those of an algorithm that the cell does not run.
+    pub fn faulty(&self) -> u64 {
+        let faults = self.rejected.iter().filter(|(reason, _)| **reason != RejectReason::NotFused);
+        faults.map(|(_, rejections)| rejections.lines).sum()
+    }
 }
 
 /// Lines that were rejected for one reason.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Rejections {
     /// Their number.
     pub lines: u64,
-    /// Line number of the first, from 1, blank lines included.
-    pub first_line: u64,
+    /// The first ones, [`EXAMPLES`] at most, by line number; lines are counted from 1, blank ones included.
+    pub examples: BTreeMap<u64, Flaw>,
 }
 
 /// A running replay; see the module.
@@ -128,8 +142,12 @@ pub struct Replay {
     heard: [bool; ReportKind::COUNT],
     /// Locations of an open cell.
     learnt: HashSet<LandmarkId>,
+    /// True if any line could be read.
+    begun: bool,
     /// True if a report waits for its round to close.
     pending: bool,
+    /// True until a round has closed.
+    is_first_round: bool,
     /// Line number of the newest line, blank ones included.
     number: u64,
     summary: Summary,
@@ -148,14 +166,16 @@ impl Replay {
         }
         Self {
             clock: VirtualClock::new(config.fusion.window.max_clock_offset_s),
-            config,
             ahead: VecDeque::with_capacity(LOOKAHEAD + 1),
             cell: None,
             heard: [false; ReportKind::COUNT],
             learnt: HashSet::new(),
+            begun: false,
             pending: false,
+            is_first_round: config.passes.is_none(),
             number: 0,
             summary: Summary::default(),
+            config,
         }
     }
 
@@ -173,15 +193,18 @@ impl Replay {
     pub fn report(&mut self, kind: ReportKind, report: ObjectReport, received_at: Timestamp) -> Vec<FusedLine> {
         self.number += 1;
         self.summary.lines += 1;
-        let checked = report.validate(&self.config.limits);
-        self.push(checked.map(|()| RecordedReport { kind, at: received_at, report }))
+        let checked = report.check_values(&self.config.limits);
+        self.push(match checked {
+            Ok(()) => Ok(RecordedReport { kind, at: received_at, is_placed: true, report }),
+            Err(InvalidValue { field, reason }) => Err(Flaw::new(reason, field, "is not valid")),
+        })
     }
 
     /// Counts a line that was too large to be read at all.
     pub fn oversized_line(&mut self) {
         self.number += 1;
         self.summary.lines += 1;
-        self.reject(self.number, RejectReason::TooLarge);
+        self.reject(self.number, Flaw::too_large(&self.config.limits));
     }
 
     /// Takes the lines that were read ahead, closes the last round, and judges an incomplete packet of VOTE's `paper`
@@ -192,6 +215,7 @@ impl Replay {
             output.append(&mut self.process_next());
         }
         let mut end = self.clock.now();
+        self.close_first_round(end, &mut output);
         if self.pending
             && let Some(deadline) = self.cell.as_ref().map(Aggregator::deadline)
         {
@@ -212,18 +236,27 @@ impl Replay {
         (output, self.summary)
     }
 
-    fn push(&mut self, line: Result<RecordedReport, RejectReason>) -> Vec<FusedLine> {
+    fn push(&mut self, line: Result<RecordedReport, Flaw>) -> Vec<FusedLine> {
         match line {
-            Ok(line) => self.ahead.push_back((self.number, line)),
-            Err(reason) => self.reject(self.number, reason),
+            Ok(line) => {
+                if !std::mem::replace(&mut self.begun, true) {
+                    self.summary.unit = TimeUnit::of(line.report.captured_at_us);
+                }
+                self.ahead.push_back((self.number, line));
+            }
+            Err(flaw) => self.reject(self.number, flaw),
         }
         if self.ahead.len() > LOOKAHEAD { self.process_next() } else { Vec::new() }
     }
 
-    fn reject(&mut self, number: u64, reason: RejectReason) {
-        let rejections = self.summary.rejected.entry(reason).or_insert(Rejections { lines: 0, first_line: number });
-        rejections.lines += 1;
-        rejections.first_line = rejections.first_line.min(number);
+    fn reject(&mut self, number: u64, flaw: Flaw) {
+        let Rejections { lines, examples } = self.summary.rejected.entry(flaw.reason).or_default();
+        *lines += 1;
+        examples.insert(number, flaw);
+        // A line that was read ahead is rejected after later ones.
+        if examples.len() > EXAMPLES {
+            examples.pop_last();
+        }
     }
 
     /// Takes the oldest of the lines that were read ahead.
@@ -232,7 +265,7 @@ impl Replay {
         let Some((number, mut line)) = self.ahead.pop_front() else { return output };
         let is_plausible = self.clock.is_plausible(line.at, self.ahead.iter().map(|(_, line)| line.at));
         if !is_plausible && self.config.passes.is_none() {
-            self.reject(number, RejectReason::FromTheFuture);
+            self.reject(number, Flaw::of_report(RejectReason::FromTheFuture));
             return output;
         }
         let before = self.clock.now();
@@ -240,6 +273,10 @@ impl Replay {
         let now = self.clock.now();
         if self.config.passes.is_some() {
             (line.report.captured_at_us, line.report.seq) = (now, number);
+        }
+        // Objects are where their landmark is, but how far that is from the reporter only a known landmark can tell.
+        if !line.is_placed && self.config.landmarks.is_empty() {
+            line.report.pose = None;
         }
         self.close_due_rounds(before, now, &mut output);
         self.learn_landmarks(&line);
@@ -250,7 +287,7 @@ impl Replay {
                 self.pending = fused.is_none();
                 self.write(fused, &mut output);
             }
-            Err(reason) => self.reject(number, reason),
+            Err(reason) => self.reject(number, Flaw::of_report(reason)),
         }
         output
     }
@@ -265,6 +302,9 @@ impl Replay {
     /// A round without reports waits half a period longer for a line, and all lines of one time go into one round.
     /// Otherwise rounds would cut recordings of the same period at arbitrary lines.
     fn close_due_rounds(&mut self, before: Timestamp, now: Timestamp, output: &mut Vec<FusedLine>) {
+        if now > before {
+            self.close_first_round(before, output);
+        }
         let period = Duration::from_secs_f64(self.config.fusion.round.period_s);
         let silent_from = before + SILENCE.max(3 * period);
         while let Some(deadline) = self.cell.as_ref().map(Aggregator::deadline) {
@@ -274,6 +314,16 @@ impl Replay {
                 break;
             }
             self.tick(due, output);
+        }
+    }
+
+    /// Closes the round of the first time, if it is still open, at that time: no round before it was to end at a period's
+    /// end, and a recording whose period is that of the rounds has a map for its first frame too.
+    fn close_first_round(&mut self, at: Timestamp, output: &mut Vec<FusedLine>) {
+        if self.pending && std::mem::take(&mut self.is_first_round) {
+            let fused = self.cell.as_mut().and_then(|cell| cell.close_early(at));
+            self.pending = false;
+            self.write(fused, output);
         }
     }
 
@@ -314,7 +364,7 @@ impl Replay {
 /// The report of a line and its kind, for programs that read a recording without replaying it.
 ///
 /// # Errors
-/// The reason why a replay would reject the line.
-pub fn read_report(text: &[u8], limits: &Limits) -> Result<(ReportKind, ObjectReport), RejectReason> {
+/// The flaw for which a replay would reject the line.
+pub fn read_report(text: &[u8], limits: &Limits) -> Result<(ReportKind, ObjectReport), Flaw> {
     RecordedReport::read(text, limits).map(|line| (line.kind, line.report))
 }

@@ -43,7 +43,8 @@ pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
 pub use validation::{
-    Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload, check_fused_at,
+    InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload,
+    check_fused_at,
 };
 
 use crate::model::epoch::Epoch;

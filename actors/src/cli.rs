@@ -114,6 +114,9 @@ const USAGE: u8 = 2;
 /// Exit code of a node whose name is another's.
 const NAME_TAKEN: u8 = 4;
 
+/// Exit code for input of which nothing, or too little, could be used.
+const REJECTED: u8 = 3;
+
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     exit("ecod-node", parse().and_then(run_command))
@@ -207,5 +210,10 @@ impl Failure {
     /// A configuration or argument that cannot be used.
     pub fn usage(error: impl Into<anyhow::Error>) -> Self {
         Self { error: error.into(), code: USAGE }
+    }
+
+    /// Input of which nothing, or too little, could be used.
+    fn rejected(error: anyhow::Error) -> Self {
+        Self { error, code: REJECTED }
     }
 }

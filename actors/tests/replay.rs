@@ -75,17 +75,47 @@ fn lines_that_cannot_be_used_are_counted_by_reason() {
     input.extend_from_slice(first);
     input.push(b'\n');
     input.extend_from_slice(&first[..first.len() / 2]);
-    let run = ecod_with_input(&["replay", "--input", "-", "--output", "-"], &input);
-    assert!(run.status.success());
-    let said = said(&run);
-    for part in
-        ["6 lines, 1 used, 1 written", "rejected malformed 3", "rejected too_large 1", "rejected out_of_order 1"]
-    {
-        assert!(said.contains(part), "{said}");
+    for (most, code) in [("82", 3), ("84", 0)] {
+        let run = ecod_with_input(&["replay", "--input", "-", "--output", "-", "--max-rejected", most], &input);
+        assert_eq!(run.status.code(), Some(code));
+        let said = said(&run);
+        for part in [
+            "6 lines, 1 used, 1 written",
+            "rejected malformed 3\n  line 3: is no JSON object\n  line 4: is no JSON object\n  line 7: ",
+            "rejected too_large 1\n  line 5: is longer than",
+            "rejected out_of_order 1\n  line 6: captured_at_us: is not later than in an earlier line of this node",
+        ] {
+            assert!(said.contains(part), "{said}");
+        }
+        assert_eq!(said.contains("5 of 6 reports were rejected, more than 82 % (--max-rejected)"), code == 3, "{said}");
+        assert_eq!(run.stdout.iter().filter(|byte| **byte == b'\n').count(), 1);
     }
-    assert_eq!(run.stdout.iter().filter(|byte| **byte == b'\n').count(), 1);
-    let nothing = ecod(&["replay", "--input", "-", "--output", "-"]);
-    assert!(nothing.status.success() && nothing.stdout.is_empty());
+}
+
+#[test]
+fn input_that_is_no_recording_fails() {
+    let folder = TempDir::new().unwrap();
+    let (readme, empty) = (folder.path().join("README.md"), folder.path().join("empty.jsonl"));
+    fs::write(&readme, "# A title\n\nSome text.\n").unwrap();
+    fs::write(&empty, "").unwrap();
+    for input in [&readme, &empty] {
+        let run = ecod(&["replay", "--input", text(input), "--output", "-", "--max-rejected", "100"]);
+        assert!(run.status.code() == Some(3) && run.stdout.is_empty(), "{}", said(&run));
+        assert!(said(&run).contains("no report could be used"), "{}", said(&run));
+    }
+}
+
+#[test]
+fn times_in_another_unit_are_told_of() {
+    let line = |unit: u64| {
+        let times = (0..3).map(|n| 1_732_154_400_000_000 / unit + n);
+        let lines = times
+            .map(|at| format!("{{\"schema\":1,\"node\":\"a\",\"seq\":1,\"captured_at_us\":{at},\"objects\":[]}}\n"));
+        said(&ecod_with_input(&["replay", "--input", "-", "--output", "-"], lines.collect::<String>().as_bytes()))
+    };
+    assert!(line(1000).contains("times look like milliseconds"), "{}", line(1000));
+    assert!(line(1_000_000).contains("times look like seconds"));
+    assert!(!line(1).contains("times look like"));
 }
 
 #[test]

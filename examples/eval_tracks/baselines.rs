@@ -123,6 +123,7 @@ impl Tracker {
             id: id.unwrap_or_else(|| self.begin(at, object)),
             label: object.label.clone(),
             score: object.score,
+            existence: None,
             position: object.position,
         });
         identified.collect()

@@ -8,6 +8,7 @@
 //! Call [`Evaluation::fused`] with every line of a replay's output and, for the baselines, [`Evaluation::report`] with
 //! every report, in any order; then [`Evaluation::result`].
 
+pub mod formats;
 pub mod tracks;
 mod truth;
 mod votes;
@@ -60,8 +61,23 @@ pub struct Scores {
     pub majority_accuracy_pct: Option<f64>,
     /// Every vehicle alone; with reports only.
     pub vehicles: BTreeMap<NodeName, VehicleScores>,
+    /// Right items of every class.
+    pub recall: Vec<ClassRecall>,
+    /// Mean of the classes' recalls, each class alike however frequent.
+    pub mean_recall_pct: Option<f64>,
     /// Confusion matrix by item, correct labels included.
     pub confusion: Vec<ConfusionCell>,
+}
+
+/// Items of one class.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ClassRecall {
+    /// The first accepted label; null where nothing stands.
+    pub truth: Option<Label>,
+    /// Items.
+    pub items: u64,
+    /// Right ones in percent.
+    pub recall_pct: Option<f64>,
 }
 
 /// Entries of all lines.
@@ -203,6 +219,7 @@ impl Tally {
         }
         let (mut items, mut right, mut labelled, mut labelled_right) = (0, 0, 0, 0);
         let (mut standing, mut covered) = (0, 0);
+        let mut classes: BTreeMap<Option<Label>, (u64, u64)> = BTreeMap::new();
         let mut confusion: BTreeMap<(Option<Label>, Option<Label>), u64> = BTreeMap::new();
         for (id, number, span) in truth.spans() {
             let said = self.last.get(&(id.clone(), number)).and_then(|last| last.said(truth, span));
@@ -217,9 +234,14 @@ impl Tally {
                 standing += 1;
                 covered += u64::from(said.is_some());
             }
+            let of_class = classes.entry(span.name().cloned()).or_default();
+            *of_class = (of_class.0 + 1, of_class.1 + is_right);
             *confusion.entry((span.name().cloned(), said.cloned())).or_default() += 1;
         }
         let entry = |((truth, said), count)| ConfusionCell { truth, said, count };
+        let recalls = classes.values().map(|&(items, right)| right as f64 / items as f64);
+        let mean_recall_pct = percent(recalls.sum(), classes.len() as u64);
+        let of_class = |(truth, (items, right))| ClassRecall { truth, items, recall_pct: percent(right as f64, items) };
         Some(Scores {
             lines: self.lines,
             items,
@@ -229,6 +251,8 @@ impl Tally {
             rounds: RoundScores { accuracy_pct: percent(self.rounds.right as f64, self.rounds.entries), ..self.rounds },
             majority_accuracy_pct: self.votes.majority_accuracy_pct(truth),
             vehicles: self.votes.vehicles(truth),
+            mean_recall_pct,
+            recall: classes.into_iter().map(of_class).collect(),
             confusion: confusion.into_iter().map(entry).collect(),
         })
     }

@@ -84,13 +84,12 @@ impl Section for Objects {
 
     fn html(&self) -> String {
         let scores = self.0.clone().result();
-        let tables = tables(&scores).map(|rows| match rows.split_first() {
-            Some((head, rows)) => table(&head.iter().map(String::as_str).collect::<Vec<_>>(), rows),
-            None => String::new(),
-        });
+        let tables = tables(&scores);
+        let tables = tables.iter().filter_map(|rows| rows.split_first());
+        let tables = tables.map(|(head, rows)| table(&head.iter().map(String::as_str).collect::<Vec<_>>(), rows));
         let warning = without_map(&scores).map_or_else(String::new, |warning| format!(" {warning}."));
         let about =
             format!("Objects of maps judged by where the true ones were, in {} frames.{warning}", scores.frames);
-        section("Accuracy of objects", &about, &tables.concat())
+        section("Accuracy of objects", &about, &tables.collect::<String>())
     }
 }

@@ -17,7 +17,7 @@ fn ecod_lab(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_ecod-lab")).args(arguments).output().unwrap()
 }
 
-fn said(output: &Output) -> String {
+fn said_by(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
@@ -64,9 +64,12 @@ fn a_replay_is_judged_beside_majority_and_every_vehicle() {
         "--out",
         text(&result),
     ]);
-    assert!(run.status.success(), "{}", said(&run));
+    assert!(run.status.success(), "{}", said_by(&run));
     let table = String::from_utf8(run.stdout).unwrap();
-    assert!(["PACE", "VOTE", "majority %", "euclid", "truth"].iter().all(|part| table.contains(part)), "{table}");
+    assert!(
+        ["PACE", "VOTE", "majority %", "euclid", "truth", "recall %"].iter().all(|part| table.contains(part)),
+        "{table}"
+    );
     let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
     for (algorithm, least) in [("pace", 100.0), ("vote", 75.0)] {
         let scores = &result[algorithm];
@@ -83,10 +86,12 @@ fn objects_that_move_are_judged_by_where_they_were() {
     let recorded = |name: &str| Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/eval_tracks")).join(name);
     let (truth, maps, result) = (recorded("truth.json"), recorded("maps.jsonl"), folder.path().join("result.json"));
     let run = ecod_lab(&["eval", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)]);
-    assert!(run.status.success(), "{}", said(&run));
+    assert!(run.status.success(), "{}", said_by(&run));
     let table = String::from_utf8(run.stdout).unwrap();
     assert!(
-        ["AP@0.5 %", "AP@4 %", "bicycle", "MODA %", "HOTA %", "switches"].iter().all(|p| table.contains(p)),
+        ["AP@0.5 %", "AP@4 %", "bicycle", "MODA %", "HOTA %", "switches", "fragments", "calibration error %"]
+            .iter()
+            .all(|p| table.contains(p)),
         "{table}"
     );
     let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
@@ -96,7 +101,76 @@ fn objects_that_move_are_judged_by_where_they_were() {
     fs::write(&broken, r#"{"frames": [{"t_us": 1, "objects": [{"id": 1, "label": "car", "x_m": 0}]}]}"#).unwrap();
     let run = ecod_lab(&["eval", "--truth", text(&broken), "--input", text(&maps)]);
     assert_eq!(run.status.code(), Some(2));
-    assert!(said(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"), "{}", said(&run));
+    assert!(said_by(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"), "{}", said_by(&run));
+}
+
+/// Two cars in four frames of KITTI: the tracker loses one and calls the other by two names.
+#[test]
+fn files_of_benchmarks_are_judged_by_name_line_and_field() {
+    let folder = TempDir::new().unwrap();
+    let line = |frame: u32, track: u32, x: f64, z: f64, score: &str| {
+        format!("{frame} {track} Car 0 0 -1 0 0 9 9 1.5 1.6 3.9 {x} 1.7 {z} 0 {score}\n")
+    };
+    let write = |name: &str, content: String| {
+        let path = folder.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, content).unwrap();
+        path
+    };
+    let truth = (0..4).map(|n| line(n, 1, 2.0, 10.0 + f64::from(n), "") + &line(n, 2, -8.0, 30.0, "")).collect();
+    let said = (0..4).map(|n| line(n, 5 + n / 2, 2.0, 10.0 + f64::from(n), "0.9")).collect();
+    let truth = write("truth/0001.txt", truth);
+    write("truth/0002.txt", line(0, 1, 0.0, 5.0, ""));
+    let said = write("said/0001.txt", said);
+    let result = folder.path().join("result.json");
+    for (truth, input) in [(&truth, &said), (&folder.path().join("truth"), &folder.path().join("said"))] {
+        let run = ecod_lab(&[
+            "eval",
+            "--format",
+            "kitti",
+            "--truth",
+            text(truth),
+            "--input",
+            text(input),
+            "--out",
+            text(&result),
+        ]);
+        assert!(run.status.success(), "{}", said_by(&run));
+        let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
+        let (tracks, at) = (&result["tracks"], &result["tracks"]["at_default"]);
+        assert_eq!((tracks["frames"].as_u64(), tracks["objects"].as_u64()), (Some(4), Some(8)));
+        assert_eq!(
+            (at["matches"].as_u64(), at["misses"].as_u64(), at["id_switches"].as_u64()),
+            (Some(4), Some(4), Some(1))
+        );
+        assert_eq!(at["mota_pct"].as_f64(), Some(37.5));
+    }
+    let detections: String = (0..4).map(|n| format!("{n},2,0,0,9,9,8.5,1.5,1.6,3.9,-8.0,1.7,30.0,0,0\n")).collect();
+    let run = |input: &Path| {
+        let flags =
+            ["eval", "--format", "kitti", "--truth", text(&truth), "--input", text(input), "--out", text(&result)];
+        ecod_lab(&flags)
+    };
+    assert!(run(&write("detections.txt", detections)).status.success());
+    let broken = run(&write("broken.txt", "0,2,0,0,9,9,8.5,1.5,1.6,3.9,x,1.7,30.0,0,0\n".into()));
+    assert_eq!(broken.status.code(), Some(2));
+    assert!(said_by(&broken).contains("broken.txt: line 1: column 11 (x): \"x\" is no number"), "{}", said_by(&broken));
+}
+
+#[test]
+fn a_truth_without_identities_judges_none() {
+    let folder = TempDir::new().unwrap();
+    let (truth, maps, result) =
+        (folder.path().join("truth.txt"), folder.path().join("maps.txt"), folder.path().join("result.json"));
+    fs::write(&truth, "1,-1,0,0,9,9,1,3,4,0\n2,-1,0,0,9,9,1,3,4,0\n").unwrap();
+    fs::write(&maps, "1,4,0,0,9,9,1,3,4,0\n2,4,0,0,9,9,1,3,5,0\n").unwrap();
+    let run =
+        ecod_lab(&["eval", "--format", "mot", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)]);
+    assert!(run.status.success(), "{}", said_by(&run));
+    let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
+    let at = &result["tracks"]["at_default"];
+    assert_eq!((at["moda_pct"].as_f64(), at["motp_m"].as_f64()), (Some(100.0), Some(0.5)));
+    assert!(["mota_pct", "idf1_pct", "hota_pct"].iter().all(|figure| at[figure].is_null()), "{at}");
 }
 
 #[test]
@@ -118,7 +192,7 @@ fn the_recorded_intersection_is_judged_right() {
         "--reports",
         text(&reports),
     ]);
-    assert!(run.status.success(), "{}", said(&run));
+    assert!(run.status.success(), "{}", said_by(&run));
     let result: Value = serde_json::from_slice(&fs::read(out).unwrap()).unwrap();
     let recording = &result["scenes"][0];
     assert_eq!((recording["verdicts"].as_u64(), recording["vote_accuracy_pct"].as_f64()), (Some(9), Some(100.0)));
@@ -138,7 +212,7 @@ fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_interse
         let (scenes, out) = (folder.path().join("scenes.json"), folder.path().join("result.json"));
         fs::write(&scenes, scene).unwrap();
         let run = ecod_lab(&["testbed", "--scenes", text(&scenes), "--scene", "recording", "--out", text(&out)]);
-        assert!(run.status.success(), "{}", said(&run));
+        assert!(run.status.success(), "{}", said_by(&run));
         let result: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
         assert_eq!(result["scenes"][0]["vote_accuracy_pct"].as_f64(), Some(100.0), "{result}");
     }
@@ -159,10 +233,10 @@ fn what_cannot_be_judged_is_said() {
         (Path::new("/no.json"), &recording, 2, "/no.json"),
         (&truth, &recording, 2, "`a` has {}"),
         (&lot, &empty, 1, "no map"),
-        (&lot, &recording, 1, "1 lines are neither"),
+        (&lot, &recording, 1, "1 lines cannot be used, the first is line 1: it is neither a map nor verdicts"),
     ] {
         let run = ecod_lab(&["eval", "--truth", text(truth), "--input", text(input)]);
-        assert_eq!(run.status.code(), Some(code), "{truth:?}: {}", said(&run));
-        assert!(said(&run).contains(part), "{truth:?}: {}", said(&run));
+        assert_eq!(run.status.code(), Some(code), "{truth:?}: {}", said_by(&run));
+        assert!(said_by(&run).contains(part), "{truth:?}: {}", said_by(&run));
     }
 }

@@ -53,6 +53,6 @@ fn figures_are_those_of_trackeval_and_motmetrics() {
     }
     let threshold = expected.as_object_mut().unwrap().remove("best_f1_threshold").unwrap();
     assert_eq!(Some(scores.at_best_f1.threshold), threshold.as_f64());
-    assert_eq!(compare("", &found, &expected), 5 + 2 * 13);
+    assert_eq!(compare("", &found, &expected), 6 + 2 * 14);
     assert!(scores.at_best_f1.id_switches > 0 && scores.at_best_f1.false_alarms > 0);
 }

@@ -172,7 +172,8 @@ impl RoundTrigger {
         is_due
     }
 
-    fn close(&mut self, now: Timestamp) {
+    /// Begins the next round, whether or not the present one is due.
+    pub(super) fn close(&mut self, now: Timestamp) {
         let period = self.config.period();
         // After a round that was held, another node may take over, or vehicles are still connecting.
         let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;

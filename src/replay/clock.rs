@@ -1,5 +1,6 @@
-//! The virtual time of a replay: that of the newest plausible line.
+//! The virtual time of a replay, that of the newest plausible line, and the unit of a recording's times.
 
+use std::fmt;
 use std::time::Duration;
 
 use crate::model::time::Timestamp;
@@ -49,9 +50,59 @@ impl VirtualClock {
     }
 }
 
+/// A unit of times that are not in microseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TimeUnit {
+    /// 10⁶ µs.
+    Seconds,
+    /// 10³ µs.
+    Milliseconds,
+    /// 10⁻³ µs.
+    Nanoseconds,
+}
+
+/// Seconds of the Unix time in which recordings begin: from September 2001 until 2096.
+const RECORDED_S: std::ops::Range<u64> = 1_000_000_000..4_000_000_000;
+
+impl TimeUnit {
+    /// The unit in which a recording's first time is a date, if it is none in microseconds. Times that count from the
+    /// beginning of a recording are none in any unit.
+    pub fn of(first: Timestamp) -> Option<Self> {
+        let units = [(Self::Seconds, 1), (Self::Milliseconds, 1000), (Self::Nanoseconds, 1_000_000_000)];
+        units
+            .into_iter()
+            .find(|(_, in_second)| RECORDED_S.contains(&(first.micros() / in_second)))
+            .map(|(unit, _)| unit)
+    }
+}
+
+impl fmt::Display for TimeUnit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Seconds => "seconds",
+            Self::Milliseconds => "milliseconds",
+            Self::Nanoseconds => "nanoseconds",
+        })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn dates_in_other_units_are_told_from_times_since_the_beginning() {
+        for (first, unit) in [
+            (1_732_154_400, Some(TimeUnit::Seconds)),
+            (1_732_154_400_123, Some(TimeUnit::Milliseconds)),
+            (1_732_154_400_123_456, None),
+            (1_732_154_400_123_456_789, Some(TimeUnit::Nanoseconds)),
+            (0, None),
+            (60_000_000, None),
+        ] {
+            assert_eq!(TimeUnit::of(Timestamp(first)), unit, "{first}");
+        }
+    }
 
     const HOUR: u64 = 3_600_000_000;
 

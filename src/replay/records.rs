@@ -1,7 +1,9 @@
 //! Lines of a replay's input and output.
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
+use super::flaw::Flaw;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{GlobalMap, Limits, ObjectReport, RejectReason, ReportKind, Verdicts, decode};
@@ -21,12 +23,14 @@ pub enum FusedLine {
 pub(super) struct RecordedReport {
     pub(super) kind: ReportKind,
     pub(super) at: Timestamp,
+    /// True if every object has a position.
+    pub(super) is_placed: bool,
     pub(super) report: ObjectReport,
 }
 
 /// The optional fields of a line beside its report.
 #[derive(Debug, Deserialize)]
-struct Envelope {
+pub(super) struct Envelope {
     #[serde(default)]
     topic: Option<String>,
     #[serde(default)]
@@ -34,31 +38,64 @@ struct Envelope {
 }
 
 impl RecordedReport {
-    pub(super) fn read(text: &[u8], limits: &Limits) -> Result<Self, RejectReason> {
+    pub(super) fn read(text: &[u8], limits: &Limits) -> Result<Self, Flaw> {
         let text = text.trim_ascii();
         if text.len() > limits.payload_bytes {
-            return Err(RejectReason::TooLarge);
+            return Err(Flaw::too_large(limits));
         }
         if text.first() != Some(&b'{') {
-            return Err(RejectReason::Malformed);
+            return Err(Flaw::new(RejectReason::Malformed, "", "is no JSON object"));
         }
-        let report: ObjectReport = decode(text, limits)?;
-        let Envelope { topic, received_at_us } = serde_json::from_slice(text).map_err(|_| RejectReason::Malformed)?;
-        let kind = topic.map_or(Ok(ReportKind::default()), |topic| kind(&topic, &report.node))?;
-        Ok(Self { kind, at: received_at_us.unwrap_or(report.captured_at_us), report })
+        let reason = match decode::<ObjectReport>(text, limits) {
+            Ok(report) => return Self::new(text, report, limits),
+            Err(reason) => reason,
+        };
+        let Some(placed) = votes_by_name(text) else { return Err(Flaw::of_line(text, reason, limits)) };
+        let limits = Limits { payload_bytes: usize::MAX, ..*limits };
+        let report = decode(&placed, &limits).map_err(|reason| Flaw::of_line(&placed, reason, &limits))?;
+        Ok(Self { is_placed: false, ..Self::new(&placed, report, &limits)? })
     }
+
+    fn new(text: &[u8], report: ObjectReport, limits: &Limits) -> Result<Self, Flaw> {
+        let Envelope { topic, received_at_us } =
+            serde_json::from_slice(text).map_err(|_| Flaw::of_line(text, RejectReason::Malformed, limits))?;
+        let kind = topic.map_or(Ok(ReportKind::default()), |topic| kind(&topic, &report.node))?;
+        Ok(Self { kind, at: received_at_us.unwrap_or(report.captured_at_us), is_placed: true, report })
+    }
+}
+
+/// A line of votes by name, with zeros for the positions that its objects do not have; `None` for other lines.
+fn votes_by_name(text: &[u8]) -> Option<Vec<u8>> {
+    let mut line: Value = serde_json::from_slice(text).ok()?;
+    if !line.get("topic")?.as_str()?.split('/').any(|level| level == "vote_detections") {
+        return None;
+    }
+    let mut is_by_name = false;
+    for object in line.get_mut("objects")?.as_array_mut()?.iter_mut().filter_map(Value::as_object_mut) {
+        let is_absent = |key| object.get(key).is_none_or(Value::is_null);
+        if object.get("landmark").is_some_and(Value::is_string) && is_absent("x_m") && is_absent("y_m") {
+            object.extend(["x_m", "y_m"].map(|key| (key.to_owned(), 0.into())));
+            is_by_name = true;
+        }
+    }
+    is_by_name.then(|| line.to_string().into_bytes())
 }
 
 /// The kind of a `topic` field: `detections` or `vote_detections`, or a whole MQTT topic that ends with it and the node's
 /// name.
-fn kind(topic: &str, node: &NodeName) -> Result<ReportKind, RejectReason> {
+fn kind(topic: &str, node: &NodeName) -> Result<ReportKind, Flaw> {
     let mut levels = topic.rsplit('/');
     let last = levels.next().unwrap_or_default();
     let (level, named) = levels.next().map_or((last, None), |level| (level, Some(last)));
     let kind = match level {
         "detections" => ReportKind::Detections,
         "vote_detections" => ReportKind::VoteDetections,
-        _ => return Err(RejectReason::UnknownTopic),
+        _ => {
+            let fault = "is neither detections nor vote_detections";
+            return Err(Flaw::new(RejectReason::UnknownTopic, "topic", fault));
+        }
     };
-    if named.is_none_or(|named| named == node.as_str()) { Ok(kind) } else { Err(RejectReason::NodeMismatch) }
+    let is_other = named.is_some_and(|named| named != node.as_str());
+    let fault = || format!("names another node than `{node}`");
+    if is_other { Err(Flaw::new(RejectReason::NodeMismatch, "topic", fault())) } else { Ok(kind) }
 }

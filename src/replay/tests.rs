@@ -145,6 +145,23 @@ fn time_does_not_go_back_and_a_wrong_clock_does_not_take_it_along() {
 }
 
 #[test]
+fn the_first_frame_has_a_map_at_its_time_with_all_its_reports() {
+    for (start, period) in [(0, 100), (0, 20), (START, 100), (START, 500)] {
+        let report = |node: &str, frame: u64, x: &str| {
+            let at = Timestamp(start + frame * period * 1000);
+            line(&ObjectReport { captured_at_us: at, ..report(node, frame, &[(x, "car")]) }, &[])
+        };
+        for frames in [1, 5] {
+            let lines = (0..frames).flat_map(|frame| [report("a", frame, "x"), report("b", frame, "y")]);
+            let (output, _) = replay(ReplayConfig::default(), lines);
+            let FusedLine::Map(first) = &output[0] else { panic!("{output:?}") };
+            assert_eq!(first.fused_at_us, Timestamp(start), "every {period} ms");
+            assert_eq!(map_labels(&output[..1]).len(), 2);
+        }
+    }
+}
+
+#[test]
 fn a_long_silence_is_passed_over() {
     let day = 86_400_000;
     let lines = [0, 100, day, day + 100].map(|at| line(&report("a", at, &[("x", "car")]), &[]));
@@ -200,9 +217,15 @@ fn a_recording_without_times_gets_a_verdict_on_every_item() {
 }
 
 #[test]
-fn the_first_line_of_a_kind_of_junk_is_told() {
-    let (_, summary) = replay(ReplayConfig::default(), ["", "junk", "{}", "[]"]);
-    assert_eq!(summary.rejected[&RejectReason::Malformed], Rejections { lines: 3, first_line: 2 });
+fn the_first_lines_of_a_kind_of_junk_are_told() {
+    let (_, summary) = replay(ReplayConfig::default(), ["", "junk", "{}", "[]", "more"]);
+    let Rejections { lines, examples } = &summary.rejected[&RejectReason::Malformed];
+    let said: Vec<_> = examples.iter().map(|(line, flaw)| format!("line {line}: {flaw}")).collect();
+    assert_eq!(*lines, 4);
+    assert_eq!(
+        said,
+        ["line 2: is no JSON object", "line 3: missing field `schema`, at column 2", "line 4: is no JSON object"]
+    );
 }
 
 /// Reports of four vehicles around a lot of eight spots, of both kinds, with disagreement.
@@ -254,7 +277,8 @@ fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
     (landmarks.collect(), reports)
 }
 
-/// Output of a live node until the round of the last report: reports as they come, timers at their deadlines.
+/// Output of a live node until the round of the last report: reports as they come, timers at their deadlines. It closes its
+/// first round when all reports of the first time have come.
 fn live(config: &ReplayConfig, reports: &[(ReportKind, ObjectReport, Timestamp)]) -> Vec<FusedLine> {
     let ReplayConfig { aggregator, fusion, landmarks, .. } = config.clone();
     let mut cell = Aggregator::new(aggregator, 1, fusion, landmarks, reports[0].2);
@@ -264,8 +288,11 @@ fn live(config: &ReplayConfig, reports: &[(ReportKind, ObjectReport, Timestamp)]
         output.extend(map.map(FusedLine::Map));
         output.extend(verdicts.map(FusedLine::Verdicts));
     };
-    let mut pending = false;
+    let (mut pending, mut first) = (false, Some(reports[0].2));
     for (kind, report, received_at) in reports {
+        if let Some(first) = first.take_if(|first| *first < *received_at) {
+            publish(cell.close_early(first));
+        }
         while cell.deadline() <= *received_at {
             let deadline = cell.deadline();
             publish(cell.tick(deadline));
@@ -309,6 +336,33 @@ fn with_passes_the_last_answer_counts_once_and_whole() {
     for labels in [&["cup", "mouse"][..], &["cup", "cup", "mouse"], &["mouse", "mouse"]] {
         let score = answers(labels);
         assert!((score - once).abs() < 1e-9, "{labels:?}: {score} instead of {once}");
+    }
+}
+
+#[test]
+fn votes_by_name_need_no_position() {
+    let pose = WirePose::from(Pose::new(500.0, 0.0, 1.0));
+    let placeless = |topic: &str, key: &str| {
+        let text =
+            line(&ObjectReport { pose: Some(pose), ..report("a", 0, &[("x", "cup")]) }, &[("topic", topic.into())]);
+        text.replace(",\"x_m\":0.0,\"y_m\":0.0", key)
+    };
+    let vote = placeless("vote_detections", "");
+    assert!(!vote.contains("\"x_m\":0"), "{vote}");
+    let null = placeless("cell/vote_detections/a", ",\"x_m\":null,\"y_m\":null");
+    for text in [vote.clone(), null] {
+        let (output, summary) = replay(ReplayConfig::default(), [&text]);
+        assert!(rejected(&summary).is_empty(), "{text}: {summary:?}");
+        assert_eq!(verdict_labels(&output)["x"].as_deref(), Some("cup"), "nobody knows how far x is from the pose");
+    }
+    for (text, flaw) in [
+        (placeless("detections", ""), "objects[0]: missing field `x_m`"),
+        (placeless("vote_detections", ",\"x_m\":1"), "objects[0]: missing field `y_m`"),
+        (vote.replace("\"landmark\":\"x\"", "\"landmark\":null"), "objects[0]: missing field `x_m`"),
+        (vote.replace("\"confidence\":0.9", "\"confidence\":9"), "objects[0].confidence: is not within 0 to 1: 9"),
+    ] {
+        let said = read_report(text.as_bytes(), &Limits::default()).unwrap_err().to_string();
+        assert!(said.starts_with(flaw), "{text}: {said}");
     }
 }
 

@@ -112,27 +112,53 @@ payloads! {
     NodeStatus: at most payload_bytes, checked by check_status;
 }
 
+/// A value that is not valid.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct InvalidValue {
+    /// Path of the value in its payload, as `objects[3].x_m`.
+    pub field: String,
+    /// The reason for which the payload is rejected.
+    pub reason: RejectReason,
+}
+
 impl ObjectReport {
     /// Checks version, counts, numbers and labels.
     ///
     /// # Errors
     /// The first reason found.
     pub fn validate(&self, limits: &Limits) -> Result<(), RejectReason> {
+        self.check_values(limits).map_err(|invalid| invalid.reason)
+    }
+
+    /// Checks as [`Self::validate`] does.
+    ///
+    /// # Errors
+    /// The first value that is not valid.
+    pub fn check_values(&self, limits: &Limits) -> Result<(), InvalidValue> {
+        let of = |field: &'static str| move |reason| InvalidValue { field: field.to_owned(), reason };
         if self.schema != SCHEMA_VERSION {
-            return Err(RejectReason::UnknownSchema);
+            return Err(of("schema")(RejectReason::UnknownSchema));
         }
         let seen = self.seen.as_deref().unwrap_or_default();
-        if self.objects.len() > limits.objects || seen.len() > limits.objects {
-            return Err(RejectReason::TooManyObjects);
+        for (field, count) in [("objects", self.objects.len()), ("seen", seen.len())] {
+            if count > limits.objects {
+                return Err(of(field)(RejectReason::TooManyObjects));
+            }
         }
-        if let Some(pose) = self.pose
-            && !(in_world(pose.x_m) && in_world(pose.y_m) && pose.heading_rad.is_finite())
-        {
-            return Err(RejectReason::NotFinite);
+        if let Some(pose) = self.pose {
+            check_coordinate(pose.x_m).map_err(of("pose.x_m"))?;
+            check_coordinate(pose.y_m).map_err(of("pose.y_m"))?;
+            check_between(pose.heading_rad, f64::MIN, f64::MAX).map_err(of("pose.heading_rad"))?;
         }
-        self.view.map_or(Ok(()), check_view)?;
-        check_labels(seen.iter().map(|id| &**id))?;
-        self.objects.iter().try_for_each(PerceivedObject::validate)
+        self.view.map_or(Ok(()), check_view).map_err(of("view"))?;
+        for (index, id) in seen.iter().enumerate() {
+            check_labels([&**id]).map_err(|reason| InvalidValue { field: format!("seen[{index}]"), reason })?;
+        }
+        for (index, object) in self.objects.iter().enumerate() {
+            let in_object = |(field, reason)| InvalidValue { field: format!("objects[{index}].{field}"), reason };
+            object.check_fields().map_err(in_object)?;
+        }
+        Ok(())
     }
 }
 
@@ -142,12 +168,21 @@ impl PerceivedObject {
     /// # Errors
     /// The first reason found.
     pub fn validate(&self) -> Result<(), RejectReason> {
-        check_place(self.x_m, self.y_m)?;
-        self.covariance().map_or(Ok(()), check_covariance)?;
-        check_confidence(self.confidence)?;
-        check_motion(self.velocity_mps, self.heading_rad, self.size_m)?;
-        check_scores(&self.scores)?;
-        check_labels([&*self.label].into_iter().chain(self.landmark.as_deref()))
+        self.check_fields().map_err(|(_, reason)| reason)
+    }
+
+    fn check_fields(&self) -> Result<(), (&'static str, RejectReason)> {
+        let of = |field| move |reason| (field, reason);
+        check_coordinate(self.x_m).map_err(of("x_m"))?;
+        check_coordinate(self.y_m).map_err(of("y_m"))?;
+        self.covariance().map_or(Ok(()), check_covariance).map_err(of("covariance_m2"))?;
+        check_confidence(self.confidence).map_err(of("confidence"))?;
+        check_motion(self.velocity_mps, None, None).map_err(of("velocity_mps"))?;
+        check_motion(None, self.heading_rad, None).map_err(of("heading_rad"))?;
+        check_motion(None, None, self.size_m).map_err(of("size_m"))?;
+        check_scores(&self.scores).map_err(of("scores"))?;
+        check_labels([&*self.label]).map_err(of("label"))?;
+        check_labels(self.landmark.as_deref()).map_err(of("landmark"))
     }
 }
 
@@ -285,7 +320,12 @@ fn check_verdict(verdict: &Verdict) -> Result<(), RejectReason> {
 }
 
 fn check_place(x_m: f64, y_m: f64) -> Result<(), RejectReason> {
-    if in_world(x_m) && in_world(y_m) { Ok(()) } else { Err(RejectReason::NotFinite) }
+    check_coordinate(x_m)?;
+    check_coordinate(y_m)
+}
+
+fn check_coordinate(coordinate_m: f64) -> Result<(), RejectReason> {
+    if coordinate_m.abs() <= WORLD_BOUND_M { Ok(()) } else { Err(RejectReason::NotFinite) }
 }
 
 fn check_covariance(covariance: Covariance) -> Result<(), RejectReason> {
@@ -306,10 +346,6 @@ fn check_labels<'a>(labels: impl IntoIterator<Item = &'a str>) -> Result<(), Rej
 
 fn check_integers(values: impl IntoIterator<Item = u64>) -> Result<(), RejectReason> {
     if values.into_iter().all(|value| value <= MAX_INTEGER) { Ok(()) } else { Err(RejectReason::OutOfRange) }
-}
-
-fn in_world(coordinate_m: f64) -> bool {
-    coordinate_m.abs() <= WORLD_BOUND_M
 }
 
 #[cfg(test)]

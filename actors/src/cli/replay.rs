@@ -39,14 +39,18 @@ pub(super) struct ReplayArguments {
     /// Repeat VOTE over all evidence N times, and write the verdicts of the last pass only
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     passes: Option<u32>,
+    /// Share of rejected reports beyond which the program ends with code 3, as it does if none was usable
+    #[arg(long, value_name = "PERCENT", value_parser = clap::value_parser!(u64).range(0..=100), default_value_t = 10)]
+    max_rejected: u64,
 }
 
 pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
-    let ReplayArguments { config, input, node, output, passes } = arguments;
+    let ReplayArguments { config, input, node, output, passes, max_rejected } = arguments;
     let given = config.as_deref().map(|path| cell(Some(path))).transpose()?;
     if let Some(lines) = input_of_lines(input, node)? {
         let config = ReplayConfig { passes: *passes, ..given.unwrap_or_default() };
-        return replay_lines(config, lines, RoundWriter::create(output, input)?);
+        let usable = replay_lines(config, lines, RoundWriter::create(output, input)?)?;
+        return usable.map_or(Ok(()), |usable| usable.check(*max_rejected));
     }
     let Logs { files, unusable } = Logs::find(input, node)?;
     if let (Some(unusable), None) = (unusable, &given) {
@@ -54,7 +58,8 @@ pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
         return Err(Failure::usage(why));
     }
     let rounds = RoundWriter::create(output, &files)?;
-    LogReplay::new(given.as_ref(), *passes).run(&files, rounds)
+    let usable = LogReplay::new(given.as_ref(), *passes).run(&files, rounds)?;
+    usable.map_or(Ok(()), |usable| usable.check(*max_rejected))
 }
 
 /// The input, if it is a file of lines or standard input; none for logs.
@@ -69,7 +74,8 @@ fn input_of_lines<'a>(inputs: &'a [PathBuf], node: &NodeArguments) -> Result<Opt
     Ok(Some(input))
 }
 
-fn replay_lines(config: ReplayConfig, input: &Path, mut rounds: RoundWriter) -> Result<(), Failure> {
+/// Replays lines; gives nothing if the reader of the output closed it.
+fn replay_lines(config: ReplayConfig, input: &Path, mut rounds: RoundWriter) -> Result<Option<Usable>, Failure> {
     let mut source = lines::open(input).map_err(Failure::usage)?;
     let limit = config.limits.payload_bytes;
     let (mut replay, mut line) = (Replay::new(config), Vec::new());
@@ -79,7 +85,7 @@ fn replay_lines(config: ReplayConfig, input: &Path, mut rounds: RoundWriter) -> 
             LineRead::TooLarge => replay.oversized_line(),
             LineRead::Whole => {
                 if !rounds.write(&replay.line(&line))? {
-                    return Ok(());
+                    return Ok(None);
                 }
             }
         }
@@ -87,7 +93,40 @@ fn replay_lines(config: ReplayConfig, input: &Path, mut rounds: RoundWriter) -> 
     let (rest, summary) = replay.finish();
     rounds.write(&rest)?;
     print_summary(&summary);
-    rounds.finish()
+    rounds.finish()?;
+    Ok(Some(Usable::of(&summary)))
+}
+
+/// Counts of reports, to tell input of another kind, or damaged input, from a recording.
+#[derive(Debug, Clone, Copy, Default)]
+struct Usable {
+    reports: u64,
+    used: u64,
+    faulty: u64,
+}
+
+impl Usable {
+    fn of(summary: &Summary) -> Self {
+        Self { reports: summary.lines, used: summary.used(), faulty: summary.faulty() }
+    }
+
+    fn plus(self, other: Self) -> Self {
+        let Self { reports, used, faulty } = other;
+        Self { reports: self.reports + reports, used: self.used + used, faulty: self.faulty + faulty }
+    }
+
+    /// Fails if nothing was used, or more than a share was rejected.
+    fn check(self, max_rejected_pct: u64) -> Result<(), Failure> {
+        let Self { reports, used, faulty } = self;
+        if used == 0 {
+            return Err(Failure::rejected(anyhow!("no report could be used: the input is no recording of reports")));
+        }
+        if faulty * 100 > max_rejected_pct * reports {
+            let share = format!("{faulty} of {reports} reports were rejected, more than {max_rejected_pct} %");
+            return Err(Failure::rejected(anyhow!("{share} (--max-rejected)")));
+        }
+        Ok(())
+    }
 }
 
 /// The cell that a configuration file describes; without a file, an open one.
@@ -146,10 +185,16 @@ impl RoundWriter {
 }
 
 fn print_summary(summary: &Summary) {
-    let Summary { lines, rejected, late, ignored_votes, overtaken, tracks, written } = summary;
+    let Summary { lines, rejected, unit, late, ignored_votes, overtaken, tracks, written } = summary;
     eprintln!("{lines} lines, {} used, {written} written", summary.used());
-    for (reason, Rejections { lines, first_line }) in rejected {
-        eprintln!("rejected {reason} {lines}, the first in line {first_line}");
+    for (reason, Rejections { lines, examples }) in rejected {
+        eprintln!("rejected {reason} {lines}");
+        for (number, flaw) in examples {
+            eprintln!("  line {number}: {flaw}");
+        }
+    }
+    if let Some(unit) = unit {
+        eprintln!("times look like {unit}: captured_at_us and received_at_us are microseconds since 1970");
     }
     for (what, number) in [
         ("reports used although older than an earlier line", *late),

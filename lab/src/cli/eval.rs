@@ -2,31 +2,35 @@
 
 mod tracks;
 
+use std::fmt::Display;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
+use ecod::model::names::Label;
 use ecod::perception::landmark::LandmarkIndex;
 use ecod::replay::{FusedLine, ReplayConfig, read_report};
-use ecod::wire::GlobalMap;
+use ecod::wire::{GlobalMap, RejectReason};
 use ecod_actors::cli::lines::{self, LineRead, read_line};
 use ecod_actors::cli::{Failure, cell};
 use serde::Deserialize;
 
 use super::columns::columns;
 use super::write_json;
+use crate::eval::formats::FileFormat;
 use crate::eval::tracks::TrackTruth;
-use crate::eval::{EvalResult, Evaluation, Scores, Truth};
+use crate::eval::{ClassRecall, EvalResult, Evaluation, Scores, Truth};
 use crate::report::tracks::percent;
 
 /// Flags of `eval`.
 #[derive(Debug, Args)]
 pub(super) struct EvalArguments {
-    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), or the places of all objects (JSON)
+    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), the places of all objects (JSON), or
+    /// a file of --format
     #[arg(long, value_name = "FILE")]
     truth: PathBuf,
-    /// Output of `replay`, or the map log of a node; `-` for standard input
+    /// Output of `replay`, or the map log of a node, `-` for standard input; with --format also a file of that form
     #[arg(long, value_name = "FILE")]
     input: PathBuf,
     /// The reports that were replayed, for majority vote and every vehicle alone
@@ -35,16 +39,27 @@ pub(super) struct EvalArguments {
     /// Configuration of the cell (TOML), to place reported objects that name no location and for synonyms
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// Form of a benchmark's files, or of all files in a directory
+    #[arg(long, value_enum, value_name = "FORM")]
+    format: Option<FileFormat>,
+    /// Frames a second in files of --format
+    #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = frame_rate, requires = "format")]
+    frame_rate: f64,
     /// Write the results to this file (JSON)
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 }
 
+fn frame_rate(text: &str) -> Result<f64, String> {
+    let rate = text.parse().ok().filter(|rate| (0.01..=1000.0).contains(rate));
+    rate.ok_or_else(|| "is no number from 0.01 to 1000".to_owned())
+}
+
 /// Longest line of output in bytes: the last of several passes is one line.
 const MAX_LINE_BYTES: usize = 1 << 28;
 
-/// Confusions that are printed; the file has all.
-const MAX_CONFUSIONS: usize = 12;
+/// Classes and confusions that are printed; the file has all.
+const MAX_ROWS: usize = 12;
 
 /// A line of a replay's output or of a node's map log.
 #[derive(Deserialize)]
@@ -60,6 +75,9 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
         let reports = arguments.reports.iter();
         let inputs: Vec<_> = [path, &arguments.input].into_iter().chain(reports).collect();
         lines::check_apart(out, &inputs).map_err(Failure::usage)?;
+    }
+    if let Some(format) = arguments.format {
+        return tracks::run_files(arguments, format);
     }
     let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
     let text = text.map_err(Failure::usage)?;
@@ -87,45 +105,68 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
 }
 
 fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failure> {
-    let (mut read, mut unreadable) = (0u64, 0u64);
-    each_line(path, MAX_LINE_BYTES, |line| {
+    let mut read = 0u64;
+    let mut unreadable = UnreadableLines::default();
+    each_line(path, MAX_LINE_BYTES, |number, line| {
         match line.map(serde_json::from_slice) {
             Some(Ok(InputLine::Fused(line))) => take(line),
             Some(Ok(InputLine::Received { map })) => take(FusedLine::Map(map)),
-            _ => return unreadable += 1,
+            _ => return unreadable.add(number, "it is neither a map nor verdicts"),
         }
         read += 1;
     })?;
-    if unreadable > 0 {
-        eprintln!("{}: {unreadable} lines are neither maps nor verdicts", path.display());
-    }
+    unreadable.print(path);
     if read == 0 { Err(anyhow!("there is no map and no verdict in {}", path.display()).into()) } else { Ok(()) }
 }
 
 fn read_reports(evaluation: &mut Evaluation, path: &Path, config: &ReplayConfig) -> Result<(), Failure> {
-    let mut unreadable = 0u64;
-    each_line(path, config.limits.payload_bytes, |line| match line.map(|line| read_report(line, &config.limits)) {
-        Some(Ok((kind, report))) => evaluation.report(kind, &report),
-        _ => unreadable += 1,
+    let mut unreadable = UnreadableLines::default();
+    each_line(path, config.limits.payload_bytes, |number, line| {
+        match line.map(|line| read_report(line, &config.limits)) {
+            Some(Ok((kind, report))) => evaluation.report(kind, &report),
+            Some(Err(flaw)) => unreadable.add(number, flaw),
+            None => unreadable.add(number, RejectReason::TooLarge),
+        }
     })?;
-    if unreadable > 0 {
-        eprintln!("{}: {unreadable} lines are not reports", path.display());
-    }
+    unreadable.print(path);
     Ok(())
 }
 
-/// Gives every line that is not blank to `take`, `None` for one that is too large.
-fn each_line(path: &Path, limit: usize, mut take: impl FnMut(Option<&[u8]>)) -> Result<(), Failure> {
-    let mut source = lines::open(path).map_err(Failure::usage)?;
-    let mut line = Vec::new();
-    loop {
-        match read_line(&mut source, limit, &mut line).with_context(|| format!("cannot read {}", path.display()))? {
-            LineRead::End => return Ok(()),
-            LineRead::TooLarge => take(None),
-            LineRead::Whole if line.trim_ascii().is_empty() => {}
-            LineRead::Whole => take(Some(&line)),
+/// Lines that cannot be used; the first is kept.
+#[derive(Default)]
+struct UnreadableLines {
+    lines: u64,
+    first: String,
+}
+
+impl UnreadableLines {
+    fn add(&mut self, number: u64, why: impl Display) {
+        if self.lines == 0 {
+            self.first = format!("line {number}: {why}");
+        }
+        self.lines += 1;
+    }
+
+    fn print(&self, path: &Path) {
+        if self.lines > 0 {
+            eprintln!("{}: {} lines cannot be used, the first is {}", path.display(), self.lines, self.first);
         }
     }
+}
+
+/// Gives every line that is not blank to `take`, with its number from 1; `None` for one that is too large.
+fn each_line(path: &Path, limit: usize, mut take: impl FnMut(u64, Option<&[u8]>)) -> Result<(), Failure> {
+    let mut source = lines::open(path).map_err(Failure::usage)?;
+    let mut line = Vec::new();
+    for number in 1.. {
+        match read_line(&mut source, limit, &mut line).with_context(|| format!("cannot read {}", path.display()))? {
+            LineRead::End => break,
+            LineRead::TooLarge => take(number, None),
+            LineRead::Whole if line.trim_ascii().is_empty() => {}
+            LineRead::Whole => take(number, Some(&line)),
+        }
+    }
+    Ok(())
 }
 
 fn table(result: &EvalResult) -> String {
@@ -144,9 +185,30 @@ fn table(result: &EvalResult) -> String {
             }));
             text += &format!("\n{name}, every vehicle\n{}", columns(&rows));
         }
+        text += &recall(name, scores);
         text += &confusion(name, scores);
     }
     text
+}
+
+fn recall(name: &str, scores: &Scores) -> String {
+    let mut classes: Vec<_> = scores.recall.iter().collect();
+    classes.sort_by_key(|class| std::cmp::Reverse(class.items));
+    let row = |class: &&ClassRecall| vec![name_of(&class.truth), class.items.to_string(), percent(class.recall_pct)];
+    let mut rows = vec![header(&["truth", "items", "recall %"])];
+    rows.extend(classes.iter().take(MAX_ROWS).map(row));
+    rows.push(vec!["mean".into(), String::new(), percent(scores.mean_recall_pct)]);
+    format!("\n{name}, every class\n{}{}", columns(&rows), rest(classes.len()))
+}
+
+fn name_of(label: &Option<Label>) -> String {
+    label.as_deref().unwrap_or("-").to_owned()
+}
+
+/// What follows a table of which [`MAX_ROWS`] rows are printed.
+fn rest(rows: usize) -> String {
+    let more = rows.saturating_sub(MAX_ROWS);
+    if more > 0 { format!("and {more} more\n") } else { String::new() }
 }
 
 fn header(cells: &[&str]) -> Vec<String> {
@@ -161,12 +223,7 @@ fn summary(name: &str, scores: &Scores) -> Vec<String> {
 fn confusion(name: &str, scores: &Scores) -> String {
     let mut cells: Vec<_> = scores.confusion.iter().collect();
     cells.sort_by_key(|cell| std::cmp::Reverse(cell.count));
-    let name_of = |label: &Option<ecod::model::names::Label>| label.as_deref().unwrap_or("-").to_owned();
     let mut rows = vec![header(&["truth", "said", "items"])];
-    rows.extend(
-        cells.iter().take(MAX_CONFUSIONS).map(|c| vec![name_of(&c.truth), name_of(&c.said), c.count.to_string()]),
-    );
-    let more = cells.len().saturating_sub(MAX_CONFUSIONS);
-    let rest = if more > 0 { format!("and {more} more\n") } else { String::new() };
-    format!("\n{name}, truth and what was said\n{}{rest}", columns(&rows))
+    rows.extend(cells.iter().take(MAX_ROWS).map(|c| vec![name_of(&c.truth), name_of(&c.said), c.count.to_string()]));
+    format!("\n{name}, truth and what was said\n{}{}", columns(&rows), rest(cells.len()))
 }

@@ -56,6 +56,9 @@ fn figures_are_those_worked_out_by_hand() {
     assert_eq!(vote.labelled_accuracy_pct, Some(50.0), "a of a and b");
     assert!((vote.coverage_pct.unwrap() - 200.0 / 3.0).abs() < 1e-9, "a and b of a, b and c");
     assert_eq!((vote.rounds.entries, vote.rounds.right), (8, 3), "b once, a once, d once");
+    let recall: Vec<_> = vote.recall.iter().map(|c| (c.truth.as_deref(), c.items, c.recall_pct)).collect();
+    assert_eq!(recall, [(None, 1, Some(100.0)), (Some("cup"), 2, Some(50.0)), (Some("mouse"), 1, Some(0.0))]);
+    assert_eq!(vote.mean_recall_pct, Some(50.0), "of nothing, cup and mouse");
     assert_eq!(vote.majority_accuracy_pct, Some(37.5), "a whole and b half of four");
     let v1 = &vote.vehicles[&NodeName::from_static("v1")];
     assert_eq!((v1.votes, v1.accuracy_pct), (3, Some(25.0)));

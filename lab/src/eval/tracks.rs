@@ -2,11 +2,12 @@
 //!
 //! An object of a map can be taken for a true one of the same label that is near enough. Detection is judged by average
 //! precision at four distances and by the best F1; then, at a threshold on the confidence, by MODA and MODP, CLEAR MOT,
-//! IDF1 and HOTA. Definitions and sources stand with each part; `docs/evaluation.md` has them together.
+//! IDF1 and HOTA. Stated probabilities are judged by their calibration. Definitions and sources stand with each part; `docs/evaluation.md` has them together.
 //!
 //! Call [`TrackEvaluation::map`] with every map of a replay, in order, then [`TrackEvaluation::result`]. Output of
 //! other programs is judged by [`score`].
 
+mod calibration;
 mod clear;
 mod hota;
 mod identity;
@@ -26,8 +27,10 @@ use nalgebra::Point2;
 use serde::Serialize;
 use uuid::Uuid;
 
+pub use calibration::{Calibration, Reliability, ReliabilityBin};
 pub use truth::{TrackTruth, TrackTruthError};
 
+use super::formats::{Sequence, time_of};
 use super::percent;
 
 /// Distances in metres at which average precision is given.
@@ -76,6 +79,8 @@ pub struct SaidObject {
     pub label: Label,
     /// Confidence that it is there; only the order matters to average precision.
     pub score: f64,
+    /// Probability that it exists, wherever exactly, if it is stated apart.
+    pub existence: Option<f64>,
     /// Its centre in metres.
     pub position: Point2<f64>,
 }
@@ -101,6 +106,8 @@ pub struct TrackScores {
     pub at_best_f1: ThresholdScores,
     /// At [`DEFAULT_THRESHOLD`].
     pub at_default: ThresholdScores,
+    /// Calibration of the stated probabilities, whatever the threshold.
+    pub calibration: Calibration,
 }
 
 /// Figures of the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes
@@ -117,6 +124,8 @@ pub struct ThresholdScores {
     pub misses: u64,
     /// Times that a true object was given another identity than before.
     pub id_switches: u64,
+    /// Times that a true object was found again after it had been missed.
+    pub fragments: u64,
     /// Detection accuracy 1 − (misses + false alarms) / objects; below zero with many false alarms.
     pub moda_pct: Option<f64>,
     /// Detection precision, mean of 1 − d/[`MATCH_DISTANCE_M`] over the matches.
@@ -156,6 +165,7 @@ pub fn score(frames: &[Frame]) -> TrackScores {
         best_f1_pct: best.map(|best| 100.0 * best.f1),
         at_best_f1: at_threshold(frames, best.map_or(DEFAULT_THRESHOLD, |best| best.threshold)),
         at_default: at_threshold(frames, DEFAULT_THRESHOLD),
+        calibration: calibration::judge(frames),
     }
 }
 
@@ -178,6 +188,7 @@ fn at_threshold(frames: &[Frame], threshold: f64) -> ThresholdScores {
         false_alarms: clear.false_alarms,
         misses: clear.misses,
         id_switches: clear.id_switches,
+        fragments: clear.fragments,
         moda_pct: percent(objects as f64 - wrong, objects),
         modp_pct: motp_m.map(|mean| 100.0 * (1.0 - mean / MATCH_DISTANCE_M)),
         mota_pct: percent(objects as f64 - wrong - clear.id_switches as f64, objects),
@@ -221,6 +232,7 @@ impl TrackEvaluation {
                 id: *ids.entry(object.id).or_insert(fresh),
                 label: object.label.clone(),
                 score: object.confidence,
+                existence: object.existence,
                 position: Point2::new(object.x_m, object.y_m),
             }
         });
@@ -253,6 +265,40 @@ impl TrackEvaluation {
                 None => Frame { truth: self.truth.frames()[number].objects.clone(), said: Vec::new() },
             })
             .collect();
-        TrackScores { frames_with_map: with_map, ..score(&frames) }
+        let mut scores = TrackScores { frames_with_map: with_map, ..score(&frames) };
+        if !self.truth.has_identities() {
+            for at in [&mut scores.at_best_f1, &mut scores.at_default] {
+                *at = ThresholdScores { id_switches: 0, fragments: 0, mota_pct: None, idf1_pct: None, ..*at };
+                (at.hota_pct, at.deta_pct, at.assa_pct, at.loca_pct) = (None, None, None, None);
+            }
+        }
+        scores
+    }
+
+    /// Takes what the files of a benchmark say, frame by frame.
+    pub fn sequences(&mut self, sequences: &[Sequence], frame_rate_hz: f64) {
+        let times: Vec<Timestamp> = self.truth.frames().iter().map(|frame| frame.at).collect();
+        let mut said: BTreeMap<Timestamp, Vec<SaidObject>> = times.into_iter().map(|at| (at, Vec::new())).collect();
+        let mut ids: HashMap<(usize, i64), u32> = HashMap::new();
+        // Detections have no identity: none goes on.
+        let mut next = 0;
+        for (number, sequence) in sequences.iter().enumerate() {
+            for (frame, objects) in &sequence.frames {
+                let objects = objects.iter().map(|object| {
+                    next += 1;
+                    SaidObject {
+                        id: object.id.map_or(next, |id| *ids.entry((number, id)).or_insert(next)),
+                        label: object.label.clone(),
+                        score: object.score,
+                        existence: None,
+                        position: object.position,
+                    }
+                });
+                said.insert(time_of(number, *frame, frame_rate_hz), objects.collect());
+            }
+        }
+        for (at, objects) in &said {
+            self.said(*at, objects);
+        }
     }
 }

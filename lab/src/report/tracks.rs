@@ -1,9 +1,9 @@
 //! Figures of objects that move, as rows for pages and terminals.
 
-use crate::eval::tracks::{AP_DISTANCES_M, ThresholdScores, TrackScores};
+use crate::eval::tracks::{AP_DISTANCES_M, Reliability, ThresholdScores, TrackScores};
 
 /// Headings of the figures at a threshold, in the order of [`at`].
-const AT_THRESHOLD: [&str; 12] = [
+const AT_THRESHOLD: [&str; 13] = [
     "at confidence",
     "",
     "F1 %",
@@ -16,10 +16,12 @@ const AT_THRESHOLD: [&str; 12] = [
     "AssA %",
     "LocA %",
     "switches",
+    "fragments",
 ];
 
-/// Two tables, each under its header: average precision of all and of every class, and what holds at two thresholds.
-pub(crate) fn tables(scores: &TrackScores) -> [Vec<Vec<String>>; 2] {
+/// Tables, each under its header: average precision of all and of every class, what holds at two thresholds, and the
+/// reliability of each stated probability.
+pub(crate) fn tables(scores: &TrackScores) -> Vec<Vec<Vec<String>>> {
     let distances = AP_DISTANCES_M.map(|distance| format!("AP@{distance} %"));
     let row = |name: &str, objects: String, said: String, ap: &[Option<f64>; AP_DISTANCES_M.len()]| {
         [name.to_owned(), objects, said].into_iter().chain(ap.map(percent)).collect::<Vec<_>>()
@@ -35,7 +37,21 @@ pub(crate) fn tables(scores: &TrackScores) -> [Vec<Vec<String>>; 2] {
         at("best F1", scores.best_f1_pct, &scores.at_best_f1),
         at("default", None, &scores.at_default),
     ];
-    [precision, thresholds]
+    let calibration = &scores.calibration;
+    let stated = [("confidence", Some(&calibration.confidence)), ("existence", calibration.existence.as_ref())];
+    let reliability = stated.into_iter().filter_map(|(name, of)| Some(self::reliability(name, of?)));
+    [precision, thresholds].into_iter().chain(reliability).collect()
+}
+
+/// One row for each bin of a reliability diagram, the expected calibration error last.
+fn reliability(name: &str, of: &Reliability) -> Vec<Vec<String>> {
+    let mut rows = vec![[name, "stated %", "right %", "objects"].map(str::to_owned).to_vec()];
+    rows.extend(of.bins.iter().map(|bin| {
+        let shares = [bin.stated_pct, bin.right_pct].map(|share| percent(Some(share)));
+        [vec![String::new()], shares.to_vec(), vec![bin.objects.to_string()]].concat()
+    }));
+    rows.push(vec!["calibration error %".into(), percent(of.ece_pct)]);
+    rows
 }
 
 /// Warning about frames without a map.
@@ -46,7 +62,7 @@ pub(crate) fn without_map(scores: &TrackScores) -> Option<String> {
 }
 
 fn at(name: &str, best_f1_pct: Option<f64>, scores: &ThresholdScores) -> Vec<String> {
-    let ThresholdScores { matches, false_alarms, misses, .. } = scores;
+    let ThresholdScores { matches, false_alarms, misses, id_switches, fragments, .. } = scores;
     let f1 = best_f1_pct.or_else(|| {
         let all = 2 * matches + false_alarms + misses;
         (all > 0).then(|| 200.0 * *matches as f64 / all as f64)
@@ -63,7 +79,7 @@ fn at(name: &str, best_f1_pct: Option<f64>, scores: &ThresholdScores) -> Vec<Str
         scores.loca_pct,
     ];
     let named = [name.to_owned(), format!("{:.3}", scores.threshold)];
-    named.into_iter().chain(shares.map(percent)).chain([scores.id_switches.to_string()]).collect()
+    named.into_iter().chain(shares.map(percent)).chain([id_switches, fragments].map(u64::to_string)).collect()
 }
 
 /// A share in percent; a dash where there is none.

@@ -9,7 +9,7 @@ use ecod::perception::landmark::Landmark;
 use ecod::replay::{FusedLine, JournalEntry, JournalReplay, Replay, ReplayConfig};
 use ecod::wire::{Limits, ObjectReport, RejectReason, ReportKind, decode};
 
-use super::{Failure, RoundWriter, print_summary};
+use super::{Failure, RoundWriter, Usable, print_summary};
 use crate::observe::recorder::{LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName};
 
 /// Bounds of memory only: the node checked its own limits when it recorded.
@@ -32,15 +32,18 @@ pub(super) struct LogReplay<'a> {
     /// Chosen by the first journal entry or report.
     engine: Option<ReplayEngine>,
     unreadable: BTreeMap<RejectReason, u64>,
+    /// Reports of the fusions that have ended, and unreadable ones.
+    usable: Usable,
 }
 
 impl<'a> LogReplay<'a> {
     pub(super) fn new(cell: Option<&'a ReplayConfig>, passes: Option<u32>) -> Self {
-        Self { cell, passes, identity: None, engine: None, unreadable: BTreeMap::new() }
+        Self { cell, passes, identity: None, engine: None, unreadable: BTreeMap::new(), usable: Usable::default() }
     }
 
-    /// Reads the files and writes their rounds. Unusable parts are reported and skipped.
-    pub(super) fn run(mut self, files: &[PathBuf], mut rounds: RoundWriter) -> Result<(), Failure> {
+    /// Reads the files and writes their rounds. Unusable parts are reported and skipped. Gives nothing for a journal, and
+    /// if the reader of the output closed it.
+    pub(super) fn run(mut self, files: &[PathBuf], mut rounds: RoundWriter) -> Result<Option<Usable>, Failure> {
         for file in files {
             let mut log = LogReader::open(file).map_err(Failure::usage)?;
             for event in log.by_ref() {
@@ -53,7 +56,7 @@ impl<'a> LogReplay<'a> {
                     }
                 };
                 if !rounds.write(&lines)? {
-                    return Ok(());
+                    return Ok(None);
                 }
             }
             for (schema, messages) in log.unknown() {
@@ -91,7 +94,7 @@ impl<'a> LogReplay<'a> {
             Some(ReplayEngine::Journal(rerun)) => rerun.restart(config.fusion, config.landmarks),
             Some(ReplayEngine::Reports(replay)) if self.cell.is_none() && !is_as_before => {
                 eprintln!("{file} is of a run under another configuration: fusion starts again there");
-                return Ok(end(std::mem::replace(&mut **replay, Replay::new(config))));
+                return Ok(end(std::mem::replace(&mut **replay, Replay::new(config)), &mut self.usable));
             }
             _ => {}
         }
@@ -121,6 +124,7 @@ impl<'a> LogReplay<'a> {
     }
 
     fn reject(&mut self, reason: RejectReason) -> Vec<FusedLine> {
+        self.usable = self.usable.plus(Usable { reports: 1, used: 0, faulty: 1 });
         *self.unreadable.entry(reason).or_default() += 1;
         Vec::new()
     }
@@ -153,18 +157,22 @@ impl<'a> LogReplay<'a> {
         ReplayConfig { passes: self.passes, limits: LIMITS, ..config }
     }
 
-    fn finish(self, mut rounds: RoundWriter) -> Result<(), Failure> {
+    fn finish(mut self, mut rounds: RoundWriter) -> Result<Option<Usable>, Failure> {
         for (reason, messages) in &self.unreadable {
             eprintln!("rejected {reason} {messages}");
         }
         match self.engine {
             None => eprintln!("the log holds no report and no journal"),
             Some(ReplayEngine::Reports(replay)) => {
-                rounds.write(&end(*replay))?;
+                rounds.write(&end(*replay, &mut self.usable))?;
             }
-            Some(ReplayEngine::Journal(rerun)) => print_rerun(&rerun),
+            Some(ReplayEngine::Journal(rerun)) => {
+                print_rerun(&rerun);
+                // What the live aggregator rejected is part of its journal, and it may have fused nothing.
+                return rounds.finish().map(|()| None);
+            }
         }
-        rounds.finish()
+        rounds.finish().map(|()| Some(self.usable))
     }
 }
 
@@ -180,10 +188,11 @@ pub fn rounds_of_log(file: &Path) -> Vec<FusedLine> {
     rounds
 }
 
-/// The last rounds of a replay of reports, whose summary is printed.
-fn end(replay: Replay) -> Vec<FusedLine> {
+/// The last rounds of a replay of reports, whose summary is printed and added up.
+fn end(replay: Replay, usable: &mut Usable) -> Vec<FusedLine> {
     let (lines, summary) = replay.finish();
     print_summary(&summary);
+    *usable = usable.plus(Usable::of(&summary));
     lines
 }
 

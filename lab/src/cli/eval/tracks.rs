@@ -1,11 +1,15 @@
 //! Objects that move, judged by where they were.
 
+use std::io::BufRead;
+use std::path::Path;
+
 use anyhow::{Context, anyhow};
 use ecod::replay::FusedLine;
-use ecod_actors::cli::Failure;
+use ecod_actors::cli::{Failure, lines};
 use serde::Serialize;
 
 use super::{EvalArguments, columns, read_output, write_json};
+use crate::eval::formats::FileFormat;
 use crate::eval::tracks::{TrackEvaluation, TrackScores, TrackTruth};
 use crate::report::tracks::{tables, without_map};
 
@@ -16,12 +20,50 @@ struct Judged {
 }
 
 pub(super) fn run(arguments: &EvalArguments, text: &str) -> Result<(), Failure> {
-    if arguments.reports.is_some() || arguments.config.is_some() {
-        return Err(Failure::usage(anyhow!("--reports and --config are for a truth of locations")));
-    }
     let path = &arguments.truth;
     let truth = TrackTruth::parse(text).with_context(|| format!("truth {}", path.display())).map_err(Failure::usage)?;
+    judge_maps(arguments, TrackEvaluation::new(truth))
+}
+
+/// Judges by the truth in files of a benchmark: maps, or files of the same form.
+pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result<(), Failure> {
+    let EvalArguments { truth: path, input, frame_rate, .. } = arguments;
+    let mut truth = format.read(path).map_err(Failure::usage)?;
+    let said = if is_of_maps(input)? { None } else { Some(format.read(input).map_err(Failure::usage)?) };
+    if let Some(said) = said.as_ref().filter(|said| said.len() > 1 || truth.len() > 1) {
+        // Part of the sequences may be judged.
+        truth.retain(|sequence| said.iter().any(|other| other.name == sequence.name));
+        if let Some(other) = said.iter().find(|other| truth.iter().all(|sequence| sequence.name != other.name)) {
+            let what = format!("{} has no truth of the sequence {}", path.display(), other.name);
+            return Err(Failure::usage(anyhow!(what)));
+        }
+    }
+    let truth = TrackTruth::from_sequences(&truth, *frame_rate);
+    let truth = truth.with_context(|| format!("truth {}", path.display())).map_err(Failure::usage)?;
     let mut evaluation = TrackEvaluation::new(truth);
+    match said {
+        None => judge_maps(arguments, evaluation),
+        Some(said) => {
+            evaluation.sequences(&said, *frame_rate);
+            print_scores(arguments, evaluation)
+        }
+    }
+}
+
+/// True for output of a replay and for a map log: they begin with a JSON object.
+fn is_of_maps(input: &Path) -> Result<bool, Failure> {
+    if input == Path::new("-") {
+        return Ok(true);
+    }
+    if input.is_dir() {
+        return Ok(false);
+    }
+    let mut source = lines::open(input).map_err(Failure::usage)?;
+    let begin = source.fill_buf().with_context(|| format!("cannot read {}", input.display()))?;
+    Ok(begin.trim_ascii_start().starts_with(b"{"))
+}
+
+fn judge_maps(arguments: &EvalArguments, mut evaluation: TrackEvaluation) -> Result<(), Failure> {
     let mut maps = 0u64;
     read_output(&arguments.input, |line| {
         if let FusedLine::Map(map) = line {
@@ -32,11 +74,18 @@ pub(super) fn run(arguments: &EvalArguments, text: &str) -> Result<(), Failure> 
     if maps == 0 {
         return Err(anyhow!("there is no map in {}", arguments.input.display()).into());
     }
+    print_scores(arguments, evaluation)
+}
+
+fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Result<(), Failure> {
+    if arguments.reports.is_some() || arguments.config.is_some() {
+        return Err(Failure::usage(anyhow!("--reports and --config are for a truth of locations")));
+    }
     let scores = evaluation.result();
     if let Some(warning) = without_map(&scores) {
         eprintln!("{warning}");
     }
-    print!("{}", tables(&scores).map(|rows| columns(&rows)).join("\n"));
+    print!("{}", tables(&scores).iter().map(|rows| columns(rows)).collect::<Vec<_>>().join("\n"));
     if let Some(out) = &arguments.out {
         write_json(out, &Judged { tracks: scores })?;
     }

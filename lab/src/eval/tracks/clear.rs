@@ -3,7 +3,7 @@
 //!
 //! In every frame, pairs that matched in the frame before and are still near enough match again; the others match so
 //! that the sum of their similarities is greatest. A true object that matches another identity than the last time it
-//! matched is a switch. Equal to `trackeval.metrics.CLEAR` at a threshold of 0.5, a frame in which nothing was said
+//! matched is a switch. One that matches again after frames without a match is a fragment. Equal to `trackeval.metrics.CLEAR` at a threshold of 0.5, a frame in which nothing was said
 //! included: it ends no pair.
 
 use hashbrown::HashMap;
@@ -18,6 +18,7 @@ pub(super) struct Clear {
     pub(super) false_alarms: u64,
     pub(super) misses: u64,
     pub(super) id_switches: u64,
+    pub(super) fragments: u64,
     pub(super) distance_sum_m: f64,
 }
 
@@ -43,11 +44,13 @@ pub(super) fn judge(frames: &[Frame]) -> Clear {
         if frame.said.is_empty() || frame.truth.is_empty() {
             continue;
         }
-        before.clear();
+        let followed = std::mem::take(&mut before);
         for pair in &matched {
             let (truth, said) = ids(pair);
             before.insert(truth, said);
-            clear.id_switches += u64::from(last.insert(truth, said).is_some_and(|earlier| earlier != said));
+            let earlier = last.insert(truth, said);
+            clear.id_switches += u64::from(earlier.is_some_and(|earlier| earlier != said));
+            clear.fragments += u64::from(earlier.is_some() && !followed.contains_key(&truth));
             clear.distance_sum_m += (frame.truth[pair.truth].position - frame.said[pair.said].position).norm();
         }
     }

@@ -10,7 +10,7 @@ fn truth(id: u32, x: f64) -> TrueObject {
 }
 
 fn said(id: u32, x: f64, score: f64) -> SaidObject {
-    SaidObject { id, label: "car".into(), score, position: Point2::new(x, 0.0) }
+    SaidObject { id, label: "car".into(), score, existence: None, position: Point2::new(x, 0.0) }
 }
 
 fn near(found: Option<f64>, expected: f64) {
@@ -103,6 +103,49 @@ fn one_switch_costs_what_it_should() {
     near(at.deta_pct, 100.0);
     near(at.assa_pct, 50.0);
     near(at.hota_pct, 100.0 * 0.5f64.sqrt());
+}
+
+/// One object over six frames, missed in two runs, found by another identity at last.
+#[test]
+fn an_object_that_is_found_again_is_a_fragment() {
+    let frame = |id: Option<u32>| Frame {
+        truth: vec![truth(0, 0.0)],
+        said: id.map_or_else(|| vec![said(9, 50.0, 0.9)], |id| vec![said(id, 0.0, 0.9)]),
+    };
+    let at = score(&[None, Some(1), None, Some(1), None, Some(2)].map(frame)).at_default;
+    assert_eq!((at.fragments, at.id_switches, at.misses, at.matches), (2, 1, 3, 3));
+    let switched = score(&[Some(1), Some(2)].map(frame)).at_default;
+    assert_eq!((switched.fragments, switched.id_switches), (0, 1), "it was never missed");
+}
+
+/// Five objects said: 0.95 right, 0.9 and 1.0 where 1.0 is wrong, 0.55 wrong, 0.05 right.
+/// Bins: 0.9 to 1 states 0.95 and 2 of 3 are right, 0.55 with none, 0.05 with one.
+#[test]
+fn calibration_is_that_worked_out_by_hand() {
+    let frame = Frame {
+        truth: vec![truth(0, 0.0), truth(1, 10.0), truth(2, 20.0)],
+        said: vec![
+            said(0, 1.4, 0.95),
+            said(1, 10.0, 0.9),
+            said(2, 50.0, 1.0),
+            said(3, 12.0, 0.55),
+            said(4, 21.0, 0.05),
+        ],
+    };
+    let Calibration { confidence, existence } = score(&[frame]).calibration;
+    assert_eq!(existence, None);
+    near(confidence.ece_pct, 100.0 * (3.0 * (0.95 - 2.0 / 3.0) + 0.55 + 0.95) / 5.0);
+    let bins: Vec<_> =
+        confidence.bins.iter().map(|bin| (bin.stated_pct.round(), bin.right_pct.round(), bin.objects)).collect();
+    assert_eq!(bins, [(5.0, 100.0, 1), (55.0, 0.0, 1), (95.0, 67.0, 3)]);
+
+    let mut exists = said(0, 3.0, 0.5);
+    exists.existence = Some(1.0);
+    let frame = Frame { truth: vec![truth(0, 0.0)], said: vec![exists, said(1, 50.0, 0.1)] };
+    let Calibration { confidence, existence } = score(&[frame]).calibration;
+    near(confidence.ece_pct, 30.0);
+    near(existence.unwrap().ece_pct, 0.0);
+    assert_eq!(score(&[]).calibration.confidence.ece_pct, None);
 }
 
 /// A pair that goes on keeps its match although another is nearer now.

@@ -8,6 +8,7 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use super::TrueObject;
+use crate::eval::formats::{Sequence, time_of};
 
 /// The period of a truth of one frame, in microseconds.
 const USUAL_PERIOD_US: u64 = 100_000;
@@ -20,10 +21,12 @@ const USUAL_PERIOD_US: u64 = 100_000;
 /// {"frames": [{"t_us": 1732154400000000, "objects": [{"id": "car-1", "label": "car", "x_m": 12.5, "y_m": -3.0}]}]}
 /// ```
 ///
-/// Frames ascend in time; an `id` is text or a whole number, once in a frame, and the same object in every frame.
+/// Frames ascend in time; an `id` is text or a whole number, once in a frame, and the same object in every frame. Where any
+/// object has none, identities are not judged.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackTruth {
     frames: Vec<TrueFrame>,
+    has_identities: bool,
 }
 
 /// One moment.
@@ -44,7 +47,7 @@ pub enum TrackTruthError {
         /// Reason.
         reason: String,
     },
-    /// No frame at all.
+    /// No frame at all, or no object in the files of a benchmark.
     #[error("truth has no frame")]
     Empty,
 }
@@ -62,7 +65,7 @@ struct FrameFields {
 
 #[derive(Deserialize)]
 struct ObjectFields {
-    id: Id,
+    id: Option<Id>,
     label: String,
     x_m: f64,
     y_m: f64,
@@ -102,7 +105,7 @@ impl TrackTruth {
         let fields: Fields = serde_path_to_error::deserialize(&mut source)
             .map_err(|error| form(error.path().to_string(), error.into_inner().to_string()))?;
         source.end().map_err(|error| form("the end", error.to_string()))?;
-        let mut ids = HashMap::new();
+        let mut ids = Ids { has_identities: true, ..Ids::default() };
         let mut frames: Vec<TrueFrame> = Vec::with_capacity(fields.frames.len());
         for (number, frame) in fields.frames.into_iter().enumerate() {
             let place = format!("frames[{number}]");
@@ -111,7 +114,42 @@ impl TrackTruth {
             }
             frames.push(TrueFrame { at: frame.t_us, objects: objects(frame.objects, &place, &mut ids)? });
         }
-        if frames.is_empty() { Err(TrackTruthError::Empty) } else { Ok(Self { frames }) }
+        let Ids { has_identities, .. } = ids;
+        if frames.is_empty() { Err(TrackTruthError::Empty) } else { Ok(Self { frames, has_identities }) }
+    }
+
+    /// The truth in files of a benchmark, with an empty frame for each that a file leaves out.
+    ///
+    /// # Errors
+    /// Naming sequence and frame where an identity occurs twice, or when there is no object at all.
+    pub fn from_sequences(sequences: &[Sequence], frame_rate_hz: f64) -> Result<Self, TrackTruthError> {
+        let mut ids = Ids { has_identities: true, ..Ids::default() };
+        let mut frames = Vec::new();
+        for (number, sequence) in sequences.iter().enumerate() {
+            let last = sequence.frames.keys().last().copied().unwrap_or(sequence.first);
+            for frame in sequence.first..=last {
+                let objects = sequence.frames.get(&frame).map(Vec::as_slice).unwrap_or_default();
+                let fields = objects.iter().map(|object| ObjectFields {
+                    id: object.id.map(|id| Id::Text(format!("{number}/{id}"))),
+                    label: object.label.to_string(),
+                    x_m: object.position.x,
+                    y_m: object.position.y,
+                });
+                let place = format!("sequence {}, frame {frame}", sequence.name);
+                let objects = self::objects(fields.collect(), &place, &mut ids)?;
+                frames.push(TrueFrame { at: time_of(number, frame, frame_rate_hz), objects });
+            }
+        }
+        if ids.next == 0 {
+            Err(TrackTruthError::Empty)
+        } else {
+            Ok(Self { frames, has_identities: ids.has_identities })
+        }
+    }
+
+    /// True if the same object has the same id in every frame.
+    pub(super) fn has_identities(&self) -> bool {
+        self.has_identities
     }
 
     /// Ascending in time, at least one.
@@ -148,11 +186,30 @@ impl TrackTruth {
     }
 }
 
-fn objects(
-    fields: Vec<ObjectFields>,
-    place: &str,
-    ids: &mut HashMap<Id, u32>,
-) -> Result<Vec<TrueObject>, TrackTruthError> {
+/// The numbers of the objects' ids; an object without one gets a number of its own.
+#[derive(Default)]
+struct Ids {
+    numbers: HashMap<Id, u32>,
+    next: u32,
+    has_identities: bool,
+}
+
+impl Ids {
+    fn number(&mut self, id: Option<Id>) -> u32 {
+        let next = self.next;
+        let number = match id {
+            Some(id) => *self.numbers.entry(id).or_insert(next),
+            None => {
+                self.has_identities = false;
+                next
+            }
+        };
+        self.next = next.max(number + 1);
+        number
+    }
+}
+
+fn objects(fields: Vec<ObjectFields>, place: &str, ids: &mut Ids) -> Result<Vec<TrueObject>, TrackTruthError> {
     let mut in_frame = HashSet::new();
     let mut objects = Vec::with_capacity(fields.len());
     for (number, ObjectFields { id, label, x_m, y_m }) in fields.into_iter().enumerate() {
@@ -160,8 +217,7 @@ fn objects(
         if !(1..=MAX_NAME_BYTES).contains(&label.len()) {
             return Err(form(place("label"), format!("is not 1 to {MAX_NAME_BYTES} bytes long")));
         }
-        let fresh = ids.len() as u32;
-        let id = *ids.entry(id).or_insert(fresh);
+        let id = ids.number(id);
         if !in_frame.insert(id) {
             return Err(form(place("id"), "is in this frame already"));
         }

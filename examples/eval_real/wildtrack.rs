@@ -1,0 +1,108 @@
+//! WILDTRACK (Chavdarova et al., CVPR 2018): seven cameras around a square, with boxes that ReST keeps of MVDeTr.
+//!
+//! The 40 frames of its test part, two a second. Each camera reports the feet of its boxes on the ground. MVDeTr finds
+//! people in all images together, so the cameras' errors are not independent. The truth of MVDet has no identities.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+
+use anyhow::Context;
+use ecod::model::names::NodeName;
+use ecod::wire::{ObjectReport, PerceivedObject};
+use ecod_lab::eval::formats::time_of;
+use nalgebra::{Matrix2, Matrix3, Point2, Vector3};
+use serde_json::Value;
+
+use super::{Recording, write_reports};
+
+pub(super) const BOXES: (&str, &str) =
+    ("ReST/datasets/Wildtrack/sequence1/output/MVDeTr_test.json", "chengche6230/ReST");
+
+pub(super) const CAMERAS: (&str, &str) = ("ReST/datasets/Wildtrack/metainfo.json", "chengche6230/ReST");
+
+pub(super) const TRUTH: (&str, &str) = ("MVDet/multiview_detector/evaluation/gt-demo.txt", "hou-yz/MVDet");
+
+const FRAME_RATE_HZ: f64 = 2.0;
+
+/// The truth counts frames of ten a second, on a grid of 2.5 cm from this corner in metres.
+const TRUTH_FRAMES: u64 = 5;
+const GRID_M: f64 = 0.025;
+const CORNER_M: [f64; 2] = [-3.0, -9.0];
+
+/// The boxes have no confidence.
+const CONFIDENCE: f64 = 0.9;
+
+/// Standard deviation in pixels of the foot of a box.
+const FOOT_PIXELS: f64 = 5.0;
+
+/// The boxes of a frame: left, top, width, height, nothing, camera.
+type Boxes = BTreeMap<String, Vec<[f64; 6]>>;
+
+pub(super) fn convert(boxes: &Path, cameras: &Path, truth: &Path, work: &Path) -> anyhow::Result<Recording> {
+    let recording = Recording {
+        name: "WILDTRACK",
+        format: "mot",
+        frame_rate: "2",
+        truth: work.join("truth.txt"),
+        detections: work.join("detections.txt"),
+        reports: work.join("reports.jsonl"),
+    };
+    let read = |path: &Path| fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
+    let boxes: Boxes = serde_json::from_str(&read(boxes)?)?;
+    let cameras: Value = serde_json::from_str(&read(cameras)?)?;
+    let homographies: Vec<[[f64; 3]; 3]> = serde_json::from_value(cameras["sequence1"]["homography"].clone())?;
+    let to_ground: Option<Vec<Matrix3<f64>>> =
+        homographies.iter().map(|rows| Matrix3::from_fn(|row, column| rows[row][column]).try_inverse()).collect();
+    let to_ground = to_ground.context("a homography has no inverse")?;
+    let mut positions: BTreeMap<u64, Vec<[f64; 2]>> = BTreeMap::new();
+    for (number, line) in read(truth)?.lines().enumerate() {
+        let cells: Option<Vec<u64>> = line.split_ascii_whitespace().map(|cell| cell.parse().ok()).collect();
+        let cells: [u64; 3] = cells
+            .and_then(|cells| cells.try_into().ok())
+            .with_context(|| format!("{}: line {}: not three numbers", truth.display(), number + 1))?;
+        let [frame, x, y] = cells;
+        let place = [x as f64, y as f64];
+        let place = std::array::from_fn(|axis| CORNER_M[axis] + GRID_M * place[axis]);
+        positions.entry(frame / TRUTH_FRAMES).or_default().push(place);
+    }
+    let (mut truth, mut detections, mut reports) = (String::new(), String::new(), Vec::new());
+    for (number, (frame, boxes)) in (1..).zip(boxes) {
+        let frame: u64 = frame.parse()?;
+        for [x, y] in positions.get(&frame).into_iter().flatten() {
+            writeln!(truth, "{number},-1,0,0,0,0,1,{x},{y},0")?;
+        }
+        for (camera, to_ground) in to_ground.iter().enumerate() {
+            let of_camera = boxes.iter().filter(|cells| cells[5] as usize == camera);
+            let objects: Vec<PerceivedObject> = of_camera.map(|cells| object(cells, to_ground)).collect();
+            for PerceivedObject { x_m, y_m, .. } in &objects {
+                writeln!(detections, "{number},-1,0,0,0,0,{CONFIDENCE},{x_m},{y_m},0")?;
+            }
+            let node = NodeName::new(format!("camera-{}", camera + 1))?;
+            reports
+                .push(ObjectReport { objects, ..ObjectReport::new(node, number, time_of(0, number, FRAME_RATE_HZ)) });
+        }
+    }
+    fs::write(&recording.truth, truth)?;
+    fs::write(&recording.detections, detections)?;
+    write_reports(&recording.reports, reports)?;
+    Ok(recording)
+}
+
+/// The foot of a box on the ground, with the error of its pixels.
+fn object(&[left, top, width, height, ..]: &[f64; 6], to_ground: &Matrix3<f64>) -> PerceivedObject {
+    let ground = |x: f64, y: f64| {
+        let place = to_ground * Vector3::new(x, y, 1.0);
+        // Centimetres.
+        Point2::new(place.x / place.z, place.y / place.z) / 100.0
+    };
+    let (x, y) = (left + width / 2.0, top + height);
+    let place = ground(x, y);
+    let steps = [ground(x + FOOT_PIXELS, y) - place, ground(x, y + FOOT_PIXELS) - place];
+    let covariance: Matrix2<f64> = steps.iter().map(|step| step * step.transpose()).sum();
+    PerceivedObject {
+        covariance_m2: Some([covariance[(0, 0)], covariance[(0, 1)], covariance[(1, 1)]]),
+        ..PerceivedObject::new("person", CONFIDENCE, place.x, place.y)
+    }
+}

@@ -1,0 +1,185 @@
+//! Files of benchmarks, as truth and as what a tracker or a detector said: KITTI tracking and MOTChallenge.
+//!
+//! Frames are numbered in these files; frame n is n periods after the first. Positions are on the ground, in metres. A
+//! directory is a sequence for each file, by name, a thousand seconds apart.
+
+mod kitti;
+mod mot;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use clap::ValueEnum;
+use ecod::model::names::Label;
+use ecod::model::time::Timestamp;
+use nalgebra::Point2;
+
+/// Time between the beginnings of two sequences.
+const SEQUENCE_US: u64 = 1_000_000_000;
+
+/// The form of a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum FileFormat {
+    /// KITTI tracking: label_02 and results, or AB3DMOT's detections; the frame of the vehicle, x forward, y left
+    Kitti,
+    /// MOTChallenge with positions on the ground (columns 8 and 9), as 3D MOT 2015 has them
+    Mot,
+}
+
+/// An object in a frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FileObject {
+    /// Its identity in its sequence; none for detections.
+    pub id: Option<i64>,
+    /// Its class.
+    pub label: Label,
+    /// Confidence, 0 to 1; of truth, 1.
+    pub score: f64,
+    /// Its place on the ground in metres.
+    pub position: Point2<f64>,
+}
+
+/// The objects of every frame that has any, by its number.
+pub type Frames = BTreeMap<u64, Vec<FileObject>>;
+
+/// A sequence of frames.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sequence {
+    /// Name of its file, without ending.
+    pub name: String,
+    /// Number of the first frame.
+    pub first: u64,
+    /// Its frames.
+    pub frames: Frames,
+}
+
+/// A line that cannot be read.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("line {line}: {field}: {fault}")]
+pub struct LineError {
+    /// Its number, from 1.
+    pub line: usize,
+    /// The column and what it should be.
+    pub field: String,
+    /// What is wrong with it.
+    pub fault: String,
+}
+
+impl FileFormat {
+    /// Reads a file, or all `.txt` files of a directory.
+    ///
+    /// # Errors
+    /// Naming file, line and field.
+    pub fn read(self, path: &Path) -> anyhow::Result<Vec<Sequence>> {
+        files(path)?.iter().map(|file| self.sequence(file)).collect()
+    }
+
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// Naming file, line and field.
+    pub fn sequence(self, file: &Path) -> anyhow::Result<Sequence> {
+        let text = fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
+        let frames = self.parse(&text).with_context(|| file.display().to_string())?;
+        let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let first = match self {
+            Self::Kitti => 0,
+            Self::Mot => 1,
+        };
+        Ok(Sequence { name, first, frames })
+    }
+
+    /// Reads the text of a file.
+    ///
+    /// # Errors
+    /// [`LineError`] naming line and field.
+    pub fn parse(self, text: &str) -> Result<Frames, LineError> {
+        let mut frames = Frames::new();
+        for (number, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
+            let cells = Cells::new(number + 1, line);
+            let object = match self {
+                Self::Kitti => kitti::object(&cells)?,
+                Self::Mot => mot::object(&cells)?,
+            };
+            if let Some((frame, object)) = object {
+                frames.entry(frame).or_default().push(object);
+            }
+        }
+        as_probabilities(&mut frames);
+        Ok(frames)
+    }
+}
+
+/// The time of a frame.
+pub fn time_of(sequence: usize, frame: u64, frame_rate_hz: f64) -> Timestamp {
+    Timestamp(sequence as u64 * SEQUENCE_US + (frame as f64 * 1e6 / frame_rate_hz).round() as u64)
+}
+
+/// Scores that are none of 0 to 1 are taken for log-odds: their order stays.
+fn as_probabilities(frames: &mut Frames) {
+    let mut scores: Vec<&mut f64> = frames.values_mut().flatten().map(|object| &mut object.score).collect();
+    if scores.iter().any(|score| !(0.0..=1.0).contains(&**score)) {
+        scores.iter_mut().for_each(|score| **score = 1.0 / (1.0 + (-**score).exp()));
+    }
+}
+
+fn files(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    if !path.is_dir() {
+        return Ok(vec![path.to_owned()]);
+    }
+    let entries = fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let is_text = |file: &PathBuf| file.extension().is_some_and(|extension| extension == "txt");
+    let mut files: Vec<PathBuf> = entries.filter_map(Result::ok).map(|entry| entry.path()).filter(is_text).collect();
+    files.sort();
+    if files.is_empty() { bail!("there is no .txt file in {}", path.display()) } else { Ok(files) }
+}
+
+/// The cells of a line, separated by commas or else by blanks.
+struct Cells<'a> {
+    line: usize,
+    cells: Vec<&'a str>,
+    has_commas: bool,
+}
+
+impl<'a> Cells<'a> {
+    fn new(line: usize, text: &'a str) -> Self {
+        let has_commas = text.contains(',');
+        let cells =
+            if has_commas { text.split(',').map(str::trim).collect() } else { text.split_ascii_whitespace().collect() };
+        Self { line, cells, has_commas }
+    }
+
+    fn text(&self, column: usize, name: &str) -> Result<&'a str, LineError> {
+        let missing = || self.error(column, name, format!("is missing, there are {} columns", self.cells.len()));
+        self.cells.get(column - 1).copied().ok_or_else(missing)
+    }
+
+    /// A finite number.
+    fn number(&self, column: usize, name: &str) -> Result<f64, LineError> {
+        let text = self.text(column, name)?;
+        let number = text.parse().ok().filter(|number: &f64| number.is_finite());
+        number.ok_or_else(|| self.error(column, name, format!("{text:?} is no number")))
+    }
+
+    /// A whole number, which some programs write as a fraction of zero.
+    fn integer(&self, column: usize, name: &str) -> Result<i64, LineError> {
+        let number = self.number(column, name)?;
+        let is_whole = number.fract() == 0.0 && number.abs() < 1e15;
+        if is_whole { Ok(number as i64) } else { Err(self.error(column, name, format!("{number} is no whole number"))) }
+    }
+
+    fn frame(&self) -> Result<u64, LineError> {
+        let frame = self.integer(1, "frame")?;
+        // Beyond this, the times of two sequences would meet.
+        let is_plausible = (0..100_000_000).contains(&frame);
+        if is_plausible { Ok(frame as u64) } else { Err(self.error(1, "frame", format!("{frame} is out of bounds"))) }
+    }
+
+    fn error(&self, column: usize, name: &str, fault: String) -> LineError {
+        LineError { line: self.line, field: format!("column {column} ({name})"), fault }
+    }
+}
