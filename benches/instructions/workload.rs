@@ -81,7 +81,7 @@ pub fn payload(encoding: Encoding) -> (Vec<u8>, NodeName) {
 /// A node that follows a leader, and the leader's next beat.
 pub fn following() -> (Election, ElectionInput, Timestamp) {
     let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 0, NOON);
-    let health = Health { broker: true, fuser: true, gateway: true, reports: true, load_percent: 5 };
+    let health = Health { broker: true, fuser: true, gateway: true, reports: true, settings: true, load_percent: 5 };
     election.handle(ElectionInput::Health { health }, NOON);
     election.handle(ElectionInput::PeerAlive { peer: NodeName::from_static("edge") }, NOON);
     let mut now = NOON;

@@ -49,7 +49,7 @@ impl Flaw {
 
     /// The flaw of a value that is no valid one.
     fn of_value(text: &[u8], reason: RejectReason, field: String) -> Self {
-        let pointer = format!("/{}", field.replace('.', "/").replace('[', "/").replace(']', ""));
+        let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
         let line: Value = serde_json::from_slice(text).unwrap_or_default();
         let value = line.pointer(&pointer).cloned().unwrap_or_default();
         let fault = match reason {

@@ -1,6 +1,9 @@
 use super::*;
 
-fn positions(frames: &Frames) -> Vec<(u64, Option<i64>, &str, f64, f64, f64)> {
+/// Frame, identity, label, score and position.
+type Row<'a> = (u64, Option<i64>, &'a str, f64, f64, f64);
+
+fn positions(frames: &Frames) -> Vec<Row<'_>> {
     let flat = frames.iter().flat_map(|(frame, objects)| objects.iter().map(move |object| (*frame, object)));
     flat.map(|(frame, o)| (frame, o.id, o.label.as_str(), o.score, o.position.x, o.position.y)).collect()
 }
