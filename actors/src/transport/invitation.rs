@@ -171,7 +171,7 @@ mod tests {
     #[tokio::test]
     async fn guests_that_have_not_joined_in_time_are_named_and_find_nobody() {
         let (wait, began) = (Duration::from_secs(2), Instant::now());
-        let Scene { token, mut serving, .. } = host_for(wait, &["euclid", "noether"]).await;
+        let Scene { token, mut serving, directory: _kept, .. } = host_for(wait, &["euclid", "noether"]).await;
         redeem(&token).await.unwrap().keep().await.unwrap();
         assert!(timeout(wait / 2, &mut serving).await.is_err(), "the others have time");
         let left = timeout(SOON, serving).await.unwrap().unwrap();
