@@ -12,6 +12,7 @@ mod config;
 mod coverage;
 mod detection_history;
 mod existence;
+mod gauge;
 mod gating;
 mod grid;
 mod kinematics;
