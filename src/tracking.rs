@@ -27,6 +27,7 @@ mod tests;
 mod track;
 mod tracker;
 mod trust;
+mod turning;
 mod update;
 
 use std::collections::BTreeMap;

@@ -59,6 +59,9 @@ const SIZE_BOUND_M: f64 = 1e5;
 /// Largest angle in radians: headings may count full turns.
 const ANGLE_BOUND_RAD: f64 = 1e6;
 
+/// Largest yaw rate of a frame: far more than that of any vehicle.
+const YAW_RATE_BOUND_RADPS: f64 = 100.0;
+
 /// Maximum number of classes with scores of one object.
 const MAX_SCORES: usize = 256;
 
@@ -131,6 +134,8 @@ impl ObjectReport {
             return Err(RejectReason::NotFinite);
         }
         self.view.map_or(Ok(()), check_view)?;
+        let check_yaw_rate = |rate| check_between(rate, -YAW_RATE_BOUND_RADPS, YAW_RATE_BOUND_RADPS);
+        self.frame_yaw_rate_radps.map_or(Ok(()), check_yaw_rate)?;
         check_labels(seen.iter().map(|id| &**id))?;
         self.objects.iter().try_for_each(PerceivedObject::validate)
     }
