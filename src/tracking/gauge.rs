@@ -97,17 +97,8 @@ impl MotionSums {
         let offset = weight / (prior.offset_m * prior.offset_m);
         let rotation = weight / (prior.heading_rad * prior.heading_rad);
         let both = arm * offset;
-        self.normal += Matrix3::new(
-            offset,
-            0.0,
-            both.x,
-            0.0,
-            offset,
-            both.y,
-            both.x,
-            both.y,
-            both.dot(&arm) + rotation,
-        );
+        self.normal +=
+            Matrix3::new(offset, 0.0, both.x, 0.0, offset, both.y, both.x, both.y, both.dot(&arm) + rotation);
         let turned = both.dot(&change.xy()) + rotation * change.z;
         self.gradient += Vector3::new(offset * change.x, offset * change.y, turned);
         self.delay_s += weight * change.w;

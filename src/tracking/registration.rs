@@ -33,6 +33,9 @@ const CAUCHY: f64 = 2.0;
 /// Maximum delay, in standard deviations.
 const MAX_DELAY: f64 = 3.0;
 
+/// Time in seconds after which a vehicle that states the same pose is known to stand.
+const STANDS_S: f64 = 1.0;
+
 /// Maximum weight of a vehicle that stands, as a multiple of that of one that moves.
 const MAX_WEIGHT: f64 = 10.0;
 
@@ -164,7 +167,14 @@ pub(super) struct Registration {
 impl Registration {
     /// An estimate without correspondences.
     pub(super) fn new(at: Timestamp, prior: &BiasPrior) -> Self {
-        Self { at, pivot: Vector2::zeros(), error: Vector4::zeros(), covariance: prior.covariance(), pairs: 0.0, stood_s: 0.0 }
+        Self {
+            at,
+            pivot: Vector2::zeros(),
+            error: Vector4::zeros(),
+            covariance: prior.covariance(),
+            pairs: 0.0,
+            stood_s: 0.0,
+        }
     }
 
     /// Sets the centre of the rotation; the error goes with the vehicle.
@@ -227,13 +237,7 @@ impl Registration {
 
     /// Updates the estimate; returns its change. The references hold for `at`, which is the report's stamp less
     /// `delay_s`.
-    fn observe(
-        &mut self,
-        at: Timestamp,
-        delay_s: f64,
-        pairs: &[Correspondence],
-        prior: &BiasPrior,
-    ) -> Vector4<f64> {
+    fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) -> Vector4<f64> {
         self.fade(at, prior);
         let predicted = self.error;
         self.fit(delay_s, pairs, prior);
@@ -276,7 +280,7 @@ impl Registration {
 
     /// Predicts the errors at `at`: they decay, and their covariance returns to the prior.
     fn fade(&mut self, at: Timestamp, prior: &BiasPrior) {
-        let stood = 1.0 + self.stood_s / prior.memory_s;
+        let stood = 1.0 + self.stood_s / STANDS_S;
         let kept = (-at.since(self.at).as_secs_f64() / (prior.memory_s * stood * stood)).exp();
         self.error *= kept;
         self.covariance = self.covariance * (kept * kept) + prior.covariance() * (1.0 - kept * kept);
