@@ -122,7 +122,7 @@ impl Tracker {
     /// The yaw rate of the frame by a vehicle that is trusted.
     fn stated_yaw_rate(&self, report: &ObjectReport) -> Option<f64> {
         let trust = self.sensors.by_name(&report.node).map_or(1.0, |sensor| self.sensors.fleet.trust(sensor.id));
-        report.frame_yaw_rate_radps.filter(|_| trust > 0.0)
+        (trust > 0.0).then(|| report.frame_yaw_rate_radps.unwrap_or(0.0))
     }
 
     /// The reports of a round in the order of capture, whatever the order of arrival.

@@ -2,7 +2,7 @@
 //!
 //! In such a frame whatever stands goes in a circle, which no filter of nearly constant velocity follows. Tracks therefore
 //! live in a frame with the same origin that does not turn: its angle is the integral of the yaw rates that the reports
-//! state.
+//! state. A report without one states that the frame does not turn.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,10 +26,13 @@ pub(super) struct TurningFrame {
 }
 
 impl TurningFrame {
-    /// Moves on to `now`, with the yaw rates that vehicles state. The median holds: one of many turns no frame.
+    /// Moves on to `now`, with the yaw rates that vehicles state. The median holds, the lesser of two in the middle: no
+    /// single vehicle turns the frame of others.
     pub(super) fn advance(&mut self, mut stated: Vec<f64>, now: Timestamp) {
         stated.sort_by(f64::total_cmp);
-        let median = stated.get(stated.len() / 2).copied();
+        let middle = stated.len().saturating_sub(1) / 2..=stated.len() / 2;
+        let middle = stated.get(middle).unwrap_or_default();
+        let median = middle.iter().copied().min_by(|a, b| a.abs().total_cmp(&b.abs()));
         let is_held = now.since(self.stated_at) <= HELD;
         let rate_radps = median.unwrap_or(if is_held { self.rate_radps } else { 0.0 });
         let passed_s = now.since(self.at).as_secs_f64();

@@ -127,3 +127,18 @@ fn a_frame_may_turn_with_its_vehicle() {
         assert!(error_m < 1.3 * straight_m, "{error_m} m at {yaw_rate_radps} rad/s, {straight_m} m straight on");
     }
 }
+
+#[test]
+fn one_vehicle_turns_no_frame_of_others() {
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..30 {
+        for (node, frame_yaw_rate_radps) in [("euclid", None), ("liar", Some(2.0))] {
+            let objects = vec![car(0.0, 40.0), car(30.0, 0.0)];
+            tracker.observe(ObjectReport { frame_yaw_rate_radps, ..report(node, frame, objects) }, at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    let cars = sure(&round);
+    assert!(cars.len() == 2 && near(cars[0], 0.0, 40.0, 0.1) && near(cars[1], 30.0, 0.0, 0.1), "{cars:?}");
+}
