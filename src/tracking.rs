@@ -13,6 +13,7 @@ mod coverage;
 mod detection_history;
 mod existence;
 mod gating;
+mod gauge;
 mod grid;
 mod kinematics;
 mod lifecycle;
@@ -26,6 +27,7 @@ mod tests;
 mod track;
 mod tracker;
 mod trust;
+mod turning;
 mod update;
 
 use std::collections::BTreeMap;

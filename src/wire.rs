@@ -90,6 +90,11 @@ pub struct ObjectReport {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(8)]
     pub clock_error_us: Option<u32>,
+    /// Yaw rate in radians per second, counter-clockwise, of a frame of positions that turns, as one that is fixed to a
+    /// vehicle does; absent in a frame that does not turn.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(9), with = "Single", has_nil)]
+    pub frame_yaw_rate_radps: Option<f64>,
 }
 
 impl ObjectReport {
@@ -105,6 +110,7 @@ impl ObjectReport {
             seen: None,
             view: None,
             clock_error_us: None,
+            frame_yaw_rate_radps: None,
         }
     }
 }

@@ -215,12 +215,13 @@ impl<'a> Watch<'a> {
         let mut watcher = |number| {
             let due = if config.synchronous { 0 } else { dice.below(period) as u64 };
             let clock_s = if config.synchronous { 0.0 } else { CLOCK_S * dice.normal() };
+            let late_s = if number % 2 == 1 { config.sensor.stamped_late_s } else { 0.0 };
             Watcher {
                 name: observer_name(number),
                 sensor: SimulatedSensor::new(bodies, dice),
                 due,
                 shutter: due,
-                clock_us: (clock_s * 1e6) as i64,
+                clock_us: ((clock_s + late_s) * 1e6) as i64,
                 seq: 0,
             }
         };
@@ -247,8 +248,12 @@ impl<'a> Watch<'a> {
 
     fn capture(&mut self, number: usize, step: u64, town: &Town, bodies: &[Body], dice: &mut Dice<'_>) {
         let config = self.config;
-        let pose = Pose { position: bodies[number].center, heading_rad: bodies[number].heading_rad };
-        let sights = sight::sights(number, bodies, &town.buildings, config.sensor.range_m);
+        let (position, heading_rad) = match bodies.get(number) {
+            Some(vehicle) if !config.fixed => (vehicle.center, vehicle.heading_rad),
+            _ => town.roads.post(number),
+        };
+        let pose = Pose { position, heading_rad };
+        let sights = sight::sights(position, bodies, &town.buildings, config.sensor.range_m);
         for sight in sights.iter().filter(|sight| SimulatedSensor::sees(config, &pose, sight)) {
             self.seen_at[sight.body] = Some(step);
         }
@@ -257,7 +262,8 @@ impl<'a> Watch<'a> {
         let around = Surroundings { pose, bodies, sights: &sights, lures: &lures, at_s: step as f64 * STEP_S };
         let watcher = &mut self.observers[number];
         watcher.seq += 1;
-        let mut report = ObjectReport::new(watcher.name.clone(), watcher.seq, time_of(step).shifted(watcher.clock_us));
+        let stamp = time_of(step).shifted(watcher.clock_us);
+        let mut report = ObjectReport::new(watcher.name.clone(), watcher.seq, stamp);
         watcher.sensor.observe(config, &around, &mut report, dice);
         watcher.due += (STEPS_PER_S / config.sensor.rate_hz).round() as u64;
         watcher.shutter = if config.synchronous { watcher.due } else { watcher.due - 1 + dice.below(3) as u64 };
@@ -280,7 +286,7 @@ impl<'a> Watch<'a> {
     /// Objects that belong to the truth.
     fn known(&self, step: u64, bodies: &[Body]) -> Vec<TruthObject> {
         let memory = (self.config.memory_s * STEPS_PER_S) as u64;
-        let observers = if self.config.said.poses { self.observers.len() } else { 0 };
+        let observers = if self.config.said.poses && !self.config.fixed { self.observers.len() } else { 0 };
         let is_known = |id: usize| id < observers || self.seen_at[id].is_some_and(|seen| step - seen <= memory);
         let round = |value: f64| (value * 1e3).round() / 1e3;
         let objects = bodies.iter().enumerate().filter(|(id, _)| is_known(*id));

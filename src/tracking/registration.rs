@@ -1,7 +1,7 @@
 //! Registration: the offset, rotation and delay of each vehicle's pose, estimated from objects that others detect too.
 //!
 //! The errors are a Gauss-Markov process of four states: small, changing slowly, with a known spread at rest. An error
-//! that all vehicles share is not observable; it decays. Every round is one step of an extended Kalman filter in
+//! that all vehicles share is not observable; no update changes it ([`Gauge`]), and it decays. Every round is one step of an extended Kalman filter in
 //! information form over all correspondences, reweighted against wrong ones by Cauchy's function (Holland, Welsch,
 //! "Robust regression using iteratively reweighted least-squares", 1977).
 //!
@@ -14,6 +14,7 @@ use std::time::Duration;
 use nalgebra::{Matrix2, Matrix4, Rotation2, Vector2, Vector4};
 
 use super::config::TracksConfig;
+use super::gauge::{Gauge, Motion};
 use super::sensors::{SensorId, Sensors};
 use super::store::{TrackIndex, TrackStore};
 use crate::model::geometry::wrap_angle;
@@ -31,6 +32,12 @@ const CAUCHY: f64 = 2.0;
 
 /// Maximum delay, in standard deviations.
 const MAX_DELAY: f64 = 3.0;
+
+/// Time in seconds after which a vehicle that states the same pose is known to stand.
+const STANDS_S: f64 = 1.0;
+
+/// Maximum weight of a vehicle that stands, as a multiple of that of one that moves.
+const MAX_WEIGHT: f64 = 10.0;
 
 /// Minimum number of correspondences of a published correction.
 const MIN_PAIRS: f64 = 3.0;
@@ -66,13 +73,17 @@ pub(super) fn register(
 ) {
     let prior = config.bias_prior();
     let mut pairs: Vec<Correspondence> = Vec::new();
+    let mut gauge = Gauge::default();
     for frame in frames {
         pairs.clear();
-        pairs.extend(frame.samples.iter().filter_map(|sample| Correspondence::of(sample, &frame, tracks, sensors)));
+        let samples = frame.samples.iter();
+        pairs.extend(samples.filter_map(|sample| Correspondence::of(sample, &frame, tracks, sensors, &mut gauge)));
         if let Some(sensor) = sensors.get_mut(frame.sensor) {
-            sensor.registration.observe(frame.at, frame.delay_s, &pairs, &prior);
+            let change = sensor.registration.observe(frame.at, frame.delay_s, &pairs, &prior);
+            gauge.note(frame.sensor, change);
         }
     }
+    gauge.hold(sensors, &prior);
 }
 
 /// A reported position and the position at which others detected the same object.
@@ -95,6 +106,7 @@ impl Correspondence {
         frame: &RegistrationFrame,
         tracks: &TrackStore,
         sensors: &Sensors,
+        gauge: &mut Gauge,
     ) -> Option<Self> {
         let track = &tracks[sample.track];
         let velocity = track.state.velocity;
@@ -109,6 +121,7 @@ impl Correspondence {
             sum += (other.position + velocity * (passed_us as f64 * 1e-6)) * trust;
             common += theirs.registration.variance_at(&sample.reported, &velocity) * trust;
             weight += trust;
+            gauge.join(frame.sensor, other.sensor);
         }
         (weight > 0.0).then(|| Self {
             reported: sample.reported,
@@ -147,17 +160,47 @@ pub(super) struct Registration {
     covariance: Matrix4<f64>,
     /// Fading number of correspondences.
     pairs: f64,
+    /// Time for which the vehicle has stood where it says, seconds.
+    stood_s: f64,
 }
 
 impl Registration {
     /// An estimate without correspondences.
     pub(super) fn new(at: Timestamp, prior: &BiasPrior) -> Self {
-        Self { at, pivot: Vector2::zeros(), error: Vector4::zeros(), covariance: prior.covariance(), pairs: 0.0 }
+        Self {
+            at,
+            pivot: Vector2::zeros(),
+            error: Vector4::zeros(),
+            covariance: prior.covariance(),
+            pairs: 0.0,
+            stood_s: 0.0,
+        }
     }
 
     /// Sets the centre of the rotation; the error goes with the vehicle.
     pub(super) fn set_pivot(&mut self, pivot: Vector2<f64>) {
         self.pivot = pivot;
+    }
+
+    /// Notes that the vehicle has stood still for another `passed_s`, or that it moves.
+    pub(super) fn stand(&mut self, passed_s: Option<f64>) {
+        self.stood_s = passed_s.map_or(0.0, |passed_s| self.stood_s + passed_s);
+    }
+
+    /// Centre of the rotation, metres.
+    pub(super) fn pivot(&self) -> Vector2<f64> {
+        self.pivot
+    }
+
+    /// Weight in what all have in common: the longer an error lasts, the more is known of it.
+    pub(super) fn weight(&self, prior: &BiasPrior) -> f64 {
+        (1.0 + self.stood_s / prior.memory_s).min(MAX_WEIGHT)
+    }
+
+    /// Takes back a motion that the vehicle shares with others.
+    pub(super) fn take_back(&mut self, common: &Motion, prior: &BiasPrior) {
+        self.error -= common.at(&self.pivot);
+        self.limit_delay(prior);
     }
 
     /// A function that corrects reported positions.
@@ -192,9 +235,16 @@ impl Registration {
         (self.covariance.m11 + self.covariance.m22 + rotation_and_delay) / 2.0
     }
 
-    /// Updates the estimate. The references hold for `at`, which is the report's stamp less `delay_s`.
-    fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) {
+    /// Updates the estimate; returns its change. The references hold for `at`, which is the report's stamp less
+    /// `delay_s`.
+    fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) -> Vector4<f64> {
         self.fade(at, prior);
+        let predicted = self.error;
+        self.fit(delay_s, pairs, prior);
+        self.error - predicted
+    }
+
+    fn fit(&mut self, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) {
         let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty()) else { return };
         let predicted = self.error;
         let mut counted = 0.0;
@@ -216,17 +266,22 @@ impl Registration {
             let (information, gradient) = (normal.information(), normal.gradient());
             let Some(covariance) = (prior_information + information).try_inverse() else { return };
             self.error = covariance * (prior_information * predicted + information * self.error + gradient);
-            // The stamps of one vehicle must not move the time at which all reports are fused.
-            let max_s = MAX_DELAY * prior.delay_s;
-            self.error.w = self.error.w.clamp(-max_s, max_s);
+            self.limit_delay(prior);
             self.covariance = (covariance + covariance.transpose()) * 0.5;
         }
         self.pairs += counted;
     }
 
+    /// The stamps of one vehicle must not move the time at which all reports are fused.
+    fn limit_delay(&mut self, prior: &BiasPrior) {
+        let max_s = MAX_DELAY * prior.delay_s;
+        self.error.w = self.error.w.clamp(-max_s, max_s);
+    }
+
     /// Predicts the errors at `at`: they decay, and their covariance returns to the prior.
     fn fade(&mut self, at: Timestamp, prior: &BiasPrior) {
-        let kept = (-at.since(self.at).as_secs_f64() / prior.memory_s).exp();
+        let stood = 1.0 + self.stood_s / STANDS_S;
+        let kept = (-at.since(self.at).as_secs_f64() / (prior.memory_s * stood * stood)).exp();
         self.error *= kept;
         self.covariance = self.covariance * (kept * kept) + prior.covariance() * (1.0 - kept * kept);
         self.pairs *= kept;

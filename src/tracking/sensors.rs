@@ -14,7 +14,7 @@ use crate::model::geometry::Covariance;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use crate::wire::{ObjectReport, PerceivedObject};
+use crate::wire::{ObjectReport, PerceivedObject, WirePose};
 
 /// Number of a vehicle that is heard. [`Sensors::forget_silent`] frees it for another vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -91,6 +91,11 @@ impl Sensors {
         self.models.iter().flatten().map(Box::as_ref)
     }
 
+    /// The same, mutable.
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut SensorModel> {
+        self.models.iter_mut().flatten().map(Box::as_mut)
+    }
+
     /// Takes the counts of all vehicles from a ledger: of the latest votes that are remembered. Vehicles that are not in
     /// it have none.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
@@ -139,6 +144,7 @@ pub(super) struct SensorModel {
     pub(super) id: SensorId,
     pub(super) node: NodeName,
     last_report: Timestamp,
+    pose: Option<WirePose>,
     pub(super) registration: Registration,
     pub(super) noise: NoiseModel,
     pub(super) calibration: Calibration,
@@ -152,6 +158,7 @@ impl SensorModel {
             id,
             node,
             last_report: at,
+            pose: None,
             registration: Registration::new(at, &config.bias_prior()),
             noise: NoiseModel::default(),
             calibration: Calibration::new(config.even_confidence),
@@ -162,11 +169,16 @@ impl SensorModel {
 
     /// Updates time, place and field of view from a report; true if the vehicle has jumped to another place.
     pub(super) fn observe(&mut self, report: &ObjectReport, at: Timestamp, config: &TracksConfig) -> bool {
+        let passed_s = at.since(self.last_report).as_secs_f64();
         self.last_report = self.last_report.max(at);
         let has_jumped = self.coverage.observe(report);
         if has_jumped {
             self.registration = Registration::new(at, &config.bias_prior());
         }
+        // Estimates of a vehicle that drives, and even waits, differ from report to report.
+        let stands = report.pose.is_some() && self.pose == report.pose;
+        self.registration.stand(stands.then_some(passed_s));
+        self.pose = report.pose;
         if let Some(centre) = self.coverage.centre() {
             self.registration.set_pivot(centre);
         }

@@ -1,5 +1,6 @@
 mod beside;
 mod fast;
+mod fixed;
 mod trust;
 
 use std::collections::BTreeSet;

@@ -8,6 +8,7 @@ use super::lifecycle::{adopt_map, merge, prune};
 use super::registration::{RegistrationFrame, register};
 use super::sensors::Sensors;
 use super::store::TrackStore;
+use super::turning::TurningFrame;
 use super::update::{ReportOutcome, ReportUpdate};
 use super::{TracksLosses, TracksRound};
 use crate::model::names::NodeName;
@@ -23,6 +24,7 @@ pub struct Tracker {
     tracks: TrackStore,
     /// Reports of the open round with their times of capture.
     pending: Vec<(Timestamp, Arc<ObjectReport>)>,
+    frame: TurningFrame,
     /// Time of the latest report that was fused.
     fused_until: Timestamp,
     late: u64,
@@ -38,6 +40,7 @@ impl Tracker {
             tracks: TrackStore::new(&config),
             config,
             pending: Vec::new(),
+            frame: TurningFrame::default(),
             fused_until: Timestamp(0),
             late: 0,
             recorded_from: Timestamp::default(),
@@ -85,7 +88,8 @@ impl Tracker {
 
     /// Takes identities, and objects that are unknown here, from another aggregator's map, received at `now`.
     pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
-        adopt_map(&mut self.tracks, map, now, &self.config);
+        let steady = self.frame.steady_map(map, now);
+        adopt_map(&mut self.tracks, steady.as_ref().unwrap_or(map), now, &self.config);
     }
 
     /// Begins a leadership: earlier observations are for the leader before to judge.
@@ -102,13 +106,23 @@ impl Tracker {
     pub fn close(&mut self, now: Timestamp) -> TracksRound {
         let pending = std::mem::take(&mut self.pending);
         let oldest_capture = pending.iter().map(|(captured_at, _)| *captured_at).min();
+        let stated = pending.iter().filter_map(|(_, report)| self.stated_yaw_rate(report));
+        self.frame.advance(stated.collect(), now);
         let (frames, evidence) = self.update(&self.in_order(pending), now);
         if self.config.align {
             register(frames, &self.tracks, &mut self.sensors, &self.config);
         }
         merge(&mut self.tracks, now, &self.config);
         prune(&mut self.tracks, &mut self.sensors, now, &self.config);
-        TracksRound { objects: self.objects(now), pose_corrections: self.corrections(), oldest_capture, evidence }
+        let (mut objects, mut pose_corrections) = (self.objects(now), self.corrections());
+        self.frame.restore(now, &mut objects, pose_corrections.values_mut());
+        TracksRound { objects, pose_corrections, oldest_capture, evidence }
+    }
+
+    /// The yaw rate of the frame by a vehicle that is trusted.
+    fn stated_yaw_rate(&self, report: &ObjectReport) -> Option<f64> {
+        let trust = self.sensors.by_name(&report.node).map_or(1.0, |sensor| self.sensors.fleet.trust(sensor.id));
+        (trust > 0.0).then(|| report.frame_yaw_rate_radps.unwrap_or(0.0))
     }
 
     /// The reports of a round in the order of capture, whatever the order of arrival.
@@ -118,7 +132,8 @@ impl Tracker {
             .map(|(stamp, report)| {
                 let sensor = self.sensors.by_name(&report.node);
                 let delay_s = sensor.map_or(0.0, |sensor| sensor.registration.delay_s());
-                Captured { at: stamp.shifted((-delay_s * 1e6) as i64), delay_s, report }
+                let at = stamp.shifted((-delay_s * 1e6) as i64);
+                Captured { at, delay_s, report: self.frame.steady(report, at) }
             })
             .collect();
         reports.sort_by(|a, b| (a.at, &a.report.node, a.report.seq).cmp(&(b.at, &b.report.node, b.report.seq)));
@@ -177,10 +192,11 @@ struct Captured {
 /// The report with the `wanted` objects only.
 fn only(report: &ObjectReport, wanted: impl Fn(&PerceivedObject) -> bool) -> Arc<ObjectReport> {
     let objects = report.objects.iter().filter(|object| wanted(object)).cloned().collect();
-    let (pose, view) = (report.pose, report.view);
+    let ObjectReport { pose, view, frame_yaw_rate_radps, .. } = *report;
     Arc::new(ObjectReport {
         pose,
         view,
+        frame_yaw_rate_radps,
         objects,
         ..ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us)
     })

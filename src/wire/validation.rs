@@ -59,6 +59,9 @@ const SIZE_BOUND_M: f64 = 1e5;
 /// Largest angle in radians: headings may count full turns.
 const ANGLE_BOUND_RAD: f64 = 1e6;
 
+/// Largest yaw rate of a frame: far more than that of any vehicle.
+const YAW_RATE_BOUND_RADPS: f64 = 100.0;
+
 /// Maximum number of classes with scores of one object.
 const MAX_SCORES: usize = 256;
 
@@ -151,6 +154,8 @@ impl ObjectReport {
             check_between(pose.heading_rad, f64::MIN, f64::MAX).map_err(of("pose.heading_rad"))?;
         }
         self.view.map_or(Ok(()), check_view).map_err(of("view"))?;
+        let check_yaw_rate = |rate| check_between(rate, -YAW_RATE_BOUND_RADPS, YAW_RATE_BOUND_RADPS);
+        self.frame_yaw_rate_radps.map_or(Ok(()), check_yaw_rate).map_err(of("frame_yaw_rate_radps"))?;
         for (index, id) in seen.iter().enumerate() {
             check_labels([&**id]).map_err(|reason| InvalidValue { field: format!("seen[{index}]"), reason })?;
         }

@@ -78,12 +78,14 @@ pub struct Frame {
     pub seen: Option<Vec<LandmarkId>>,
     /// Field of view from the pose.
     pub view: Option<FieldOfView>,
+    /// Yaw rate in radians per second, counter-clockwise, if the cell's frame turns with a vehicle.
+    pub frame_yaw_rate_radps: Option<f64>,
 }
 
 impl Frame {
     /// Objects of a frame that was captured now.
     pub fn new(objects: Vec<PerceivedObject>) -> Self {
-        Self { captured_at: SystemTime::now(), objects, pose: None, seen: None, view: None }
+        Self { captured_at: SystemTime::now(), objects, pose: None, seen: None, view: None, frame_yaw_rate_radps: None }
     }
 }
 
@@ -263,6 +265,7 @@ impl Cell {
             objects: frame.objects,
             seen: frame.seen,
             view: frame.view,
+            frame_yaw_rate_radps: frame.frame_yaw_rate_radps,
             ..ObjectReport::new(self.name.clone(), *seq + 1, Timestamp::default() + since_epoch)
         };
         check(&report)?;

@@ -29,6 +29,8 @@ pub struct TrafficConfig {
     pub warm_up_s: f64,
     /// The observers drive one behind the other and on the same route. Default false.
     pub convoy: bool,
+    /// The observers are cameras on posts, four about a crossing, whose pose errors stay. Default false.
+    pub fixed: bool,
     /// All observers capture at the same moments and reports arrive at once. Default false: each has a phase of its
     /// own, and reports take their time.
     pub synchronous: bool,
@@ -66,6 +68,8 @@ pub struct SensorConfig {
     pub pose_m: f64,
     /// Standard deviation of its heading in radians. Default 0.01.
     pub pose_rad: f64,
+    /// Time in seconds by which every second observer stamps its captures late. Default 0.
+    pub stamped_late_s: f64,
     /// Mean time in seconds that a report takes beyond 30 ms. Default 0.025.
     pub latency_s: f64,
     /// Share of reports that are lost; as many come 0.2 to 0.5 s late. Default 0.01.
@@ -103,6 +107,7 @@ impl Default for TrafficConfig {
             duration_s: 30.0,
             warm_up_s: 20.0,
             convoy: false,
+            fixed: false,
             synchronous: false,
             memory_s: 1.0,
             sensor: SensorConfig::default(),
@@ -125,6 +130,7 @@ impl Default for SensorConfig {
             lures: 0.7,
             pose_m: 0.35,
             pose_rad: 0.01,
+            stamped_late_s: 0.0,
             latency_s: 0.025,
             lost: 0.01,
         }
@@ -170,7 +176,9 @@ impl TrafficConfig {
         // A vehicle and the gap before it take some 15 m of each of the two lanes.
         let lanes_m = 4.0 * (self.roads * (self.roads - 1)) as f64 * self.block_m;
         check_range("vehicles", self.vehicles as f64, 1.0, lanes_m / 15.0)?;
-        check_range("observers", self.observers as f64, 1.0, self.vehicles as f64)?;
+        let posts = 4 * self.roads * self.roads;
+        let max_observers = if self.fixed { posts } else { self.vehicles };
+        check_range("observers", self.observers as f64, 1.0, max_observers as f64)?;
         check_range("parked", self.parked as f64, 0.0, lanes_m / 15.0)?;
         check_range("people", self.people as f64, 0.0, 1e4)?;
         check_range("bicycles", self.bicycles as f64, 0.0, 1e4)?;
@@ -200,6 +208,7 @@ impl SensorConfig {
             ("lures", self.lures),
             ("pose_m", self.pose_m),
             ("pose_rad", self.pose_rad),
+            ("stamped_late_s", self.stamped_late_s),
             ("latency_s", self.latency_s),
         ] {
             check_range(key, value, 0.0, 100.0)?;

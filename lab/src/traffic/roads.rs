@@ -6,6 +6,8 @@ use nalgebra::{Point2, Vector2};
 const LANE_M: f64 = 1.75;
 /// From the middle of a road to that of a parked vehicle.
 const PARKED_M: f64 = 5.2;
+/// From the middles of both roads to a post.
+const POST_M: f64 = 9.0;
 /// From the middle of a road to the buildings.
 const BUILDING_M: f64 = 10.0;
 /// From the middle of a crossing to its stop lines.
@@ -120,6 +122,15 @@ impl Roads {
         let end = center + unit(to) * CROSSING_M + right_of(to) * LANE_M;
         let corner = begin + unit(from) * (end - begin).dot(&unit(from));
         [begin, if from % 4 == to % 4 { nalgebra::center(&begin, &end) } else { corner }, end]
+    }
+
+    /// Position and heading in radians of a camera on a post: four look at each crossing, the middle one first.
+    pub(super) fn post(&self, number: usize) -> (Point2<f64>, f64) {
+        let crossings = self.count * self.count;
+        let crossing = (number / 4 + crossings / 2 + self.count / 2) % crossings;
+        let corner = number % 4;
+        let out = (unit(corner) + unit(corner + 1)) * POST_M;
+        (self.center((crossing % self.count, crossing / self.count)) + out, (-out.y).atan2(-out.x))
     }
 
     /// True if the signal lets this direction go.

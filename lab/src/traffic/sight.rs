@@ -32,13 +32,10 @@ pub(super) struct Sight {
     half_rad: f64,
 }
 
-/// Bodies within `range_m` of body number `own`, and how much of each is seen from there.
-pub(super) fn sights(own: usize, bodies: &[Body], buildings: &[Building], range_m: f64) -> Vec<Sight> {
-    let from = bodies[own].center;
-    let mut sights: Vec<Sight> = (0..bodies.len())
-        .filter(|body| *body != own)
-        .filter_map(|body| Sight::towards(from, body, &bodies[body], range_m))
-        .collect();
+/// Bodies within `range_m` of a place, and how much of each is seen from there; the one at the place itself is not.
+pub(super) fn sights(from: Point2<f64>, bodies: &[Body], buildings: &[Building], range_m: f64) -> Vec<Sight> {
+    let mut sights: Vec<Sight> =
+        (0..bodies.len()).filter_map(|body| Sight::towards(from, body, &bodies[body], range_m)).collect();
     sights.sort_by(|a, b| a.range_m.total_cmp(&b.range_m));
     for place in 0..sights.len() {
         let (nearer, rest) = sights.split_at_mut(place);
@@ -103,7 +100,7 @@ mod tests {
 
     fn share(bodies: &[Body], body: usize) -> f64 {
         let buildings = Roads { count: 2, block_m: 80.0 }.buildings();
-        sights(0, bodies, &buildings, 100.0).into_iter().find(|sight| sight.body == body).unwrap().share
+        sights(bodies[0].center, bodies, &buildings, 100.0).into_iter().find(|sight| sight.body == body).unwrap().share
     }
 
     #[test]
@@ -123,6 +120,6 @@ mod tests {
         // The building stands between 10 and 70 m on both axes.
         let corner = [car(0.0, 40.0), car(40.0, 0.0), car(5.0, 80.0)];
         assert_eq!([1, 2].map(|body| share(&corner, body)), [0.0, 1.0]);
-        assert!(sights(0, &corner, &[], 30.0).is_empty(), "too far");
+        assert!(sights(corner[0].center, &corner, &[], 30.0).is_empty(), "too far");
     }
 }

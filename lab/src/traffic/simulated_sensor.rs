@@ -138,9 +138,10 @@ impl SimulatedSensor {
             let (position, label) = (somewhere(config, &around.pose, dice), around.label(dice));
             found.push(Found { position, label, confidence: share_of(0.8 * dice.normal() - 0.9), body: None });
         }
+        let drift_s = if config.fixed { 0.0 } else { passed_s };
         let error =
-            Vector2::from(self.offset.each_mut().map(|drift| drift.step(passed_s, POSE_S, dice))) * sensor.pose_m;
-        let turned_rad = self.turn.step(passed_s, POSE_S, dice) * sensor.pose_rad;
+            Vector2::from(self.offset.each_mut().map(|drift| drift.step(drift_s, POSE_S, dice))) * sensor.pose_m;
+        let turned_rad = self.turn.step(drift_s, POSE_S, dice) * sensor.pose_rad;
         let said = Pose { position: around.pose.position + error, heading_rad: around.pose.heading_rad + turned_rad };
         let is_posed = config.said.poses;
         report.pose = is_posed.then(|| Pose { heading_rad: rounded(wrap_angle(said.heading_rad)), ..said }.into());

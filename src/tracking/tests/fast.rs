@@ -88,3 +88,57 @@ fn a_glimpse_of_something_far_away_widens_no_view() {
     coverage.observe(&stated);
     assert!(coverage.range_m() < 30.0, "a view without a pose says nothing of where it is");
 }
+
+/// Mean error of the map in the frame of a vehicle that goes at 8 m/s and turns, among parked cars 20 m apart and others
+/// that drive; another vehicle reports in the same frame.
+fn error_in_a_frame_that_turns(yaw_rate_radps: f64) -> f64 {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let mut tracker = tracker();
+    let (mut place, mut errors) = (Vector2::new(3.0, 5.0), Vec::new());
+    for frame in 0..150 {
+        let t_s = frame as f64 * 0.1;
+        let heading = nalgebra::Rotation2::new(yaw_rate_radps * t_s);
+        let lattice = (0..441).map(|n| Vector2::new(f64::from(n / 21 - 10) * 20.0, f64::from(n % 21 - 10) * 20.0));
+        let driving = lattice.clone().step_by(5).map(|at| at + Vector2::new(6.0 * t_s, 10.0));
+        let seen = lattice.chain(driving).map(|at| heading.inverse() * (at - place));
+        let seen: Vec<Vector2<f64>> = seen.filter(|at| at.norm() < 45.0 && at.norm() > 3.0).collect();
+        for node in ["euclid", "gauss"] {
+            let object = |at: &Vector2<f64>| car(at.x + noise(&mut rng, 0.3), at.y + noise(&mut rng, 0.3));
+            let objects = seen.iter().map(object).collect();
+            let frame_yaw_rate_radps = (yaw_rate_radps != 0.0).then_some(yaw_rate_radps);
+            tracker.observe(ObjectReport { frame_yaw_rate_radps, ..report(node, frame, objects) }, at(frame));
+        }
+        let round = tracker.close(at(frame));
+        for object in sure(&round).into_iter().filter(|_| frame > 50) {
+            let error = |at: &Vector2<f64>| (at.x - object.x_m).hypot(at.y - object.y_m);
+            errors.extend(seen.iter().map(error).min_by(f64::total_cmp).filter(|error| *error < 4.0));
+        }
+        place += nalgebra::Rotation2::new(yaw_rate_radps * (t_s + 0.05)) * Vector2::new(0.8, 0.0);
+    }
+    assert!(errors.len() > 1000, "{}", errors.len());
+    errors.iter().sum::<f64>() / errors.len() as f64
+}
+
+#[test]
+fn a_frame_may_turn_with_its_vehicle() {
+    let straight_m = error_in_a_frame_that_turns(0.0);
+    for yaw_rate_radps in [0.15, -0.3, 0.6] {
+        let error_m = error_in_a_frame_that_turns(yaw_rate_radps);
+        assert!(error_m < 1.3 * straight_m, "{error_m} m at {yaw_rate_radps} rad/s, {straight_m} m straight on");
+    }
+}
+
+#[test]
+fn one_vehicle_turns_no_frame_of_others() {
+    let mut tracker = tracker();
+    let mut round = TracksRound::default();
+    for frame in 0..30 {
+        for (node, frame_yaw_rate_radps) in [("euclid", None), ("liar", Some(2.0))] {
+            let objects = vec![car(0.0, 40.0), car(30.0, 0.0)];
+            tracker.observe(ObjectReport { frame_yaw_rate_radps, ..report(node, frame, objects) }, at(frame));
+        }
+        round = tracker.close(at(frame));
+    }
+    let cars = sure(&round);
+    assert!(cars.len() == 2 && near(cars[0], 0.0, 40.0, 0.1) && near(cars[1], 30.0, 0.0, 0.1), "{cars:?}");
+}

@@ -40,7 +40,11 @@ fn survives<T: Payload + PartialEq + std::fmt::Debug>(payload: &T) {
 #[test]
 fn every_field_of_every_payload_survives() {
     let node = NodeName::from_static;
-    survives(&ObjectReport { view: Some(FieldOfView { range_m: 60.0, angle_rad: 6.25 }), ..report_without_rounding() });
+    survives(&ObjectReport {
+        view: Some(FieldOfView { range_m: 60.0, angle_rad: 6.25 }),
+        frame_yaw_rate_radps: Some(-0.375),
+        ..report_without_rounding()
+    });
     let fused_at_us = Timestamp(1_732_154_400_123_456);
     survives(&GlobalMap {
         schema: SCHEMA_VERSION,

@@ -138,15 +138,17 @@ class Cell:
         pose: Optional[AnyPose] = None,
         seen: Optional[Iterable[str]] = None,
         view: Optional[FieldOfView] = None,
+        frame_yaw_rate_radps: Optional[float] = None,
     ) -> bool:
         """Reports what one frame shows, for the map. A frame without objects is a report, too.
 
         `captured_at` is a datetime with time zone, or Unix seconds; default now. `pose` is the camera's, east and north in
-        metres and heading in radians. `seen` names the known locations in view. Gives whether the report was sent:
+        metres and heading in radians. `seen` names the known locations in view. `frame_yaw_rate_radps` is for a cell whose
+        frame turns with a vehicle. Gives whether the report was sent:
         without a connection it is dropped and counted. Raises `Invalid` for values that the protocol does not allow, and
         `Refused` when the broker refused an earlier report.
         """
-        return self._report("detections", list(objects), captured_at, pose, seen, view)
+        return self._report("detections", list(objects), captured_at, pose, seen, view, frame_yaw_rate_radps)
 
     def vote(
         self,
@@ -219,13 +221,24 @@ class Cell:
         pose: Optional[AnyPose],
         seen: Optional[Iterable[str]],
         view: Optional[FieldOfView],
+        frame_yaw_rate_radps: Optional[float] = None,
     ) -> bool:
         full_topic = f"{self._root}{topic}/{self.name}"
         pose = Pose(*pose) if isinstance(pose, (tuple, list)) else pose
         seen = None if seen is None else list(seen)
         with self._sending:
             seq = self._seq[topic] + 1
-            report = ObjectReport(SCHEMA_VERSION, self.name, seq, micros(captured_at), objects, pose, seen, view)
+            report = ObjectReport(
+                SCHEMA_VERSION,
+                self.name,
+                seq,
+                micros(captured_at),
+                objects,
+                pose,
+                seen,
+                view,
+                frame_yaw_rate_radps=frame_yaw_rate_radps,
+            )
             payload = encode(report)
             if len(payload) > MAX_REPORT_BYTES:
                 raise Invalid(f"not sent: {len(payload)} bytes with {len(objects)} objects, at most {MAX_REPORT_BYTES}")

@@ -68,6 +68,7 @@ Metres = Annotated[float, _between(-1e8, 1e8), MILLIMETRES]
 Size = Annotated[float, _between(0, 1e5)]
 Speed = Annotated[float, _between(-1e4, 1e4)]
 Angle = Annotated[float, _between(-1e6, 1e6)]
+YawRate = Annotated[float, _between(-100, 100)]
 Score = Annotated[float, _between(-1e9, 1e9)]
 Amount = Annotated[float, _between(0, 2**53 - 1)]
 Covariance = Annotated[tuple[float, float, float], Rule(_is_covariance, "must be a covariance [xx, xy, yy]")]
@@ -125,6 +126,8 @@ class ObjectReport:
     view: Optional[FieldOfView] = None
     # How wrong the stamp may be, of a node that knows the cell's time. Programs leave it out.
     clock_error_us: Optional[Count] = None
+    # Of a frame that turns, counter-clockwise, as one that is fixed to a vehicle does.
+    frame_yaw_rate_radps: Optional[YawRate] = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,122 @@
+//! Gauge of the registration: a shift, a rotation and a delay that the errors of all observers have in common.
+//!
+//! Observers find their errors relative to each other. A motion of all together changes no residual, so nothing but
+//! unequal gains decides on it, and it would wander without end. Therefore an update leaves the common motion of
+//! observers that correspond, directly or through others, as it was. It fades with the errors themselves: those of
+//! observers that leave or join do not move the map at once.
+
+use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
+
+use super::registration::BiasPrior;
+use super::sensors::{SensorId, Sensors};
+
+/// Changes of all errors in a round, and the groups of observers that correspond.
+#[derive(Debug, Default)]
+pub(super) struct Gauge {
+    /// By sensor: the next one towards the representative of its group.
+    towards: Vec<usize>,
+    /// By sensor.
+    changes: Vec<Vector4<f64>>,
+}
+
+impl Gauge {
+    /// Puts two observers into one group.
+    pub(super) fn join(&mut self, one: SensorId, other: SensorId) {
+        let (one, other) = (self.group(one.number()), self.group(other.number()));
+        self.towards[one] = other;
+    }
+
+    /// Adds a change of an observer's error.
+    pub(super) fn note(&mut self, sensor: SensorId, change: Vector4<f64>) {
+        self.group(sensor.number());
+        self.changes[sensor.number()] += change;
+    }
+
+    /// Takes the common motion of each group back.
+    pub(super) fn hold(mut self, sensors: &mut Sensors, prior: &BiasPrior) {
+        let known = self.towards.len();
+        let mut sums = vec![MotionSums::default(); known];
+        for sensor in sensors.iter().filter(|sensor| sensor.id.number() < known) {
+            let number = sensor.id.number();
+            let weight = sensors.fleet.trust(sensor.id) * sensor.registration.weight(prior);
+            sums[self.group(number)].add(&sensor.registration.pivot(), &self.changes[number], weight, prior);
+        }
+        let common: Vec<Option<Motion>> = sums.iter().map(MotionSums::motion).collect();
+        for sensor in sensors.iter_mut().filter(|sensor| sensor.id.number() < known) {
+            if let Some(common) = &common[self.group(sensor.id.number())] {
+                sensor.registration.take_back(common, prior);
+            }
+        }
+    }
+
+    /// The representative of an observer's group. Halves the way to it.
+    fn group(&mut self, mut sensor: usize) -> usize {
+        let known = self.towards.len();
+        if sensor >= known {
+            self.towards.extend(known..=sensor);
+            self.changes.resize(sensor + 1, Vector4::zeros());
+        }
+        while self.towards[sensor] != sensor {
+            self.towards[sensor] = self.towards[self.towards[sensor]];
+            sensor = self.towards[sensor];
+        }
+        sensor
+    }
+}
+
+/// Shift, rotation and delay of all observers together.
+#[derive(Debug)]
+pub(super) struct Motion {
+    about: Vector2<f64>,
+    shift: Vector2<f64>,
+    rotation_rad: f64,
+    delay_s: f64,
+}
+
+impl Motion {
+    /// Its part of the error of an observer: offset, rotation and delay.
+    pub(super) fn at(&self, pivot: &Vector2<f64>) -> Vector4<f64> {
+        let offset = self.shift + quarter_turn(&(pivot - self.about)) * self.rotation_rad;
+        Vector4::new(offset.x, offset.y, self.rotation_rad, self.delay_s)
+    }
+}
+
+/// Weighted sums for the motion that is nearest to the changes of a group, in standard deviations of the errors.
+#[derive(Debug, Clone, Default)]
+struct MotionSums {
+    about: Option<Vector2<f64>>,
+    normal: Matrix3<f64>,
+    gradient: Vector3<f64>,
+    delay_s: f64,
+    weight: f64,
+}
+
+impl MotionSums {
+    fn add(&mut self, pivot: &Vector2<f64>, change: &Vector4<f64>, weight: f64, prior: &BiasPrior) {
+        let arm = quarter_turn(&(pivot - *self.about.get_or_insert(*pivot)));
+        let offset = weight / (prior.offset_m * prior.offset_m);
+        let rotation = weight / (prior.heading_rad * prior.heading_rad);
+        let both = arm * offset;
+        self.normal +=
+            Matrix3::new(offset, 0.0, both.x, 0.0, offset, both.y, both.x, both.y, both.dot(&arm) + rotation);
+        let turned = both.dot(&change.xy()) + rotation * change.z;
+        self.gradient += Vector3::new(offset * change.x, offset * change.y, turned);
+        self.delay_s += weight * change.w;
+        self.weight += weight;
+    }
+
+    /// The motion; `None` without weight.
+    fn motion(&self) -> Option<Motion> {
+        let solution = self.normal.try_inverse()? * self.gradient;
+        Some(Motion {
+            about: self.about?,
+            shift: solution.xy(),
+            rotation_rad: solution.z,
+            delay_s: self.delay_s / self.weight,
+        })
+    }
+}
+
+fn quarter_turn(offset: &Vector2<f64>) -> Vector2<f64> {
+    Vector2::new(-offset.y, offset.x)
+}

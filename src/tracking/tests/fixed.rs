@@ -1,0 +1,117 @@
+//! Cameras that stand, and what all observers have in common.
+
+use super::*;
+
+/// A camera: its place, and the offset and rotation by which it is wrong.
+struct Camera {
+    node: String,
+    place: Vector2<f64>,
+    offset: Vector2<f64>,
+    turned_rad: f64,
+    is_posed: bool,
+}
+
+impl Camera {
+    /// Cameras around a square, each wrong by some decimetres.
+    fn around(count: usize, is_posed: bool, rng: &mut ChaCha8Rng) -> Vec<Self> {
+        let camera = |n: usize| {
+            let (sin, cos) = (n as f64 * std::f64::consts::TAU / count as f64 + 0.6).sin_cos();
+            let place = Vector2::new(cos, sin) * 15.0;
+            let offset = Vector2::new(noise(rng, 0.5), noise(rng, 0.5));
+            Self { node: format!("camera-{n}"), place, offset, turned_rad: noise(rng, 0.01), is_posed }
+        };
+        (0..count).map(camera).collect()
+    }
+
+    /// A report of the people that are found, nine in ten.
+    fn report(&self, frame: u64, people: &[Vector2<f64>], rng: &mut ChaCha8Rng) -> ObjectReport {
+        let turned = nalgebra::Rotation2::new(self.turned_rad);
+        let mut objects = Vec::new();
+        for person in people {
+            let seen = self.place + self.offset + turned * (person - self.place);
+            let (x_m, y_m) = (seen.x + noise(rng, 0.3), seen.y + noise(rng, 0.3));
+            if rng.random_bool(0.9) {
+                objects.push(PerceivedObject::new("person", 0.8, x_m, y_m));
+            }
+        }
+        let pose = WirePose { x_m: self.place.x, y_m: self.place.y, heading_rad: 0.0 };
+        ObjectReport { pose: self.is_posed.then_some(pose), ..report(&self.node, frame, objects) }
+    }
+}
+
+/// Eight people who go around in the square, at a tenth of a second a frame.
+fn people(frame: u64) -> Vec<Vector2<f64>> {
+    let person = |n: u64| {
+        let angle = (n as f64) * 0.8 + frame as f64 * 0.1 * 0.2;
+        let (sin, cos) = angle.sin_cos();
+        Vector2::new(cos, sin) * (3.0 + n as f64)
+    };
+    (0..8).map(person).collect()
+}
+
+/// The mean of all corrections' offsets, and the largest difference between what two cameras are still wrong by.
+fn common_and_rest(round: &TracksRound, cameras: &[Camera]) -> (Vector2<f64>, f64) {
+    let corrections: Vec<_> = cameras.iter().filter_map(|c| round.pose_corrections.get(&name(&c.node))).collect();
+    let offsets = || corrections.iter().map(|c| Vector2::new(c.dx_m, c.dy_m));
+    let common = offsets().sum::<Vector2<f64>>() / corrections.len().max(1) as f64;
+    let rests: Vec<_> = offsets().zip(cameras).map(|(offset, camera)| offset + camera.offset).collect();
+    let rest = rests.iter().flat_map(|a| rests.iter().map(move |b| (a - b).norm())).fold(0.0, f64::max);
+    (common, rest)
+}
+
+/// An hour at two frames a second.
+#[test]
+fn nothing_moves_the_map_of_fixed_cameras() {
+    for (seed, count, is_posed) in [(1, 2, true), (2, 2, false), (3, 3, true)] {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let cameras = Camera::around(count, is_posed, &mut rng);
+        let mut tracker = tracker();
+        let (mut common_m, mut rest_m, mut rounds) = (0.0, 0.0, 0.0);
+        for frame in (0..36_000).step_by(5) {
+            for camera in &cameras {
+                tracker.observe(camera.report(frame, &people(frame), &mut rng), at(frame));
+            }
+            let (common, rest) = common_and_rest(&tracker.close(at(frame)), &cameras);
+            if frame > 600 {
+                (common_m, rest_m, rounds) = (common_m + common.norm(), rest_m + rest, rounds + 1.0);
+            }
+        }
+        let (common_m, rest_m) = (common_m / rounds, rest_m / rounds);
+        assert!(common_m < 0.02, "{count} cameras, poses {is_posed}: {common_m} m in common");
+        assert!(rest_m < if is_posed { 0.1 } else { 0.4 }, "{count} cameras, poses {is_posed}: {rest_m} m apart");
+    }
+}
+
+/// Mean offset of the objects of a map from the people that are nearest.
+fn off(round: &TracksRound, people: &[Vector2<f64>]) -> Vector2<f64> {
+    let cars = sure(round).into_iter().filter(|object| object.vehicle.is_none());
+    let offset = |object: &FusedObject| {
+        let offsets = people.iter().map(|person| Vector2::new(object.x_m, object.y_m) - person);
+        offsets.min_by(|a, b| a.norm().total_cmp(&b.norm())).unwrap_or_default()
+    };
+    let offsets: Vec<_> = cars.map(offset).collect();
+    offsets.iter().sum::<Vector2<f64>>() / offsets.len().max(1) as f64
+}
+
+/// The third of three cameras is wrong by 0.9 m more than the others.
+#[test]
+fn the_map_stays_where_it_is_when_a_camera_leaves() {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let mut cameras = Camera::around(3, true, &mut rng);
+    cameras[2].offset.x += 0.9;
+    let mut tracker = tracker();
+    let (mut with, mut without) = (Vec::new(), Vec::new());
+    for frame in 0..900 {
+        for camera in &cameras[..if frame < 600 { 3 } else { 2 }] {
+            tracker.observe(camera.report(frame, &people(0), &mut rng), at(frame));
+        }
+        let off = off(&tracker.close(at(frame)), &people(0));
+        match frame {
+            500..600 => with.push(off),
+            610.. => without.push(off),
+            _ => {}
+        }
+    }
+    let [with, without] = [with, without].map(|off| off.iter().sum::<Vector2<f64>>() / off.len() as f64);
+    assert!((with - without).norm() < 0.05, "from {with:?} to {without:?}");
+}
