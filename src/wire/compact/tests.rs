@@ -158,7 +158,7 @@ fn what_others_write_is_read() {
     e.begin_array().unwrap().u8(1).unwrap().str("euclid").unwrap().u8(7).unwrap().u32(5).unwrap();
     e.begin_array().unwrap();
     object(&mut e).unwrap();
-    e.end().unwrap().null().unwrap().null().unwrap().null().unwrap().null().unwrap();
+    e.end().unwrap().null().unwrap().null().unwrap().null().unwrap().null().unwrap().null().unwrap();
     e.bool(true).unwrap().end().unwrap();
     let report: ObjectReport = decode(&bytes, &Limits::default()).unwrap();
     let expected =

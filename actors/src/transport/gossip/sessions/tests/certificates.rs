@@ -293,7 +293,7 @@ fn meets_again(a: &mut End, restarted: &mut End, at: Timestamp) -> bool {
 }
 
 #[test]
-fn forged_challenges_hold_up_handshakes_of_the_node_whose_address_they_bear_and_nothing_else() {
+fn forged_challenges_hold_up_no_other_node_and_no_session_that_is_there() {
     let mut authority = TrialAuthority::new();
     let [mut a, mut b, mut c] = [("a", 1), ("b", 2), ("c", 3)].map(|(name, id)| node(&mut authority, name, id));
     introduce(&mut a, &mut b);
@@ -309,6 +309,5 @@ fn forged_challenges_hold_up_handshakes_of_the_node_whose_address_they_bear_and_
     assert!(meets_again(&mut a, &mut restarted("c", 3), later), "another node's places are its own");
     assert_both_heard(&mut a, &mut b);
     let mut b = restarted("b", 2);
-    assert!(!meets_again(&mut a, &mut b, later));
     assert!(meets_again(&mut a, &mut b, later + Duration::from_secs(1)), "the attack is over");
 }
