@@ -114,9 +114,15 @@ impl Summary {
         self.lines - self.rejected.values().map(|rejections| rejections.lines).sum::<u64>()
     }
 
-    /// Number of rejected lines, but for those of an algorithm that the cell does not run.
-    pub fn faulty(&self) -> u64 {
-        let faults = self.rejected.iter().filter(|(reason, _)| **reason != RejectReason::NotFused);
+    /// Number of rejected lines, but for those of an algorithm that the cell does not run, and with `may_repeat` for those
+    /// that a vehicle sent again or before.
+    pub fn faulty(&self, may_repeat: bool) -> u64 {
+        let is_fault = |reason: RejectReason| match reason {
+            RejectReason::NotFused => false,
+            RejectReason::OutOfOrder => !may_repeat,
+            _ => true,
+        };
+        let faults = self.rejected.iter().filter(|(reason, _)| is_fault(**reason));
         faults.map(|(_, rejections)| rejections.lines).sum()
     }
 }

@@ -94,7 +94,7 @@ fn replay_lines(config: ReplayConfig, input: &Path, mut rounds: RoundWriter) -> 
     rounds.write(&rest)?;
     print_summary(&summary);
     rounds.finish()?;
-    Ok(Some(Usable::of(&summary)))
+    Ok(Some(Usable::of(&summary, false)))
 }
 
 /// Counts of reports, to tell input of another kind, or damaged input, from a recording.
@@ -106,8 +106,8 @@ struct Usable {
 }
 
 impl Usable {
-    fn of(summary: &Summary) -> Self {
-        Self { reports: summary.lines, used: summary.used(), faulty: summary.faulty() }
+    fn of(summary: &Summary, may_repeat: bool) -> Self {
+        Self { reports: summary.lines, used: summary.used(), faulty: summary.faulty(may_repeat) }
     }
 
     fn plus(self, other: Self) -> Self {
