@@ -4,6 +4,9 @@ PACKAGES := build-essential ca-certificates clang cmake gstreamer1.0-plugins-bas
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 SECONDS_PER_SCENE ?= 15
 BUILD := $(or $(CARGO_TARGET_DIR),target)
+# PROFILE=dev measures with the programs of `make test`, which are there sooner.
+PROFILE ?= release
+PROGRAMS := $(BUILD)/$(if $(filter dev,$(PROFILE)),debug,$(PROFILE))
 SETS ?= examples/crowd_labels
 VERDICTS ?= 200
 PASSES ?= 50
@@ -28,10 +31,10 @@ demo: setup ## run a whole cell as separate processes on this machine and print 
 	$(BUILD)/release/ecod-lab demo --scenes examples/testbed/pace_setup1.json --seconds $(SECONDS_PER_SCENE) --out target/demo
 
 testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
-	cargo build --release --locked --bin ecod-lab
-	for setup in 1 2; do $(BUILD)/release/ecod-lab testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
+	cargo build --profile $(PROFILE) --locked --bin ecod-lab
+	for setup in 1 2; do $(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/pace_setup$$setup.json --verdicts $(VERDICTS) \
 	    --at-least 99.5 --occupied-at-least 99 --out target/testbed-setup$$setup.json || exit; done
-	$(BUILD)/release/ecod-lab testbed --scenes examples/testbed/vote_recording.json --at-least 100 --out target/testbed-vote.json
+	$(PROGRAMS)/ecod-lab testbed --scenes examples/testbed/vote_recording.json --at-least 100 --out target/testbed-vote.json
 
 # SETS=DIR runs other label sets: DIR/<set>/label.csv (item,worker,label and perhaps confidence) and truth.csv (item,truth).
 eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/algorithms.md
@@ -73,7 +76,7 @@ sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of S
 
 trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
-	cargo test --release --locked --test trials -- --ignored --exact trials --nocapture
+	cargo test --profile $(PROFILE) --locked --test trials -- --ignored --exact trials --nocapture
 
 joining: PACKAGES += iproute2
 joining: setup ## three machines, in network namespaces, become a cell by the commands of the README
@@ -85,11 +88,11 @@ clocks: setup ## real cells with wrong clocks that step, as vehicle and as leade
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
-	cargo test --release --locked --test trials -- --ignored --exact soak::soak --nocapture
+	cargo test --profile $(PROFILE) --locked --test trials -- --ignored --exact soak::soak --nocapture
 
 attack: PACKAGES += iproute2
 attack: setup ## attackers of all kinds against real cells, and a table; ROWS=text runs those named so, ATTACK=quick a part
-	cargo test --release --locked --test attacks -- --ignored --exact attacks --nocapture
+	cargo test --profile $(PROFILE) --locked --test attacks -- --ignored --exact attacks --nocapture
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
@@ -111,8 +114,8 @@ rooms: ## print the modules of each crate by floor, and prove that imports run d
 code-lines: ## count the lines of code of each room, without tests and comments
 	packaging/code-lines
 
-replay-check: setup ## prove that replays are byte-equal from run to run and from debug to release
-	packaging/check-replay
+replay-check: ## prove that replays of a release build have the bytes that the tests of the debug build demand
+	cargo test --locked --release -p ecod --test replays
 
 recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
@@ -161,7 +164,7 @@ instructions: setup ## instructions of the core's hot paths against the baseline
 
 liars: setup ## what lying vehicles achieve against VOTE, within a bound: table in docs/vote.md, drawing in target/liars.svg; SEEDS=n only checks
 	mkdir -p target
-	cargo run --release --locked --example liars -- $(if $(SEEDS),--seeds $(SEEDS),--write-table docs/vote.md --svg target/liars.svg)
+	cargo run --profile $(PROFILE) --locked --example liars -- $(if $(SEEDS),--seeds $(SEEDS),--write-table docs/vote.md --svg target/liars.svg)
 
 clean: ## remove everything that was built
 	cargo clean

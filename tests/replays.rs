@@ -1,0 +1,56 @@
+//! Replay of the committed recording. Debug and release builds run this test: all must give the bytes of these digests.
+//!
+//! A change of fusion changes the digests. Whoever makes one replaces them by those that the test prints.
+
+use ecod::aggregator::FusionConfig;
+use ecod::perception::landmark::{Landmark, LandmarkConfig};
+use ecod::replay::{FusedLine, Replay, ReplayConfig};
+use serde::Deserialize;
+use uuid::Uuid;
+
+/// The part of `lot.toml` that fusion needs.
+#[derive(Deserialize)]
+struct Lot {
+    name: String,
+    fusion: FusionConfig,
+    landmarks: Vec<LandmarkConfig>,
+}
+
+fn lot() -> ReplayConfig {
+    let Lot { name, fusion, landmarks } = toml::from_str(include_str!("../examples/recordings/lot.toml")).unwrap();
+    let landmarks = landmarks.iter().map(Landmark::from).collect();
+    ReplayConfig { aggregator: name.parse().unwrap(), fusion, landmarks, ..ReplayConfig::default() }
+}
+
+/// Digest of all lines of output.
+fn digest(config: ReplayConfig) -> String {
+    let mut replay = Replay::new(config);
+    let recording = include_str!("../examples/recordings/lot.jsonl");
+    let mut rounds: Vec<FusedLine> = recording.lines().flat_map(|line| replay.line(line.as_bytes())).collect();
+    rounds.extend(replay.finish().0);
+    let lines: Vec<_> = rounds.iter().map(|round| serde_json::to_string(round).unwrap()).collect();
+    assert!(!lines.is_empty());
+    Uuid::new_v5(&Uuid::NAMESPACE_OID, lines.join("\n").as_bytes()).to_string()
+}
+
+#[track_caller]
+fn check(config: ReplayConfig, expected: &str) {
+    let found = digest(config.clone());
+    assert_eq!(found, digest(config), "two runs differ");
+    assert_eq!(found, expected);
+}
+
+#[test]
+fn a_known_cell_is_replayed_to_the_byte() {
+    check(lot(), "5b0f916a-a8e9-54c4-b678-5c1bc838eb06");
+}
+
+#[test]
+fn a_cell_that_learns_its_locations_is_replayed_to_the_byte() {
+    check(ReplayConfig::default(), "fd83c4a0-35db-5987-bfc8-c919a05a7601");
+}
+
+#[test]
+fn passes_over_all_votes_are_replayed_to_the_byte() {
+    check(ReplayConfig { passes: Some(20), ..ReplayConfig::default() }, "6a0d41b7-96ec-5b9f-abbf-26833e3b4aef");
+}
