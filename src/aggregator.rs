@@ -29,6 +29,7 @@ mod tests;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
@@ -37,7 +38,7 @@ use crate::admission::report_window::{Admitted, ReportWindow};
 use crate::admission::timeliness::Timeliness;
 use crate::aggregator::round::{FirstRound, RoundTrigger};
 use crate::model::epoch::Epoch;
-use crate::model::names::NodeName;
+use crate::model::names::{LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::pace::Pace;
 use crate::perception::landmark::{Landmark, LandmarkIndex};
@@ -229,6 +230,17 @@ impl Aggregator {
     /// When the round closes without a further report.
     pub fn deadline(&self) -> Timestamp {
         self.rounds.deadline()
+    }
+
+    /// Time for which reports of a vehicle or part have been rejected for their time, and nothing else.
+    pub fn untimely_for(&self, kind: ReportKind, name: &NodeName, now: Timestamp) -> Duration {
+        self.windows[kind as usize].untimely_for(name, now)
+    }
+
+    /// True if PACE knows a location of this id; `None` if it knows none at all, or does not run.
+    pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
+        let landmarks = self.pace.as_ref()?.landmarks();
+        (!landmarks.landmarks().is_empty()).then(|| landmarks.position_of(id).is_some())
     }
 
     /// Adds known locations for PACE; evidence stays, but tracking in mode `auto` ends. VOTE takes locations from reports

@@ -22,10 +22,12 @@ mod client_refusals;
 mod codec;
 mod compact;
 mod description;
+pub(crate) mod flaw;
 mod ledger;
 mod object;
 mod reject;
 mod topic;
+mod trouble;
 mod validation;
 
 use std::collections::BTreeMap;
@@ -38,10 +40,12 @@ use uuid::Uuid;
 pub use client_refusals::{ClientRefusal, ClientRefusals};
 pub use codec::{Encoding, decode, decode_report, decode_share, encode};
 pub use description::{CellDescription, ContentHash, DescriptionStamp, DescriptionStatus, InvalidHash};
+pub use flaw::Flaw;
 pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
+pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
     InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload,
     check_fused_at,
@@ -334,6 +338,10 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(9)]
     pub description: Option<DescriptionStatus>,
+    /// Present troubles of the node, and of vehicles as the node sees them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(10), with = "skip_empty", has_nil)]
+    pub troubles: Vec<Trouble>,
 }
 
 impl NodeStatus {
@@ -350,6 +358,7 @@ impl NodeStatus {
             fit: None,
             version: version.to_owned(),
             description: None,
+            troubles: Vec::new(),
         }
     }
 }

@@ -150,6 +150,26 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_certificate_of_another_ca_or_a_revoked_one_is_broken() {
+        let (directory, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let mut config = config();
+        let (files, others) = (certificates(&config, directory.path()), certificates(&config, elsewhere.path()));
+        for ca in [&files, &others] {
+            std::fs::set_permissions(&ca.key, Permissions::from_mode(0o600)).unwrap();
+        }
+        config.tls = Some(files.clone());
+        assert_eq!(finding(&config, "certificates").await.verdict, CheckResult::Fine);
+        config.tls = Some(TlsConfig { ca: others.ca, revocation_list: None, ..files.clone() });
+        let found = finding(&config, "certificates").await;
+        assert!(found.verdict == CheckResult::Broken && found.seen.contains("does not accept"), "{found:?}");
+        let now = crate::platform::clock::now();
+        Authority::open(directory.path()).unwrap().revoke(&NodeName::from_static("edge"), now).unwrap();
+        config.tls = Some(files);
+        let found = finding(&config, "certificates").await;
+        assert!(found.verdict == CheckResult::Broken && found.seen.to_lowercase().contains("revoked"), "{found:?}");
+    }
+
+    #[tokio::test]
     async fn a_revocation_list_without_a_list_is_named() {
         let directory = tempfile::tempdir().unwrap();
         let mut config = config();

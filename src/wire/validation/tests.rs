@@ -85,6 +85,12 @@ fn status() -> NodeStatus {
         fit: Some(true),
         version: "0.1.0".into(),
         description: None,
+        troubles: vec![Trouble {
+            kind: "clock_off".into(),
+            about: Some("late".into()),
+            cause: "refused, its clock is 5.0 s ahead".into(),
+            remedy: "run a time service".into(),
+        }],
     }
 }
 

@@ -325,6 +325,7 @@ impl NodeBuilder {
             plane: self.config.data_plane(),
             shared: self.shared.subscribe(),
             security: self.security.clone(),
+            counters: self.counters(),
             fuser: self.slots.fuser.clone(),
             gateway: self.slots.gateway.clone(),
             broker: self.cell_broker(),

@@ -9,7 +9,7 @@ use std::time::Duration;
 use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind};
+use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind, Trouble};
 use serde::Serialize;
 
 use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
@@ -54,6 +54,9 @@ pub struct LatestReport {
 /// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or long silent nodes. Of
 /// the parts of one node [`MAX_PARTS`] are kept: further ones replace parts of the same node.
 pub const MAX_SHOWN: usize = 256;
+
+/// Maximum number of troubles that are shown.
+const MAX_TOLD_TROUBLES: usize = 64;
 
 /// Silence after which a vehicle may be replaced by another.
 const SILENCE: Duration = Duration::from_secs(10);
@@ -117,6 +120,26 @@ impl LiveState {
     /// Latest status of each node.
     pub(crate) fn statuses(&self) -> BTreeMap<NodeName, ReportedStatus> {
         self.latest().statuses.clone()
+    }
+
+    /// The present troubles of the cell, each once: those of this node, and those that living nodes tell of themselves and
+    /// of others.
+    pub(crate) fn troubles(&self, own: Vec<Trouble>) -> Vec<(Option<NodeName>, Trouble)> {
+        let mut all: Vec<_> = own.into_iter().map(|trouble| (None, trouble)).collect();
+        let mut known = BTreeSet::new();
+        for ReportedStatus { status, .. } in self.latest().statuses.values() {
+            if status.state == NodeState::Offline {
+                continue;
+            }
+            for trouble in &status.troubles {
+                let about = trouble.about.clone().unwrap_or_else(|| status.node.to_string());
+                let is_told = all.iter().any(|(_, own)| own.kind == trouble.kind && own.about.as_ref() == Some(&about));
+                if !is_told && known.insert((about, trouble.kind.clone())) && all.len() < MAX_TOLD_TROUBLES {
+                    all.push((Some(status.node.clone()), trouble.clone()));
+                }
+            }
+        }
+        all
     }
 
     fn latest(&self) -> MutexGuard<'_, Latest> {

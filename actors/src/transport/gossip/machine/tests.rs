@@ -80,9 +80,9 @@ impl Cell {
         };
         let mut session = SessionNonce::default();
         self.rng.fill(&mut session);
-        let key = CellKey::new(key, &NodeName::from_static("lot-1"));
-        let seed = self.rng.random();
-        let setup = GossipSetup { own, key, session, identity, secret: [7; 32], seed, counters: Arc::default() };
+        let cell = NodeName::from_static("lot-1");
+        let (key, seed) = (CellKey::new(key, &cell), self.rng.random());
+        let setup = GossipSetup { own, cell, key, session, identity, secret: [7; 32], seed, counters: Arc::default() };
         let machine = GossipMachine::new(setup, &MembershipConfig::default(), self.now);
         self.nodes.insert(node, Node { machine, events: Vec::new(), stopped: false });
     }
