@@ -205,6 +205,21 @@ pub struct LandmarkState {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(6), with = "skip_empty", has_nil)]
     pub observers: Vec<NodeName>,
+    /// Labels that nodes read at the location lately, and which nodes; in a cell that votes, too.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(7), with = "skip_empty", has_nil)]
+    pub readings: Vec<LabelReading>,
+}
+
+/// Nodes that read a label at a known location.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct LabelReading {
+    /// The label.
+    #[cbor(n(0), with = "Text")]
+    pub label: Label,
+    /// The nodes.
+    #[n(1)]
+    pub nodes: Vec<NodeName>,
 }
 
 /// The verdicts of one round (VOTE).
@@ -256,7 +271,7 @@ pub struct Verdict {
     /// Score of the label; 0 without a label.
     #[cbor(n(2), with = "Half")]
     pub score: f64,
-    /// Score of the label minus that of the next best; below 0 while hysteresis keeps a label.
+    /// Lead of the label's score over that of the next best; 0 while hysteresis keeps a label that does not lead.
     #[cbor(n(3), with = "Half")]
     pub margin: f64,
     /// Score of every label that was voted for.

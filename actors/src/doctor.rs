@@ -1,10 +1,11 @@
 //! Checks of what a node needs from its machine.
 //!
-//! The checks change nothing: they close the ports that they open, remove the files that they create, and disconnect
-//! from the broker. While the node itself runs, its ports are reported as in use.
+//! The checks change nothing: they close the ports that they open, remove the files that they create, disconnect from the
+//! broker, and leave the cell in which they look on for some seconds. While the node itself runs, its ports are reported as in use.
 
 #[cfg(feature = "camera")]
 mod camera;
+mod cell;
 mod certificates;
 mod clock;
 mod network;
@@ -64,6 +65,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     findings.extend(network::broker(config).await);
     findings.push(network::gossip(config));
     findings.extend(network::seeds(config).await);
+    findings.extend(cell::examine(config).await);
     #[cfg(feature = "camera")]
     findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));
@@ -283,6 +285,33 @@ mod tests {
         let verdicts: Vec<_> = findings.iter().map(|finding| finding.verdict).collect();
         assert_eq!(verdicts, [CheckResult::Fine, CheckResult::Doubtful, CheckResult::Doubtful], "{findings:?}");
         assert!(findings.iter().zip(&seeds).all(|(finding, seed)| finding.seen.contains(seed)), "{findings:?}");
+    }
+
+    /// An edge on loopback, and the configuration of a node that has it as its seed.
+    async fn edge_and_seeded(key: &str) -> (crate::node::NodeHandle, NodeConfig) {
+        use crate::platform::secret::Secret;
+        let mut edge = config();
+        edge.cell = NodeName::from_static("ux-lot");
+        edge.membership.key = Some(Secret::new("correct horse battery"));
+        let edge = crate::node::start(edge).await.unwrap();
+        let mut config = config();
+        (config.name, config.role) = (Some(NodeName::from_static("euclid")), Role::Cav);
+        config.cell = NodeName::from_static("ux-lot");
+        config.membership.key = Some(Secret::new(key));
+        config.membership.seeds = vec![edge.gossip_address().unwrap().to_string()];
+        (edge, config)
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn the_cell_is_looked_at_with_the_key() {
+        let (edge, mut config) = edge_and_seeded("correct horse battery").await;
+        let found = finding(&config, "cell").await;
+        assert!(found.verdict == CheckResult::Fine && found.seen.contains("ux-lot is led by edge"), "{found:?}");
+        config.membership.key = Some(crate::platform::secret::Secret::new("another horse battery"));
+        let findings = examine(&config, Path::new("node.toml")).await;
+        let seen: Vec<_> = findings.iter().filter(|found| found.check == "cell").map(|found| &*found.seen).collect();
+        assert!(seen[0] == "no node of ux-lot answers" && seen[1..].iter().any(|seen| seen.contains("another key")), "{seen:?}");
+        edge.stop().await;
     }
 
     /// A log may be written by whoever tries, and not by the service, whose unit protects the system from it.

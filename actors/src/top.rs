@@ -268,6 +268,7 @@ mod tests {
             y_m: 0.0,
             contributors: vec![name("gauss")],
             observers: Vec::new(),
+            readings: Vec::new(),
         };
         let map: GlobalMap = serde_json::from_value(serde_json::json!({
             "schema": SCHEMA_VERSION, "aggregator": "euclid", "epoch": 4, "round": 9, "fused_at_us": 0,

@@ -278,7 +278,8 @@ fn check_description(description: &CellDescription, _: &Limits) -> Result<(), Re
 fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {
     check_place(state.x_m, state.y_m)?;
     check_confidence(state.confidence)?;
-    check_labels([&*state.id].into_iter().chain(state.label.as_deref()))
+    let read = state.readings.iter().map(|reading| &*reading.label);
+    check_labels([&*state.id].into_iter().chain(state.label.as_deref()).chain(read))
 }
 
 fn check_object(object: &FusedObject) -> Result<(), RejectReason> {

@@ -13,7 +13,7 @@ pub use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPositi
 pub use ecod::model::time::Timestamp;
 pub use ecod::wire::{
     CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, NodeState, NodeStatus, PerceivedObject,
-    Reputation, Reputations, Role, Verdict, Verdicts, WirePose,
+    Reputation, Reputations, Role, Trouble, Verdict, Verdicts, WirePose,
 };
 pub use error::Error;
 pub use tls::Tls;

@@ -62,6 +62,7 @@ fn every_field_of_every_payload_survives() {
                 y_m: 123_456.789,
                 contributors: vec![node("edge")],
                 observers: vec![node("edge"), node("euclid")],
+                readings: Vec::new(),
             },
             LandmarkState {
                 id: "slot-1".into(),
@@ -71,6 +72,7 @@ fn every_field_of_every_payload_survives() {
                 y_m: 0.0,
                 contributors: vec![],
                 observers: vec![],
+                readings: Vec::new(),
             },
         ],
         objects: vec![FusedObject {

@@ -28,6 +28,7 @@ fn map() -> GlobalMap {
             y_m: 0.48,
             contributors: vec![edge()],
             observers: vec![edge()],
+            readings: Vec::new(),
         }],
         objects: vec![FusedObject {
             contributors: vec![edge()],

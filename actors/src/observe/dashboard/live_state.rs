@@ -82,6 +82,13 @@ impl LiveState {
                 let rank = |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
                 insert(&mut latest.statuses, (status.node.clone(), entry), is_beside, rank, |_| true);
             }
+            Incoming::StatusWithdrawn { node, via } => {
+                let Some(entry) = latest.statuses.get_mut(node) else { return };
+                entry.via.remove(via);
+                if entry.via.is_empty() && entry.status.state == NodeState::Offline {
+                    latest.statuses.remove(node);
+                }
+            }
             Incoming::Link { broker, state: LinkState::Down | LinkState::Refused } => {
                 for entry in latest.statuses.values_mut() {
                     entry.via.remove(broker);
@@ -242,6 +249,53 @@ mod tests {
         let shown = |name: &'static str| statuses.contains_key(&NodeName::from_static(name));
         assert_eq!((shown("late"), shown("node-1"), shown("node-0"), shown("node-3")), (true, false, true, true));
         assert_eq!((statuses.len(), live_state.reports_since(later).len()), (MAX_SHOWN, 1));
+    }
+
+    #[test]
+    fn who_took_its_status_back_at_every_broker_is_not_there() {
+        let live_state = LiveState::default();
+        let say = |state, via: &str| {
+            let starting = NodeStatus::starting(NodeName::from_static("top-1"), Uuid::nil(), Role::Cav, "0.1.0");
+            let status = Arc::new(NodeStatus { state, ..starting });
+            live_state.update(&Incoming::Status { status, via: broker(via) }, Timestamp(1));
+        };
+        let withdraw = |via: &str| {
+            let message = Incoming::StatusWithdrawn { node: NodeName::from_static("top-1"), via: broker(via) };
+            live_state.update(&message, Timestamp(2));
+        };
+        let (edge, standby) = ("10.0.0.2:1883", "10.0.0.3:1883");
+        say(NodeState::Following, edge);
+        withdraw(edge);
+        assert_eq!(live_state.statuses().len(), 1, "it goes on elsewhere");
+        for via in [edge, standby] {
+            say(NodeState::Offline, via);
+        }
+        withdraw(edge);
+        assert_eq!(live_state.statuses().len(), 1);
+        withdraw(standby);
+        assert!(live_state.statuses().is_empty());
+    }
+
+    #[test]
+    fn troubles_of_the_cell_are_told_once_by_who_knows_best() {
+        let live_state = LiveState::default();
+        let trouble = |kind: &str, about: Option<&str>, cause: &str| Trouble {
+            kind: kind.into(),
+            about: about.map(str::to_owned),
+            cause: cause.into(),
+            remedy: "mend it".into(),
+        };
+        let say = |node: &str, state, troubles| {
+            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
+            let status = Arc::new(NodeStatus { state, troubles, ..starting });
+            live_state.update(&Incoming::Status { status, via: broker("10.0.0.2:1883") }, Timestamp(1));
+        };
+        say("edge", NodeState::Aggregating, vec![trouble("clock_off", Some("late"), "by the edge")]);
+        say("late", NodeState::Following, vec![trouble("clock_off", None, "by itself"), trouble("camera", None, "x")]);
+        say("gone", NodeState::Offline, vec![trouble("camera", None, "y")]);
+        let told = live_state.troubles(vec![trouble("malformed", Some("watson"), "z")]);
+        let told: Vec<_> = told.iter().map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause)).collect();
+        assert_eq!(told, [(None, "z"), (Some("edge"), "by the edge"), (Some("late"), "x")]);
     }
 
     /// A stolen certificate may speak in the names of any number of parts.

@@ -53,6 +53,13 @@ pub enum Incoming {
         /// The broker that forwarded it.
         via: BrokerAddress,
     },
+    /// A node has stopped, or no longer uses this broker, and took its status back.
+    StatusWithdrawn {
+        /// The node.
+        node: NodeName,
+        /// The broker that told it.
+        via: BrokerAddress,
+    },
     /// The state of a link changed.
     Link {
         /// The broker at its other end.
@@ -300,8 +307,12 @@ impl Inbox {
         received_at: Timestamp,
     ) -> Result<PacketOutcome, RejectReason> {
         let is_shed = |vehicle| self.is_shed(&self.status_throttle, ShedReason::StatusThrottled, vehicle, received_at);
-        if payload.is_empty() || is_shed(&node.vehicle()) {
+        if is_shed(&node.vehicle()) {
             return Ok(PacketOutcome::Done);
+        }
+        if payload.is_empty() {
+            let message = Incoming::StatusWithdrawn { node: node.clone(), via: via.address.clone() };
+            return Ok(self.deliver(via, message, Origin::Claimed, received_at));
         }
         let status: NodeStatus = decode(payload, &self.limits)?;
         if status.node != *node {

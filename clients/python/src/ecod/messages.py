@@ -270,6 +270,16 @@ class DescriptionStatus:
 
 
 @dataclass(frozen=True)
+class Trouble:
+    """A present trouble of a node, or of a vehicle as the node sees it; without `about` it is the node's own."""
+
+    kind: Label
+    about: Optional[Label]
+    cause: str
+    remedy: str
+
+
+@dataclass(frozen=True)
 class NodeStatus:
     """A node's status, published by itself, or `offline` by its broker."""
 
@@ -283,3 +293,4 @@ class NodeStatus:
     fit: Optional[bool]
     version: Label
     description: Optional[DescriptionStatus]
+    troubles: list[Trouble] = field(default_factory=list)

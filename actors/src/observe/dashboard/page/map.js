@@ -216,11 +216,12 @@ export class BirdsEye {
   }
 }
 
-/// Bounds of places, objects and vehicles: west, south, east, north. Raw detections, which are less certain, count only
-/// where there is little else.
+/// Bounds of places, objects and vehicles: west, south, east, north. Vehicles that see nothing of them, and raw detections,
+/// which are less certain, count only where there is little else.
 function bounds({ places, objects, vehicles }) {
-  const sure = [...places, ...objects, ...vehicles.map((v) => v.pose)].filter(Boolean);
-  const points = sure.length > 1 ? sure : [...sure, ...vehicles.flatMap((v) => v.objects)];
+  const looking = vehicles.filter((v) => v.objects.length + v.seen.length > 0);
+  const sure = [...places, ...objects, ...looking.map((v) => v.pose)].filter(Boolean);
+  const points = sure.length > 1 ? sure : [...sure, ...vehicles.map((v) => v.pose).filter(Boolean), ...vehicles.flatMap((v) => v.objects)];
   return points.length > 0 ? points.map((p) => [p.x_m, p.y_m, p.x_m, p.y_m]).reduce((a, b) => union(a, b)) : [0, 0, 0, 0];
 }
 

@@ -29,6 +29,13 @@ export function tiles({ leadership, map, verdicts }, now, perSecond) {
   text(byId("failovers"), failovers === 1 ? "1 change of leader" : `${failovers} changes of leader`);
 }
 
+export function troubles({ troubles }) {
+  byId("troubles-card").hidden = troubles.length === 0;
+  rows(byId("troubles"), troubles, ({ told_by, about, kind }) => `${told_by} ${about} ${kind}`, ({ told_by, about, cause, remedy }) => [
+    about ?? told_by, { text: cause, class: "warn" }, remedy, { text: told_by, class: "dim" },
+  ]);
+}
+
 export function latency(samples) {
   const begin = samples.at(-1).at_us - 10e6;
   const last = samples.filter((sample) => sample.at_us > begin && sample.latency_p50_ms !== null);
@@ -63,15 +70,21 @@ export function verdicts(received, now) {
   text(byId("verdicts-age"), received ? ago((now - received.received_at_us) / 1e6) : "");
 }
 
-export function vehicles(entries, now) {
+/// Kinds of troubles for which a vehicle's reports are not used.
+const REFUSALS = ["untimely", "malformed", "not_permitted"];
+
+export function vehicles(entries, now, troubles) {
+  const refused = new Set(troubles.filter(({ kind }) => REFUSALS.includes(kind)).map(({ about }) => about));
   fill("vehicles", entries, (vehicle) => vehicle.node, (vehicle) => {
     const age = (now - vehicle.received_at_us) / 1e6;
+    const used = !refused.has(vehicle.node);
     return [
       { text: vehicle.node, colour: vehicle.colour }, n(vehicle.detected ?? "–"), n(vehicle.inView ?? "–"), n(vehicle.votes ?? "–"),
-      { text: ago(age), class: age > 2 ? "n bad" : "n" },
+      { text: used ? ago(age) : "refused", class: age > 2 || !used ? "n bad" : "n" },
     ];
   });
-  text(byId("vehicles-count"), entries.length ? `${entries.length} reporting` : "");
+  const refusals = entries.filter(({ node }) => refused.has(node)).length;
+  text(byId("vehicles-count"), entries.length ? `${entries.length} reporting${refusals ? `, ${refusals} refused` : ""}` : "");
 }
 
 export function reputations(received, colour) {

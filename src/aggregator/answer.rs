@@ -1,0 +1,114 @@
+//! One answer for each place where PACE and VOTE both run.
+//!
+//! PACE says whether an object is there: it alone counts misses. VOTE says what it is: it alone knows whom to trust. Its
+//! label stands unless the vote is undecided, or PACE knows that the place is empty. Both rest on the same frames, so that
+//! neither adds certainty to the other: the probability is their logarithmic opinion pool with equal weights, which sum to
+//! one (Genest & Zidek, "Combining probability distributions", Statistical Science 1(1), 1986, section 3).
+
+use crate::model::names::Label;
+use crate::wire::{LabelReading, LandmarkState, Verdict};
+
+/// Share of all votes by which the best label must lead to decide against PACE.
+const MIN_LEAD: f64 = 0.1;
+
+/// Combines the state of a place by PACE with its verdict and with what each vehicle read there. `sign` is the label of
+/// the place's vacancy sign.
+pub(super) fn agree(
+    mut state: LandmarkState,
+    verdict: Option<&Verdict>,
+    readings: Vec<LabelReading>,
+    sign: Option<&Label>,
+) -> LandmarkState {
+    let is_known_empty = match &state.label {
+        Some(label) => Some(label) == sign,
+        None => !state.observers.is_empty(),
+    };
+    if let Some((label, share, lead)) = verdict.and_then(decision).filter(|_| !is_known_empty) {
+        match &state.label {
+            Some(known) if known == label => state.confidence = pool(state.confidence, share),
+            Some(_) if lead < MIN_LEAD => state.confidence = pool(state.confidence, 1.0 - share),
+            known => {
+                state.confidence = if known.is_some() { pool(1.0 - state.confidence, share) } else { share };
+                let by = readings.iter().find(|reading| reading.label == *label);
+                state.contributors = by.map(|reading| reading.nodes.clone()).unwrap_or_default();
+                state.label = Some(label.clone());
+            }
+        }
+    }
+    state.readings = readings;
+    state
+}
+
+/// The label of a verdict, its share of all votes, and its lead over the next as a share of all votes.
+fn decision(verdict: &Verdict) -> Option<(&Label, f64, f64)> {
+    let total: f64 = verdict.votes.values().sum();
+    let label = verdict.label.as_ref().filter(|_| total > 0.0)?;
+    Some((label, (verdict.score / total).clamp(0.0, 1.0), verdict.margin / total))
+}
+
+/// Logarithmic opinion pool of two probabilities of the same event.
+fn pool(p: f64, q: f64) -> f64 {
+    let (yes, no) = ((p * q).sqrt(), ((1.0 - p) * (1.0 - q)).sqrt());
+    if yes + no > 0.0 { yes / (yes + no) } else { 0.5 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::names::NodeName;
+
+    fn name(name: &'static str) -> NodeName {
+        NodeName::from_static(name)
+    }
+
+    fn state(label: Option<&str>, confidence: f64, observers: &[&'static str]) -> LandmarkState {
+        LandmarkState {
+            id: "slot-0".into(),
+            label: label.map(Label::new),
+            confidence,
+            x_m: 0.0,
+            y_m: 0.0,
+            contributors: Vec::new(),
+            observers: observers.iter().map(|node| name(node)).collect(),
+            readings: Vec::new(),
+        }
+    }
+
+    fn verdict(votes: &[(&str, f64)]) -> Verdict {
+        let (score, next) = (votes[0].1, votes.get(1).map_or(0.0, |(_, score)| *score));
+        Verdict {
+            landmark: "slot-0".into(),
+            label: Some(votes[0].0.into()),
+            score,
+            margin: score - next,
+            votes: votes.iter().map(|(label, score)| (Label::new(label), *score)).collect(),
+            contributors: Vec::new(),
+        }
+    }
+
+    fn answer(state: LandmarkState, votes: &[(&str, f64)]) -> (Option<String>, f64) {
+        let readings = vec![LabelReading { label: "car".into(), nodes: vec![name("euclid")] }];
+        let empty = Label::new("EMPTY");
+        let state = agree(state, Some(&verdict(votes)), readings, Some(&empty));
+        (state.label.map(|label| label.to_string()), (state.confidence * 100.0).round() / 100.0)
+    }
+
+    #[test]
+    fn who_is_trusted_decides_what_is_there_and_pace_whether_anything_is() {
+        let seen: &[&str] = &["euclid"];
+        assert_eq!(answer(state(Some("car"), 0.9, seen), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.9));
+        assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.9), ("van", 0.1)]).0, Some("car".into()));
+        assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.05), ("van", 0.95)]).0, Some("van".into()));
+        assert_eq!(answer(state(None, 0.0, &[]), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.9));
+        assert_eq!(answer(state(None, 0.0, seen), &[("car", 2.0)]), (None, 0.0), "seen empty");
+        assert_eq!(answer(state(Some("EMPTY"), 0.8, seen), &[("car", 2.0)]), (Some("EMPTY".into()), 0.8));
+    }
+
+    #[test]
+    fn two_views_of_the_same_frames_make_nothing_surer() {
+        for (p, q) in [(0.9, 0.9), (0.99, 0.6), (0.5, 0.5), (1.0, 0.0), (0.0, 0.0)] {
+            let pooled = pool(p, q);
+            assert!(pooled >= f64::min(p, q) && pooled <= f64::max(p, q), "{p} {q} {pooled}");
+        }
+    }
+}
