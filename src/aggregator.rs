@@ -47,7 +47,8 @@ use crate::reputation::{Evidence, ReputationLedger};
 use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
-    FusedObject, GlobalMap, LandmarkState, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts,
+    FusedObject, GlobalMap, LandmarkState, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict,
+    Verdicts,
 };
 
 /// A closed round.

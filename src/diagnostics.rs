@@ -213,7 +213,14 @@ impl TroubleRegister {
         }
         let shown = words(0);
         self.make_room(key.0.as_deref(), now).then(|| {
-            let entry = Entry { shown: shown.clone(), shown_at: now, times: 0, seen_at: now, logged_at: now, is_settled: false };
+            let entry = Entry {
+                shown: shown.clone(),
+                shown_at: now,
+                times: 0,
+                seen_at: now,
+                logged_at: now,
+                is_settled: false,
+            };
             self.entries.insert(key, entry);
             shown
         })

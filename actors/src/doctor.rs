@@ -310,7 +310,10 @@ mod tests {
         config.membership.key = Some(crate::platform::secret::Secret::new("another horse battery"));
         let findings = examine(&config, Path::new("node.toml")).await;
         let seen: Vec<_> = findings.iter().filter(|found| found.check == "cell").map(|found| &*found.seen).collect();
-        assert!(seen[0] == "no node of ux-lot answers" && seen[1..].iter().any(|seen| seen.contains("another key")), "{seen:?}");
+        assert!(
+            seen[0] == "no node of ux-lot answers" && seen[1..].iter().any(|seen| seen.contains("another key")),
+            "{seen:?}"
+        );
         edge.stop().await;
     }
 

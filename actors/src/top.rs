@@ -357,7 +357,9 @@ mod tests {
         };
         view.troubles = (0..6).map(|n| (Some(name("edge")), trouble(n))).collect();
         let text = shown(&mut view, 100, 40);
-        for part in ["4 of 6 troubles", "edge: its clock is 5.0 s ahead", "v3: its clock", "-> run a time service", "slot-0"] {
+        for part in
+            ["4 of 6 troubles", "edge: its clock is 5.0 s ahead", "v3: its clock", "-> run a time service", "slot-0"]
+        {
             assert!(text.contains(part), "{part}: {text}");
         }
     }

@@ -7,8 +7,8 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, NodeStatus, ObjectReport,
-    MAX_TROUBLE_TEXT, MAX_TROUBLES, PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Trouble,
+    CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_TROUBLE_TEXT, MAX_TROUBLES,
+    NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Trouble,
     Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;

@@ -220,7 +220,12 @@ impl FuserState {
     }
 
     /// Counts a report that was not used. Reports that are refused for their time again and again are a trouble.
-    fn note_rejection(&self, reason: RejectReason, (kind, report): (ReportKind, &ObjectReport), received_at: Timestamp) {
+    fn note_rejection(
+        &self,
+        reason: RejectReason,
+        (kind, report): (ReportKind, &ObjectReport),
+        received_at: Timestamp,
+    ) {
         let node = report.node.as_str();
         match reason {
             RejectReason::FromTheFuture | RejectReason::Stale => {
@@ -230,9 +235,9 @@ impl FuserState {
                     self.counters.troubles().note_about(node, TroubleKind::Untimely, &format!("refused, {clock}"));
                 }
             }
-            RejectReason::NotFused => self.counters.reject_with(reason, node, || {
-                "its reports are for an algorithm that the cell does not run".into()
-            }),
+            RejectReason::NotFused => self
+                .counters
+                .reject_with(reason, node, || "its reports are for an algorithm that the cell does not run".into()),
             _ => self.counters.reject(reason, node),
         }
     }

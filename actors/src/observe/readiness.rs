@@ -56,19 +56,7 @@ pub struct Vitals {
 /// Settings that the nodes of a cell share, as far as pages and readiness go by them.
 #[derive(Debug, Clone, Default)]
 pub struct SharedFacts {
-    /// What may separate the node from its cell, in words.
-fn separating(troubles: &[Trouble]) -> Option<&str> {
-    let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
-    troubles.iter().find(kind).map(|trouble| trouble.cause.as_str())
-}
-
-/// The node's own trouble for which it does not do its work, in words.
-fn disabling(troubles: &[Trouble]) -> Option<String> {
-    let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_disabling);
-    troubles.iter().filter(|trouble| trouble.about.is_none()).find(kind).map(|trouble| trouble.cause.clone())
-}
-
-/// Maximum age of the newest round of a live aggregator; none where rounds come only with reports.
+    /// Maximum age of the newest round of a live aggregator; none where rounds come only with reports.
     pub patience: Option<Duration>,
     /// Maximum time between two rounds of a live aggregator, in seconds.
     pub round_period_s: f64,
@@ -91,6 +79,18 @@ pub struct Probe {
     pub broker_serves: bool,
     /// Vehicles whose reports are usable by their time, and others.
     pub timeliness: Timeliness,
+}
+
+/// What may separate the node from its cell, in words.
+fn separating(troubles: &[Trouble]) -> Option<&str> {
+    let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
+    troubles.iter().find(kind).map(|trouble| trouble.cause.as_str())
+}
+
+/// The node's own trouble for which it does not do its work, in words.
+fn disabling(troubles: &[Trouble]) -> Option<String> {
+    let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_disabling);
+    troubles.iter().filter(|trouble| trouble.about.is_none()).find(kind).map(|trouble| trouble.cause.clone())
 }
 
 /// Maximum age of the newest round of a live aggregator; none for VOTE's `paper` mode alone, which has a round whenever

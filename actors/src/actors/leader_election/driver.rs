@@ -4,13 +4,13 @@ use std::collections::{BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::cell_time::{CellTime, ClockEvent};
 use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::diagnostics::TroubleKind;
 use ecod::wire::{Encoding, NodeState, NodeStatus, RejectReason, Role, Trouble};
 use ractor::ActorRef;
 use tokio::sync::watch;

@@ -137,9 +137,10 @@ pub(super) fn without_credentials(url: &str) -> String {
 
 /// Names of the elements of a GStreamer pipeline; caps, references and properties are none.
 fn elements(pipeline: &str) -> impl Iterator<Item = &str> {
-    pipeline.split('!').filter_map(|part| part.split_whitespace().next()).filter(|word| {
-        word.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-')
-    })
+    pipeline
+        .split('!')
+        .filter_map(|part| part.split_whitespace().next())
+        .filter(|word| word.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-'))
 }
 
 /// True if GStreamer says that it does not know an element; OpenCV only waits for frames then.
@@ -166,7 +167,8 @@ mod tests {
 
     #[test]
     fn the_elements_of_a_pipeline_are_told_from_caps_and_properties() {
-        let pipeline = "libcamerasrc camera-name=x ! video/x-raw,width=640 ! videoconvert ! tee name=t ! appsink drop=true";
+        let pipeline =
+            "libcamerasrc camera-name=x ! video/x-raw,width=640 ! videoconvert ! tee name=t ! appsink drop=true";
         assert_eq!(elements(pipeline).collect::<Vec<_>>(), ["libcamerasrc", "videoconvert", "tee", "appsink"]);
     }
 }

@@ -294,7 +294,8 @@ mod tests {
         say("late", NodeState::Following, vec![trouble("clock_off", None, "by itself"), trouble("camera", None, "x")]);
         say("gone", NodeState::Offline, vec![trouble("camera", None, "y")]);
         let told = live_state.troubles(vec![trouble("malformed", Some("watson"), "z")]);
-        let told: Vec<_> = told.iter().map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause)).collect();
+        let told: Vec<_> =
+            told.iter().map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause)).collect();
         assert_eq!(told, [(None, "z"), (Some("edge"), "by the edge"), (Some("late"), "x")]);
     }
 

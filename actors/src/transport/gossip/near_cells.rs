@@ -35,17 +35,18 @@ fn slips(name: &str) -> impl Iterator<Item = NodeName> + '_ {
     let letters = ('a'..='z').chain('A'..='Z').chain('0'..='9').chain(['-', '_']);
     let splits = (0..=name.len()).filter_map(|at| name.split_at_checked(at));
     let after = |rest: &'_ str| rest.char_indices().nth(1).map_or(rest.len(), |(at, _)| at);
-    splits.flat_map(move |(before, rest)| {
-        let (first, others) = rest.split_at_checked(after(rest)).unwrap_or_default();
-        let (second, last) = others.split_at_checked(after(others)).unwrap_or_default();
-        let shorter = [format!("{before}{others}"), format!("{before}{second}{first}{last}")];
-        let longer = letters.clone().flat_map(move |letter| {
-            [format!("{before}{letter}{rest}"), format!("{before}{letter}{others}")]
-        });
-        shorter.into_iter().chain(longer)
-    })
-    .filter(move |slip| slip != name)
-    .filter_map(|slip| NodeName::new(slip).ok())
+    splits
+        .flat_map(move |(before, rest)| {
+            let (first, others) = rest.split_at_checked(after(rest)).unwrap_or_default();
+            let (second, last) = others.split_at_checked(after(others)).unwrap_or_default();
+            let shorter = [format!("{before}{others}"), format!("{before}{second}{first}{last}")];
+            let longer = letters
+                .clone()
+                .flat_map(move |letter| [format!("{before}{letter}{rest}"), format!("{before}{letter}{others}")]);
+            shorter.into_iter().chain(longer)
+        })
+        .filter(move |slip| slip != name)
+        .filter_map(|slip| NodeName::new(slip).ok())
 }
 
 #[cfg(test)]

@@ -10,8 +10,8 @@ use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, Flaw, GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind,
-    Reputations, Topic, Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
+    CellDescription, Flaw, GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason,
+    ReportKind, Reputations, Topic, Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;

@@ -27,12 +27,7 @@ impl End {
         Self::of_cell(("lot-1", "07"), name, session, identity)
     }
 
-    fn of_cell(
-        (cell, key): (&'static str, &str),
-        name: &'static str,
-        session: u8,
-        identity: Option<Identity>,
-    ) -> Self {
+    fn of_cell((cell, key): (&'static str, &str), name: &'static str, session: u8, identity: Option<Identity>) -> Self {
         let address = SocketAddr::from((Ipv4Addr::new(10, 0, 0, session), 1));
         let name = NodeName::from_static(name);
         let cell = NodeName::from_static(cell);
