@@ -124,6 +124,7 @@ pub struct NodeHandle {
     slots: ActorSlots,
     counters: Arc<Counters>,
     live_state: Arc<LiveState>,
+    name: NodeName,
 }
 
 /// Time between two log lines about a node's health.
@@ -145,7 +146,8 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let (newest, broker, gossip) = (builder.newest(), builder.broker_address(), builder.gossip_address());
     let (members, leadership) = (builder.members(), builder.leadership());
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
-    let (slots, counters, live_state) = (builder.slots().clone(), builder.counters(), builder.live_state());
+    let (slots, counters) = (builder.slots().clone(), builder.counters());
+    let (live_state, name) = (builder.live_state(), builder.name().clone());
     let started = Actor::spawn(None, Node, builder).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
@@ -163,6 +165,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
         slots,
         counters,
         live_state,
+        name,
     })
 }
 
@@ -224,7 +227,7 @@ impl NodeHandle {
 
     /// Present troubles of the cell: those of this node, and those that others tell in their statuses.
     pub fn troubles(&self) -> Vec<(Option<NodeName>, Trouble)> {
-        self.live_state.troubles(self.counters.troubles().present())
+        self.live_state.troubles(&self.name, self.counters.troubles().present())
     }
 
     /// Has the supervisor tell a service manager that the node runs, and how it is, until it ends.

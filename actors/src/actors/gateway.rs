@@ -156,7 +156,8 @@ impl Actor for Gateway {
     }
 
     async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
-        state.set_status(NodeStatus { state: NodeState::Offline, ..state.status.clone() });
+        let gone = NodeStatus { state: NodeState::Offline, troubles: Vec::new(), ..state.status.clone() };
+        state.set_status(gone);
         if state.looks_on {
             state.send(&state.status_topic, &Bytes::new(), Retention::Retained);
         }

@@ -214,6 +214,10 @@ impl NodeBuilder {
         self.members.subscribe()
     }
 
+    pub(super) fn name(&self) -> &NodeName {
+        &self.name
+    }
+
     pub(super) fn live_state(&self) -> Arc<LiveState> {
         Arc::clone(&self.live_state)
     }

@@ -129,19 +129,19 @@ impl LiveState {
         self.latest().statuses.clone()
     }
 
-    /// The present troubles of the cell, each once: those of this node, and those that living nodes tell of themselves and
-    /// of others.
-    pub(crate) fn troubles(&self, own: Vec<Trouble>) -> Vec<(Option<NodeName>, Trouble)> {
+    /// The present troubles of the cell, each once: those of this node `name`, and those that living nodes tell of
+    /// themselves and of others.
+    pub(crate) fn troubles(&self, name: &NodeName, own: Vec<Trouble>) -> Vec<(Option<NodeName>, Trouble)> {
+        let subject = |trouble: &Trouble, by: &NodeName| trouble.about.clone().unwrap_or_else(|| by.to_string());
+        let mut known: BTreeSet<_> = own.iter().map(|trouble| (subject(trouble, name), trouble.kind.clone())).collect();
         let mut all: Vec<_> = own.into_iter().map(|trouble| (None, trouble)).collect();
-        let mut known = BTreeSet::new();
         for ReportedStatus { status, .. } in self.latest().statuses.values() {
             if status.state == NodeState::Offline {
                 continue;
             }
             for trouble in &status.troubles {
-                let about = trouble.about.clone().unwrap_or_else(|| status.node.to_string());
-                let is_told = all.iter().any(|(_, own)| own.kind == trouble.kind && own.about.as_ref() == Some(&about));
-                if !is_told && known.insert((about, trouble.kind.clone())) && all.len() < MAX_TOLD_TROUBLES {
+                let is_new = known.insert((subject(trouble, &status.node), trouble.kind.clone()));
+                if is_new && all.len() < MAX_TOLD_TROUBLES {
                     all.push((Some(status.node.clone()), trouble.clone()));
                 }
             }
@@ -293,10 +293,12 @@ mod tests {
         say("edge", NodeState::Aggregating, vec![trouble("clock_off", Some("late"), "by the edge")]);
         say("late", NodeState::Following, vec![trouble("clock_off", None, "by itself"), trouble("camera", None, "x")]);
         say("gone", NodeState::Offline, vec![trouble("camera", None, "y")]);
-        let told = live_state.troubles(vec![trouble("malformed", Some("watson"), "z")]);
+        let own = vec![trouble("malformed", Some("watson"), "z"), trouble("overload", None, "own")];
+        say("gauss", NodeState::Following, vec![trouble("overload", Some("self"), "by gauss")]);
+        let told = live_state.troubles(&NodeName::from_static("self"), own);
         let told: Vec<_> =
             told.iter().map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause)).collect();
-        assert_eq!(told, [(None, "z"), (Some("edge"), "by the edge"), (Some("late"), "x")]);
+        assert_eq!(told, [(None, "z"), (None, "own"), (Some("edge"), "by the edge"), (Some("late"), "x")]);
     }
 
     /// A stolen certificate may speak in the names of any number of parts.

@@ -143,7 +143,7 @@ impl NodeMonitor {
 
     fn troubles(&self) -> Vec<TroubleEntry> {
         let NodeSources { node, counters, live_state, .. } = &self.sources;
-        let all = live_state.troubles(counters.troubles().present()).into_iter();
+        let all = live_state.troubles(&node.name, counters.troubles().present()).into_iter();
         all.map(|(by, trouble)| TroubleEntry { told_by: by.unwrap_or_else(|| node.name.clone()), trouble }).collect()
     }
 

@@ -62,7 +62,7 @@ function arrange(picture, landmarks, now) {
   const places = source.map((place) => {
     const empty = (place.observers ?? []).length > 0;
     const state = place.label !== null ? "full" : empty ? "" : "unknown";
-    return { ...place, facing_rad: known.get(place.id)?.facing_rad, state, words: empty ? "seen empty" : "not seen" };
+    return { ...place, facing_rad: known.get(place.id)?.facing_rad, vacancy: known.get(place.id)?.vacancy, state, words: empty ? "seen empty" : "not seen" };
   });
   const byNode = new Map();
   for (const sighting of picture.vehicles) {

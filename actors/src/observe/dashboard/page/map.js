@@ -1,5 +1,6 @@
 // Bird's-eye view: world metres to screen pixels, symbols of constant size, labels that do not overlap.
 
+import { reasons } from "./tables.js";
 import { ago, byId, keyed, set, span, svg, text } from "./dom.js";
 
 /// Standard deviations of the 95 % error ellipse in two dimensions: the square root of the χ² quantile.
@@ -116,7 +117,7 @@ export class BirdsEye {
       const reach = facing === null ? 0 : 13;
       set(line, { x1: x, y1: y, x2: x + reach * Math.cos(facing ?? 0), y2: y - reach * Math.sin(facing ?? 0) });
       set(sign, { x: x - 5.5, y: y - 5.5, class: `place ${place.state}` });
-      text(title, `${place.id}: ${place.label ?? place.words}`);
+      text(title, [`${place.id}: ${place.label ?? place.words}`, reasons(place)].filter(Boolean).join(", "));
       labels.put(`place ${place.id}`, place.label ?? place.id, x, y, 9, place.label ? "" : "dim");
     });
   }

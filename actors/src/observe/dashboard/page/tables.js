@@ -52,8 +52,18 @@ export function places(scene) {
   ];
   rows(byId("places"), entries, (entry) => entry.id, (entry) => [
     entry.name, entry.label ?? { text: entry.words ?? "–", class: "dim" }, n(entry.label ? percent(entry.confidence) : "–"),
-    n(entry.x_m.toFixed(2)), n(entry.y_m.toFixed(2)), n(entry.age_s === undefined ? "–" : ago(entry.age_s)), { text: list(entry.contributors ?? []), class: "dim" },
+    n(entry.x_m.toFixed(2)), n(entry.y_m.toFixed(2)), n(entry.age_s === undefined ? "–" : ago(entry.age_s)), { text: reasons(entry) ?? list(entry.contributors ?? []), class: "dim" },
   ]);
+}
+
+/// Why a place has its label, in words: who read what.
+export function reasons({ label, readings, vacancy }) {
+  if (!readings?.length) return null;
+  const all = new Set(readings.flatMap(({ nodes }) => nodes)).size;
+  const agreeing = readings.find((reading) => reading.label === label)?.nodes.length ?? 0;
+  const others = readings.filter((reading) => reading.label !== label);
+  const words = others.map((reading) => `${list(reading.nodes)} read ${reading.label === vacancy ? "the sign behind it" : reading.label}`);
+  return [`${agreeing} of ${all} saw ${label ?? "nothing"}`, ...words].join("; ");
 }
 
 export function verdicts(received, now) {
