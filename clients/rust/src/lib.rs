@@ -12,7 +12,7 @@ pub use ecod::model::names::{Label, LandmarkId, NodeName};
 pub use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition};
 pub use ecod::model::time::Timestamp;
 pub use ecod::wire::{
-    CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, NodeState, NodeStatus, PerceivedObject,
+    CellDescription, FieldOfView, FusedObject, GlobalMap, LabelReading, LandmarkState, NodeState, NodeStatus, PerceivedObject,
     Reputation, Reputations, Role, Trouble, Verdict, Verdicts, WirePose,
 };
 pub use error::Error;

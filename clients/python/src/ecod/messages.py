@@ -131,6 +131,14 @@ class ObjectReport:
 
 
 @dataclass(frozen=True)
+class LabelReading:
+    """Nodes that read a label at a known location."""
+
+    label: Label
+    nodes: list[Name]
+
+
+@dataclass(frozen=True)
 class LandmarkState:
     """The agreed state of one known location."""
 
@@ -141,6 +149,8 @@ class LandmarkState:
     y_m: Metres
     contributors: list[Name]
     observers: list[Name] = field(default_factory=list)
+    # Who read what lately, in a cell that votes, too.
+    readings: list[LabelReading] = field(default_factory=list)
 
     @property
     def is_empty(self) -> bool:
