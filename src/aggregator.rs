@@ -349,9 +349,13 @@ impl Aggregator {
         at.shifted(self.cell_offset_us)
     }
 
-    /// The state of each place, as PACE and VOTE agree on it.
+    /// The state of each place, as PACE and VOTE agree on it. Their `paper` modes stay as published.
     fn agree(&self, places: Vec<LandmarkState>, verdicts: Option<&[Verdict]>, now: Timestamp) -> Vec<LandmarkState> {
-        let (Some(vote), Some(pace), Some(verdicts)) = (&self.vote, &self.pace, verdicts) else { return places };
+        let (Some(vote), Some(pace @ Pace::Bayes(_)), Some(verdicts), false) =
+            (&self.vote, &self.pace, verdicts, self.by_packets)
+        else {
+            return places;
+        };
         let known: BTreeMap<_, _> = verdicts.iter().map(|verdict| (&verdict.landmark, verdict)).collect();
         let landmarks = pace.landmarks().landmarks();
         let sign = |place: usize| Some(&landmarks.get(place)?.vacancy.as_ref()?.label);

@@ -189,6 +189,11 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
             (|s| s.epoch = 1 << 53, RejectReason::OutOfRange),
             (|s| s.version = String::new(), RejectReason::InvalidLabel),
             (|s| s.version = "0".repeat(1000), RejectReason::InvalidLabel),
+            (|s| s.troubles = vec![s.troubles[0].clone(); MAX_TROUBLES + 1], RejectReason::TooManyObjects),
+            (|s| s.troubles[0].cause = "x".repeat(MAX_TROUBLE_TEXT + 1), RejectReason::TooLarge),
+            (|s| s.troubles[0].remedy = "run\nthis".into(), RejectReason::InvalidLabel),
+            (|s| s.troubles[0].kind.clear(), RejectReason::InvalidLabel),
+            (|s| s.troubles[0].about = Some("a\u{202E}b".into()), RejectReason::InvalidLabel),
         ],
     );
 }
