@@ -80,7 +80,7 @@ trouble_kinds! {
     /// Reports for an algorithm that the cell does not run.
     NotFused = "not_fused", SHORT, "set `fusion.algorithms` to what the cell is for, or report for the other algorithm";
     /// Messages beyond the rights of their sender, or without a signature that is due.
-    NotPermitted = "not_permitted", SHORT, "give the sender the cell's key and a certificate of its own name and role";
+    NotPermitted = "not_permitted", SHORT, "report at the sender's own node, or give it the cell's key and a certificate of its own name and role";
     /// More messages than are taken.
     Overload = "overload", SHORT, "send less often, or raise `mqtt.max_report_hz` or `broker.max_messages_hz`";
     /// A node of this cell with another key.

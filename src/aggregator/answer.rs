@@ -2,8 +2,7 @@
 //!
 //! PACE says whether an object is there: it alone counts misses. VOTE says what it is: it alone knows whom to trust. Its
 //! label stands unless the vote is undecided, or PACE knows that the place is empty. Both rest on the same frames, so that
-//! neither adds certainty to the other: the probability is their logarithmic opinion pool with equal weights, which sum to
-//! one (Genest & Zidek, "Combining probability distributions", Statistical Science 1(1), 1986, section 3).
+//! neither adds certainty to the other: the answer is as sure as the less sure of them.
 
 use crate::model::names::Label;
 use crate::wire::{LabelReading, LandmarkState, Verdict};
@@ -23,12 +22,14 @@ pub(super) fn agree(
         Some(label) => Some(label) == sign,
         None => !state.observers.is_empty(),
     };
-    if let Some((label, share, lead)) = verdict.and_then(decision).filter(|_| !is_known_empty) {
+    if let Some(Decision { label, share, lead, mass }) = verdict.and_then(decision).filter(|_| !is_known_empty) {
         match &state.label {
-            Some(known) if known == label => state.confidence = pool(state.confidence, share),
-            Some(_) if lead < MIN_LEAD => state.confidence = pool(state.confidence, 1.0 - share),
+            Some(known) if known == label => state.confidence = state.confidence.min(share),
+            Some(_) if lead < MIN_LEAD => state.confidence = state.confidence.min(1.0 - share),
             known => {
-                state.confidence = if known.is_some() { pool(1.0 - state.confidence, share) } else { share };
+                // Without PACE, few voters make nothing sure: Laplace's rule of succession for votes that all agree.
+                let sure = if known.is_some() { state.confidence } else { mass / (mass + 1.0) };
+                state.confidence = share.min(sure);
                 let by = readings.iter().find(|reading| reading.label == *label);
                 state.contributors = by.map(|reading| reading.nodes.clone()).unwrap_or_default();
                 state.label = Some(label.clone());
@@ -39,17 +40,22 @@ pub(super) fn agree(
     state
 }
 
-/// The label of a verdict, its share of all votes, and its lead over the next as a share of all votes.
-fn decision(verdict: &Verdict) -> Option<(&Label, f64, f64)> {
-    let total: f64 = verdict.votes.values().sum();
-    let label = verdict.label.as_ref().filter(|_| total > 0.0)?;
-    Some((label, (verdict.score / total).clamp(0.0, 1.0), verdict.margin / total))
+/// The outcome of a vote.
+struct Decision<'a> {
+    label: &'a Label,
+    /// The label's share of all votes.
+    share: f64,
+    /// Its lead over the next as a share of all votes.
+    lead: f64,
+    /// Weight of all votes.
+    mass: f64,
 }
 
-/// Logarithmic opinion pool of two probabilities of the same event.
-fn pool(p: f64, q: f64) -> f64 {
-    let (yes, no) = ((p * q).sqrt(), ((1.0 - p) * (1.0 - q)).sqrt());
-    if yes + no > 0.0 { yes / (yes + no) } else { 0.5 }
+fn decision(verdict: &Verdict) -> Option<Decision<'_>> {
+    let mass: f64 = verdict.votes.values().sum();
+    let label = verdict.label.as_ref().filter(|_| mass > 0.0)?;
+    let share = (verdict.score / mass).clamp(0.0, 1.0);
+    Some(Decision { label, share, lead: verdict.margin / mass, mass })
 }
 
 #[cfg(test)]
@@ -99,16 +105,17 @@ mod tests {
         assert_eq!(answer(state(Some("car"), 0.9, seen), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.9));
         assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.9), ("van", 0.1)]).0, Some("car".into()));
         assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.05), ("van", 0.95)]).0, Some("van".into()));
-        assert_eq!(answer(state(None, 0.0, &[]), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.9));
+        assert_eq!(answer(state(None, 0.0, &[]), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.67));
         assert_eq!(answer(state(None, 0.0, seen), &[("car", 2.0)]), (None, 0.0), "seen empty");
         assert_eq!(answer(state(Some("EMPTY"), 0.8, seen), &[("car", 2.0)]), (Some("EMPTY".into()), 0.8));
     }
 
     #[test]
-    fn two_views_of_the_same_frames_make_nothing_surer() {
-        for (p, q) in [(0.9, 0.9), (0.99, 0.6), (0.5, 0.5), (1.0, 0.0), (0.0, 0.0)] {
-            let pooled = pool(p, q);
-            assert!(pooled >= f64::min(p, q) && pooled <= f64::max(p, q), "{p} {q} {pooled}");
-        }
+    fn the_answer_is_as_sure_as_the_less_sure_of_both() {
+        let seen: &[&str] = &["euclid"];
+        assert_eq!(answer(state(Some("car"), 0.8, seen), &[("car", 1.0)]).1, 0.8);
+        assert_eq!(answer(state(Some("car"), 0.99, seen), &[("car", 1.5), ("van", 0.5)]).1, 0.75);
+        assert_eq!(answer(state(Some("van"), 0.6, seen), &[("car", 1.9), ("van", 0.1)]).1, 0.6);
+        assert_eq!(answer(state(None, 0.0, &[]), &[("car", 1.0)]).1, 0.5, "one voter alone");
     }
 }
