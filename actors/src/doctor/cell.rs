@@ -50,9 +50,9 @@ fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
     let fix = "start another node, or check `membership.seeds`, the key, and that UDP 17884 passes; the first node of a \
         cell is alone";
     let found = match leader {
-        Some(leader) => Finding::fine("cell", format!("{cell} is led by {leader}, {nodes} nodes answer")),
+        Some(leader) => Finding::fine("cell", format!("{cell} is led by {leader}, nodes that answer: {nodes}")),
         None if nodes > 0 => {
-            Finding::doubtful("cell", format!("{nodes} nodes of {cell} answer, and none leads"), "start an edge")
+            Finding::doubtful("cell", format!("{cell} has no leader, nodes that answer: {nodes}"), "start an edge")
         }
         None => Finding::doubtful("cell", format!("no node of {cell} answers"), fix),
     };
