@@ -324,8 +324,10 @@ mod tests {
     }
 
     #[test]
-    fn every_kind_has_a_name_of_its_own_and_a_remedy_that_fits() {
+    fn every_kind_has_a_name_of_its_own_a_remedy_that_fits_and_a_line_in_the_manual() {
+        let manual = include_str!("../docs/troubleshooting.md");
         for kind in TroubleKind::ALL {
+            assert!(manual.contains(&format!("\n| `{}` |", kind.as_str())), "{kind:?}");
             assert_eq!(TroubleKind::named(kind.as_str()), Some(*kind));
             assert!((10..MAX_TROUBLE_TEXT).contains(&kind.remedy().len()), "{kind:?}");
         }
