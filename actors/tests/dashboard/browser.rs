@@ -164,7 +164,7 @@ async fn an_older_browser_shows_the_map_and_a_page_that_cannot_be_drawn_says_so(
 const FAR_M: f64 = 9e7;
 
 /// A vehicle that is told a wrong pose makes the map a dot, until it is told a right one. What it only detects far away
-/// does not.
+/// does not, nor does a vehicle that sees nothing.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn a_wrong_position_is_got_over() {
@@ -176,6 +176,10 @@ async fn a_wrong_position_is_got_over() {
     let width = "(([...all]) => { const xs = all.map((place) => Number(place.getAttribute('x'))); \
         return Math.max(...xs) - Math.min(...xs); })(document.querySelectorAll('#map .place'))";
     browser.until(&format!("{width} > 300")).await;
+    stray.stand(FAR_M).await;
+    browser.until("document.querySelectorAll('#vehicles tr').length === 1").await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(browser.evaluate(&format!("{width} > 300")).await, true, "a vehicle that sees nothing rules nothing");
     stray.report(FAR_M, 1.0).await;
     browser.until(&format!("{width} < 1")).await;
     stray.report(1.0, FAR_M).await;
