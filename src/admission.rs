@@ -2,5 +2,6 @@
 
 pub mod live_stream;
 pub mod minimum_delay;
+pub mod recent_reports;
 pub mod report_window;
 pub mod timeliness;

@@ -12,6 +12,7 @@
 
 pub mod round;
 
+mod answer;
 mod command;
 mod config;
 /// The report as its vehicle's: what a part saw, its vehicle saw. So the parts of a vehicle are one witness, with one
@@ -29,6 +30,7 @@ mod tests;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
@@ -37,15 +39,16 @@ use crate::admission::report_window::{Admitted, ReportWindow};
 use crate::admission::timeliness::Timeliness;
 use crate::aggregator::round::{FirstRound, RoundTrigger};
 use crate::model::epoch::Epoch;
-use crate::model::names::NodeName;
+use crate::model::names::{LandmarkId, NodeName};
 use crate::model::time::Timestamp;
-use crate::pace::Pace;
+use crate::pace::{Pace, PaceRound};
 use crate::perception::landmark::{Landmark, LandmarkIndex};
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
-    FusedObject, GlobalMap, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict, Verdicts,
+    FusedObject, GlobalMap, LandmarkState, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict,
+    Verdicts,
 };
 
 /// A closed round.
@@ -231,6 +234,17 @@ impl Aggregator {
         self.rounds.deadline()
     }
 
+    /// Time for which reports of a vehicle or part have been rejected for their time, and nothing else.
+    pub fn untimely_for(&self, kind: ReportKind, name: &NodeName, now: Timestamp) -> Duration {
+        self.windows[kind as usize].untimely_for(name, now)
+    }
+
+    /// True if PACE knows a location of this id; `None` if it knows none at all, or does not run.
+    pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
+        let landmarks = self.pace.as_ref()?.landmarks();
+        (!landmarks.landmarks().is_empty()).then(|| landmarks.position_of(id).is_some())
+    }
+
     /// Adds known locations for PACE; evidence stays, but tracking in mode `auto` ends. VOTE takes locations from reports
     /// itself where none are known.
     pub fn add_landmarks(&mut self, landmarks: Vec<Landmark>) {
@@ -335,6 +349,23 @@ impl Aggregator {
         at.shifted(self.cell_offset_us)
     }
 
+    /// The state of each place, as PACE and VOTE agree on it. Their `paper` modes stay as published.
+    fn agree(&self, places: Vec<LandmarkState>, verdicts: Option<&[Verdict]>, now: Timestamp) -> Vec<LandmarkState> {
+        let (Some(vote), Some(pace @ Pace::Bayes(_)), Some(verdicts), false) =
+            (&self.vote, &self.pace, verdicts, self.by_packets)
+        else {
+            return places;
+        };
+        let known: BTreeMap<_, _> = verdicts.iter().map(|verdict| (&verdict.landmark, verdict)).collect();
+        let landmarks = pace.landmarks().landmarks();
+        let sign = |place: usize| Some(&landmarks.get(place)?.vacancy.as_ref()?.label);
+        let agreed = places.into_iter().enumerate().map(|(place, state)| {
+            let (verdict, readings) = (known.get(&state.id).copied(), vote.readings(&state.id, now));
+            answer::agree(state, verdict, readings, sign(place))
+        });
+        agreed.collect()
+    }
+
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
         let tracks = self.tracks.as_mut().map(|tracks| tracks.close(now)).unwrap_or_default();
@@ -356,14 +387,15 @@ impl Aggregator {
         let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
         evidence.extend(seen);
         let oldest = [pace.as_ref().and_then(|pace| pace.oldest_capture), oldest_capture].into_iter().flatten().min();
-        let map = pace.map(|pace| GlobalMap {
+        let pace = pace.map(|PaceRound { landmarks, .. }| self.agree(landmarks, verdicts.as_deref(), now));
+        let map = pace.map(|landmarks| GlobalMap {
             schema: SCHEMA_VERSION,
             aggregator: epoch.leader.clone(),
             epoch: epoch.term,
             round,
             fused_at_us: fused_at,
             oldest_capture_us: oldest.map(|oldest| self.in_cell_time(oldest)),
-            landmarks: pace.landmarks,
+            landmarks,
             objects,
             pose_corrections,
         });

@@ -12,6 +12,7 @@ pub mod aggregator;
 pub mod association;
 pub mod config;
 pub mod description;
+pub mod diagnostics;
 pub mod leadership;
 pub mod model;
 pub mod pace;

@@ -137,12 +137,21 @@ impl Pace {
         }
     }
 
-    /// True if an object names a known location or is within the gate of one.
-    pub fn is_at_landmark(&self, object: &PerceivedObject) -> bool {
-        let (landmarks, gate_m) = match self {
+    /// The known locations.
+    pub fn landmarks(&self) -> &LandmarkIndex {
+        self.places().0
+    }
+
+    fn places(&self) -> (&LandmarkIndex, f64) {
+        match self {
             Self::Paper(pace) => pace.places(),
             Self::Bayes(pace) => pace.places(),
-        };
+        }
+    }
+
+    /// True if an object names a known location or is within the gate of one.
+    pub fn is_at_landmark(&self, object: &PerceivedObject) -> bool {
+        let (landmarks, gate_m) = self.places();
         let point = Point2::new(object.x_m, object.y_m);
         object.landmark.is_some() || landmarks.within(&point, gate_m).next().is_some()
     }

@@ -22,7 +22,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 pub use clock::TimeUnit;
-pub use flaw::Flaw;
 pub use journal::{JournalEntry, JournalEvent, JournalReplay, JournalSummary};
 pub use records::FusedLine;
 
@@ -32,6 +31,7 @@ use crate::model::time::Timestamp;
 use crate::perception::landmark::{Landmark, LandmarkConfig};
 use crate::tracking::TracksLosses;
 use crate::vote::MAX_LABELS;
+pub use crate::wire::Flaw;
 use crate::wire::{InvalidValue, Limits, ObjectReport, RejectReason, ReportKind};
 use clock::VirtualClock;
 use records::RecordedReport;
@@ -210,7 +210,7 @@ impl Replay {
     pub fn oversized_line(&mut self) {
         self.number += 1;
         self.summary.lines += 1;
-        self.reject(self.number, Flaw::too_large(&self.config.limits));
+        self.reject(self.number, flaw::too_large(&self.config.limits));
     }
 
     /// Takes the lines that were read ahead, closes the last round, and judges an incomplete packet of VOTE's `paper`
@@ -271,7 +271,7 @@ impl Replay {
         let Some((number, mut line)) = self.ahead.pop_front() else { return output };
         let is_plausible = self.clock.is_plausible(line.at, self.ahead.iter().map(|(_, line)| line.at));
         if !is_plausible && self.config.passes.is_none() {
-            self.reject(number, Flaw::of_report(RejectReason::FromTheFuture));
+            self.reject(number, flaw::of_unused(RejectReason::FromTheFuture));
             return output;
         }
         let before = self.clock.now();
@@ -293,7 +293,7 @@ impl Replay {
                 self.pending = fused.is_none();
                 self.write(fused, &mut output);
             }
-            Err(reason) => self.reject(number, Flaw::of_report(reason)),
+            Err(reason) => self.reject(number, flaw::of_unused(reason)),
         }
         output
     }

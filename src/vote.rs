@@ -35,11 +35,11 @@ pub use paper::REPUTATION_RANGE;
 pub use visibility::{paper as paper_visibility, weighted as weighted_visibility};
 
 use crate::model::geometry::Pose;
-use crate::model::names::{LandmarkId, NodeName};
+use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::perception::landmark::Landmark;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::wire::{Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict};
+use crate::wire::{LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict};
 use configured_method::ConfiguredMethod;
 use method::NewVote;
 
@@ -91,6 +91,8 @@ pub struct Vote {
     arrivals: VecDeque<LandmarkId>,
     last_reports: BTreeMap<NodeName, LastReport>,
     method: ConfiguredMethod,
+    /// Vacancy signs that were read lately, and when, by vehicle.
+    signs: BTreeMap<LandmarkId, BTreeMap<NodeName, Timestamp>>,
     ignored: u64,
 }
 
@@ -108,6 +110,7 @@ impl Vote {
             arrivals: VecDeque::new(),
             last_reports: BTreeMap::new(),
             method,
+            signs: BTreeMap::new(),
             ignored: 0,
         }
     }
@@ -189,12 +192,14 @@ impl Vote {
         Ok(())
     }
 
-    /// The most confident object at each landmark, the first on a tie, by landmark.
+    /// The most confident object at each landmark, the first on a tie, by landmark; its vacancy sign only if nothing is
+    /// before it.
     fn one_per_landmark<'a>(&mut self, objects: &'a [PerceivedObject]) -> Vec<&'a PerceivedObject> {
         let mut best: BTreeMap<Option<&LandmarkId>, &PerceivedObject> = BTreeMap::new();
         for object in objects {
             let kept = best.entry(object.landmark.as_ref()).or_insert(object);
-            if object.confidence > kept.confidence {
+            let rank = |object: &PerceivedObject| (!self.is_sign(object), object.confidence);
+            if rank(object) > rank(kept) {
                 *kept = object;
             }
         }
@@ -212,7 +217,7 @@ impl Vote {
         let landmark = known.and_then(Option::as_ref);
         let position = landmark.map_or(Point2::new(object.x_m, object.y_m), |l| l.position);
         let synonym = landmark.and_then(|landmark| landmark.synonym(&object.label));
-        let label = synonym.or_else(|| self.config.synonyms.get(&object.label)).unwrap_or(&object.label);
+        let label = synonym.or_else(|| self.config.synonyms.get(&object.label)).unwrap_or(&object.label).clone();
         let range_bearing = pose.map(|p| p.range_bearing(&position));
         let max_range_m = match self.config.mode {
             VoteMode::Paper => self.config.paper.max_range_m,
@@ -221,21 +226,63 @@ impl Vote {
         if range_bearing.is_some_and(|(distance_m, _)| distance_m > max_range_m) {
             return false;
         }
+        if self.is_sign(object) && self.is_behind_object(id, &label, &report.node, at) {
+            return true;
+        }
         let vote = NewVote {
             landmark: id,
             node: &report.node,
-            label: &label.clone(),
+            label: &label,
             confidence: object.confidence,
             range_bearing,
             at,
         };
         let Some(forgotten) = self.method.get_mut().make_room_for(&vote, self.config.max_labels) else { return false };
         self.ignored += forgotten as u64;
-        if known.is_none() {
+        if !self.landmarks.contains_key(id) {
             self.open_landmark(id);
         }
         self.method.get_mut().add_vote(&vote);
         true
+    }
+
+    /// True if an object is the vacancy sign of the landmark that it names.
+    fn is_sign(&self, object: &PerceivedObject) -> bool {
+        let landmark = object.landmark.as_ref().and_then(|id| self.landmarks.get(id)?.as_ref());
+        landmark.and_then(|landmark| landmark.vacancy.as_ref()).is_some_and(|sign| sign.label == object.label)
+    }
+
+    /// Notes that a vehicle read a landmark's vacancy sign. True if it is behind an object, and no vote against that: at
+    /// least as many other vehicles read an object there as read the sign.
+    fn is_behind_object(&mut self, landmark: &LandmarkId, sign: &Label, node: &NodeName, at: Timestamp) -> bool {
+        let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
+        let signs = self.signs.entry(landmark.clone()).or_default();
+        signs.insert(node.clone(), at);
+        signs.retain(|_, read_at| at.since(*read_at) < freshness);
+        let readings = self.method.get().readings(landmark);
+        let objects = readings.iter().filter(|(label, _)| *label != sign).flat_map(|(_, nodes)| nodes);
+        let objects = objects.filter(|other| *other != node).count();
+        objects > 0 && objects >= signs.len()
+    }
+
+    /// Labels that vehicles read at a landmark lately, those that are no votes included, and which vehicles.
+    pub fn readings(&self, landmark: &LandmarkId, now: Timestamp) -> Vec<LabelReading> {
+        let mut readings = self.method.get().readings(landmark);
+        let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
+        let known = self.landmarks.get(landmark).and_then(Option::as_ref);
+        if let (Some(sign), Some(signs)) = (known.and_then(|l| l.vacancy.as_ref()), self.signs.get(landmark)) {
+            let votes: BTreeSet<NodeName> = readings.values().flatten().cloned().collect();
+            let fresh = signs.iter().filter(|(node, at)| now.since(**at) < freshness && !votes.contains(*node));
+            let fresh: Vec<_> = fresh.map(|(node, _)| node.clone()).collect();
+            if !fresh.is_empty() {
+                readings.entry(sign.label.clone()).or_default().extend(fresh);
+            }
+        }
+        let sorted = readings.into_iter().map(|(label, mut nodes)| {
+            nodes.sort();
+            LabelReading { label, nodes }
+        });
+        sorted.collect()
     }
 
     fn open_landmark(&mut self, landmark: &LandmarkId) {

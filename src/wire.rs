@@ -22,10 +22,12 @@ mod client_refusals;
 mod codec;
 mod compact;
 mod description;
+pub(crate) mod flaw;
 mod ledger;
 mod object;
 mod reject;
 mod topic;
+mod trouble;
 mod validation;
 
 use std::collections::BTreeMap;
@@ -38,10 +40,12 @@ use uuid::Uuid;
 pub use client_refusals::{ClientRefusal, ClientRefusals};
 pub use codec::{Encoding, decode, decode_report, decode_share, encode};
 pub use description::{CellDescription, ContentHash, DescriptionStamp, DescriptionStatus, InvalidHash};
+pub use flaw::Flaw;
 pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
+pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
     InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload,
     check_fused_at,
@@ -201,6 +205,21 @@ pub struct LandmarkState {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(6), with = "skip_empty", has_nil)]
     pub observers: Vec<NodeName>,
+    /// Labels that nodes read at the location lately, and which nodes; in a cell that votes, too.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(7), with = "skip_empty", has_nil)]
+    pub readings: Vec<LabelReading>,
+}
+
+/// Nodes that read a label at a known location.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct LabelReading {
+    /// The label.
+    #[cbor(n(0), with = "Text")]
+    pub label: Label,
+    /// The nodes.
+    #[n(1)]
+    pub nodes: Vec<NodeName>,
 }
 
 /// The verdicts of one round (VOTE).
@@ -252,7 +271,7 @@ pub struct Verdict {
     /// Score of the label; 0 without a label.
     #[cbor(n(2), with = "Half")]
     pub score: f64,
-    /// Score of the label minus that of the next best; below 0 while hysteresis keeps a label.
+    /// Lead of the label's score over that of the next best; 0 while hysteresis keeps a label that does not lead.
     #[cbor(n(3), with = "Half")]
     pub margin: f64,
     /// Score of every label that was voted for.
@@ -334,6 +353,10 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(9)]
     pub description: Option<DescriptionStatus>,
+    /// Present troubles of the node, and of vehicles as the node sees them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(10), with = "skip_empty", has_nil)]
+    pub troubles: Vec<Trouble>,
 }
 
 impl NodeStatus {
@@ -350,6 +373,7 @@ impl NodeStatus {
             fit: None,
             version: version.to_owned(),
             description: None,
+            troubles: Vec::new(),
         }
     }
 }

@@ -1,10 +1,11 @@
 //! Checks of what a node needs from its machine.
 //!
-//! The checks change nothing: they close the ports that they open, remove the files that they create, and disconnect
-//! from the broker. While the node itself runs, its ports are reported as in use.
+//! The checks change nothing: they close the ports that they open, remove the files that they create, disconnect from the
+//! broker, and leave the cell in which they look on for some seconds. While the node itself runs, its ports are reported as in use.
 
 #[cfg(feature = "camera")]
 mod camera;
+mod cell;
 mod certificates;
 mod clock;
 mod network;
@@ -64,6 +65,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     findings.extend(network::broker(config).await);
     findings.push(network::gossip(config));
     findings.extend(network::seeds(config).await);
+    findings.extend(cell::examine(config).await);
     #[cfg(feature = "camera")]
     findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));
@@ -147,6 +149,26 @@ mod tests {
             let finding = finding(&config, "certificates").await;
             assert_eq!(finding.verdict, verdict, "{mode:o}: {finding:?}");
         }
+    }
+
+    #[tokio::test]
+    async fn a_certificate_of_another_ca_or_a_revoked_one_is_broken() {
+        let (directory, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let mut config = config();
+        let (files, others) = (certificates(&config, directory.path()), certificates(&config, elsewhere.path()));
+        for ca in [&files, &others] {
+            std::fs::set_permissions(&ca.key, Permissions::from_mode(0o600)).unwrap();
+        }
+        config.tls = Some(files.clone());
+        assert_eq!(finding(&config, "certificates").await.verdict, CheckResult::Fine);
+        config.tls = Some(TlsConfig { ca: others.ca, revocation_list: None, ..files.clone() });
+        let found = finding(&config, "certificates").await;
+        assert!(found.verdict == CheckResult::Broken && found.seen.contains("does not accept"), "{found:?}");
+        let now = crate::platform::clock::now();
+        Authority::open(directory.path()).unwrap().revoke(&NodeName::from_static("edge"), now).unwrap();
+        config.tls = Some(files);
+        let found = finding(&config, "certificates").await;
+        assert!(found.verdict == CheckResult::Broken && found.seen.to_lowercase().contains("revoked"), "{found:?}");
     }
 
     #[tokio::test]
@@ -263,6 +285,35 @@ mod tests {
         let verdicts: Vec<_> = findings.iter().map(|finding| finding.verdict).collect();
         assert_eq!(verdicts, [CheckResult::Fine, CheckResult::Doubtful, CheckResult::Doubtful], "{findings:?}");
         assert!(findings.iter().zip(&seeds).all(|(finding, seed)| finding.seen.contains(seed)), "{findings:?}");
+    }
+
+    /// An edge on loopback, and the configuration of a node that has it as its seed.
+    async fn edge_and_seeded(key: &str) -> (crate::node::NodeHandle, NodeConfig) {
+        use crate::platform::secret::Secret;
+        let mut edge = config();
+        edge.cell = NodeName::from_static("ux-lot");
+        edge.membership.key = Some(Secret::new("correct horse battery"));
+        let edge = crate::node::start(edge).await.unwrap();
+        let mut config = config();
+        (config.name, config.role) = (Some(NodeName::from_static("euclid")), Role::Cav);
+        config.cell = NodeName::from_static("ux-lot");
+        config.membership.key = Some(Secret::new(key));
+        config.membership.seeds = vec![edge.gossip_address().unwrap().to_string()];
+        (edge, config)
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn the_cell_is_looked_at_with_the_key() {
+        let (edge, mut config) = edge_and_seeded("correct horse battery").await;
+        let found = finding(&config, "cell").await;
+        assert!(found.verdict == CheckResult::Fine && found.seen.contains("ux-lot is led by edge"), "{found:?}");
+        config.membership.key = Some(crate::platform::secret::Secret::new("another horse battery"));
+        let found = finding(&config, "cell").await;
+        assert!(found.verdict == CheckResult::Doubtful && found.seen == "no node of ux-lot answers", "{found:?}");
+        assert!(found.fix.unwrap().contains("the key"));
+        let troubles = edge.troubles();
+        assert!(troubles.iter().any(|(_, trouble)| trouble.cause.contains("another key")), "{troubles:?}");
+        edge.stop().await;
     }
 
     /// A log may be written by whoever tries, and not by the service, whose unit protects the system from it.

@@ -36,7 +36,7 @@ use std::time::Duration;
 use ecod::leadership::Leadership;
 use ecod::leadership::readiness::Readiness;
 use ecod::model::names::NodeName;
-use ecod::wire::{CellDescription, Reputations, Verdicts};
+use ecod::wire::{CellDescription, Reputations, Trouble, Verdicts};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, SupervisionEvent};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -48,6 +48,7 @@ pub use slots::{ActorKind, ActorSlots};
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::node::config::NodeConfig;
 use crate::node::service::ServiceManager;
+use crate::observe::dashboard::LiveState;
 use crate::observe::readiness::Vitals;
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
@@ -122,6 +123,8 @@ pub struct NodeHandle {
     dashboard: watch::Receiver<Option<SocketAddr>>,
     slots: ActorSlots,
     counters: Arc<Counters>,
+    live_state: Arc<LiveState>,
+    name: NodeName,
 }
 
 /// Time between two log lines about a node's health.
@@ -144,6 +147,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let (members, leadership) = (builder.members(), builder.leadership());
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
     let (slots, counters) = (builder.slots().clone(), builder.counters());
+    let (live_state, name) = (builder.live_state(), builder.name().clone());
     let started = Actor::spawn(None, Node, builder).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
@@ -160,6 +164,8 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
         dashboard,
         slots,
         counters,
+        live_state,
+        name,
     })
 }
 
@@ -217,6 +223,11 @@ impl NodeHandle {
     /// The node's counters.
     pub fn counters(&self) -> &Arc<Counters> {
         &self.counters
+    }
+
+    /// Present troubles of the cell: those of this node, and those that others tell in their statuses.
+    pub fn troubles(&self) -> Vec<(Option<NodeName>, Trouble)> {
+        self.live_state.troubles(&self.name, self.counters.troubles().present())
     }
 
     /// Has the supervisor tell a service manager that the node runs, and how it is, until it ends.

@@ -4,3 +4,4 @@ pub mod counters;
 #[cfg(feature = "otel")]
 pub mod otlp;
 pub mod spans;
+pub mod troubles;

@@ -7,7 +7,7 @@ use ecod::leadership::Leadership;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{Reputations, Verdict, Verdicts};
+use ecod::wire::{Reputations, Trouble, Verdict, Verdicts};
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Style, Stylize};
@@ -20,6 +20,9 @@ use crate::node::config::NodeConfig;
 use crate::observe::readiness::{newest_round, patience};
 use crate::telemetry::counters::CounterSnapshot;
 use crate::transport::gossip::Member;
+
+/// Maximum number of troubles shown.
+const MAX_TROUBLES: usize = 4;
 
 /// Maximum number of leaderships shown.
 const HISTORY: usize = 5;
@@ -45,6 +48,8 @@ pub struct CellView {
     pub verdicts: Option<Received<Verdicts>>,
     /// The newest reputations.
     pub reputations: Option<Received<Reputations>>,
+    /// Present troubles of the cell, with the node that tells each.
+    pub troubles: Vec<(Option<NodeName>, Trouble)>,
     /// The observer's counters.
     pub counters: CounterSnapshot,
     /// Number of lines above the first visible one.
@@ -65,6 +70,7 @@ impl CellView {
             map: node.newest_map().borrow().clone(),
             verdicts: node.newest_verdicts().borrow().clone(),
             reputations: node.newest_reputations().borrow().clone(),
+            troubles: node.troubles(),
             counters: node.counters().snapshot(),
             scroll,
         };
@@ -90,12 +96,20 @@ impl CellView {
 
 /// Draws the cell, and limits the scroll position to the last line.
 pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
-    let [head, places, below, foot] =
-        Layout::vertical([Constraint::Length(4), Constraint::Min(5), Constraint::Length(9), Constraint::Length(1)])
-            .areas(frame.area());
+    // Two lines for each trouble, and the borders.
+    let told = if view.troubles.is_empty() { 0 } else { 2 + 2 * view.troubles.len().min(MAX_TROUBLES) as u16 };
+    let [head, wrong, places, below, foot] = Layout::vertical([
+        Constraint::Length(4),
+        Constraint::Length(told),
+        Constraint::Min(5),
+        Constraint::Length(9),
+        Constraint::Length(1),
+    ])
+    .areas(frame.area());
     let [nodes, losses] = Layout::horizontal([Constraint::Percentage(60), Constraint::Percentage(40)]).areas(below);
     let table = locations(view, places.height);
     frame.render_widget(summary(view), head);
+    frame.render_widget(troubles(view), wrong);
     frame.render_widget(table, places);
     frame.render_widget(vehicles(view), nodes);
     frame.render_widget(counted(view), losses);
@@ -123,6 +137,20 @@ fn summary(view: &CellView) -> Paragraph<'_> {
     let before = if before.is_empty() { String::new() } else { format!("  before: {}", before.join(", ")) };
     let lines = vec![Line::from(vec![leader, "  ".into(), freshness]), Line::from(before).dim()];
     Paragraph::new(lines).block(Block::bordered().title(format!(" cell {} ", view.cell)))
+}
+
+/// The first troubles with their remedies.
+fn troubles(view: &CellView) -> Paragraph<'_> {
+    let lines = view.troubles.iter().take(MAX_TROUBLES).flat_map(|(by, Trouble { about, cause, remedy, .. })| {
+        let by = by.as_ref().map(NodeName::as_str);
+        let about = about.as_deref().or(by).unwrap_or("this observer");
+        [Line::from(format!("{about}: {cause}")).yellow(), Line::from(format!("  -> {remedy}")).dim()]
+    });
+    let title = match view.troubles.len() {
+        all if all > MAX_TROUBLES => format!(" {MAX_TROUBLES} of {all} troubles "),
+        _ => " troubles ".to_owned(),
+    };
+    Paragraph::new(lines.collect::<Vec<_>>()).block(Block::bordered().title(title))
 }
 
 /// Table of locations and objects that fits a box of this height.
@@ -240,6 +268,7 @@ mod tests {
             y_m: 0.0,
             contributors: vec![name("gauss")],
             observers: Vec::new(),
+            readings: Vec::new(),
         };
         let map: GlobalMap = serde_json::from_value(serde_json::json!({
             "schema": SCHEMA_VERSION, "aggregator": "euclid", "epoch": 4, "round": 9, "fused_at_us": 0,
@@ -280,6 +309,7 @@ mod tests {
             map: Some(ReceivedMap { received_at: Timestamp(7_000_000), map: Arc::new(map) }),
             verdicts: None,
             reputations: Some(Received { received_at: Timestamp(7_000_000), message: Arc::new(reputations) }),
+            troubles: Vec::new(),
             counters: Counters::default().snapshot(),
             scroll: 0,
         };
@@ -313,6 +343,25 @@ mod tests {
             assert!(text.contains(part), "{part}: {text}");
         }
         assert!(text.contains("nothing lost here") && !text.contains("STALE"), "{text}");
+    }
+
+    #[test]
+    fn troubles_are_told_with_their_remedies() {
+        let mut view = view(Timestamp(7_200_000));
+        assert!(!shown(&mut view, 100, 40).contains("troubles"));
+        let trouble = |n: usize| Trouble {
+            kind: "clock_off".into(),
+            about: (n > 0).then(|| format!("v{n}")),
+            cause: "its clock is 5.0 s ahead of the cell's time".into(),
+            remedy: "run a time service".into(),
+        };
+        view.troubles = (0..6).map(|n| (Some(name("edge")), trouble(n))).collect();
+        let text = shown(&mut view, 100, 40);
+        for part in
+            ["4 of 6 troubles", "edge: its clock is 5.0 s ahead", "v3: its clock", "-> run a time service", "slot-0"]
+        {
+            assert!(text.contains(part), "{part}: {text}");
+        }
     }
 
     #[test]

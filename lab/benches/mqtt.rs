@@ -111,6 +111,7 @@ async fn join(
         counters: Arc::new(Counters::default()),
         subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
         seed: 1,
+        looks_on: false,
     };
     let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
     gateway.cast(GatewayMessage::SetBrokers { addresses: vec![broker.clone()] })?;

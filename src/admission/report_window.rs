@@ -113,6 +113,12 @@ impl ReportWindow {
         admitted
     }
 
+    /// Time for which a sender's reports have been rejected for their time, and nothing else.
+    pub fn untimely_for(&self, name: &NodeName, now: Timestamp) -> Duration {
+        let since = self.vehicles.get(name).and_then(|vehicle| vehicle.untimely_since);
+        since.map_or(Duration::ZERO, |since| now.since(since))
+    }
+
     /// The share of the vehicles heard lately whose reports are admitted.
     pub fn timeliness(&self, now: Timestamp) -> Timeliness {
         // By vehicle: the parts of one must not speak for many.

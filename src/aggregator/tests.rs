@@ -1,4 +1,5 @@
 mod configure;
+mod one_answer;
 
 use ReportKind::{Detections, VoteDetections};
 use nalgebra::Point2;

@@ -70,10 +70,19 @@ struct PeerClock {
     has_stamps: bool,
     last: AnsweredStamps,
     filter: OffsetFilter,
-    /// Its wall clock less its steady clock, if it may lead and its clock was set.
+    /// Its wall clock less its steady clock, if its clock was set.
     wall_offset_us: Option<i64>,
+    /// True if it may lead: its wall clock counts for the cell's time.
+    is_candidate: bool,
     /// The cell's time less its steady clock, as it knows it.
     cell_offset_us: Option<i64>,
+}
+
+impl PeerClock {
+    /// Its wall clock less this node's steady clock.
+    fn wall_offset_us(&self, now: Timestamp) -> Option<i64> {
+        Some(self.wall_offset_us?.saturating_add(self.filter.best(now)?.offset_us))
+    }
 }
 
 impl CellTime {
@@ -92,6 +101,15 @@ impl CellTime {
     pub fn reading(&self) -> ClockReading {
         let own = ClockReading { offset_us: self.wall_offset_us.unwrap_or_default(), error_us: None };
         self.reading.unwrap_or(own)
+    }
+
+    /// Errors of all wall clocks that are known in microseconds, positive if ahead of the cell's time: of the node's own,
+    /// without a name, and of others. None while the node does not know the cell's time.
+    pub fn wall_errors(&self, now: Timestamp) -> Vec<(Option<&NodeName>, i64)> {
+        let Some(cell) = self.reading.map(|reading| reading.offset_us) else { return Vec::new() };
+        let own = self.wall_offset_us.map(|wall| (None, wall));
+        let others = self.peers.iter().filter_map(|(name, peer)| Some((Some(name), peer.wall_offset_us(now)?)));
+        own.into_iter().chain(others).map(|(name, wall)| (name, wall.saturating_sub(cell))).collect()
     }
 
     /// Stamps for a message to a node, sent `now` by the steady clock.
@@ -116,7 +134,7 @@ impl CellTime {
             cell_us: None,
         });
         let role = rights.limit_role(message.candidacy.role);
-        let wall = stamps.wall_us.filter(|wall| role != Role::Cav && *wall >= EARLIEST);
+        let wall = stamps.wall_us.filter(|wall| *wall >= EARLIEST);
         let last = AnsweredStamps { sent_us: stamps.sent_us, received_us: now };
         let new = || PeerClock {
             run: message.run,
@@ -124,6 +142,7 @@ impl CellTime {
             last,
             filter: OffsetFilter::default(),
             wall_offset_us: None,
+            is_candidate: false,
             cell_offset_us: None,
         };
         let peer = self.peers.entry(message.from.clone()).or_insert_with(new);
@@ -132,7 +151,7 @@ impl CellTime {
         }
         let offset = |time: Timestamp| time.micros_from(stamps.sent_us);
         peer.last = last;
-        peer.wall_offset_us = wall.map(offset);
+        (peer.wall_offset_us, peer.is_candidate) = (wall.map(offset), role != Role::Cav);
         peer.cell_offset_us = stamps.cell_us.map(offset);
         if let Some(AnsweredStamps { sent_us, received_us }) = stamps.answers {
             peer.filter.observe(Exchange { t1: sent_us, t2: received_us, t3: stamps.sent_us, t4: now });
@@ -194,10 +213,8 @@ impl CellTime {
     /// The wall clocks of all candidates that were set, as offsets from this node's steady clock.
     fn walls(&self, now: Timestamp) -> Vec<i64> {
         let is_set = |offset: &i64| self.is_candidate && now.shifted(*offset) >= EARLIEST;
-        let others = self.peers.values().filter_map(|peer| {
-            let Offset { offset_us, .. } = peer.filter.best(now)?;
-            Some(peer.wall_offset_us?.saturating_add(offset_us))
-        });
+        let candidates = self.peers.values().filter(|peer| peer.is_candidate);
+        let others = candidates.filter_map(|peer| peer.wall_offset_us(now));
         self.wall_offset_us.filter(is_set).into_iter().chain(others).collect()
     }
 }

@@ -217,6 +217,12 @@ impl LeadershipNode {
                     self.feed(ElectionInput::Greet, now);
                 }
             }
+            Input::Troubled { troubles } => {
+                if self.status.troubles != troubles {
+                    self.status.troubles = troubles;
+                    self.is_status_told = false;
+                }
+            }
             Input::Leave => self.feed(ElectionInput::Leave, now),
         }
     }

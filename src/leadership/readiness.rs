@@ -32,6 +32,15 @@ impl Readiness {
         Self { ready: false, reason, needs_restart: true }
     }
 
+    /// The readiness of the same node with what may be the cause, if it is not ready.
+    #[must_use]
+    pub fn because(self, cause: Option<&str>) -> Self {
+        match cause {
+            Some(cause) if !self.ready => Self { reason: format!("{}: {cause}", self.reason), ..self },
+            _ => self,
+        }
+    }
+
     /// The readiness of the same node with a problem of its settings, if there is one, which no start anew mends.
     #[must_use]
     pub fn unless(self, problem: Option<String>) -> Self {
@@ -136,6 +145,18 @@ mod tests {
         assert_eq!(judge(None, Some(&fresh)), (true, "following edge".into(), false));
         assert_eq!(judge(Some("no origin"), Some(&fresh)), (false, "no origin".into(), false));
         assert_eq!(judge(Some("no origin"), None), (false, "no origin".into(), true), "rounds are missing, too");
+    }
+
+    #[test]
+    fn a_cause_is_told_where_a_node_is_not_ready() {
+        let told = |leadership: &Leadership| {
+            let judged = Readiness::judge(leadership, None, false, None, Timestamp(0));
+            judged.because(Some("heard cell lot-1 with another key from 10.0.0.7")).reason
+        };
+        let alone = "no leader known: heard cell lot-1 with another key from 10.0.0.7";
+        assert_eq!(told(&Leadership::default()), alone);
+        let following = Leadership { position: Position::Following, epoch: Some(epoch(4)), ..Leadership::default() };
+        assert_eq!(told(&following), "following edge");
     }
 
     #[test]

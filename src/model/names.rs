@@ -113,7 +113,25 @@ pub type LandmarkId = SmolStr;
 
 /// True if a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
 pub fn is_label(text: &str) -> bool {
-    (1..=MAX_NAME_BYTES).contains(&text.len()) && !text.chars().any(|c| c.is_control() || is_layout_control(c))
+    (1..=MAX_NAME_BYTES).contains(&text.len()) && is_plain_text(text)
+}
+
+/// True if a text has no control characters.
+pub fn is_plain_text(text: &str) -> bool {
+    !text.chars().any(|c| c.is_control() || is_layout_control(c))
+}
+
+/// A text as [`is_plain_text`] wants it, of at most so many bytes: control characters become spaces.
+pub fn plain_text(text: &str, max_bytes: usize) -> String {
+    let plain = |c: char| if c.is_control() || is_layout_control(c) { ' ' } else { c };
+    let mut kept = String::new();
+    for c in text.chars().map(plain) {
+        if kept.len() + c.len_utf8() > max_bytes {
+            break;
+        }
+        kept.push(c);
+    }
+    kept
 }
 
 /// True if a character breaks lines or turns the direction of the text around it: a label with one would show another's

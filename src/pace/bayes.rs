@@ -199,6 +199,7 @@ impl BayesPace {
             y_m: position.y,
             contributors,
             observers: names(observers),
+            readings: Vec::new(),
         })
     }
 
@@ -216,6 +217,7 @@ impl BayesPace {
             y_m: landmark.position.y,
             contributors: if vacancy.is_some() { observers.clone() } else { Vec::new() },
             observers,
+            readings: Vec::new(),
         }
     }
 }

@@ -142,5 +142,6 @@ fn agree<'a>(
         y_m: position.y,
         contributors,
         observers: Vec::new(),
+        readings: Vec::new(),
     }
 }

@@ -1,125 +1,40 @@
-//! What is wrong with a line of a recording, for people: the field and its fault.
-//!
-//! A line that can be used is never looked at here.
-
-use std::fmt;
-
-use serde::de::DeserializeOwned;
-use serde_json::Value;
+//! What is wrong with a line of a recording, for people.
 
 use super::records::Envelope;
-use crate::model::names::MAX_NAME_BYTES;
-use crate::wire::{InvalidValue, Limits, ObjectReport, RejectReason, SCHEMA_VERSION};
+use crate::wire::flaw::read_json;
+use crate::wire::{Flaw, Limits, RejectReason};
 
-/// The reason why a line was rejected, with the field that is to blame.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Flaw {
-    /// The reason.
-    pub reason: RejectReason,
-    /// Path of the field, as `objects[3].x_m`; empty for the whole line.
-    pub field: String,
-    /// The fault, a predicate.
-    pub fault: String,
+/// The flaw of a line that is longer than allowed.
+pub(super) fn too_large(limits: &Limits) -> Flaw {
+    Flaw::new(RejectReason::TooLarge, "", format!("is longer than {} bytes", limits.payload_bytes))
 }
 
-impl Flaw {
-    pub(super) fn new(reason: RejectReason, field: impl Into<String>, fault: impl Into<String>) -> Self {
-        Self { reason, field: field.into(), fault: fault.into() }
-    }
-
-    /// The flaw of a line that is longer than allowed.
-    pub(super) fn too_large(limits: &Limits) -> Self {
-        Self::new(RejectReason::TooLarge, "", format!("is longer than {} bytes", limits.payload_bytes))
-    }
-
-    /// The flaw of a line that was rejected for `reason` when it was decoded.
-    pub(super) fn of_line(text: &[u8], reason: RejectReason, limits: &Limits) -> Self {
-        let report: ObjectReport = match read(text) {
-            Ok(report) => report,
-            Err(_) if reason == RejectReason::UnknownSchema => return Self::of_value(text, reason, "schema".into()),
-            Err((field, fault)) => return Self::new(reason, field, fault),
-        };
-        match report.check_values(limits) {
-            Err(InvalidValue { field, reason }) => Self::of_value(text, reason, field),
-            Ok(()) => read::<Envelope>(text)
-                .err()
-                .map_or_else(|| Self::new(reason, "", ""), |(field, fault)| Self::new(reason, field, fault)),
-        }
-    }
-
-    /// The flaw of a value that is no valid one.
-    fn of_value(text: &[u8], reason: RejectReason, field: String) -> Self {
-        let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
-        let line: Value = serde_json::from_slice(text).unwrap_or_default();
-        let value = line.pointer(&pointer).cloned().unwrap_or_default();
-        let fault = match reason {
-            RejectReason::UnknownSchema => format!("is {value}, not {SCHEMA_VERSION}"),
-            RejectReason::ConfidenceOutOfRange => format!("is not within 0 to 1: {value}"),
-            RejectReason::NotFinite if field.ends_with("covariance_m2") => format!("is no covariance: {value}"),
-            RejectReason::TooManyObjects => "has too many entries".into(),
-            RejectReason::InvalidLabel => {
-                format!("is empty, longer than {MAX_NAME_BYTES} bytes, or has control characters")
-            }
-            _ => format!("is out of bounds: {value}"),
-        };
-        Self::new(reason, field, fault)
-    }
-
-    /// The flaw of a readable line that the aggregator did not use.
-    pub(super) fn of_report(reason: RejectReason) -> Self {
-        let (field, fault) = match reason {
-            RejectReason::FromTheFuture => ("captured_at_us", "is ahead of most of the lines after it"),
-            RejectReason::Stale => ("captured_at_us", "is too long before the line's time"),
-            RejectReason::OutOfOrder => ("captured_at_us", "is not later than in an earlier line of this node"),
-            RejectReason::TooManyVehicles => ("node", "is one vehicle too many"),
-            RejectReason::NotFused => ("topic", "is of an algorithm that the cell does not run"),
-            _ => ("", ""),
-        };
-        Self::new(reason, field, fault)
-    }
+/// The flaw of a line that was rejected for `reason` when it was decoded.
+pub(super) fn of_line(text: &[u8], reason: RejectReason, limits: &Limits) -> Flaw {
+    let of_envelope = || match read_json::<Envelope>(text) {
+        Err((field, fault)) => Flaw::new(reason, field, fault),
+        Ok(_) => Flaw::new(reason, "", ""),
+    };
+    Flaw::of_json(text, reason, limits).unwrap_or_else(of_envelope)
 }
 
-impl fmt::Display for Flaw {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match (self.field.as_str(), self.fault.as_str()) {
-            (_, "") => write!(f, "{}", self.reason),
-            ("", fault) => f.write_str(fault),
-            (field, fault) => write!(f, "{field}: {fault}"),
-        }
-    }
-}
-
-/// Reads JSON.
-///
-/// # Errors
-/// The path of the value that cannot be read, and its fault.
-fn read<T: DeserializeOwned>(text: &[u8]) -> Result<T, (String, String)> {
-    let mut source = serde_json::Deserializer::from_slice(text);
-    let value = serde_path_to_error::deserialize(&mut source).map_err(|error| {
-        // Beyond a broken name, the path is unknown.
-        let path = error.path().to_string();
-        (path.trim_matches(['.', '?']).to_owned(), fault(text, error.inner()))
-    })?;
-    source.end().map_err(|error| (String::new(), fault(text, &error)))?;
-    Ok(value)
-}
-
-/// The fault that a reader of JSON found. Its line is always the first.
-fn fault(text: &[u8], error: &serde_json::Error) -> String {
-    // The column is at the first letter of a word or next to it.
-    let around = text.get(error.column().saturating_sub(3)..).unwrap_or_default();
-    let around = around.get(.."-Infinity".len() + 2).unwrap_or(around);
-    let is_near = |word: &str| around.windows(word.len()).any(|part| part == word.as_bytes());
-    match ["NaN", "Infinity"].into_iter().find(|word| error.is_syntax() && is_near(word)) {
-        Some(word) => format!("is {word}"),
-        None => error.to_string().replace(" at line 1 column ", ", at column "),
-    }
+/// The flaw of a readable line that the aggregator did not use.
+pub(super) fn of_unused(reason: RejectReason) -> Flaw {
+    let (field, fault) = match reason {
+        RejectReason::FromTheFuture => ("captured_at_us", "is ahead of most of the lines after it"),
+        RejectReason::Stale => ("captured_at_us", "is too long before the line's time"),
+        RejectReason::OutOfOrder => ("captured_at_us", "is not later than in an earlier line of this node"),
+        RejectReason::TooManyVehicles => ("node", "is one vehicle too many"),
+        RejectReason::NotFused => ("topic", "is of an algorithm that the cell does not run"),
+        _ => ("", ""),
+    };
+    Flaw::new(reason, field, fault)
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use crate::replay::read_report;
+    use crate::wire::Limits;
 
     #[test]
     fn field_and_fault_are_named() {

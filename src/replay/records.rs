@@ -3,10 +3,10 @@
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::flaw::Flaw;
+use super::flaw;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
-use crate::wire::{GlobalMap, Limits, ObjectReport, RejectReason, ReportKind, Verdicts, decode};
+use crate::wire::{Flaw, GlobalMap, Limits, ObjectReport, RejectReason, ReportKind, Verdicts, decode};
 
 /// One line of a replay's output.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -41,7 +41,7 @@ impl RecordedReport {
     pub(super) fn read(text: &[u8], limits: &Limits) -> Result<Self, Flaw> {
         let text = text.trim_ascii();
         if text.len() > limits.payload_bytes {
-            return Err(Flaw::too_large(limits));
+            return Err(flaw::too_large(limits));
         }
         if text.first() != Some(&b'{') {
             return Err(Flaw::new(RejectReason::Malformed, "", "is no JSON object"));
@@ -50,15 +50,15 @@ impl RecordedReport {
             Ok(report) => return Self::new(text, report, limits),
             Err(reason) => reason,
         };
-        let Some(placed) = votes_by_name(text) else { return Err(Flaw::of_line(text, reason, limits)) };
+        let Some(placed) = votes_by_name(text) else { return Err(flaw::of_line(text, reason, limits)) };
         let limits = Limits { payload_bytes: usize::MAX, ..*limits };
-        let report = decode(&placed, &limits).map_err(|reason| Flaw::of_line(&placed, reason, &limits))?;
+        let report = decode(&placed, &limits).map_err(|reason| flaw::of_line(&placed, reason, &limits))?;
         Ok(Self { is_placed: false, ..Self::new(&placed, report, &limits)? })
     }
 
     fn new(text: &[u8], report: ObjectReport, limits: &Limits) -> Result<Self, Flaw> {
         let Envelope { topic, received_at_us } =
-            serde_json::from_slice(text).map_err(|_| Flaw::of_line(text, RejectReason::Malformed, limits))?;
+            serde_json::from_slice(text).map_err(|_| flaw::of_line(text, RejectReason::Malformed, limits))?;
         let kind = topic.map_or(Ok(ReportKind::default()), |topic| kind(&topic, &report.node))?;
         Ok(Self { kind, at: received_at_us.unwrap_or(report.captured_at_us), is_placed: true, report })
     }

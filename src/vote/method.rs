@@ -46,6 +46,11 @@ pub(super) trait VotingMethod {
     /// The verdict at a landmark.
     fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict>;
 
+    /// The labels of the present votes on a landmark, and their vehicles.
+    fn readings(&self, _landmark: &LandmarkId) -> BTreeMap<Label, Vec<NodeName>> {
+        BTreeMap::new()
+    }
+
     /// The trust in each vehicle.
     fn reputations(&self) -> BTreeMap<NodeName, Reputation>;
 
@@ -69,7 +74,7 @@ pub(super) trait VotingMethod {
 
 /// A verdict with `published` or else the label of the highest score, the first in alphabetical order on a tie.
 ///
-/// With hysteresis the published label may not be the highest for a while; its margin is negative then.
+/// With hysteresis the published label may not be the highest for a while; its margin is 0 then.
 pub(super) fn verdict(
     landmark: LandmarkId,
     votes: BTreeMap<Label, f64>,
@@ -79,7 +84,7 @@ pub(super) fn verdict(
     let label = published.or_else(|| best(&votes).cloned());
     let score = label.as_ref().and_then(|l| votes.get(l)).copied().unwrap_or(0.0);
     let others = votes.iter().filter(|(l, _)| Some(*l) != label.as_ref()).map(|(_, s)| *s);
-    let margin = score - others.fold(0.0, f64::max);
+    let margin = (score - others.fold(0.0, f64::max)).max(0.0);
     Verdict { landmark, label, score, margin, votes, contributors }
 }
 

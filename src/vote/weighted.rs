@@ -21,7 +21,7 @@ use super::landmark_votes::{LandmarkVotes, RecentStatements, StoredVote};
 use super::method::{self, NewVote, VotingMethod};
 use super::paper::REPUTATION_RANGE;
 use super::visibility;
-use crate::model::names::{LandmarkId, NodeName};
+use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::reputation::{Counts, Evidence, ReputationLedger};
 use crate::wire::{Reputation, Verdict};
@@ -270,6 +270,15 @@ impl VotingMethod for WeightedVoting {
         let mut contributors: Vec<_> = votes.iter().map(|vote| self.names[vote.vehicle].clone()).collect();
         contributors.sort();
         Some(method::verdict(landmark.clone(), scores, published.map(name), contributors))
+    }
+
+    fn readings(&self, landmark: &LandmarkId) -> BTreeMap<Label, Vec<NodeName>> {
+        let mut readings: BTreeMap<Label, Vec<NodeName>> = BTreeMap::new();
+        for vote in self.landmarks.get(landmark).into_iter().flat_map(|known| &known.votes) {
+            let label = self.labels.name(vote.label).clone();
+            readings.entry(label).or_default().push(self.names[vote.vehicle].clone());
+        }
+        readings
     }
 
     fn reputations(&self) -> BTreeMap<NodeName, Reputation> {

@@ -93,7 +93,7 @@ fn schema(bytes: &[u8]) -> Option<u32> {
     }
 }
 
-fn read<T: Payload>(bytes: &[u8]) -> Result<T, RejectReason> {
+pub(super) fn read<T: Payload>(bytes: &[u8]) -> Result<T, RejectReason> {
     match bytes.first() {
         Some(&first) if is_compact(first) => compact::read(bytes),
         _ => read_named(bytes),

@@ -7,11 +7,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, NodeStatus, ObjectReport,
-    PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Verdict, Verdicts,
+    CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_TROUBLE_TEXT, MAX_TROUBLES,
+    NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Trouble,
+    Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;
-use crate::model::names::{Label, is_label};
+use crate::model::names::{Label, is_label, is_plain_text};
 use crate::model::time::Timestamp;
 
 /// Maximum length of the text of a cell's description in bytes; all vehicles get it with each connection to a broker.
@@ -249,7 +250,22 @@ fn check_status(status: &NodeStatus, _: &Limits) -> Result<(), RejectReason> {
             return Err(RejectReason::InvalidLabel);
         }
     }
+    if status.troubles.len() > MAX_TROUBLES {
+        return Err(RejectReason::TooManyObjects);
+    }
+    status.troubles.iter().try_for_each(check_trouble)?;
     check_labels([&*status.version])
+}
+
+fn check_trouble(trouble: &Trouble) -> Result<(), RejectReason> {
+    let texts = [&trouble.cause, &trouble.remedy];
+    if texts.iter().any(|text| text.len() > MAX_TROUBLE_TEXT) {
+        return Err(RejectReason::TooLarge);
+    }
+    if !texts.iter().all(|text| is_plain_text(text)) {
+        return Err(RejectReason::InvalidLabel);
+    }
+    check_labels([&*trouble.kind].into_iter().chain(trouble.about.as_deref()))
 }
 
 fn check_description(description: &CellDescription, _: &Limits) -> Result<(), RejectReason> {
@@ -262,7 +278,8 @@ fn check_description(description: &CellDescription, _: &Limits) -> Result<(), Re
 fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {
     check_place(state.x_m, state.y_m)?;
     check_confidence(state.confidence)?;
-    check_labels([&*state.id].into_iter().chain(state.label.as_deref()))
+    let read = state.readings.iter().map(|reading| &*reading.label);
+    check_labels([&*state.id].into_iter().chain(state.label.as_deref()).chain(read))
 }
 
 fn check_object(object: &FusedObject) -> Result<(), RejectReason> {

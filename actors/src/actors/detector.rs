@@ -10,13 +10,14 @@
 
 use std::sync::Arc;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::model::detection::Detection;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::Semaphore;
 use tokio::task::{JoinHandle, spawn_blocking};
 
 use crate::camera::detect::Detect;
-use crate::camera::frame_source::capture::{Capture, CaptureConfig, Opener};
+use crate::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus, Opener};
 use crate::camera::image_size::{ImageSize, SizeMismatch};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::detector::DetectorMessage;
@@ -54,7 +55,7 @@ pub struct DetectorState {
     /// Absent only while a frame is being processed.
     detect: Option<Box<dyn Detect>>,
     optics: ImageSize,
-    /// The last size mismatch, which is logged once.
+    /// The size mismatch of the last frame.
     mismatch: Option<SizeMismatch>,
     /// True if the last frame failed; only the first failure in a row is logged.
     failing: bool,
@@ -125,13 +126,13 @@ impl Actor for Detector {
 }
 
 impl DetectorState {
-    /// Scales the detections to the size of the optics; false, and logged once, for a frame of another shape.
+    /// Scales the detections to the size of the optics; false for a frame of another shape.
     fn scale(&mut self, frame: ImageSize, detections: &mut [Detection]) -> bool {
         let mismatch = self.optics.fit(frame, detections).err();
-        if let Some(error) = mismatch
-            && self.mismatch != mismatch
-        {
-            tracing::error!(%error, "cannot use frames");
+        match &mismatch {
+            Some(error) => self.counters.troubles().note(TroubleKind::Camera, &error.to_string()),
+            None if self.mismatch.is_some() => self.counters.troubles().settle(TroubleKind::Camera, None),
+            None => {}
         }
         self.mismatch = mismatch;
         mismatch.is_none()
@@ -164,6 +165,12 @@ async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: A
             }
             if let Some(frame) = frame {
                 break frame;
+            }
+            match &*status.borrow() {
+                CaptureStatus::Failed { error, .. } => {
+                    counters.troubles().note(TroubleKind::Camera, &format!("the camera gives no frames: {error}"));
+                }
+                _ => counters.troubles().settle(TroubleKind::Camera, None),
             }
         };
         let Some(frame) = frame else { return };

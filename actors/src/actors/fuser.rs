@@ -15,16 +15,18 @@ mod report_queue;
 mod tests;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::aggregator::round::FirstRound;
 use ecod::aggregator::{Aggregator, Command, Fused};
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::replay::JournalEvent;
 use ecod::tracking::TracksLosses;
-use ecod::wire::GlobalMap;
+use ecod::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
@@ -145,6 +147,22 @@ impl Actor for Fuser {
     }
 }
 
+/// Time for which reports are refused for their time until it is a trouble: a stalled link costs one or two.
+const MIN_UNTIMELY: Duration = Duration::from_millis(500);
+
+/// Lead or delay of an accepted report, in microseconds, from which its sender's clock must be off: far more than reports
+/// take on their way.
+const MAX_UNNOTED_LEAD_US: i64 = 1_500_000;
+
+/// The lead of a report's time in words.
+fn lead_in_words(lead_us: i64) -> String {
+    let seconds = lead_us.unsigned_abs() as f64 / 1e6;
+    match lead_us {
+        0.. => format!("its clock is {seconds:.1} s ahead"),
+        _ => format!("its clock is {seconds:.1} s behind, or its reports take that long"),
+    }
+}
+
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
         let FuserArguments { aggregator, report_queue, newest, recording, clock, gateway, keeper, counters, spans } =
@@ -184,9 +202,11 @@ impl FuserState {
     fn take(&mut self, delivery: &Delivery<QueuedReport>) {
         let QueuedReport { kind, report } = &delivery.message;
         self.recording.send(delivery.received_at, LogItem::Report(*kind, Arc::clone(report)));
+        self.compare_locations(*kind, report);
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         match taken {
             Ok(fused) => {
+                self.note_clock(report, delivery.received_at);
                 if self.aggregator.leads().is_some() {
                     self.spans.note(report, delivery.received_at, &mut self.reports);
                 }
@@ -194,7 +214,67 @@ impl FuserState {
             }
             Err(reason) => {
                 tracing::debug!(node = %report.node, seq = report.seq, ?kind, %reason, "report not used");
-                self.counters.reject(reason, report.node.as_str());
+                self.note_rejection(reason, (*kind, report), delivery.received_at);
+            }
+        }
+    }
+
+    /// Counts a report that was not used. Reports that are refused for their time again and again are a trouble.
+    fn note_rejection(
+        &self,
+        reason: RejectReason,
+        (kind, report): (ReportKind, &ObjectReport),
+        received_at: Timestamp,
+    ) {
+        let node = report.node.as_str();
+        match reason {
+            RejectReason::FromTheFuture | RejectReason::Stale => {
+                self.counters.count_reject(reason, node);
+                if self.aggregator.untimely_for(kind, &report.node, received_at) >= MIN_UNTIMELY {
+                    let clock = lead_in_words(self.lead_us(report, received_at));
+                    self.counters.troubles().note_about(node, TroubleKind::Untimely, &format!("refused, {clock}"));
+                }
+            }
+            RejectReason::NotFused => self
+                .counters
+                .reject_with(reason, node, || "its reports are for an algorithm that the cell does not run".into()),
+            _ => self.counters.reject(reason, node),
+        }
+    }
+
+    /// Notes a clock of a sender's own that is off, though its reports are put right.
+    fn note_clock(&self, report: &ObjectReport, received_at: Timestamp) {
+        let lead_us = self.lead_us(report, received_at);
+        if report.clock_error_us.is_none() && lead_us.saturating_abs() > MAX_UNNOTED_LEAD_US {
+            let cause = format!("{}; its reports are put right by that", lead_in_words(lead_us));
+            self.counters.troubles().note_about(report.node.as_str(), TroubleKind::ClockOff, &cause);
+        }
+    }
+
+    /// Lead of a report's time of capture over the cell's time of its receipt, in microseconds.
+    fn lead_us(&self, report: &ObjectReport, received_at: Timestamp) -> i64 {
+        report.captured_at_us.micros_from(self.clock.date(received_at))
+    }
+
+    /// Compares a location that a report names with the known ones; another one each time.
+    fn compare_locations(&self, kind: ReportKind, report: &ObjectReport) {
+        if kind != ReportKind::Detections {
+            return;
+        }
+        let named = report.objects.iter().filter_map(|object| object.landmark.as_ref());
+        let named: Vec<_> = named.chain(report.seen.iter().flatten()).collect();
+        let next = (report.seq as usize).checked_rem(named.len()).and_then(|place| named.get(place));
+        let Some(id) = next else { return };
+        let (node, troubles) = (report.node.as_str(), self.counters.troubles());
+        match self.aggregator.knows_location(id) {
+            Some(true) => {}
+            Some(false) => {
+                let cause = format!("names the location {id}, which this node does not know");
+                troubles.note_about(node, TroubleKind::UnknownLocation, &cause);
+            }
+            None => {
+                let cause = format!("{node} names known locations, such as {id}, and this node has none");
+                troubles.note(TroubleKind::NoLocations, &cause);
             }
         }
     }

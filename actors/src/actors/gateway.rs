@@ -60,6 +60,8 @@ pub struct GatewayArguments {
     pub subscriber: Subscriber,
     /// Seed of the jitter between attempts to connect.
     pub seed: u64,
+    /// True if the node only looks on: once it has stopped, no broker keeps its status.
+    pub looks_on: bool,
 }
 
 /// The only owner of MQTT clients.
@@ -72,6 +74,7 @@ pub struct GatewayState {
     role: SubscriptionRole,
     encoding: Encoding,
     report_brokers: Option<Vec<BrokerAddress>>,
+    looks_on: bool,
     /// True if to subscribe to reports on every broker.
     watches_reports: bool,
     status: NodeStatus,
@@ -153,7 +156,11 @@ impl Actor for Gateway {
     }
 
     async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
-        state.set_status(NodeStatus { state: NodeState::Offline, ..state.status.clone() });
+        let gone = NodeStatus { state: NodeState::Offline, troubles: Vec::new(), ..state.status.clone() };
+        state.set_status(gone);
+        if state.looks_on {
+            state.send(&state.status_topic, &Bytes::new(), Retention::Retained);
+        }
         for link in std::mem::take(&mut state.links).into_values() {
             link.leave(LEAVE_TIMEOUT).await;
         }
@@ -174,7 +181,8 @@ async fn links_first() {
 
 impl GatewayState {
     fn new(arguments: GatewayArguments) -> Self {
-        let GatewayArguments { cell, role, status, mqtt, security, clock, counters, subscriber, seed } = arguments;
+        let GatewayArguments { cell, role, status, mqtt, security, clock, counters, subscriber, seed, looks_on } =
+            arguments;
         let topics = Topics::new(&cell);
         let encoding = mqtt.encoding;
         let status_topic = topics.path(&Topic::Nodes(status.node.clone()));
@@ -190,6 +198,7 @@ impl GatewayState {
         let (will, inbox) = (Mutex::new(will), Arc::new(inbox));
         let setup = LinkSetup { client_id, filters, will, config: mqtt, security, inbox, counters, seed };
         Self {
+            looks_on,
             report_brokers: None,
             watches_reports: false,
             topics,

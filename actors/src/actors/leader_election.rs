@@ -113,7 +113,7 @@ impl Actor for LeaderElection {
         match message {
             LeaderElectionMessage::Membership { event } => driver.take_event(event).await,
             LeaderElectionMessage::TakeStatus { delivery } => {
-                driver.handle(Input::StatusHeard { status: (*delivery.message).clone() }).await;
+                driver.take_status(&delivery.message).await;
             }
             LeaderElectionMessage::Note { input } => driver.handle(input).await,
         }

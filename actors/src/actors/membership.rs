@@ -7,10 +7,12 @@
 
 #![deny(clippy::indexing_slicing)]
 
+use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::Role;
@@ -98,7 +100,7 @@ impl Actor for Membership {
         let gossip = config.advertise.unwrap_or(address);
         let own = NodeId { name, run, life: run.max(now.micros()), role, gossip, broker };
         let (session, secret, seed) = draw_secrets()?;
-        let setup = GossipSetup { own, key, session, identity, secret, seed, counters: Arc::clone(&counters) };
+        let setup = GossipSetup { own, cell, key, session, identity, secret, seed, counters: Arc::clone(&counters) };
         let machine = GossipMachine::new(setup, &config, now);
         let (deadline, deadlines) = watch::channel(machine.next_deadline());
         let handled = Arc::new(Notify::new());
@@ -111,9 +113,13 @@ impl Actor for Membership {
             tasks.spawn(join_later(Arc::clone(&socket), config.multicast.clone()));
         }
         if !config.seeds.is_empty() {
-            tasks.spawn(crate::transport::gossip::seeds::resolve(config.seeds, address.is_ipv4(), move |addresses| {
-                myself.cast(MembershipMessage::SetSeeds { addresses }).is_ok()
-            }));
+            let told = Arc::clone(&events);
+            let trouble = move |seed: &str, error: &io::Error| {
+                let cause = format!("cannot be resolved: {error}");
+                told(MembershipEvent::Troubled { about: seed.to_owned(), kind: TroubleKind::Unresolved, cause });
+            };
+            let tell = move |addresses| myself.cast(MembershipMessage::SetSeeds { addresses }).is_ok();
+            tasks.spawn(crate::transport::gossip::seeds::resolve(config.seeds, address.is_ipv4(), trouble, tell));
         }
         members.send_replace(Vec::new());
         Ok(MembershipState {
@@ -180,7 +186,7 @@ impl MembershipState {
                 GossipOutput::Send { to, frame } => Some(self.socket.send(&frame, to)),
                 GossipOutput::Multicast { frame } => self.socket.multicast(&frame),
                 GossipOutput::Tell(event) => {
-                    changed |= !matches!(event, MembershipEvent::Received { .. });
+                    changed |= !matches!(event, MembershipEvent::Received { .. } | MembershipEvent::Troubled { .. });
                     (self.events)(event);
                     None
                 }

@@ -11,6 +11,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::aggregator::Algorithms;
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::cell_time::ClockReading;
 use ecod::model::detection::Detection;
 use ecod::model::geometry::Pose;
@@ -146,7 +147,10 @@ impl ProjectorState {
 
     fn report(&mut self, detections: Vec<Detection>, captured_at: Timestamp) {
         let pose = self.poses.as_ref().map_or(self.standing, |poses| poses.at(captured_at));
-        let Some(pose) = pose else { return self.counters.count(Event::FrameWithoutPose) };
+        let Some(pose) = pose else {
+            self.counters.troubles().note(TroubleKind::NoPose, "no pose is known near the time of the camera's frames");
+            return self.counters.count(Event::FrameWithoutPose);
+        };
         self.perception.set_pose(pose);
         let found = detections.len();
         let span = tracing::info_span!("project");
@@ -155,6 +159,9 @@ impl ProjectorState {
         let ClockReading { offset_us, error_us } = self.clock.reading();
         (report.captured_at_us, report.clock_error_us) = (captured_at.shifted(offset_us), error_us);
         self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
+        if let Some(cause) = self.perception.without_size() {
+            self.counters.troubles().note(TroubleKind::NoSize, &cause);
+        }
         if self.algorithms.vote() {
             self.publish(ReportKind::VoteDetections, votes(&report));
         }

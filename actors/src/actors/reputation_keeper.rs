@@ -19,6 +19,7 @@ mod store;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Leadership;
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::node::Input;
@@ -358,10 +359,17 @@ impl ReputationKeeperState {
         let arguments = &self.arguments;
         let outcome =
             self.writer.save(|| Saved::of(&arguments.reputations.open(), self.certificate.as_ref(), arguments)).await;
+        let (counters, troubles) = (&arguments.counters, arguments.counters.troubles());
         match outcome {
             SaveOutcome::Unchanged => {}
-            SaveOutcome::Written => self.arguments.counters.count(Event::ReputationsSaved),
-            SaveOutcome::Failed => self.arguments.counters.count(Event::ReputationsNotSaved),
+            SaveOutcome::Written => {
+                counters.count(Event::ReputationsSaved);
+                troubles.settle(TroubleKind::NotSaved, None);
+            }
+            SaveOutcome::Failed => {
+                counters.count(Event::ReputationsNotSaved);
+                troubles.note(TroubleKind::NotSaved, "reputations cannot be saved, and end with this node");
+            }
         }
     }
 }

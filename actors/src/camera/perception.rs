@@ -6,11 +6,11 @@ use std::sync::Arc;
 
 use ecod::model::detection::Detection;
 use ecod::model::geometry::Pose;
-use ecod::model::names::NodeName;
+use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::perception::camera::Mount;
 use ecod::perception::landmark::{LandmarkGate, LandmarkIndex};
-use ecod::perception::projection::{Projection, ProjectionConfig, Ranging};
+use ecod::perception::projection::{Projection, ProjectionConfig, ProjectionError, Ranging};
 use ecod::perception::view::{ViewConfig, landmarks_in_view};
 use ecod::wire::{ObjectReport, PerceivedObject};
 use nalgebra::Point2;
@@ -45,18 +45,38 @@ pub struct Perception {
     discarded: DiscardCounts,
 }
 
-/// Number of discarded detections by reason.
+/// Number of discarded detections.
 #[derive(Debug, Clone, Default)]
-struct DiscardCounts(BTreeMap<&'static str, u64>);
+struct DiscardCounts {
+    by_reason: BTreeMap<&'static str, u64>,
+    /// Those without a size, by label; at most [`MAX_UNSIZED`] labels.
+    without_size: BTreeMap<Label, u64>,
+    /// True if the last report had one without a size.
+    is_size_missing: bool,
+}
+
+/// Maximum labels without a size that are counted: a detector of texts knows any number.
+const MAX_UNSIZED: usize = 8;
 
 impl DiscardCounts {
-    /// Counts one, and logs a warning for the first of each reason.
+    /// Counts one, and logs the first of each reason. A missing size is told otherwise.
     fn count(&mut self, reason: &'static str, error: &dyn Display) {
-        let times = self.0.entry(reason).or_default();
+        let times = self.by_reason.entry(reason).or_default();
         *times += 1;
         match *times {
-            1 => tracing::warn!(%error, "detection discarded, first for this reason"),
+            1 => tracing::info!(%error, "detection discarded, first for this reason"),
             _ => tracing::debug!(%error, "detection discarded"),
+        }
+    }
+
+    /// Counts one that has no place.
+    fn count_unplaced(&mut self, error: &ProjectionError) {
+        self.count(error.as_str(), error);
+        if let ProjectionError::UnknownSize(label) = error {
+            self.is_size_missing = true;
+            if self.without_size.len() < MAX_UNSIZED || self.without_size.contains_key(label) {
+                *self.without_size.entry(label.clone()).or_default() += 1;
+            }
         }
     }
 }
@@ -89,6 +109,7 @@ impl Perception {
 
     /// The report of one frame. Detections without a position are discarded and counted.
     pub fn report(&mut self, mut detections: Vec<Detection>, captured_at: Timestamp) -> ObjectReport {
+        self.discarded.is_size_missing = false;
         detections.retain(|detection| match self.projection.check_unclipped(detection) {
             Ok(()) => true,
             Err(error) => {
@@ -114,7 +135,14 @@ impl Perception {
 
     /// Number of detections discarded by reason since the start.
     pub fn discarded(&self) -> &BTreeMap<&'static str, u64> {
-        &self.discarded.0
+        &self.discarded.by_reason
+    }
+
+    /// The labels that have no size, in words, if one was in the last frame.
+    pub fn without_size(&self) -> Option<String> {
+        let labels = self.discarded.without_size.iter().map(|(label, times)| format!("{times} of {label}"));
+        let labels = labels.collect::<Vec<_>>().join(", ");
+        self.discarded.is_size_missing.then(|| format!("detections have no size and are not reported: {labels}"))
     }
 
     fn place(&mut self, detection: &Detection) -> Option<PerceivedObject> {
@@ -129,7 +157,7 @@ impl Perception {
             }
         };
         let placed = self.projection.place(detection, target.as_ref(), &self.camera);
-        let placed = placed.map_err(|error| self.discarded.count(error.as_str(), &error)).ok()?;
+        let placed = placed.map_err(|error| self.discarded.count_unplaced(&error)).ok()?;
         // Receivers reject a report with one invalid object, so this is checked per object.
         placed.validate().map_err(|reason| self.discarded.count(reason.as_str(), &reason)).ok()?;
         Some(self.with_landmark(placed))
@@ -179,5 +207,37 @@ mod tests {
         assert_eq!(report.objects.iter().map(|object| &*object.label).collect::<Vec<_>>(), ["car"]);
         let discarded: Vec<_> = perception.discarded().iter().map(|(reason, times)| (*reason, *times)).collect();
         assert_eq!(discarded, [("clipped", 1), ("invalid_label", 1), ("not_finite", 1)]);
+    }
+
+    #[test]
+    fn labels_without_a_size_are_counted_by_name_for_as_long_as_they_are_seen() {
+        let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 0.8);
+        let vehicle_camera = VehicleCamera {
+            node: NodeName::from_static("cam"),
+            pose: Pose::new(0.0, 0.0, 0.0),
+            mount: Mount { forward_m: 0.0, left_m: 0.0, pan_rad: 0.0 },
+            lens: Lens::ideal(camera),
+            landmarks: Arc::new(LandmarkIndex::new(Vec::new(), 0.5)),
+        };
+        let sizes = ObjectSizes { labels: [("car".into(), ObjectSize::square(1.5))].into(), default: None };
+        let projection = ProjectionConfig { ranging: Ranging::BoxHeight, sizes, ..ProjectionConfig::default() };
+        let gate = LandmarkGate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
+        let mut perception = Perception::new(vehicle_camera, projection, ViewConfig::default(), gate);
+        let seen = |label: &str| Detection {
+            label: label.into(),
+            confidence: 0.9,
+            bounding_box: BoundingBox { x_min: 300.0, y_min: 200.0, x_max: 340.0, y_max: 240.0 },
+            corners: None,
+        };
+        for _ in 0..3 {
+            perception.report(vec![seen("person"), seen("car")], Timestamp(1));
+        }
+        perception.report(vec![seen("dog")], Timestamp(2));
+        let words = "detections have no size and are not reported: 1 of dog, 3 of person";
+        assert_eq!(perception.without_size().as_deref(), Some(words));
+        perception.report(vec![seen("car")], Timestamp(3));
+        assert_eq!(perception.without_size(), None);
+        (0..100).for_each(|n| drop(perception.report(vec![seen(&format!("QR{n}"))], Timestamp(4))));
+        assert!(perception.without_size().is_some_and(|words| words.len() < 200));
     }
 }

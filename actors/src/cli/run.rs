@@ -194,17 +194,7 @@ impl ObserverArguments {
                 config.name = Some(name.map_err(Failure::usage)?);
             }
         }
-        if let Some(bind) = &mut config.membership.bind {
-            bind.set_port(0);
-        }
-        #[cfg(feature = "camera")]
-        {
-            config.camera = None;
-        }
-        (config.membership.advertise, config.state_dir, config.map_log) = (None, None, None);
-        config.dashboard.enabled = false;
-        config.broker.door = false;
-        Ok(config)
+        Ok(config.without_own_addresses())
     }
 }
 

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use ecod::diagnostics::TroubleKind;
+
 use super::Finding;
 use crate::camera::config::CameraConfig;
 use crate::camera::frame_source::SourceConfig;
@@ -14,7 +16,15 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 /// All checks of a camera, if there is one.
 pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     let Some(camera) = &config.camera else { return Vec::new() };
-    vec![frame(camera).await, calibration(camera), detector(camera).await]
+    let mut findings = vec![frame(camera).await, calibration(camera), detector(camera).await];
+    findings.extend(sizes(camera));
+    findings
+}
+
+/// Checks that sizes of labels are in metres.
+fn sizes(camera: &CameraConfig) -> Option<Finding> {
+    let seen = camera.projection.sizes.implausible()?;
+    Some(Finding::doubtful("sizes", seen, TroubleKind::ImplausibleSize.remedy()))
 }
 
 async fn frame(camera: &CameraConfig) -> Finding {

@@ -3,6 +3,8 @@
 use std::os::unix::fs::PermissionsExt;
 use std::time::Duration;
 
+use rustls::pki_types::UnixTime;
+
 use super::Finding;
 use crate::node::config::NodeConfig;
 use crate::platform::clock;
@@ -47,6 +49,11 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
     let is_public = std::fs::metadata(&files.key).is_ok_and(|metadata| metadata.permissions().mode() & 0o037 != 0);
     Some(if left.is_zero() {
         Finding::broken(check, "expired", format!("`ecod-node pki issue {name}` creates a new one"))
+    } else if let Some(distrust) = current.verify_node(current.certificate(), UnixTime::now()).err() {
+        let fix = format!(
+            "copy `ca.pem` and `revoked.pem` of the cell's CA again, or `ecod-node pki issue {name}` there; or set the clock"
+        );
+        Finding::broken(check, format!("the cell does not accept {}: {distrust}", files.certificate.display()), fix)
     } else if let Some(error) = credentials.check_rights(config.role, config.election.priority).err() {
         Finding::broken(check, error.to_string(), "issue one, or lower `role` or `election.priority`")
     } else if is_public {

@@ -151,6 +151,7 @@ impl NodeBuilder {
             dashboard_address: watch::Sender::new(None),
             failed,
         };
+        builder.note_sizes();
         builder.door = builder.new_door();
         builder.door.publish_description(&builder.present_description());
         builder
@@ -211,6 +212,14 @@ impl NodeBuilder {
 
     pub(super) fn members(&self) -> watch::Receiver<Vec<Member>> {
         self.members.subscribe()
+    }
+
+    pub(super) fn name(&self) -> &NodeName {
+        &self.name
+    }
+
+    pub(super) fn live_state(&self) -> Arc<LiveState> {
+        Arc::clone(&self.live_state)
     }
 
     pub(super) fn leadership(&self) -> watch::Receiver<Leadership> {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use ecod::admission::timeliness::Timeliness;
 use ecod::aggregator::{Algorithms, FusionConfig};
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Leadership;
 use ecod::leadership::readiness::{Readiness, round_timeout};
 use ecod::leadership::timers::READINESS_STEPS;
@@ -13,7 +14,7 @@ use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::vote::VoteMode;
-use ecod::wire::Verdicts;
+use ecod::wire::{Trouble, Verdicts};
 use tokio::sync::watch;
 
 use crate::messages::actor_slot::ActorSlot;
@@ -23,6 +24,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
+use crate::telemetry::counters::Counters;
 use crate::transport::broker::BrokerHealth;
 use crate::transport::mqtt::{BrokerAddress, DataPlane, LinkState, Security};
 
@@ -41,6 +43,8 @@ pub struct Vitals {
     pub shared: watch::Receiver<SharedFacts>,
     /// The node's certificates, which are valid at certain times only.
     pub security: Security,
+    /// Has the node's present troubles.
+    pub counters: Arc<Counters>,
     /// Tells how reports are.
     pub fuser: ActorSlot<FuserMessage>,
     /// Tells how links are.
@@ -75,6 +79,18 @@ pub struct Probe {
     pub broker_serves: bool,
     /// Vehicles whose reports are usable by their time, and others.
     pub timeliness: Timeliness,
+}
+
+/// What may separate the node from its cell, in words.
+fn separating(troubles: &[Trouble]) -> Option<&str> {
+    let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
+    troubles.iter().find(kind).map(|trouble| trouble.cause.as_str())
+}
+
+/// The node's own trouble for which it does not do its work, in words.
+fn disabling(troubles: &[Trouble]) -> Option<String> {
+    let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_disabling);
+    troubles.iter().filter(|trouble| trouble.about.is_none()).find(kind).map(|trouble| trouble.cause.clone())
 }
 
 /// Maximum age of the newest round of a live aggregator; none for VOTE's `paper` mode alone, which has a round whenever
@@ -112,8 +128,10 @@ impl Vitals {
         let lone = Some(trouble).filter(|_| leadership.is_leading() && timely == 0 && untimely > 0);
         let SharedFacts { patience, problem, .. } = self.shared.borrow().clone();
         let works = self.broker_works(probe);
+        let troubles = self.counters.troubles().present();
         Readiness::judge(&leadership, self.last_round().as_ref(), works, patience, clock::now())
-            .unless(problem.or(lone))
+            .because(separating(&troubles))
+            .unless(problem.or(lone).or_else(|| disabling(&troubles)))
     }
 
     /// True if a broker carries what this node publishes.

@@ -5,12 +5,15 @@ mod by_source;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use ecod::diagnostics::TroubleKind;
 use ecod::wire::RejectReason;
 use strum::{IntoStaticStr, VariantArray};
 
 pub use by_source::{OTHERS, Shed, ShedReason, SourceCount};
 
 use by_source::CountsBySource;
+
+use crate::telemetry::troubles::Troubles;
 
 /// An event that is too frequent for the log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, IntoStaticStr, VariantArray)]
@@ -125,6 +128,7 @@ pub struct Counters {
     rejects: [AtomicU64; RejectReason::ALL.len()],
     rejects_by_source: CountsBySource<RejectReason>,
     shed: CountsBySource<ShedReason>,
+    troubles: Troubles,
 }
 
 impl Default for Counters {
@@ -134,6 +138,7 @@ impl Default for Counters {
             rejects: [const { AtomicU64::new(0) }; RejectReason::ALL.len()],
             rejects_by_source: CountsBySource::default(),
             shed: CountsBySource::default(),
+            troubles: Troubles::default(),
         }
     }
 }
@@ -149,23 +154,29 @@ impl Counters {
         self.events[event as usize].fetch_add(times, Ordering::Relaxed);
     }
 
-    /// Counts a rejected payload of a node, or of a broker where the sender is not known. The first of each source is
-    /// also a line in the log: a warning, unless elections and re-ordering explain it.
+    /// Counts a rejected payload of a node, or of a broker where the sender is not known. It is a trouble, unless
+    /// elections and re-ordering explain it.
     pub fn reject(&self, reason: RejectReason, source: &str) {
+        self.reject_with(reason, source, || format!("rejected as {reason}"));
+    }
+
+    /// Counts a rejected payload as [`Self::reject`] does, with the cause in words.
+    pub fn reject_with(&self, reason: RejectReason, source: &str, cause: impl FnOnce() -> String) {
+        self.count_reject(reason, source);
+        if let Some(kind) = trouble_of(reason) {
+            self.troubles.note_about(source, kind, &cause());
+        }
+    }
+
+    /// Counts a rejected payload whose trouble, if it is one, is noted elsewhere.
+    pub fn count_reject(&self, reason: RejectReason, source: &str) {
         self.rejects[reason as usize].fetch_add(1, Ordering::Relaxed);
-        if !self.rejects_by_source.count(reason, source) {
-            return;
-        }
-        let reason_name = reason.as_str();
-        if is_everyday(reason) {
-            tracing::debug!(source, reason = reason_name, "payload rejected");
-        } else {
-            tracing::warn!(
-                source,
-                reason = reason_name,
-                "payloads of this sender are rejected; see docs/protocol.md#rejections"
-            );
-        }
+        self.rejects_by_source.count(reason, source);
+    }
+
+    /// The node's present troubles.
+    pub fn troubles(&self) -> &Troubles {
+        &self.troubles
     }
 
     /// Payloads rejected so far, by reason and source.
@@ -173,15 +184,16 @@ impl Counters {
         self.rejects_by_source.snapshot()
     }
 
-    /// Counts a message that was shed under overload; the first of each source is also a warning.
+    /// Counts a message that was shed under overload.
     pub fn shed(&self, reason: ShedReason, source: &str) {
-        if self.shed.count(reason, source) {
-            let meaning = match reason {
-                ShedReason::ReaderSlow => "a client reads too slowly, it misses the oldest messages",
-                _ => "more comes in than is taken, the rest is left out",
-            };
-            tracing::warn!(source, reason = reason.as_str(), "{meaning}");
-        }
+        self.shed.count(reason, source);
+        let cause = match reason {
+            ShedReason::ReaderSlow => "reads too slowly and misses the oldest messages",
+            // A busy fuser takes the later report: the vehicle need not know.
+            ShedReason::ReportReplaced => return,
+            _ => "sends more than is taken, the rest is left out",
+        };
+        self.troubles.note_about(source, TroubleKind::Overload, &format!("{cause} ({})", reason.as_str()));
     }
 
     /// Shed messages so far, by reason and source.
@@ -213,10 +225,34 @@ impl Counters {
     }
 }
 
-/// True if a reason occurs without anybody's fault: around a change of leader, or on a network that re-orders.
-fn is_everyday(reason: RejectReason) -> bool {
-    use RejectReason::{NotCandidate, NotElected, NotFused, OutOfOrder, Stale, Superseded, UnknownTerm};
-    matches!(reason, NotCandidate | NotElected | NotFused | OutOfOrder | Stale | Superseded | UnknownTerm)
+/// The trouble that a reason is a sign of. Some occur without anybody's fault: around a change of leader, or on a network
+/// that re-orders.
+fn trouble_of(reason: RejectReason) -> Option<TroubleKind> {
+    use RejectReason as Reason;
+    match reason {
+        Reason::NotCandidate
+        | Reason::NotElected
+        | Reason::OutOfOrder
+        | Reason::Stale
+        | Reason::Superseded
+        | Reason::UnknownTerm => None,
+        Reason::FromTheFuture => Some(TroubleKind::Untimely),
+        Reason::NotFused => Some(TroubleKind::NotFused),
+        Reason::TooManyVehicles => Some(TroubleKind::Overload),
+        Reason::BadSignature | Reason::Unattested | Reason::Implausible | Reason::NotPermitted => {
+            Some(TroubleKind::NotPermitted)
+        }
+        Reason::TooLarge
+        | Reason::Malformed
+        | Reason::UnknownSchema
+        | Reason::NodeMismatch
+        | Reason::TooManyObjects
+        | Reason::NotFinite
+        | Reason::OutOfRange
+        | Reason::ConfidenceOutOfRange
+        | Reason::InvalidLabel
+        | Reason::UnknownTopic => Some(TroubleKind::Malformed),
+    }
 }
 
 /// All counters of a node at one moment.

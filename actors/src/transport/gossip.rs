@@ -10,8 +10,9 @@ pub mod fuzzing;
 pub(crate) mod handshake;
 pub(crate) mod key;
 pub(crate) mod machine;
+pub(crate) mod near_cells;
 pub(crate) mod node_id;
-pub(crate) mod refusals;
+pub(crate) mod notices;
 pub(crate) mod replay_window;
 pub(crate) mod reply_throttle;
 pub(crate) mod seeds;
@@ -25,6 +26,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -101,6 +103,15 @@ pub enum MembershipEvent {
     NameTaken {
         /// The name.
         name: NodeName,
+    },
+    /// Another node or host does not fit this cell.
+    Troubled {
+        /// Name of the node, or address of the host.
+        about: String,
+        /// What is wrong.
+        kind: TroubleKind,
+        /// The same in words.
+        cause: String,
     },
     /// Another node has this node's name, and nobody accepts this one.
     Excluded,

@@ -15,6 +15,9 @@ const SHOWN: &str = "document.querySelectorAll('#map .place.full').length >= 6 \
     && document.querySelectorAll('#map .body').length >= 4 && document.querySelectorAll('#verdicts tr').length >= 4 \
     && document.querySelectorAll('#reputations tr').length >= 4";
 
+/// The node is ready, whether or not vehicles report, and report where they should.
+const IS_READY: &str = "/^(Live|No reports|[0-9]+ trouble)/.test(document.querySelector('#state-text')?.textContent)";
+
 /// The map of a cell of processes fills, a vehicle takes over when the edge's process is killed, and the page says so,
 /// also to those who do not see it. Leaves pictures of the page in `target/dashboard`.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -34,7 +37,7 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     browser.look(1440, 900, "light").await;
     let opened = Instant::now();
     browser.open(&format!("http://{}/", at_euclid.page)).await;
-    browser.until("document.querySelector('#state').classList.contains('live')").await;
+    browser.until(IS_READY).await;
     println!("page live {:?} after it was asked for, WebDriver included", opened.elapsed());
     browser.until("document.querySelector('#leader').textContent === 'edge'").await;
     browser.until(SHOWN).await;
@@ -62,7 +65,7 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     browser
         .until("[...document.querySelectorAll('#reigns tr')].some((row) => row.textContent.startsWith('edge'))")
         .await;
-    browser.until("document.querySelector('#state').classList.contains('live')").await;
+    browser.until(IS_READY).await;
     tokio::time::sleep(Duration::from_secs(3)).await;
     browser.screenshot(&pictures.join("failover.png")).await;
 
@@ -83,7 +86,7 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     assert!(chart.as_f64().unwrap() < 1.0, "{chart}");
     browser.screenshot(&pictures.join("stale.png")).await;
     let _euclid = start("euclid", Role::Auto, at_euclid, &places, directory.path());
-    browser.until("document.querySelector('#state').classList.contains('live')").await;
+    browser.until(IS_READY).await;
     browser.quit().await;
     println!("pictures of the page: {}", pictures.display());
 }
@@ -93,7 +96,6 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {
-    const LIVE: &str = "document.querySelector('#state')?.classList.contains('live') === true";
     let browser = Browser::start().await;
     let mut guarded = config("euclid", Role::Auto, 1);
     guarded.dashboard.token = Some(Secret::new("correct-horse-battery"));
@@ -101,7 +103,7 @@ async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {
     let link = format!("data:text/html,<a href='http://{page}/?token=correct-horse-battery'>the lot</a>");
     browser.open(&link).await;
     browser.evaluate("document.querySelector('a').click()").await;
-    browser.until(LIVE).await;
+    browser.until(IS_READY).await;
     assert_eq!(browser.evaluate("location.search").await, "");
     node.stop().await;
 
@@ -114,13 +116,13 @@ async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {
         others.last_mut().unwrap().next().await;
     }
     browser.open(&format!("http://{page}/")).await;
-    browser.until(LIVE).await;
+    browser.until(IS_READY).await;
     let is_told = "/no room for another live page/.test(document.querySelector('#notice').textContent)";
     browser.until(is_told).await;
     tokio::time::sleep(Duration::from_secs(5)).await;
-    assert_eq!(browser.evaluate(&format!("{LIVE} && {is_told}")).await, true);
+    assert_eq!(browser.evaluate(&format!("{IS_READY} && {is_told}")).await, true);
     drop(others);
-    browser.until(&format!("{LIVE} && document.querySelector('#notice').hidden")).await;
+    browser.until(&format!("{IS_READY} && document.querySelector('#notice').hidden")).await;
     browser.quit().await;
     node.stop().await;
 }
@@ -162,7 +164,7 @@ async fn an_older_browser_shows_the_map_and_a_page_that_cannot_be_drawn_says_so(
 const FAR_M: f64 = 9e7;
 
 /// A vehicle that is told a wrong pose makes the map a dot, until it is told a right one. What it only detects far away
-/// does not.
+/// does not, nor does a vehicle that sees nothing.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn a_wrong_position_is_got_over() {
@@ -174,6 +176,10 @@ async fn a_wrong_position_is_got_over() {
     let width = "(([...all]) => { const xs = all.map((place) => Number(place.getAttribute('x'))); \
         return Math.max(...xs) - Math.min(...xs); })(document.querySelectorAll('#map .place'))";
     browser.until(&format!("{width} > 300")).await;
+    stray.stand(FAR_M).await;
+    browser.until("document.querySelectorAll('#vehicles tr').length === 1").await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(browser.evaluate(&format!("{width} > 300")).await, true, "a vehicle that sees nothing rules nothing");
     stray.report(FAR_M, 1.0).await;
     browser.until(&format!("{width} < 1")).await;
     stray.report(1.0, FAR_M).await;

@@ -114,11 +114,20 @@ impl Stray {
 
     /// Reports from a place in the east that something stands at another.
     pub(crate) async fn report(&mut self, at_m: f64, seen_at_m: f64) {
+        self.send(at_m, vec![PerceivedObject::new("car", 0.8, seen_at_m, 0.0)]).await;
+    }
+
+    /// Reports from a place in the east that there is nothing.
+    pub(crate) async fn stand(&mut self, at_m: f64) {
+        self.send(at_m, Vec::new()).await;
+    }
+
+    async fn send(&mut self, at_m: f64, objects: Vec<PerceivedObject>) {
         self.seq += 1;
         let node = NodeName::from_static("stray");
         let report = ObjectReport {
             pose: Some(WirePose { x_m: at_m, y_m: 0.0, heading_rad: 0.0 }),
-            objects: vec![PerceivedObject::new("car", 0.8, seen_at_m, 0.0)],
+            objects,
             ..ObjectReport::new(node, self.seq, clock::now())
         };
         let payload = encode(&report, Encoding::Json);

@@ -11,4 +11,5 @@ mod load;
 mod metrics;
 mod pictures;
 mod processes;
+mod troubles;
 mod webdriver;

@@ -71,6 +71,7 @@ impl Node {
             counters: Arc::clone(&counters),
             subscriber: Arc::new(move |delivery| sender.send(delivery).unwrap_or_default()),
             seed: 7,
+            looks_on: false,
         };
         let (gateway, handle) = Actor::spawn(None, Gateway, arguments).await.unwrap();
         Self { name: name(node), gateway, counters, status, deliveries, handle }

@@ -21,6 +21,7 @@ fn large_map(round: u64, landmarks: usize) -> Arc<GlobalMap> {
         y_m: -(n as f64) / 3.0,
         contributors: vehicles.clone(),
         observers: vehicles.clone(),
+        readings: Vec::new(),
     };
     Arc::new(GlobalMap { landmarks: (0..landmarks).map(state).collect(), ..GlobalMap::clone(&map("edge", round)) })
 }

@@ -57,6 +57,7 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
             }
         }),
         seed: 4,
+        looks_on: false,
     };
     let (gateway, _) = Actor::spawn(None, Gateway, arguments).await.unwrap();
     gateway.cast(GatewayMessage::SetBrokers { addresses: vec![honest.clone(), stolen.clone()] }).unwrap();

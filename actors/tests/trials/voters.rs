@@ -55,6 +55,7 @@ impl Voters {
                 }
             }),
             seed: 1,
+            looks_on: false,
         };
         let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
         gateway.cast(GatewayMessage::SetBrokers { addresses: brokers.into_iter().map(Into::into).collect() })?;

@@ -80,7 +80,10 @@ def test_compact_cbor_is_read() -> None:
     assert (status.role, status.state, status.aggregator, status.fit) == ("edge", "aggregating", None, True)
     assert status.description is None
     status = decode(ecod.NodeStatus, cbor2.dumps([1, "edge", ident, 2, 1, 7, None, True, "0.1.0", [3, bytes(32)]]))
-    assert status.description == ecod.DescriptionStatus(3, "00" * 32, None)
+    assert status.description == ecod.DescriptionStatus(3, "00" * 32, None) and status.troubles == []
+    trouble = ["clock_off", "late", "refused, its clock is 5.0 s ahead", "run a time service"]
+    status = decode(ecod.NodeStatus, cbor2.dumps([1, "edge", ident, 2, 1, 7, None, True, "0.1.0", None, [trouble]]))
+    assert status.troubles == [ecod.Trouble(*trouble)]
 
 
 def spoilt(**changes: Any) -> dict[str, Any]:

@@ -51,6 +51,7 @@ impl ReportCollector {
             counters: Arc::default(),
             subscriber: Arc::new(move |delivery| lock(&kept).take(delivery)),
             seed: 1,
+            looks_on: false,
         };
         let (gateway, ended) = Actor::spawn(None, Gateway, arguments).await?;
         gateway.cast(GatewayMessage::SetBrokers { addresses: brokers })?;

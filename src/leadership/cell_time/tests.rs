@@ -199,6 +199,30 @@ fn a_new_leader_goes_on_from_the_old_ones_time_and_moves_slowly() {
     assert!(cell.nodes[1].events.is_empty());
 }
 
+/// A wrong clock costs nothing and is known by name, at its own node and at the leader; a vehicle's, too.
+#[test]
+fn clocks_that_are_off_are_known_by_name() {
+    let mut cell = Cell::new(&[
+        (Role::Edge, 0, 0),
+        (Role::Auto, 7 * SECOND_US, 100_000),
+        (Role::Cav, -3 * SECOND_US, 5 * SECOND_US),
+        (Role::Cav, 0, TO_1970_US),
+    ]);
+    cell.run(10);
+    let errors = |index: usize| {
+        let Node { time, steady_us, .. } = &cell.nodes[index];
+        let errors = time.wall_errors(cell.now.shifted(*steady_us));
+        errors.into_iter().map(|(name, us)| (name.map(NodeName::to_string), us)).collect::<Vec<_>>()
+    };
+    let of_leader = errors(0);
+    let off = |of: Option<&str>| of_leader.iter().find(|(name, _)| name.as_deref() == of).map(|(_, us)| *us);
+    assert!(off(Some("n2")).is_some_and(|us| (us - 5 * SECOND_US).abs() < SECOND_US / 2), "{of_leader:?}");
+    assert!([None, Some("n1")].map(off).iter().all(|us| us.is_some_and(|us| us.abs() < SECOND_US)), "{of_leader:?}");
+    assert_eq!(off(Some("n3")), None, "a clock that was never set says nothing to others");
+    assert!((errors(2)[0].1 - 5 * SECOND_US).abs() < SECOND_US / 2, "{:?}", errors(2));
+    assert!(errors(3)[0].1 < -SECOND_US, "and its own node knows");
+}
+
 #[test]
 fn stamps_of_a_liar_are_survived() {
     let mut cell = Cell::new(&[(Role::Edge, 0, 0), (Role::Auto, 0, 0), (Role::Auto, 0, 0)]);

@@ -12,7 +12,7 @@ use crate::leadership::rights::Rights;
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
-use crate::wire::{DescriptionStatus, NodeStatus, Role};
+use crate::wire::{DescriptionStatus, NodeStatus, Role, Trouble};
 
 /// Settings of one node's leadership.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -138,6 +138,11 @@ pub enum Input {
         round_period: Duration,
         /// True if the node keeps reputations.
         keeps_reputations: bool,
+    },
+    /// The troubles that the node knows of, to be told to all. It may come with every look.
+    Troubled {
+        /// All present troubles.
+        troubles: Vec<Trouble>,
     },
     /// The node is about to stop.
     Leave,

@@ -1,8 +1,8 @@
 use super::*;
 use crate::wire::{
-    CellDescription, ContentHash, DescriptionStatus, Encoding, FieldOfView, FusedObject, GlobalMap, LandmarkState,
-    Limits, NodeState, NodeStatus, ObjectReport, Payload, PerceivedObject, PoseCorrection, Reputation, Reputations,
-    Role, SCHEMA_VERSION, Verdict, Verdicts, WirePose, decode, encode,
+    CellDescription, ContentHash, DescriptionStatus, Encoding, FieldOfView, FusedObject, GlobalMap, LabelReading,
+    LandmarkState, Limits, NodeState, NodeStatus, ObjectReport, Payload, PerceivedObject, PoseCorrection, Reputation,
+    Reputations, Role, SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose, decode, encode,
 };
 
 fn report() -> ObjectReport {
@@ -62,6 +62,7 @@ fn every_field_of_every_payload_survives() {
                 y_m: 123_456.789,
                 contributors: vec![node("edge")],
                 observers: vec![node("edge"), node("euclid")],
+                readings: vec![LabelReading { label: "EMPTY".into(), nodes: vec![NodeName::from_static("galileo")] }],
             },
             LandmarkState {
                 id: "slot-1".into(),
@@ -71,6 +72,7 @@ fn every_field_of_every_payload_survives() {
                 y_m: 0.0,
                 contributors: vec![],
                 observers: vec![],
+                readings: Vec::new(),
             },
         ],
         objects: vec![FusedObject {
@@ -128,6 +130,12 @@ fn every_field_of_every_payload_survives() {
         aggregator: Some(node("edge")),
         fit: Some(true),
         description: Some(DescriptionStatus { version: 7, hash: ContentHash([9; 32]), problem: Some("no".into()) }),
+        troubles: vec![Trouble {
+            kind: "clock_off".into(),
+            about: Some("late".into()),
+            cause: "its clock is 5.0 s ahead".into(),
+            remedy: "run a time service".into(),
+        }],
         ..NodeStatus::starting(node("edge"), Uuid::from_u128(7), Role::Edge, "0.1.0")
     });
 }

@@ -28,6 +28,7 @@ fn map() -> GlobalMap {
             y_m: 0.48,
             contributors: vec![edge()],
             observers: vec![edge()],
+            readings: Vec::new(),
         }],
         objects: vec![FusedObject {
             contributors: vec![edge()],
@@ -85,6 +86,12 @@ fn status() -> NodeStatus {
         fit: Some(true),
         version: "0.1.0".into(),
         description: None,
+        troubles: vec![Trouble {
+            kind: "clock_off".into(),
+            about: Some("late".into()),
+            cause: "refused, its clock is 5.0 s ahead".into(),
+            remedy: "run a time service".into(),
+        }],
     }
 }
 
@@ -182,6 +189,11 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
             (|s| s.epoch = 1 << 53, RejectReason::OutOfRange),
             (|s| s.version = String::new(), RejectReason::InvalidLabel),
             (|s| s.version = "0".repeat(1000), RejectReason::InvalidLabel),
+            (|s| s.troubles = vec![s.troubles[0].clone(); MAX_TROUBLES + 1], RejectReason::TooManyObjects),
+            (|s| s.troubles[0].cause = "x".repeat(MAX_TROUBLE_TEXT + 1), RejectReason::TooLarge),
+            (|s| s.troubles[0].remedy = "run\nthis".into(), RejectReason::InvalidLabel),
+            (|s| s.troubles[0].kind.clear(), RejectReason::InvalidLabel),
+            (|s| s.troubles[0].about = Some("a\u{202E}b".into()), RejectReason::InvalidLabel),
         ],
     );
 }

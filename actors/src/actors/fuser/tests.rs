@@ -112,3 +112,60 @@ async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more
     fuser.forget_map(&NodeName::from_static("edge"));
     assert!(fuser.last_map.is_none());
 }
+
+/// The fuser's present troubles, as their subjects, kinds and causes.
+fn troubles(fuser: &FuserState) -> Vec<(Option<String>, String, String)> {
+    let all = fuser.counters.troubles().present().into_iter();
+    all.map(|trouble| (trouble.about, trouble.kind, trouble.cause)).collect()
+}
+
+fn take(fuser: &mut FuserState, mut report: ObjectReport, received_at: Timestamp, location: Option<&str>) {
+    report.seen = location.map(|id| vec![id.into()]);
+    let message = QueuedReport { kind: ReportKind::Detections, report: Arc::new(report) };
+    fuser.take(&Delivery::local(message, received_at));
+}
+
+/// A clock that is off is named with its error while the reports are refused, and afterwards, when they are put right.
+#[test]
+fn a_clock_that_is_off_is_named() {
+    let mut fuser = standby();
+    let late = NodeName::from_static("late");
+    for n in 1..=20 {
+        let received_at = Timestamp(1_795_000_000_000_000 + n * 100_000);
+        let report = ObjectReport::new(late.clone(), n, received_at + Duration::from_secs(5));
+        take(&mut fuser, report, received_at, None);
+        let kinds: Vec<_> = troubles(&fuser).into_iter().map(|(_, kind, _)| kind).collect();
+        match n {
+            ..=5 => assert!(kinds.is_empty(), "{n}: {kinds:?}"),
+            7..=9 => assert_eq!(kinds, ["untimely"], "{n}"),
+            _ => {}
+        }
+    }
+    let told = troubles(&fuser);
+    let about = Some("late".to_owned());
+    assert!(told.contains(&(about.clone(), "untimely".into(), "refused, its clock is 5.0 s ahead".into())), "{told:?}");
+    let corrected = "its clock is 5.0 s ahead; its reports are put right by that";
+    assert!(told.contains(&(about, "clock_off".into(), corrected.into())), "{told:?}");
+}
+
+#[test]
+fn locations_that_only_one_side_knows_are_named() {
+    let now = Timestamp(1_795_000_000_000_000);
+    let report = |seq: u64| ObjectReport::new(NodeName::from_static("euclid"), seq, now);
+    let mut without = standby();
+    take(&mut without, report(1), now, None);
+    assert_eq!(troubles(&without), []);
+    take(&mut without, report(2), now, Some("slot-0"));
+    let cause = "euclid names known locations, such as slot-0, and this node has none";
+    assert_eq!(troubles(&without), [(None, "no_locations".into(), cause.into())]);
+
+    let mut with = standby();
+    let slot =
+        toml::from_str::<ecod::perception::landmark::LandmarkConfig>("id = \"slot-0\"\nx_m = 0\ny_m = 0").unwrap();
+    with.aggregator = Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
+    take(&mut with, report(1), now, Some("slot-0"));
+    assert_eq!(troubles(&with), []);
+    take(&mut with, report(2), now, Some("slot-9"));
+    let cause = "names the location slot-9, which this node does not know";
+    assert_eq!(troubles(&with), [(Some("euclid".into()), "unknown_location".into(), cause.into())]);
+}

@@ -4,13 +4,14 @@ use std::collections::{BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::cell_time::{CellTime, ClockEvent};
 use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{Encoding, RejectReason, Role};
+use ecod::wire::{Encoding, NodeState, NodeStatus, RejectReason, Role, Trouble};
 use ractor::ActorRef;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -42,6 +43,11 @@ pub struct ElectionDriver {
     counters: Arc<Counters>,
     /// Nodes that declared more than their certificate allows.
     overreached: BTreeSet<NodeName>,
+    name: NodeName,
+    /// What a leader said last of this node: the leader and its words.
+    complaint: Option<(NodeName, Trouble)>,
+    /// Nodes at whose brokers this one has no login.
+    no_login: Vec<NodeName>,
     /// The deadline for which the timer is set.
     alarm: Timestamp,
     timer: Option<AbortHandle>,
@@ -63,6 +69,7 @@ impl ElectionDriver {
         let saved_term = saved_term(term_file.as_ref());
         own_broker.mark_changed();
         let cell_time = CellTime::new(settings.election.role);
+        let name = settings.status.node.clone();
         let machine = LeadershipNode::new(settings, saved_term, &leadership.borrow(), clock::now());
         Self {
             machine,
@@ -75,6 +82,9 @@ impl ElectionDriver {
             leadership,
             counters,
             overreached: BTreeSet::new(),
+            name,
+            complaint: None,
+            no_login: Vec::new(),
             alarm: Timestamp(u64::MAX),
             timer: None,
             myself,
@@ -112,9 +122,26 @@ impl ElectionDriver {
             MembershipEvent::NameTaken { name } => {
                 return tracing::error!(%name, "two nodes have this name; the first one takes part");
             }
+            MembershipEvent::Troubled { about, kind, cause } => {
+                return self.counters.troubles().note_about(&about, kind, &cause);
+            }
             MembershipEvent::Excluded => return tracing::error!("another node has this node's name"),
         };
         self.handle(input).await;
+    }
+
+    /// Notes what a node says of itself, and what a leader says of this node.
+    pub(super) async fn take_status(&mut self, status: &NodeStatus) {
+        if status.state == NodeState::Aggregating && status.node != self.name {
+            let of_this = |trouble: &&Trouble| {
+                let about = trouble.about.as_ref().and_then(|about| NodeName::new(about).ok());
+                let refuses = TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::refuses_reports);
+                refuses && about.is_some_and(|about| about.vehicle() == self.name)
+            };
+            let complaint = status.troubles.iter().find(of_this).cloned();
+            self.complaint = complaint.map(|trouble| (status.node.clone(), trouble));
+        }
+        self.handle(Input::StatusHeard { status: status.clone() }).await;
     }
 
     /// Hands in what happened, and carries out what comes of it before anything else happens.
@@ -143,7 +170,7 @@ impl ElectionDriver {
     }
 
     /// Does what the leadership wants; returns what it is to be told at once.
-    async fn carry_out(&mut self, effect: Effect) -> Option<Input> {
+    async fn carry_out(&mut self, effect: Effect) -> Vec<Input> {
         match effect {
             Effect::PersistTerm { term } => self.terms.save(term),
             Effect::Send { to, mut message } => {
@@ -179,11 +206,13 @@ impl ElectionDriver {
             Effect::Look => {
                 let events = self.cell_time.look(clock::wall_offset_us(), &self.leadership.borrow(), clock::now());
                 events.into_iter().for_each(log_clock);
-                return Some(Input::Looked {
+                self.note_troubles();
+                let looked = Input::Looked {
                     rounds_due: self.counters.events(Event::RoundDue),
                     load_percent: probe::load_percent().unwrap_or(0),
                     members: self.members.borrow().iter().map(as_seen).collect(),
-                });
+                };
+                return vec![looked, Input::Troubled { troubles: self.counters.troubles().present() }];
             }
             Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
             Effect::CountImplausible { from } => self.counters.reject(RejectReason::OutOfRange, from.as_str()),
@@ -198,9 +227,43 @@ impl ElectionDriver {
                     );
                 }
             }
+            Effect::Log { notice: Notice::NoLogin { at } } => {
+                if at.is_empty() {
+                    tracing::info!("logged in at all brokers in use again");
+                }
+                self.no_login = at;
+            }
             Effect::Log { notice } => log(notice),
         }
-        None
+        Vec::new()
+    }
+
+    /// Notes clocks that are off, the leader's complaint, and that the cell's description is not used.
+    fn note_troubles(&self) {
+        let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
+        for (name, error_us) in self.cell_time.wall_errors(clock::now()) {
+            let cause = clock_words(error_us);
+            match name {
+                _ if error_us.unsigned_abs() < MIN_CLOCK_ERROR_US => {}
+                None => troubles.note(TroubleKind::ClockOff, &cause),
+                Some(name) if leadership.is_leading() => {
+                    troubles.note_about(name.as_str(), TroubleKind::ClockOff, &cause);
+                }
+                Some(_) => {}
+            }
+        }
+        for name in &self.no_login {
+            let cause = "it answers, and there is no login at its broker: this node or others may miss its maps";
+            troubles.note_about(name.as_str(), TroubleKind::BrokerUnreachable, cause);
+        }
+        let complaint = self.complaint.as_ref().filter(|(leader, _)| leadership.leader() == Some(leader));
+        if let Some((leader, Trouble { cause, remedy, .. })) = complaint {
+            troubles.relay(TroubleKind::ReportsRefused, &format!("{leader} says of this node: {cause}"), remedy);
+        }
+        match &self.parts.shared.borrow().problem {
+            Some(problem) => troubles.note(TroubleKind::Description, problem),
+            None => troubles.settle(TroubleKind::Description, None),
+        }
     }
 
     /// Shows the leadership; a change of the highest known term alone wakes nobody.
@@ -241,6 +304,16 @@ fn as_seen(member: &Member) -> node::Member {
     }
 }
 
+/// Error of a clock that is a trouble; smaller ones cost nothing.
+const MIN_CLOCK_ERROR_US: u64 = 1_000_000;
+
+/// The error of a clock in words; positive if it is ahead.
+fn clock_words(error_us: i64) -> String {
+    let seconds = error_us.unsigned_abs() as f64 / 1e6;
+    let side = if error_us > 0 { "ahead of" } else { "behind" };
+    format!("its clock is {seconds:.1} s {side} the cell's time")
+}
+
 fn log_clock(event: ClockEvent) {
     let seconds = |micros: i64| micros as f64 / 1e6;
     match event {
@@ -266,19 +339,14 @@ fn log(notice: Notice) {
         Notice::NotServed { challenger } => {
             tracing::debug!(%challenger, "the lead is not handed over yet: no login at the challenger's broker");
         }
-        Notice::NoLogin { at } if at.is_empty() => tracing::info!("logged in at all brokers in use again"),
-        Notice::NoLogin { at } => tracing::warn!(
-            ?at,
-            "no login at the brokers of these nodes, which lead or are next: check the way to them (address, firewall) \
-             and the certificates on both sides; the leader is told, and makes way if most cannot log in"
-        ),
         Notice::Deserted { without_login, followers } => tracing::warn!(
             without_login,
             followers,
             "followers cannot log in at this node's broker: check its certificate, `listen` and the firewall; if they \
              are more than half, the lead goes to another candidate"
         ),
-        Notice::Overreached { .. } => {}
+        // Told where they are carried out.
+        Notice::Overreached { .. } | Notice::NoLogin { .. } => {}
         Notice::Misattributed { from, claimed } => {
             tracing::debug!(%from, %claimed, "election message in another's name dropped");
         }

@@ -227,7 +227,7 @@ impl CaptureLoop {
             failures = if self.captured > before { 1 } else { failures + 1 };
             let retry_after = self.config.retry_after(failures);
             self.failures.fetch_add(1, Ordering::Relaxed);
-            tracing::warn!(%error, failures, ?retry_after, "frame source failed");
+            tracing::info!(%error, failures, ?retry_after, "frame source failed");
             self.status.send_replace(CaptureStatus::Failed { error, failures, retry_after });
             if self.is_stopped_within(retry_after) {
                 break;

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
 use opencv::core::{Mat, Vector};
@@ -56,6 +57,10 @@ impl Video {
     }
 
     pub(super) fn pipeline(pipeline: &str) -> Result<Self, FrameError> {
+        if let Some(element) = elements(pipeline).find(|element| is_missing(element)) {
+            let reason = format!("GStreamer has no element `{element}` here: install the package that has it");
+            return Err(FrameError::Open { origin: pipeline.into(), reason });
+        }
         Self::live(pipeline.into(), || VideoCapture::from_file(pipeline, videoio::CAP_GSTREAMER))
     }
 
@@ -130,6 +135,20 @@ pub(super) fn without_credentials(url: &str) -> String {
     }
 }
 
+/// Names of the elements of a GStreamer pipeline; caps, references and properties are none.
+fn elements(pipeline: &str) -> impl Iterator<Item = &str> {
+    pipeline
+        .split('!')
+        .filter_map(|part| part.split_whitespace().next())
+        .filter(|word| word.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-'))
+}
+
+/// True if GStreamer says that it does not know an element; OpenCV only waits for frames then.
+fn is_missing(element: &str) -> bool {
+    let answer = Command::new("gst-inspect-1.0").args(["--exists", element]).output();
+    answer.is_ok_and(|answer| answer.status.code() == Some(1))
+}
+
 /// The operating system's error for a missing or forbidden file, since OpenCV reports none.
 fn readable(path: &Path, origin: &str) -> Result<(), FrameError> {
     let failed = |e: std::io::Error| FrameError::Open { origin: origin.to_owned(), reason: e.to_string() };
@@ -144,5 +163,12 @@ mod tests {
     fn secrets_of_an_address_are_not_shown() {
         assert_eq!(without_credentials("rtsp://user:p@ss@camera:554/1"), "rtsp://camera:554/1");
         assert_eq!(without_credentials("http://camera/a@b"), "http://camera/a@b");
+    }
+
+    #[test]
+    fn the_elements_of_a_pipeline_are_told_from_caps_and_properties() {
+        let pipeline =
+            "libcamerasrc camera-name=x ! video/x-raw,width=640 ! videoconvert ! tee name=t ! appsink drop=true";
+        assert_eq!(elements(pipeline).collect::<Vec<_>>(), ["libcamerasrc", "videoconvert", "tee", "appsink"]);
     }
 }

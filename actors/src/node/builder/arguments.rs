@@ -1,7 +1,8 @@
 //! What each part is given at its start.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
+use ecod::admission::recent_reports::RecentReports;
 use ecod::aggregator::Aggregator;
 use ecod::leadership::Position;
 use ecod::leadership::election::ElectionConfig;
@@ -80,6 +81,7 @@ impl NodeBuilder {
             counters: self.counters(),
             subscriber: self.subscriber(),
             seed: self.run.as_u64_pair().1,
+            looks_on: self.config.looks_on(),
         }
     }
 
@@ -118,6 +120,7 @@ impl NodeBuilder {
         let (name, live_state, leadership) = (self.name.clone(), Arc::clone(&self.live_state), self.leadership());
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
         let (report_queue, counters, door) = (self.report_queue.clone(), self.counters(), self.door.clone());
+        let recent_reports = Mutex::<RecentReports>::default();
         Arc::new(move |delivery| {
             let at = delivery.received_at;
             live_state.update(&delivery.message, at);
@@ -128,7 +131,10 @@ impl NodeBuilder {
             }
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
-                    recording.send(at, LogItem::Report(*kind, Arc::clone(report)));
+                    let mut recent_reports = recent_reports.lock().unwrap_or_else(PoisonError::into_inner);
+                    if recent_reports.is_new(*kind, report) {
+                        recording.send(at, LogItem::Report(*kind, Arc::clone(report)));
+                    }
                     true
                 }
                 // Evidence is for those that lead now or next; others that get it only look at it.
@@ -185,6 +191,8 @@ impl NodeBuilder {
                     let input = Input::LinkChanged { broker: broker.clone(), state: *state };
                     election.send(LeaderElectionMessage::Note { input })
                 }
+                // Pages alone go by it.
+                Incoming::StatusWithdrawn { .. } => true,
                 Incoming::Status { status, .. } => {
                     recording.send(at, LogItem::Status(Arc::clone(status)));
                     let status = Arc::clone(status);
@@ -325,6 +333,7 @@ impl NodeBuilder {
             plane: self.config.data_plane(),
             shared: self.shared.subscribe(),
             security: self.security.clone(),
+            counters: self.counters(),
             fuser: self.slots.fuser.clone(),
             gateway: self.slots.gateway.clone(),
             broker: self.cell_broker(),

@@ -9,7 +9,7 @@ use std::time::Duration;
 use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind};
+use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind, Trouble};
 use serde::Serialize;
 
 use crate::transport::mqtt::{BrokerAddress, Incoming, LinkState};
@@ -55,6 +55,9 @@ pub struct LatestReport {
 /// the parts of one node [`MAX_PARTS`] are kept: further ones replace parts of the same node.
 pub const MAX_SHOWN: usize = 256;
 
+/// Maximum number of troubles that are shown.
+const MAX_TOLD_TROUBLES: usize = 64;
+
 /// Silence after which a vehicle may be replaced by another.
 const SILENCE: Duration = Duration::from_secs(10);
 
@@ -78,6 +81,13 @@ impl LiveState {
                 let is_beside = |name: &NodeName| are_parts(name, &status.node);
                 let rank = |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
                 insert(&mut latest.statuses, (status.node.clone(), entry), is_beside, rank, |_| true);
+            }
+            Incoming::StatusWithdrawn { node, via } => {
+                let Some(entry) = latest.statuses.get_mut(node) else { return };
+                entry.via.remove(via);
+                if entry.via.is_empty() && entry.status.state == NodeState::Offline {
+                    latest.statuses.remove(node);
+                }
             }
             Incoming::Link { broker, state: LinkState::Down | LinkState::Refused } => {
                 for entry in latest.statuses.values_mut() {
@@ -117,6 +127,26 @@ impl LiveState {
     /// Latest status of each node.
     pub(crate) fn statuses(&self) -> BTreeMap<NodeName, ReportedStatus> {
         self.latest().statuses.clone()
+    }
+
+    /// The present troubles of the cell, each once: those of this node `name`, and those that living nodes tell of
+    /// themselves and of others.
+    pub(crate) fn troubles(&self, name: &NodeName, own: Vec<Trouble>) -> Vec<(Option<NodeName>, Trouble)> {
+        let subject = |trouble: &Trouble, by: &NodeName| trouble.about.clone().unwrap_or_else(|| by.to_string());
+        let mut known: BTreeSet<_> = own.iter().map(|trouble| (subject(trouble, name), trouble.kind.clone())).collect();
+        let mut all: Vec<_> = own.into_iter().map(|trouble| (None, trouble)).collect();
+        for ReportedStatus { status, .. } in self.latest().statuses.values() {
+            if status.state == NodeState::Offline {
+                continue;
+            }
+            for trouble in &status.troubles {
+                let is_new = known.insert((subject(trouble, &status.node), trouble.kind.clone()));
+                if is_new && all.len() < MAX_TOLD_TROUBLES {
+                    all.push((Some(status.node.clone()), trouble.clone()));
+                }
+            }
+        }
+        all
     }
 
     fn latest(&self) -> MutexGuard<'_, Latest> {
@@ -219,6 +249,56 @@ mod tests {
         let shown = |name: &'static str| statuses.contains_key(&NodeName::from_static(name));
         assert_eq!((shown("late"), shown("node-1"), shown("node-0"), shown("node-3")), (true, false, true, true));
         assert_eq!((statuses.len(), live_state.reports_since(later).len()), (MAX_SHOWN, 1));
+    }
+
+    #[test]
+    fn who_took_its_status_back_at_every_broker_is_not_there() {
+        let live_state = LiveState::default();
+        let say = |state, via: &str| {
+            let starting = NodeStatus::starting(NodeName::from_static("top-1"), Uuid::nil(), Role::Cav, "0.1.0");
+            let status = Arc::new(NodeStatus { state, ..starting });
+            live_state.update(&Incoming::Status { status, via: broker(via) }, Timestamp(1));
+        };
+        let withdraw = |via: &str| {
+            let message = Incoming::StatusWithdrawn { node: NodeName::from_static("top-1"), via: broker(via) };
+            live_state.update(&message, Timestamp(2));
+        };
+        let (edge, standby) = ("10.0.0.2:1883", "10.0.0.3:1883");
+        say(NodeState::Following, edge);
+        withdraw(edge);
+        assert_eq!(live_state.statuses().len(), 1, "it goes on elsewhere");
+        for via in [edge, standby] {
+            say(NodeState::Offline, via);
+        }
+        withdraw(edge);
+        assert_eq!(live_state.statuses().len(), 1);
+        withdraw(standby);
+        assert!(live_state.statuses().is_empty());
+    }
+
+    #[test]
+    fn troubles_of_the_cell_are_told_once_by_who_knows_best() {
+        let live_state = LiveState::default();
+        let trouble = |kind: &str, about: Option<&str>, cause: &str| Trouble {
+            kind: kind.into(),
+            about: about.map(str::to_owned),
+            cause: cause.into(),
+            remedy: "mend it".into(),
+        };
+        let say = |node: &str, state, troubles| {
+            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
+            let status = Arc::new(NodeStatus { state, troubles, ..starting });
+            live_state.update(&Incoming::Status { status, via: broker("10.0.0.2:1883") }, Timestamp(1));
+        };
+        say("edge", NodeState::Aggregating, vec![trouble("clock_off", Some("late"), "by the edge")]);
+        say("late", NodeState::Following, vec![trouble("clock_off", None, "by itself"), trouble("camera", None, "x")]);
+        say("gone", NodeState::Offline, vec![trouble("camera", None, "y")]);
+        let own = vec![trouble("malformed", Some("watson"), "z"), trouble("overload", None, "own")];
+        say("gauss", NodeState::Following, vec![trouble("overload", Some("self"), "by gauss")]);
+        let told = live_state.troubles(&NodeName::from_static("self"), own);
+        let told: Vec<_> =
+            told.iter().map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause)).collect();
+        assert_eq!(told, [(None, "z"), (None, "own"), (Some("edge"), "by the edge"), (Some("late"), "x")]);
     }
 
     /// A stolen certificate may speak in the names of any number of parts.

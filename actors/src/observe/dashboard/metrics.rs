@@ -7,7 +7,7 @@ use std::fmt;
 use std::sync::atomic::AtomicU64;
 
 use ecod::leadership::Position;
-use ecod::wire::ReportKind;
+use ecod::wire::{ReportKind, Trouble};
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
@@ -35,6 +35,7 @@ type FloatGauge = Gauge<f64, AtomicU64>;
 pub(crate) fn metrics(monitor: &NodeMonitor) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("ecod");
     node(&mut registry, monitor);
+    troubles(&mut registry, monitor);
     election(&mut registry, monitor);
     rounds(&mut registry, monitor);
     traffic(&mut registry, monitor);
@@ -71,6 +72,21 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
     });
     gauges(registry, "mqtt_links", "Links to brokers by state", links);
     gauge(registry, "dashboard_viewers", "Browsers that receive live snapshots", count(monitor.viewers()));
+}
+
+fn troubles(registry: &mut Registry, monitor: &NodeMonitor) {
+    let present = monitor.sources.counters.troubles().present().into_iter();
+    let labels = present.map(|Trouble { kind, about, .. }| {
+        (vec![("trouble", kind), ("about", about.unwrap_or_else(|| monitor.sources.node.name.to_string()))], 1)
+    });
+    gauges(registry, "troubles", "Present troubles of the node and of vehicles as it sees them; 1 for each", labels);
+    let reading = monitor.sources.vitals.clock.reading();
+    if reading.error_us.is_some() {
+        let ahead_us = clock::wall_offset_us().saturating_sub(reading.offset_us);
+        let ahead = FloatGauge::default();
+        ahead.set(ahead_us as f64 / 1e6);
+        registry.register_with_unit("clock_ahead", "Machine's clock less the cell's time", Unit::Seconds, ahead);
+    }
 }
 
 fn election(registry: &mut Registry, monitor: &NodeMonitor) {

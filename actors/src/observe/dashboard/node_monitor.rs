@@ -16,7 +16,7 @@ use super::history::{History, SAMPLE_PERIOD};
 use super::map_latency::MapLatency;
 use super::node_sources::NodeSources;
 use super::response_cache::{CachedResponse, ResponseCache};
-use super::snapshot::{API_VERSION, LeadershipFacts, Snapshot, json, nodes};
+use super::snapshot::{API_VERSION, LeadershipFacts, Snapshot, TroubleEntry, json, nodes};
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::newest::Received;
 use crate::observe::readiness::Probe;
@@ -136,8 +136,15 @@ impl NodeMonitor {
             vehicles: sources.live_state.reports_since(now - MAX_REPORT_AGE),
             nodes: nodes(sources, met, probe.links.as_ref()),
             links: links.collect(),
+            troubles: self.troubles(),
             counters: sources.counters.snapshot(),
         }
+    }
+
+    fn troubles(&self) -> Vec<TroubleEntry> {
+        let NodeSources { node, counters, live_state, .. } = &self.sources;
+        let all = live_state.troubles(&node.name, counters.troubles().present()).into_iter();
+        all.map(|(by, trouble)| TroubleEntry { told_by: by.unwrap_or_else(|| node.name.clone()), trouble }).collect()
     }
 
     async fn follow_changes(&self) {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use ecod::model::names::{LandmarkId, NodeName};
+use ecod::model::names::{Label, LandmarkId, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::Role;
@@ -62,6 +62,7 @@ impl NodeSources {
             x_m: landmark.x_m,
             y_m: landmark.y_m,
             facing_rad: landmark.facing_deg.map(f64::to_radians),
+            vacancy: landmark.vacancy.as_ref().map(|sign| sign.label.clone()),
         };
         landmarks.iter().map(facts).collect()
     }
@@ -78,4 +79,6 @@ pub struct LandmarkFacts {
     pub y_m: f64,
     /// Direction that it faces, in radians counter-clockwise from east.
     pub facing_rad: Option<f64>,
+    /// Label of its vacancy sign.
+    pub vacancy: Option<Label>,
 }

@@ -6,7 +6,7 @@ use ecod::leadership::Position;
 use ecod::leadership::readiness::Readiness;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Verdicts};
+use ecod::wire::{GlobalMap, NodeState, NodeStatus, Reputations, Role, Trouble, Verdicts};
 use serde::Serialize;
 
 use super::live_state::{LatestReport, MAX_SHOWN, ReportedStatus};
@@ -47,8 +47,20 @@ pub(crate) struct Snapshot {
     pub nodes: Vec<NodeEntry>,
     /// State of the link to each broker: `up`, `stalled`, `down` or `refused`.
     pub links: BTreeMap<String, String>,
+    /// Present troubles of the cell as this node knows them, its own first.
+    pub troubles: Vec<TroubleEntry>,
     /// Counters of failures and losses, by reason.
     pub counters: CounterSnapshot,
+}
+
+/// A trouble, for a browser.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct TroubleEntry {
+    /// The node that tells it.
+    pub told_by: NodeName,
+    /// The trouble.
+    #[serde(flatten)]
+    pub trouble: Trouble,
 }
 
 /// The leadership of the cell, for a browser.

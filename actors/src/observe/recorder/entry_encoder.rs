@@ -7,7 +7,7 @@ use base64::prelude::{BASE64_STANDARD, Engine};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::replay::{JournalEntry, JournalEvent};
-use ecod::wire::Topic;
+use ecod::wire::{ReportKind, Topic};
 use mcap::McapResult;
 use serde::Serialize;
 
@@ -41,6 +41,8 @@ pub(crate) trait MessageSink {
 pub(crate) struct EntryEncoder {
     node: NodeName,
     drawable: bool,
+    /// Latest frame of each vehicle that was drawn, and whether the vehicle reports for PACE.
+    drawn: BTreeMap<NodeName, (Timestamp, bool)>,
     /// Buffer reused for every message.
     json: Vec<u8>,
 }
@@ -48,7 +50,7 @@ pub(crate) struct EntryEncoder {
 impl EntryEncoder {
     /// An encoder that also draws entries if they are to be `drawable`.
     pub(crate) fn new(node: NodeName, drawable: bool) -> Self {
-        Self { node, drawable, json: Vec::new() }
+        Self { node, drawable, drawn: BTreeMap::new(), json: Vec::new() }
     }
 
     /// Writes the messages of an entry.
@@ -59,6 +61,9 @@ impl EntryEncoder {
             LogItem::Report(kind, report) => {
                 let (vehicle, captured_at) = (&report.node, report.captured_at_us);
                 output.put(SchemaName::ObjectReport, kind.topic(vehicle.clone()), captured_at, report)?;
+                if !output.encoder.is_to_be_drawn(*kind, vehicle, captured_at) {
+                    return Ok(());
+                }
                 let scene = || SceneUpdate::of_report(report);
                 output.draw(SchemaName::SceneUpdate, format_args!("scene/{vehicle}"), captured_at, scene)?;
                 let Some(pose) = report.pose else { return Ok(()) };
@@ -104,6 +109,21 @@ impl EntryEncoder {
         }
     }
 
+    /// True for the first report of a frame: of both kinds and by whatever broker, a vehicle is drawn once. Votes have not
+    /// all objects; they are drawn where a vehicle sends nothing else.
+    fn is_to_be_drawn(&mut self, kind: ReportKind, vehicle: &NodeName, captured_at: Timestamp) -> bool {
+        if !self.drawable {
+            return false;
+        }
+        if self.drawn.len() >= MAX_DRAWN && !self.drawn.contains_key(vehicle) {
+            self.drawn.clear();
+        }
+        let (last, has_detections) = self.drawn.entry(vehicle.clone()).or_default();
+        *has_detections |= kind == ReportKind::Detections;
+        let is_best = kind == ReportKind::Detections || !*has_detections;
+        is_best && std::mem::replace(last, captured_at) != captured_at
+    }
+
     /// Writes an input of the aggregator.
     pub(crate) fn journal(
         &mut self,
@@ -114,6 +134,9 @@ impl EntryEncoder {
         Output { encoder: self, at, sink }.journal(event)
     }
 }
+
+/// Vehicles whose latest frame is remembered; beyond them, all are forgotten.
+const MAX_DRAWN: usize = 4096;
 
 /// The sink of one entry.
 struct Output<'a, S> {
@@ -155,5 +178,46 @@ impl<S: MessageSink> Output<'_, S> {
         json.clear();
         serde_json::to_writer(&mut *json, message).map_err(std::io::Error::from)?;
         self.sink.put(EncodedMessage { schema, topic: &topic.to_string(), at: self.at, made_at, json })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use ecod::model::geometry::Pose;
+    use ecod::wire::ObjectReport;
+
+    use super::*;
+
+    struct Topics(Vec<String>);
+
+    impl MessageSink for Topics {
+        fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()> {
+            self.0.push(message.topic.to_owned());
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_frame_is_drawn_once_however_many_reports_it_makes() {
+        let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), true);
+        let mut topics = Topics(Vec::new());
+        let mut write = |kind, node: &str, at: u64| {
+            let pose = Some(Pose::new(0.0, 0.0, 0.0).into());
+            let report = ObjectReport { pose, ..ObjectReport::new(NodeName::new(node).unwrap(), at, Timestamp(at)) };
+            let entry = LogEntry { at: Timestamp(at), item: LogItem::Report(kind, Arc::new(report)) };
+            encoder.write(&entry, &mut topics).unwrap();
+        };
+        for at in 1..=10 {
+            for _ in 0..2 {
+                write(ReportKind::VoteDetections, "euclid", at);
+                write(ReportKind::Detections, "euclid", at);
+            }
+            write(ReportKind::VoteDetections, "voter", at);
+        }
+        let count = |topic: &str| topics.0.iter().filter(|known| *known == topic).count();
+        assert_eq!([count("scene/euclid"), count("scene/voter"), count("tf")], [10, 10, 20]);
+        assert_eq!([count("detections/euclid"), count("vote_detections/euclid")], [20, 20], "each report is kept");
     }
 }

@@ -10,7 +10,6 @@
 //! the broker puts `$door/` before their filters and takes it off what it delivers. Wildcards of others do not match it.
 
 mod programs;
-mod recent_reports;
 mod refusals;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,6 +19,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
+use ecod::admission::recent_reports::RecentReports;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
@@ -31,7 +31,6 @@ use rmqtt::session::SessionState;
 use rmqtt::types::{ClientId, CodecPublish, From, Id, QoS, TopicFilter};
 use tokio::sync::mpsc;
 
-use self::recent_reports::RecentReports;
 use self::refusals::Refusals;
 use crate::platform::clock;
 use crate::platform::throttle::TokenBucket;

@@ -238,6 +238,7 @@ fn machine(node: &'static str, nonce: u8, proves: bool, now: Timestamp) -> Gossi
     let identity = proves.then(|| IDENTITIES[usize::from(node == PEER)].clone());
     let setup = GossipSetup {
         own: node_id(node, now),
+        cell: name("lot-1"),
         key: key(),
         session: [nonce; 16],
         identity,

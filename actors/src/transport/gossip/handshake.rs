@@ -10,6 +10,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -22,7 +23,7 @@ use serde::{Deserialize, Serialize};
 use super::counters::FrameEvent;
 use super::frame::HEADER_BYTES;
 use super::key::{CellKey, Cookie, SessionId, SessionNonce, session_of};
-use super::refusals::Refusals;
+use super::notices::{Notice, Notices};
 use super::replay_window::ReplayWindow;
 use super::session_keys::KeySet;
 use crate::platform::throttle::host_network;
@@ -87,7 +88,7 @@ pub(crate) struct Prover {
     nonce: SessionNonce,
     random: SystemRandom,
     pending: HashMap<PendingKey, PendingProof>,
-    refusals: Refusals,
+    notices: Notices,
 }
 
 /// Session, address and cookie of a challenger: a forged challenge does not replace an honest one's proof.
@@ -104,16 +105,13 @@ pub(crate) struct PendingProof {
 
 impl Prover {
     pub(crate) fn new(identity: Identity, nonce: SessionNonce) -> Self {
-        Self { identity, nonce, random: SystemRandom::new(), pending: HashMap::new(), refusals: Refusals::default() }
+        Self { identity, nonce, random: SystemRandom::new(), pending: HashMap::new(), notices: Notices::default() }
     }
 
     /// Replaces the certificates and the time; true when the certificates are others.
     pub(crate) fn set_identity(&mut self, identity: Identity) -> bool {
         let has_changed = !Arc::ptr_eq(&self.identity.credentials, &identity.credentials);
         self.identity = identity;
-        if has_changed {
-            self.refusals = Refusals::default();
-        }
         has_changed
     }
 
@@ -141,7 +139,7 @@ impl Prover {
             Err(Distrust::Untrusted(error)) => error.to_string(),
             Err(Distrust::Invalid(error)) => error.to_string(),
         };
-        self.refusals.log(name, from, &refusal);
+        self.refuse(name, from, &refusal);
         None
     }
 
@@ -220,9 +218,14 @@ impl Prover {
         proof.map(|proof| proof.private)
     }
 
-    /// Logs that a node without certificate, or with one where this node has none, was refused.
-    pub(crate) fn log_uncertified(&mut self, name: &NodeName, from: SocketAddr) {
-        self.refusals.log(name, from, "it shows no certificate: it has no `[tls]`, or an earlier version of ecod-node");
+    /// Notes that a node is not admitted.
+    pub(crate) fn refuse(&mut self, name: &NodeName, from: SocketAddr, cause: &str) {
+        self.notices.add(name, TroubleKind::NotAdmitted, format!("not admitted from {}: {cause}", from.ip()));
+    }
+
+    /// Nodes that were not admitted since the last call.
+    pub(crate) fn take_notices(&mut self) -> Vec<Notice> {
+        self.notices.take()
     }
 }
 

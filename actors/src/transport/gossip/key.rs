@@ -29,6 +29,12 @@ pub(crate) struct CellKey {
     tag: [u8; 4],
 }
 
+/// Public tag of a cell in its frames, of the hash of its name.
+pub(crate) fn cell_tag(cell: &NodeName) -> [u8; 4] {
+    let hash = digest::digest(&digest::SHA256, cell.as_str().as_bytes());
+    hash.as_ref().first_chunk().copied().unwrap_or_default()
+}
+
 /// A key that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum KeyError {
@@ -90,8 +96,7 @@ impl CellKey {
             pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, PBKDF2_ROUNDS, &salt, text.as_bytes(), &mut secret);
         }
         let root = hkdf::Salt::new(hkdf::HKDF_SHA256, cell.as_str().as_bytes()).extract(&secret);
-        let hash = digest::digest(&digest::SHA256, cell.as_str().as_bytes());
-        Self { root, tag: hash.as_ref().first_chunk().copied().unwrap_or_default() }
+        Self { root, tag: cell_tag(cell) }
     }
 
     /// The key that signs payloads sent through external brokers.

@@ -24,9 +24,11 @@ use super::frame::{FrameKind, Introduction, NameClaim};
 use super::handshake::Identity;
 use super::key::{CellKey, SessionNonce};
 use super::node_id::{MAX_CLAIMED_LIFE, NodeId};
+use super::notices::Notice;
 use super::sessions::{Arrival, FrameContent, Sessions};
 use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
+use crate::platform::throttle::TokenBucket;
 
 /// An action for the caller.
 #[derive(Debug, PartialEq, Eq)]
@@ -42,6 +44,7 @@ pub(crate) enum GossipOutput {
 /// Arguments of [`GossipMachine::new`].
 pub(crate) struct GossipSetup {
     pub(crate) own: NodeId,
+    pub(crate) cell: NodeName,
     pub(crate) key: CellKey,
     /// Random for each start, and unpredictable.
     pub(crate) session: SessionNonce,
@@ -71,6 +74,8 @@ pub(crate) struct GossipMachine {
     taken: Option<(NodeName, Timestamp)>,
     /// Since when all others say that this node's name is another's.
     excluded_since: Option<Timestamp>,
+    /// Throttle of what is told about other hosts.
+    notices: TokenBucket,
     /// True if the node has to learn its address from others.
     learns_address: bool,
     left: bool,
@@ -86,13 +91,13 @@ struct PendingFrames {
 
 impl GossipMachine {
     pub(crate) fn new(setup: GossipSetup, config: &MembershipConfig, now: Timestamp) -> Self {
-        let GossipSetup { own, key, session, identity, secret, seed, counters } = setup;
+        let GossipSetup { own, cell, key, session, identity, secret, seed, counters } = setup;
         let proves = identity.is_some();
         let clock = AwakeClock::new(now, STALL);
         Self {
             learns_address: own.gossip.ip().is_unspecified(),
             sessions: Sessions::new(
-                key,
+                (cell, key),
                 (&own.name, session, identity),
                 &secret,
                 config.max_peers,
@@ -109,6 +114,7 @@ impl GossipMachine {
             unproven: HashMap::new(),
             taken: None,
             excluded_since: None,
+            notices: TokenBucket::new(NOTICE_BURST, NOTICE_INTERVAL, now),
             left: false,
             rng: ChaCha8Rng::seed_from_u64(seed.wrapping_add(1)),
             outputs: VecDeque::new(),
@@ -139,7 +145,8 @@ impl GossipMachine {
             return;
         }
         let gossip = &self.gossip;
-        let arrival = Arrival { from, now: at, own: gossip.own(), known: &|name| gossip.known(name) };
+        let is_alone = gossip.alive().is_empty();
+        let arrival = Arrival { from, now: at, own: gossip.own(), is_alone, known: &|name| gossip.known(name) };
         let taken = match self.sessions.open(datagram, &arrival) {
             Ok(opened) => self.take(opened, from, at, now),
             Err(reason) => Err(reason),
@@ -147,6 +154,12 @@ impl GossipMachine {
         if let Err(reason) = taken {
             self.counters.count(reason);
             tracing::debug!(%from, reason = reason.as_str(), "gossip frame refused");
+        }
+        for Notice { about, kind, cause } in self.sessions.take_notices() {
+            if self.notices.allow(at) {
+                let event = MembershipEvent::Troubled { about, kind, cause };
+                self.outputs.push_back(GossipOutput::Tell(event));
+            }
         }
         self.flush_swim(at);
     }
@@ -412,6 +425,10 @@ const MAX_UNPROVEN: usize = 256;
 
 /// Time after which a node whose name is another's gives up: well beyond that in which a run that ended is found to be down.
 const NAME_PATIENCE: Duration = Duration::from_secs(5);
+
+/// Burst of what is told about other hosts, and time until one more.
+const NOTICE_BURST: u32 = 16;
+const NOTICE_INTERVAL: Duration = Duration::from_millis(250);
 
 /// Minimum time between two reports of the same taken name.
 const REPORT_INTERVAL: Duration = Duration::from_secs(60);

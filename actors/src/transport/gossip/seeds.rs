@@ -7,16 +7,21 @@ use std::time::Duration;
 
 use tokio::net::lookup_host;
 
-/// Resolves the seeds again and again, sooner while one has failed, until `tell` returns false.
+/// Resolves the seeds again and again, sooner while one has failed, until `tell` returns false. `trouble` is told of each
+/// failure.
 ///
-/// A seed that fails is logged once and keeps its addresses: the name server may be unreachable together with the
-/// network.
-pub(crate) async fn resolve(seeds: Vec<String>, ipv4: bool, tell: impl Fn(Vec<SocketAddr>) -> bool) {
+/// A seed that fails keeps its addresses: the name server may be unreachable together with the network.
+pub(crate) async fn resolve(
+    seeds: Vec<String>,
+    ipv4: bool,
+    trouble: impl Fn(&str, &io::Error),
+    tell: impl Fn(Vec<SocketAddr>) -> bool,
+) {
     let mut retry = RETRY_MIN;
     let mut unresolved = BTreeSet::new();
     let mut known = BTreeMap::new();
     loop {
-        resolve_once(&seeds, ipv4, &mut known, &mut unresolved).await;
+        resolve_once(&seeds, ipv4, &mut known, &mut unresolved, &trouble).await;
         let addresses = known.values().flatten().copied().collect();
         let complete = unresolved.is_empty();
         if !tell(addresses) {
@@ -36,6 +41,7 @@ async fn resolve_once(
     ipv4: bool,
     known: &mut BTreeMap<String, Vec<SocketAddr>>,
     unresolved: &mut BTreeSet<String>,
+    trouble: &impl Fn(&str, &io::Error),
 ) {
     for seed in seeds {
         match look_up(seed, ipv4).await {
@@ -45,10 +51,10 @@ async fn resolve_once(
                     tracing::info!(%seed, "seed resolved");
                 }
             }
-            Err(error) if unresolved.insert(seed.clone()) => {
-                tracing::warn!(%error, %seed, "seed cannot be resolved, trying on");
+            Err(error) => {
+                trouble(seed, &error);
+                unresolved.insert(seed.clone());
             }
-            Err(_) => {}
         }
     }
 }
@@ -71,7 +77,10 @@ mod tests {
         let (usual, before): (SocketAddr, SocketAddr) =
             ("127.0.0.1:9".parse().unwrap(), "192.0.2.1:9".parse().unwrap());
         let mut known = BTreeMap::from([("no port".to_owned(), vec![before])]);
-        resolve_once(&seeds, true, &mut known, &mut unresolved).await;
+        let failed = std::cell::RefCell::new(Vec::new());
+        let trouble = |seed: &str, _: &io::Error| failed.borrow_mut().push(seed.to_owned());
+        resolve_once(&seeds, true, &mut known, &mut unresolved, &trouble).await;
+        assert_eq!(failed.into_inner(), ["[::1]:9", "no port"]);
         assert_eq!(known.into_values().flatten().collect::<Vec<_>>(), [usual, before], "what was known once stays");
         assert_eq!(unresolved, BTreeSet::from(["[::1]:9", "no port"].map(str::to_owned)));
     }

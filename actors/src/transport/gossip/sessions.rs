@@ -15,6 +15,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -25,8 +26,9 @@ use super::counters::{FrameCounters, FrameEvent};
 use super::frame::{FrameHeader, FrameKind, Greeting, HEADER_BYTES, Hello, Introduction, Version};
 use super::handshake::{Identity, Proven, Prover};
 use super::key::{BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of};
+use super::near_cells::{NearCells, are_numbered};
 use super::node_id::NodeId;
-use super::refusals::Refusals;
+use super::notices::{Notice, Notices};
 use super::reply_throttle::ReplyThrottle;
 use crate::platform::throttle::TokenBucket;
 use peers::PeerTable;
@@ -47,8 +49,9 @@ pub(crate) struct Sessions {
     proofs: ReplyThrottle,
     verifications: ReplyThrottle,
     greetings: TokenBucket,
-    other_key_seen: bool,
-    certified: Refusals,
+    cell: NodeName,
+    near_cells: NearCells,
+    notices: Notices,
     counters: Arc<FrameCounters>,
 }
 
@@ -66,6 +69,8 @@ pub(crate) struct Arrival<'a> {
     pub(crate) now: Timestamp,
     /// This node's identity.
     pub(crate) own: &'a NodeId,
+    /// True if this node has found no other.
+    pub(crate) is_alone: bool,
     /// State of a name in this node's gossip.
     pub(crate) known: &'a dyn Fn(&NodeName) -> Option<KnownMember>,
 }
@@ -97,7 +102,7 @@ pub(crate) enum FrameContent {
 impl Sessions {
     /// No sessions. `nonce` is the node's session itself in a cell without certificates.
     pub(crate) fn new(
-        key: CellKey,
+        (cell, key): (NodeName, CellKey),
         (name, nonce, identity): (&NodeName, SessionNonce, Option<Identity>),
         secret: &[u8; 32],
         max_peers: usize,
@@ -117,8 +122,9 @@ impl Sessions {
             proofs: ReplyThrottle::new(now),
             verifications: ReplyThrottle::new(now),
             greetings: TokenBucket::new(HELLO_BURST, HELLO_INTERVAL, now),
-            other_key_seen: false,
-            certified: Refusals::default(),
+            cell,
+            near_cells: NearCells::default(),
+            notices: Notices::default(),
             counters,
         }
     }
@@ -224,7 +230,11 @@ impl Sessions {
 
     /// Processes a datagram. An error means junk, which changed nothing.
     pub(crate) fn open(&mut self, frame: &[u8], arrival: &Arrival<'_>) -> Result<FrameContent, FrameEvent> {
-        let head = FrameHeader::read(frame, self.key.tag())?;
+        let head = FrameHeader::read(frame, self.key.tag()).inspect_err(|reason| {
+            if *reason == FrameEvent::WrongCell {
+                self.note_other_cell(frame, arrival);
+            }
+        })?;
         if head.version != self.version() {
             return Err(self.refuse_version(&head, frame, arrival.from));
         }
@@ -292,10 +302,26 @@ impl Sessions {
         FrameContent::Stranger
     }
 
-    /// Warns of a greeting under another key. Once only, as greetings are repeated for ever.
+    /// Troubles with other hosts since the last call.
+    pub(crate) fn take_notices(&mut self) -> Vec<Notice> {
+        let mut notices = self.notices.take();
+        notices.extend(self.prover.iter_mut().flat_map(Prover::take_notices));
+        notices
+    }
+
+    /// Notes a greeting under another key.
     fn note_other_key(&mut self, from: SocketAddr) {
-        if !std::mem::replace(&mut self.other_key_seen, true) {
-            tracing::warn!(%from, "a node of this cell has another key, or none; its frames are ignored");
+        let cause = format!("heard cell {} with another key, or none, from {}", self.cell, from.ip());
+        self.notices.add(from.ip(), TroubleKind::WrongKey, cause);
+    }
+
+    /// Notes a cell with nearly this one's name. Numbered cells may be neighbours, unless this node has found nobody.
+    fn note_other_cell(&mut self, frame: &[u8], arrival: &Arrival<'_>) {
+        let Some(&tag) = frame.get(4..8).and_then(<[u8]>::first_chunk) else { return };
+        let Some(other) = self.near_cells.name_of(tag, &self.cell) else { return };
+        if !are_numbered(other, &self.cell) || arrival.is_alone {
+            let cause = format!("heard cell {other} from {}, this is {}", arrival.from.ip(), self.cell);
+            self.notices.add(arrival.from.ip(), TroubleKind::OtherCell, cause);
         }
     }
 
@@ -304,9 +330,10 @@ impl Sessions {
         let greeting = if head.kind == FrameKind::Hello { self.unseal(head, &BROADCAST, frame) } else { None };
         let hello = greeting.and_then(|body| decode_first::<Hello>(&body).ok().map(|(hello, _)| hello));
         if let Some(Hello { name }) = hello {
+            let has = "not admitted: it shows a certificate, and this node has no `[tls]`";
             match &mut self.prover {
-                Some(prover) => prover.log_uncertified(&name, from),
-                None => self.certified.log(&name, from, "it shows a certificate, and this node has no `[tls]`"),
+                Some(prover) => prover.refuse(&name, from, "it shows no certificate; it has no `[tls]`"),
+                None => self.notices.add(name, TroubleKind::NotAdmitted, has),
             }
         }
         FrameEvent::Uncertified

@@ -146,7 +146,8 @@ pub(crate) struct LastWill {
 
 /// Payload of the last will of a node with this status.
 pub(crate) fn offline_payload(status: &NodeStatus, encoding: Encoding) -> Vec<u8> {
-    encode(&NodeStatus { state: NodeState::Offline, aggregator: None, ..status.clone() }, encoding)
+    let gone = NodeStatus { state: NodeState::Offline, aggregator: None, troubles: Vec::new(), ..status.clone() };
+    encode(&gone, encoding)
 }
 
 /// Prepares a connection; the first poll connects.

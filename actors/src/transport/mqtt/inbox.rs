@@ -10,8 +10,8 @@ use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason, ReportKind,
-    Reputations, Topic, Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
+    CellDescription, Flaw, GlobalMap, LedgerShare, Limits, NodeState, NodeStatus, ObjectReport, RejectReason,
+    ReportKind, Reputations, Topic, Topics, Verdicts, check_fused_at, decode, decode_report, decode_share,
 };
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use uuid::Uuid;
@@ -51,6 +51,13 @@ pub enum Incoming {
         /// The status.
         status: Arc<NodeStatus>,
         /// The broker that forwarded it.
+        via: BrokerAddress,
+    },
+    /// A node has stopped, or no longer uses this broker, and took its status back.
+    StatusWithdrawn {
+        /// The node.
+        node: NodeName,
+        /// The broker that told it.
         via: BrokerAddress,
     },
     /// The state of a link changed.
@@ -168,7 +175,7 @@ impl Inbox {
     pub(crate) fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome {
         self.counters.count(Event::Received);
         self.read(via, topic, payload, received_at).unwrap_or_else(|reason| {
-            self.counters.reject(reason, &self.source(via, topic));
+            self.counters.reject_with(reason, &self.source(via, topic), || self.fault(topic, payload, reason));
             tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
             PacketOutcome::Done
         })
@@ -300,8 +307,12 @@ impl Inbox {
         received_at: Timestamp,
     ) -> Result<PacketOutcome, RejectReason> {
         let is_shed = |vehicle| self.is_shed(&self.status_throttle, ShedReason::StatusThrottled, vehicle, received_at);
-        if payload.is_empty() || is_shed(&node.vehicle()) {
+        if is_shed(&node.vehicle()) {
             return Ok(PacketOutcome::Done);
+        }
+        if payload.is_empty() {
+            let message = Incoming::StatusWithdrawn { node: node.clone(), via: via.address.clone() };
+            return Ok(self.deliver(via, message, Origin::Claimed, received_at));
         }
         let status: NodeStatus = decode(payload, &self.limits)?;
         if status.node != *node {
@@ -335,6 +346,17 @@ impl Inbox {
                 node.to_string()
             }
             _ => via.address.to_string(),
+        }
+    }
+
+    /// The fault of a rejected payload, with the field if it is a report.
+    fn fault(&self, topic: &[u8], payload: &[u8], reason: RejectReason) -> String {
+        let shown = String::from_utf8_lossy(topic);
+        match self.topics.parse(&shown) {
+            Some(Topic::Detections(_) | Topic::VoteDetections(_)) if reason != RejectReason::BadSignature => {
+                format!("report rejected: {}", Flaw::of_report(payload, reason, &self.limits))
+            }
+            _ => format!("message on {shown} rejected as {reason}"),
         }
     }
 

@@ -4,6 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::BrokerAddress;
 use ecod::leadership::echo::EchoMonitor;
 use ecod::leadership::links::LinkState;
@@ -177,6 +178,7 @@ impl LinkTask {
                 Some(_) => {}
                 None => self.has_reported_clock = false,
             }
+            self.note_unreachable(&error);
             if let Some(reason) = error.rejection() {
                 self.report_refusal(format!("{NOT_ADMITTED}: {reason}"));
             }
@@ -229,7 +231,8 @@ impl LinkTask {
         counters.count(Event::Connected);
         let node = identity.and_then(|identity| identity.node());
         self.hearing.note();
-        self.reported_refusal.take_if(|reported_refusal| reported_refusal.starts_with(NOT_ADMITTED));
+        self.end_refusal(|refusal| refusal.starts_with(NOT_ADMITTED));
+        counters.troubles().settle(TroubleKind::BrokerUnreachable, Some(&self.broker.to_string()));
         if !self.tell(LinkChange::Accepted { client, node: node.clone() }) {
             return Ok(());
         }
@@ -265,7 +268,7 @@ impl LinkTask {
                         }
                         PacketOutcome::OwnStatus => {
                             heard_itself = true;
-                            self.reported_refusal.take_if(|reported_refusal| reported_refusal == NOT_HEARD);
+                            self.end_refusal(|refusal| refusal == NOT_HEARD);
                         }
                         PacketOutcome::Done => {}
                     }
@@ -287,18 +290,43 @@ impl LinkTask {
         }
     }
 
-    /// Warns of a refusal of the broker, once for each change.
+    /// Notes that the configured broker is not reached. Others come and go with their nodes, which the election knows.
+    fn note_unreachable(&self, error: &ConnectionError) {
+        let is_expected = self.setup.config.broker.as_ref() == Some(&self.broker);
+        if is_expected && error.rejection().is_none() && !matches!(error, ConnectionError::Oversized(_)) {
+            let (broker, troubles) = (self.broker.to_string(), self.setup.counters.troubles());
+            troubles.note_about(&broker, TroubleKind::BrokerUnreachable, &format!("broker not reached: {error}"));
+        }
+    }
+
+    /// Notes a refusal of the broker.
     fn report_refusal(&mut self, refusal: String) {
+        let broker = self.broker.to_string();
+        let cause = format!("broker refuses this node: {refusal}");
+        self.setup.counters.troubles().note_about(&broker, TroubleKind::BrokerRefuses, &cause);
         if self.reported_refusal.as_ref() != Some(&refusal) {
-            tracing::warn!(broker = %self.broker, refusal, "broker refuses this node, check its password, certificate and permissions");
             self.setup.counters.count(Event::BrokerRefused);
             self.reported_refusal = Some(refusal);
+        }
+    }
+
+    /// Notes that the broker takes back a refusal for which `is_over` is true.
+    fn end_refusal(&mut self, is_over: impl Fn(&str) -> bool) {
+        if self.reported_refusal.take_if(|refusal| is_over(refusal)).is_some() {
+            let troubles = self.setup.counters.troubles();
+            troubles.settle(TroubleKind::BrokerRefuses, Some(&self.broker.to_string()));
         }
     }
 
     /// Sends to the gateway; false when it has ended.
     fn tell(&self, change: LinkChange) -> bool {
         (self.report)(LinkEvent { link: self.id, change })
+    }
+}
+
+impl Drop for LinkTask {
+    fn drop(&mut self) {
+        self.end_refusal(|_| true);
     }
 }
 

@@ -131,6 +131,14 @@ class ObjectReport:
 
 
 @dataclass(frozen=True)
+class LabelReading:
+    """Nodes that read a label at a known location."""
+
+    label: Label
+    nodes: list[Name]
+
+
+@dataclass(frozen=True)
 class LandmarkState:
     """The agreed state of one known location."""
 
@@ -141,6 +149,8 @@ class LandmarkState:
     y_m: Metres
     contributors: list[Name]
     observers: list[Name] = field(default_factory=list)
+    # Who read what lately, in a cell that votes, too.
+    readings: list[LabelReading] = field(default_factory=list)
 
     @property
     def is_empty(self) -> bool:
@@ -270,6 +280,16 @@ class DescriptionStatus:
 
 
 @dataclass(frozen=True)
+class Trouble:
+    """A present trouble of a node, or of a vehicle as the node sees it; without `about` it is the node's own."""
+
+    kind: Label
+    about: Optional[Label]
+    cause: str
+    remedy: str
+
+
+@dataclass(frozen=True)
 class NodeStatus:
     """A node's status, published by itself, or `offline` by its broker."""
 
@@ -283,3 +303,4 @@ class NodeStatus:
     fit: Optional[bool]
     version: Label
     description: Optional[DescriptionStatus]
+    troubles: list[Trouble] = field(default_factory=list)

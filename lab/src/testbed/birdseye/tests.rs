@@ -18,6 +18,7 @@ fn map(testbed: &Testbed, scene: &Scene, otherwise: &[(&str, Option<&str>)]) -> 
             y_m: spot.occupied.y - 0.003,
             contributors: Vec::new(),
             observers: Vec::new(),
+            readings: Vec::new(),
         }
     };
     GlobalMap {

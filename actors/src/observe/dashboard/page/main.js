@@ -62,7 +62,7 @@ function arrange(picture, landmarks, now) {
   const places = source.map((place) => {
     const empty = (place.observers ?? []).length > 0;
     const state = place.label !== null ? "full" : empty ? "" : "unknown";
-    return { ...place, facing_rad: known.get(place.id)?.facing_rad, state, words: empty ? "seen empty" : "not seen" };
+    return { ...place, facing_rad: known.get(place.id)?.facing_rad, vacancy: known.get(place.id)?.vacancy, state, words: empty ? "seen empty" : "not seen" };
   });
   const byNode = new Map();
   for (const sighting of picture.vehicles) {
@@ -91,10 +91,11 @@ function drawText(picture, scene) {
   text(byId("node"), picture.node.name);
   document.title = `${picture.node.cell} seen by ${picture.node.name}, ECOD`;
   const sample = live.history.samples.at(-1);
+  tables.troubles(picture);
   tables.tiles(picture, now, sample ? sample.rounds / 2 : null);
   if (!byId("map-table").hidden) tables.places(scene);
   tables.verdicts(picture.verdicts, now);
-  tables.vehicles(scene.vehicles, now);
+  tables.vehicles(scene.vehicles, now, picture.troubles);
   tables.reputations(picture.reputations, scene.colour);
   tables.leaders(live.history, now);
   tables.nodes(picture);
@@ -109,7 +110,10 @@ function drawState() {
   const [look, words] = !picture ? (live.refused ? ["stale", "Sign in"] : ["waiting", "Connecting"])
     : !live.connected ? ["stale", "Connection lost"]
     : fault ? ["stale", "Cannot draw"]
-    : picture.readiness.ready ? ["live", `Live, ${picture.readiness.reason}`] : ["unready", sentence(picture.readiness.reason)];
+    : !picture.readiness.ready ? ["unready", sentence(picture.readiness.reason)]
+    : picture.troubles.length > 0 ? ["unready", `${counted(picture.troubles.length, "trouble")}, ${picture.readiness.reason}`]
+    : !takesReports(picture) ? ["waiting", `No reports are used, ${picture.readiness.reason}`]
+    : ["live", `Live, ${picture.readiness.reason}`];
   byId("state").className = `state ${look}`;
   text(byId("state-text"), words);
   // Apart from the words: a screen reader would repeat it every second.
@@ -154,4 +158,10 @@ function drawHistory() {
   }
 }
 
+/// Whether the newest map or verdicts rest on reports.
+function takesReports({ map, verdicts }) {
+  return map?.message.oldest_capture_us !== undefined || (verdicts?.message.verdicts ?? []).some((verdict) => verdict.contributors.length > 0);
+}
+
+const counted = (number, word) => `${number} ${word}${number === 1 ? "" : "s"}`;
 const sentence = (words) => words.charAt(0).toUpperCase() + words.slice(1);

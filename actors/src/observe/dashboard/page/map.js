@@ -1,5 +1,6 @@
 // Bird's-eye view: world metres to screen pixels, symbols of constant size, labels that do not overlap.
 
+import { reasons } from "./tables.js";
 import { ago, byId, keyed, set, span, svg, text } from "./dom.js";
 
 /// Standard deviations of the 95 % error ellipse in two dimensions: the square root of the χ² quantile.
@@ -116,7 +117,7 @@ export class BirdsEye {
       const reach = facing === null ? 0 : 13;
       set(line, { x1: x, y1: y, x2: x + reach * Math.cos(facing ?? 0), y2: y - reach * Math.sin(facing ?? 0) });
       set(sign, { x: x - 5.5, y: y - 5.5, class: `place ${place.state}` });
-      text(title, `${place.id}: ${place.label ?? place.words}`);
+      text(title, [`${place.id}: ${place.label ?? place.words}`, reasons(place)].filter(Boolean).join(", "));
       labels.put(`place ${place.id}`, place.label ?? place.id, x, y, 9, place.label ? "" : "dim");
     });
   }
@@ -216,11 +217,12 @@ export class BirdsEye {
   }
 }
 
-/// Bounds of places, objects and vehicles: west, south, east, north. Raw detections, which are less certain, count only
-/// where there is little else.
+/// Bounds of places, objects and vehicles: west, south, east, north. Vehicles that see nothing of them, and raw detections,
+/// which are less certain, count only where there is little else.
 function bounds({ places, objects, vehicles }) {
-  const sure = [...places, ...objects, ...vehicles.map((v) => v.pose)].filter(Boolean);
-  const points = sure.length > 1 ? sure : [...sure, ...vehicles.flatMap((v) => v.objects)];
+  const looking = vehicles.filter((v) => v.objects.length + v.seen.length > 0);
+  const sure = [...places, ...objects, ...looking.map((v) => v.pose)].filter(Boolean);
+  const points = sure.length > 1 ? sure : [...sure, ...vehicles.map((v) => v.pose).filter(Boolean), ...vehicles.flatMap((v) => v.objects)];
   return points.length > 0 ? points.map((p) => [p.x_m, p.y_m, p.x_m, p.y_m]).reduce((a, b) => union(a, b)) : [0, 0, 0, 0];
 }
 

@@ -29,6 +29,13 @@ export function tiles({ leadership, map, verdicts }, now, perSecond) {
   text(byId("failovers"), failovers === 1 ? "1 change of leader" : `${failovers} changes of leader`);
 }
 
+export function troubles({ troubles }) {
+  byId("troubles-card").hidden = troubles.length === 0;
+  rows(byId("troubles"), troubles, ({ told_by, about, kind }) => `${told_by} ${about} ${kind}`, ({ told_by, about, cause, remedy }) => [
+    about ?? told_by, { text: cause, class: "warn" }, remedy, { text: told_by, class: "dim" },
+  ]);
+}
+
 export function latency(samples) {
   const begin = samples.at(-1).at_us - 10e6;
   const last = samples.filter((sample) => sample.at_us > begin && sample.latency_p50_ms !== null);
@@ -45,8 +52,18 @@ export function places(scene) {
   ];
   rows(byId("places"), entries, (entry) => entry.id, (entry) => [
     entry.name, entry.label ?? { text: entry.words ?? "–", class: "dim" }, n(entry.label ? percent(entry.confidence) : "–"),
-    n(entry.x_m.toFixed(2)), n(entry.y_m.toFixed(2)), n(entry.age_s === undefined ? "–" : ago(entry.age_s)), { text: list(entry.contributors ?? []), class: "dim" },
+    n(entry.x_m.toFixed(2)), n(entry.y_m.toFixed(2)), n(entry.age_s === undefined ? "–" : ago(entry.age_s)), { text: reasons(entry) ?? list(entry.contributors ?? []), class: "dim" },
   ]);
+}
+
+/// Why a place has its label, in words: who read what.
+export function reasons({ label, readings, vacancy }) {
+  if (!readings?.length) return null;
+  const all = new Set(readings.flatMap(({ nodes }) => nodes)).size;
+  const agreeing = readings.find((reading) => reading.label === label)?.nodes.length ?? 0;
+  const others = readings.filter((reading) => reading.label !== label);
+  const words = others.map((reading) => `${list(reading.nodes)} read ${reading.label === vacancy ? "the sign behind it" : reading.label}`);
+  return [`${agreeing} of ${all} saw ${label ?? "nothing"}`, ...words].join("; ");
 }
 
 export function verdicts(received, now) {
@@ -63,15 +80,21 @@ export function verdicts(received, now) {
   text(byId("verdicts-age"), received ? ago((now - received.received_at_us) / 1e6) : "");
 }
 
-export function vehicles(entries, now) {
+/// Kinds of troubles for which a vehicle's reports are not used.
+const REFUSALS = ["untimely", "malformed", "not_permitted"];
+
+export function vehicles(entries, now, troubles) {
+  const refused = new Set(troubles.filter(({ kind }) => REFUSALS.includes(kind)).map(({ about }) => about));
   fill("vehicles", entries, (vehicle) => vehicle.node, (vehicle) => {
     const age = (now - vehicle.received_at_us) / 1e6;
+    const used = !refused.has(vehicle.node);
     return [
       { text: vehicle.node, colour: vehicle.colour }, n(vehicle.detected ?? "–"), n(vehicle.inView ?? "–"), n(vehicle.votes ?? "–"),
-      { text: ago(age), class: age > 2 ? "n bad" : "n" },
+      { text: used ? ago(age) : "refused", class: age > 2 || !used ? "n bad" : "n" },
     ];
   });
-  text(byId("vehicles-count"), entries.length ? `${entries.length} reporting` : "");
+  const refusals = entries.filter(({ node }) => refused.has(node)).length;
+  text(byId("vehicles-count"), entries.length ? `${entries.length} reporting${refusals ? `, ${refusals} refused` : ""}` : "");
 }
 
 export function reputations(received, colour) {

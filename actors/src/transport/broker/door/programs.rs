@@ -19,7 +19,7 @@ use bytes::Bytes;
 use ecod::admission::report_window::MAX_PARTS;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{CellDescription, ObjectReport, RejectReason, ReportKind, Topic, decode, decode_report};
+use ecod::wire::{CellDescription, Flaw, RejectReason, ReportKind, Topic, decode, decode_report};
 use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::session::Session;
@@ -121,7 +121,7 @@ impl Door {
         let client = named.map_or(client_id, |(name, _)| name);
         match refusal.reason {
             RefusalReason::Throttled => setup.counters.shed(ShedReason::ReportThrottled, client),
-            RefusalReason::Rejected(reason) => setup.counters.reject(reason, client),
+            RefusalReason::Rejected(reason) => setup.counters.reject_with(reason, client, || refusal.text.clone()),
         }
         if refusal.reason == RefusalReason::Rejected(RejectReason::NotPermitted) {
             setup.counters.count(Event::ClientDenied);
@@ -192,8 +192,9 @@ impl DoorState {
             return Err(Refusal::new(RefusalReason::Throttled, text));
         }
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
-            let flaw = flaw(payload, reason);
-            let text = format!("the report on {topic} is not usable: {reason}{flaw}; see docs/protocol.md#rejections");
+            let flaw = Flaw::of_report(payload, reason, &setup.limits);
+            let text =
+                format!("the report on {topic} is not usable: {flaw} ({reason}); see docs/protocol.md#rejections");
             Refusal::new(RefusalReason::Rejected(reason), text)
         })?;
         if !(setup.fuses)(kind) {
@@ -282,16 +283,6 @@ impl DoorState {
             levels.next().is_none_or(|level| level == "#")
         })
     }
-}
-
-/// More about a report in JSON that is rejected for this reason.
-fn flaw(payload: &[u8], reason: RejectReason) -> String {
-    let flaw = match (reason, serde_json::from_slice::<ObjectReport>(payload)) {
-        (RejectReason::Malformed, Err(error)) if payload.is_ascii() => format!(" ({error})"),
-        (RejectReason::NodeMismatch, Ok(report)) => format!(" (it names {})", report.node),
-        _ => String::new(),
-    };
-    flaw.replace(char::is_control, " ")
 }
 
 /// Hooks of rmqtt that keep programs and nodes apart.

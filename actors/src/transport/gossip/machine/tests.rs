@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::Ipv4Addr;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::election::ElectionConfig;
 use ecod::wire::Role;
 use proptest::prelude::*;
@@ -31,6 +32,8 @@ struct Cell {
 struct Node {
     machine: GossipMachine,
     events: Vec<MembershipEvent>,
+    /// Kinds of troubles that were told, with the names or addresses that they are about.
+    troubles: BTreeSet<(String, TroubleKind)>,
     stopped: bool,
 }
 
@@ -80,11 +83,11 @@ impl Cell {
         };
         let mut session = SessionNonce::default();
         self.rng.fill(&mut session);
-        let key = CellKey::new(key, &NodeName::from_static("lot-1"));
-        let seed = self.rng.random();
-        let setup = GossipSetup { own, key, session, identity, secret: [7; 32], seed, counters: Arc::default() };
+        let cell = NodeName::from_static("lot-1");
+        let (key, seed) = (CellKey::new(key, &cell), self.rng.random());
+        let setup = GossipSetup { own, cell, key, session, identity, secret: [7; 32], seed, counters: Arc::default() };
         let machine = GossipMachine::new(setup, &MembershipConfig::default(), self.now);
-        self.nodes.insert(node, Node { machine, events: Vec::new(), stopped: false });
+        self.nodes.insert(node, Node { machine, events: Vec::new(), troubles: BTreeSet::new(), stopped: false });
     }
 
     fn run(&mut self, ms: u64) {
@@ -123,6 +126,9 @@ impl Cell {
                         sent.extend(all.iter().map(|to| (*index, address(*to), frame.clone())));
                     }
                     GossipOutput::Multicast { .. } => (),
+                    GossipOutput::Tell(MembershipEvent::Troubled { about, kind, .. }) => {
+                        node.troubles.insert((about, kind));
+                    }
                     GossipOutput::Tell(event) => node.events.push(event),
                 }
             }

@@ -24,9 +24,14 @@ impl End {
     }
 
     fn with(name: &'static str, session: u8, identity: Option<Identity>) -> Self {
+        Self::of_cell(("lot-1", "07"), name, session, identity)
+    }
+
+    fn of_cell((cell, key): (&'static str, &str), name: &'static str, session: u8, identity: Option<Identity>) -> Self {
         let address = SocketAddr::from((Ipv4Addr::new(10, 0, 0, session), 1));
         let name = NodeName::from_static(name);
-        let key = CellKey::new(&"07".repeat(32), &NodeName::from_static("lot-1"));
+        let cell = NodeName::from_static(cell);
+        let key = (cell.clone(), CellKey::new(&key.repeat(32), &cell));
         let id = NodeId { name, run: 1, life: 1, role: Role::Auto, gossip: address, broker: None };
         let sessions = Sessions::new(key, (&id.name, [session; 16], identity), &[session; 32], 4, Arc::default(), NOW);
         Self { sessions, id, address, known: None }
@@ -43,7 +48,7 @@ impl End {
 
     fn open(&mut self, frame: &[u8], from: SocketAddr, now: Timestamp) -> Result<FrameContent, FrameEvent> {
         let known = self.known;
-        self.sessions.open(frame, &Arrival { from, now, own: &self.id, known: &|_| known })
+        self.sessions.open(frame, &Arrival { from, now, own: &self.id, is_alone: known.is_none(), known: &|_| known })
     }
 }
 
@@ -220,4 +225,27 @@ proptest! {
         let _ = b.open(&frame, a.address, NOW);
         prop_assert_eq!(b.sessions.peers.len(), 1);
     }
+}
+
+/// What else was heard is named: a node with another key by its address, and a cell whose name is a slip away.
+#[test]
+fn another_key_and_a_misspelt_cell_are_named() {
+    let heard = |own: &'static str, other: (&'static str, &str), is_alone: bool| {
+        let mut node = End::of_cell((own, "07"), "euclid", 1, None);
+        node.known = (!is_alone).then_some(KnownMember { run: 1, life: 1, alive: true });
+        let mut stranger = End::of_cell(other, "gauss", 7, None);
+        let (greeting, from) = (stranger.hello(), stranger.address);
+        assert!(node.open(&greeting, from, NOW).is_err());
+        let notices = node.sessions.take_notices();
+        notices.into_iter().map(|notice| (notice.kind, notice.cause)).collect::<Vec<_>>()
+    };
+    assert_eq!(
+        heard("lot-1", ("lot-1", "08"), false),
+        [(TroubleKind::WrongKey, "heard cell lot-1 with another key, or none, from 10.0.0.7".into())]
+    );
+    let misspelt = [(TroubleKind::OtherCell, "heard cell ux-lott from 10.0.0.7, this is ux-lot".into())];
+    assert_eq!(heard("ux-lot", ("ux-lott", "07"), false), misspelt);
+    assert_eq!(heard("lot-1", ("lot-2", "07"), false), [], "a neighbour");
+    assert_eq!(heard("lot-1", ("lot-2", "07"), true).len(), 1, "who is alone may have meant the other");
+    assert_eq!(heard("ux-lot", ("crossing", "07"), true), []);
 }

@@ -100,7 +100,9 @@ proptest! {
         node.machine.tick(now);
         prop_assert_eq!(node.machine.members(), members);
         while let Some(output) = node.machine.poll() {
-            prop_assert!(!matches!(output, GossipOutput::Tell(_)), "{:?}", output);
+            // A greeting that is not sealed rightly may be one under another key.
+            let is_notice = matches!(output, GossipOutput::Tell(MembershipEvent::Troubled { .. }));
+            prop_assert!(is_notice || !matches!(output, GossipOutput::Tell(_)), "{:?}", output);
         }
     }
 }

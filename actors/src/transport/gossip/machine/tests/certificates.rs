@@ -90,6 +90,8 @@ fn a_key_without_a_certificate_of_the_cell_admits_nobody() {
     certified.cell.run(5000);
     for node in 1..=3 {
         assert_eq!(certified.events(node), [], "{node}");
+        let refused = ["node-4", "node-5"].map(|name| (name.to_owned(), TroubleKind::NotAdmitted));
+        assert_eq!(certified.cell.nodes[&node].troubles, refused.into(), "{node}");
         let machine = certified.machine(node);
         assert_eq!(machine.members().len(), 2);
         assert!(machine.counters.get(FrameEvent::Uncertified) > 0 && machine.counters.get(FrameEvent::Untrusted) > 0);

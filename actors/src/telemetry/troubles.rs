@@ -1,0 +1,54 @@
+//! The present troubles of a node, noted by its parts and read by whoever shows them.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use ecod::diagnostics::{TroubleKind, TroubleRegister};
+use ecod::wire::Trouble;
+
+use crate::platform::clock;
+
+/// A register that all parts of a node share. News of it are in the log: at first, and hourly while they last.
+#[derive(Debug, Default)]
+pub struct Troubles(Mutex<TroubleRegister>);
+
+impl Troubles {
+    /// Notes a trouble of this node itself.
+    pub fn note(&self, kind: TroubleKind, cause: &str) {
+        let news = self.register().note(kind, None, cause, clock::now());
+        log(news);
+    }
+
+    /// Notes a trouble of a vehicle, address or host.
+    pub fn note_about(&self, about: &str, kind: TroubleKind, cause: &str) {
+        let news = self.register().note(kind, Some(about), cause, clock::now());
+        log(news);
+    }
+
+    /// Notes what another node says of this one.
+    pub fn relay(&self, kind: TroubleKind, cause: &str, remedy: &str) {
+        let news = self.register().relay(kind, None, cause, remedy, clock::now());
+        log(news);
+    }
+
+    /// Notes that a trouble of this node itself, or about another, is over.
+    pub fn settle(&self, kind: TroubleKind, about: Option<&str>) {
+        self.register().settle(kind, about);
+    }
+
+    /// The present troubles, the node's own first.
+    pub fn present(&self) -> Vec<Trouble> {
+        self.register().present(clock::now())
+    }
+
+    fn register(&self) -> MutexGuard<'_, TroubleRegister> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn log(news: Option<Trouble>) {
+    let Some(Trouble { kind, about, cause, remedy }) = news else { return };
+    match about {
+        Some(about) => tracing::warn!(kind, about, remedy, "{cause}"),
+        None => tracing::warn!(kind, remedy, "{cause}"),
+    }
+}

@@ -1,0 +1,28 @@
+//! Troubles with other hosts that a membership sees, for its caller.
+
+use ecod::diagnostics::TroubleKind;
+
+/// A trouble with a node or host.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Notice {
+    /// Name of the node, or address of the host.
+    pub(crate) about: String,
+    pub(crate) kind: TroubleKind,
+    pub(crate) cause: String,
+}
+
+/// Notices that nobody has taken yet. One datagram causes one or two.
+#[derive(Debug, Default)]
+pub(crate) struct Notices(Vec<Notice>);
+
+impl Notices {
+    /// Adds a notice.
+    pub(crate) fn add(&mut self, about: impl ToString, kind: TroubleKind, cause: impl Into<String>) {
+        self.0.push(Notice { about: about.to_string(), kind, cause: cause.into() });
+    }
+
+    /// All notices since the last call.
+    pub(crate) fn take(&mut self) -> Vec<Notice> {
+        std::mem::take(&mut self.0)
+    }
+}

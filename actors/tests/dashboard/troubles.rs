@@ -1,0 +1,143 @@
+//! Whether nodes say by name what is wrong.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use ecod::model::names::NodeName;
+use ecod::wire::Role;
+use ecod_actors::node::NodeHandle;
+use ecod_actors::platform::clock;
+use rumqttc::{AsyncClient, MqttOptions, QoS};
+use tokio::task::JoinSet;
+use uuid::Uuid;
+
+use crate::cell::{config, join, start, until};
+use crate::http::get;
+
+/// A client that sends one report after the other, made by its number; ends when dropped. Its id is that of a node's run.
+fn send(broker: SocketAddr, node: &'static str, report: impl Fn(u64) -> String + Send + 'static) -> JoinSet<()> {
+    let id = format!("{node}-{}", Uuid::from_u128(7).simple());
+    let options = MqttOptions::new(id, broker.ip().to_string(), broker.port());
+    let (client, mut events) = AsyncClient::new(options, 16);
+    let mut tasks = JoinSet::new();
+    tasks.spawn(async move { while events.poll().await.is_ok() {} });
+    tasks.spawn(async move {
+        let topic = format!("ecod/v1/lot/detections/{node}");
+        for seq in 1.. {
+            let sent = client.publish(&topic, QoS::AtMostOnce, false, report(seq)).await;
+            sent.expect("the broker is there");
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    });
+    tasks
+}
+
+fn report(node: &str, seq: u64, ahead_s: u64, x_m: &str) -> String {
+    let captured = (clock::now() + Duration::from_secs(ahead_s)).micros();
+    let object = format!(r#"{{"label":"car","confidence":0.9,"x_m":{x_m},"y_m":0}}"#);
+    format!(r#"{{"schema":1,"node":"{node}","seq":{seq},"captured_at_us":{captured},"objects":[{object}]}}"#)
+}
+
+/// What the page of a node says is wrong: subject, kind and cause, each with who tells it.
+async fn told(page: SocketAddr) -> Vec<[String; 4]> {
+    let picture = get(page, "/api/picture").await.json();
+    let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
+    let all = picture["troubles"].as_array().unwrap().iter();
+    all.map(|trouble| ["told_by", "about", "kind", "cause"].map(|key| text(&trouble[key]))).collect()
+}
+
+async fn until_told(page: SocketAddr, expected: [&str; 3], cause: &str) {
+    until(&format!("{expected:?} {cause}"), || async {
+        told(page).await.iter().any(|[by, about, kind, said]| [by, about, kind] == expected && said.contains(cause))
+    })
+    .await;
+}
+
+/// A client whose reports cannot be read and one whose clock is off are named with field and figure, on every page of the
+/// cell and in the metrics; and they are forgotten when they are gone.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_the_leader_sees_is_on_every_page() {
+    let (edge, edge_page) = start(config("edge", Role::Edge, 2)).await;
+    let (cav, page) = join(config("euclid", Role::Cav, 2), &edge).await;
+    let broker = edge.broker_address().unwrap();
+    let watson = send(broker, "watson", |seq| report("watson", seq, 0, "NaN"));
+    let late = send(broker, "late", |seq| report("late", seq, 5, "1"));
+    for page in [edge_page, page] {
+        until_told(page, ["edge", "watson", "malformed"], "report rejected: objects[0].x_m: is NaN").await;
+        until_told(page, ["edge", "late", "clock_off"], "its clock is 5.0 s ahead").await;
+    }
+    let metrics = get(edge_page, "/metrics").await.body;
+    assert!(metrics.contains("ecod_troubles{trouble=\"malformed\",about=\"watson\"} 1"), "{metrics}");
+    drop((watson, late));
+    until("both are forgotten", || async { told(edge_page).await.is_empty() && told(page).await.is_empty() }).await;
+    stop([cav, edge]).await;
+}
+
+/// A vehicle whose reports the leader refuses knows it, and is not ready.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_vehicle_is_told_that_its_reports_are_refused() {
+    let (edge, _) = start(config("edge", Role::Edge, 2)).await;
+    let (cav, page) = join(config("euclid", Role::Cav, 2), &edge).await;
+    until("it follows", || async { get(page, "/readyz").await.status == 200 }).await;
+    let broken = send(edge.broker_address().unwrap(), "euclid", |seq| report("euclid", seq, 0, "1e99"));
+    until_told(page, ["euclid", "", "reports_refused"], "edge says of this node: report rejected: objects[0].x_m")
+        .await;
+    let ready = get(page, "/readyz").await;
+    assert_eq!(ready.status, 503);
+    assert!(ready.json()["reason"].as_str().unwrap().starts_with("edge says of this node"), "{}", ready.body);
+    drop(broken);
+    until("it is ready again", || async { get(page, "/readyz").await.status == 200 }).await;
+    stop([cav, edge]).await;
+}
+
+/// A node that finds nobody says what it heard instead, also where a service manager asks.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_is_alone_says_why() {
+    let (edge, _) = start(config("edge", Role::Edge, 1)).await;
+    let mut misspelt = config("euclid", Role::Cav, 1);
+    misspelt.cell = NodeName::from_static("lott");
+    let (cav, page) = join(misspelt, &edge).await;
+    // The edge hears the greetings of a seed; it does not greet itself.
+    until("the edge names the other cell", || async {
+        let troubles = edge.troubles();
+        troubles.iter().any(|(_, trouble)| trouble.cause == "heard cell lott from 127.0.0.1, this is lot")
+    })
+    .await;
+    let mut unresolved = config("gauss", Role::Cav, 1);
+    unresolved.membership.seeds = vec!["no-such-host.invalid:17884".into()];
+    let (other, other_page) = start(unresolved).await;
+    until_told(other_page, ["gauss", "no-such-host.invalid:17884", "unresolved"], "cannot be resolved").await;
+    let reason = get(other_page, "/readyz").await.json()["reason"].as_str().unwrap().to_owned();
+    assert!(reason.starts_with("no leader known: cannot be resolved"), "{reason}");
+    let mut without_broker = config("hertz", Role::Cav, 1);
+    without_broker.mqtt.broker = Some("no-such-host.invalid:1883".parse().unwrap());
+    let (last, last_page) = start(without_broker).await;
+    until_told(last_page, ["hertz", "no-such-host.invalid:1883", "broker_unreachable"], "broker not reached").await;
+    assert_eq!(get(page, "/readyz").await.status, 503);
+    stop([last, other, cav, edge]).await;
+}
+
+/// An observer that stops properly is not listed as a node that was lost.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_observer_that_has_stopped_is_not_there() {
+    let (edge, page) = start(config("edge", Role::Edge, 1)).await;
+    let mut looking = config("top", Role::Cav, 1).observing("top").unwrap();
+    let name = looking.name.clone().unwrap();
+    looking.membership.seeds = vec![edge.gossip_address().unwrap().to_string()];
+    let observer = ecod_actors::node::start(looking).await.unwrap();
+    let state = || async {
+        let picture = get(page, "/api/picture").await.json();
+        let nodes = picture["nodes"].as_array().unwrap().clone();
+        nodes.iter().find(|node| node["name"] == name.as_str()).map(|node| node["state"].as_str().map(str::to_owned))
+    };
+    until("it is there, with its status", || async { state().await.flatten().as_deref() == Some("following") }).await;
+    observer.stop().await;
+    until("it is gone", || async { state().await.is_none() }).await;
+    edge.stop().await;
+}
+
+async fn stop(nodes: impl IntoIterator<Item = NodeHandle>) {
+    for node in nodes {
+        node.stop().await;
+    }
+}

@@ -1,0 +1,85 @@
+//! Where PACE and VOTE both run, the map has one answer for each place.
+
+use super::*;
+use crate::perception::landmark::VacancySign;
+
+/// A cell with one place that has a vacancy sign, and reports of both kinds ten times a second.
+struct Lot {
+    cell: Aggregator,
+    ms: u64,
+}
+
+impl Lot {
+    fn new() -> Self {
+        let sign = VacancySign { label: "EMPTY".into(), position: Point2::new(0.9, 0.0) };
+        let landmarks = vec![Landmark { vacancy: Some(sign), ..landmarks()[0].clone() }];
+        let round = RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() };
+        let config = FusionConfig { round, ..FusionConfig::default() };
+        Self { cell: Aggregator::new(NodeName::from_static("edge"), 7, config, landmarks, at(0)), ms: 0 }
+    }
+
+    /// Each vehicle reads its label for some seconds; returns the last round.
+    fn read(&mut self, seconds: u64, vehicles: &[(&str, &str)]) -> Fused {
+        let mut last = None;
+        for _ in 0..seconds * 10 {
+            self.ms += 100;
+            for (node, label) in vehicles {
+                for kind in [Detections, VoteDetections] {
+                    let report = report(node, label, self.ms - 10);
+                    self.cell.report(kind, &report, at(self.ms - 5)).unwrap();
+                }
+            }
+            last = self.cell.tick(at(self.ms));
+            let verdicts = last.as_ref().and_then(|fused| fused.verdicts.as_ref());
+            assert!(verdicts.is_none_or(|verdicts| verdicts.verdicts.iter().all(|verdict| verdict.margin >= 0.0)));
+        }
+        last.unwrap()
+    }
+
+    fn wrong(&self, node: &'static str) -> u64 {
+        self.cell.reputations().get(&NodeName::from_static(node)).map_or(0, |reputation| reputation.incorrect)
+    }
+}
+
+fn readings(fused: &Fused) -> Vec<(String, Vec<String>)> {
+    let readings = &fused.map.as_ref().unwrap().landmarks[0].readings;
+    let names = |reading: &crate::wire::LabelReading| reading.nodes.iter().map(NodeName::to_string).collect();
+    readings.iter().map(|reading| (reading.label.to_string(), names(reading))).collect()
+}
+
+/// A vehicle at the side reads the sign behind a plate: that is no vote against the plate, and the vehicle is not wrong.
+#[test]
+fn a_sign_behind_a_plate_is_no_vote_against_it() {
+    let mut lot = Lot::new();
+    let fused = lot.read(30, &[("euclid", "MNOP101"), ("galileo", "EMPTY")]);
+    assert_eq!(shown(&fused), (Some("MNOP101"), Some("MNOP101")));
+    assert_eq!(
+        readings(&fused),
+        [("EMPTY".into(), vec!["galileo".into()]), ("MNOP101".to_owned(), vec!["euclid".to_owned()])]
+    );
+    assert!(lot.wrong("galileo") <= 1, "{:?}", lot.cell.reputations());
+}
+
+#[test]
+fn one_who_invents_a_plate_does_not_outvote_those_who_read_the_sign() {
+    let mut lot = Lot::new();
+    let honest = [("euclid", "EMPTY"), ("gauss", "EMPTY"), ("galileo", "EMPTY")];
+    let fused = lot.read(20, &[honest[0], honest[1], honest[2], ("mallory", "MNOP101")]);
+    assert_eq!(shown(&fused), (Some("EMPTY"), Some("EMPTY")));
+    assert!(lot.wrong("mallory") > 5 && lot.wrong("gauss") == 0, "{:?}", lot.cell.reputations());
+}
+
+/// Map and verdict say the same, whoever was right before: when the car leaves, when another comes, and where two differ.
+#[test]
+fn map_and_verdict_say_the_same() {
+    let mut lot = Lot::new();
+    let all = |label: &'static str| [("euclid", label), ("gauss", label), ("galileo", label)];
+    for label in ["MNOP101", "EMPTY", "QRST202", "EMPTY"] {
+        let fused = lot.read(5, &all(label));
+        assert_eq!(shown(&fused), (Some(label), Some(label)));
+        let confidence = fused.map.unwrap().landmarks[0].confidence;
+        assert!((0.8..=1.0).contains(&confidence), "{label} {confidence}");
+    }
+    let fused = lot.read(20, &[("euclid", "MNOP101"), ("gauss", "MNOP101"), ("galileo", "MNOP1O1")]);
+    assert_eq!(shown(&fused), (Some("MNOP101"), Some("MNOP101")));
+}

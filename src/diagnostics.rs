@@ -1,0 +1,335 @@
+//! Present troubles of a node and of the vehicles that it hears: each with its cause and its remedy.
+//!
+//! Parts of a node tell a [`TroubleRegister`] what they see, again and again while it lasts. The register keeps few
+//! entries, forgets those that are over, and says which are news for the log. `docs/troubleshooting.md` lists all kinds.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use crate::model::names::{MAX_NAME_BYTES, plain_text};
+use crate::model::time::Timestamp;
+use crate::wire::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
+
+/// Defines the kinds with their names on the wire, how long they count after they were last seen, and their remedies.
+macro_rules! trouble_kinds {
+    ($($(#[$doc:meta])* $kind:ident = $name:literal, $lasts:expr, $remedy:literal;)*) => {
+        /// A kind of trouble.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        pub enum TroubleKind {
+            $($(#[$doc])* $kind,)*
+        }
+
+        impl TroubleKind {
+            /// All kinds.
+            pub const ALL: &'static [Self] = &[$(Self::$kind),*];
+
+            /// Stable name.
+            pub fn as_str(self) -> &'static str {
+                match self {
+                    $(Self::$kind => $name,)*
+                }
+            }
+
+            /// What mends it.
+            pub fn remedy(self) -> &'static str {
+                match self {
+                    $(Self::$kind => $remedy,)*
+                }
+            }
+
+            /// Time for which a trouble counts after it was last seen.
+            fn lasts(self) -> Duration {
+                match self {
+                    $(Self::$kind => $lasts,)*
+                }
+            }
+        }
+    };
+}
+
+/// For what is seen with every report.
+const SHORT: Duration = Duration::from_secs(10);
+/// For what is seen with greetings, which are rare once a cell is complete.
+const LONG: Duration = Duration::from_secs(60);
+/// For what lasts until its part says that it is over.
+const UNTIL_SETTLED: Duration = Duration::MAX;
+
+trouble_kinds! {
+    /// The leader does not use this node's reports.
+    ReportsRefused = "reports_refused", SHORT, "do what the leader says";
+    /// Reports whose times cannot be used.
+    Untimely = "untimely", SHORT, "run a time service where its reports are made, such as chrony";
+    /// A clock differs from the cell's time by seconds.
+    ClockOff = "clock_off", SHORT, "run a time service on it, such as chrony";
+    /// The camera gives no frames.
+    Camera = "camera", UNTIL_SETTLED, "`ecod-node doctor` tries the camera and names what is missing";
+    /// The pose of the camera is not known, so that its frames have no place.
+    NoPose = "no_pose", SHORT, "send poses to `pose.listen`, or set `pose`; `origin` if they are on Earth";
+    /// Detections of a label that has no size.
+    NoSize = "no_size", SHORT, "set the label's size in `camera.projection.sizes.labels`, or `camera.projection.sizes.default`";
+    /// A size in another unit than metres.
+    ImplausibleSize = "implausible_size", UNTIL_SETTLED, "sizes are in metres: correct `camera.projection.sizes`";
+    /// Vehicles name known locations, and the aggregator has none.
+    NoLocations = "no_locations", SHORT, "give this node the cell's `landmarks`, or the cell a description: `ecod-node cell set`";
+    /// A vehicle names a location that the aggregator does not know.
+    UnknownLocation = "unknown_location", SHORT, "give all nodes the same `landmarks`: `ecod-node cell set`";
+    /// The node does not use the cell's description.
+    Description = "description", UNTIL_SETTLED, "`ecod-node cell diff` shows the difference";
+    /// Messages that cannot be read.
+    Malformed = "malformed", SHORT, "correct the program that sends them; docs/protocol.md has the fields and limits";
+    /// Reports for an algorithm that the cell does not run.
+    NotFused = "not_fused", SHORT, "set `fusion.algorithms` to what the cell is for, or report for the other algorithm";
+    /// Messages beyond the rights of their sender, or without a signature that is due.
+    NotPermitted = "not_permitted", SHORT, "report at the sender's own node, or give it the cell's key and a certificate of its own name and role";
+    /// More messages than are taken.
+    Overload = "overload", SHORT, "send less often, or raise `mqtt.max_report_hz` or `broker.max_messages_hz`";
+    /// A node of this cell with another key.
+    WrongKey = "wrong_key", LONG, "copy the file of `membership.key_file` from one node to all";
+    /// A node of a cell whose name is nearly this one's.
+    OtherCell = "other_cell", LONG, "give both nodes the same `cell`, if they belong together";
+    /// A node that cannot show a certificate which this one accepts.
+    NotAdmitted = "not_admitted", LONG, "give it a certificate of the cell (`ecod-node pki issue`), or set the clock";
+    /// A host name without an address.
+    Unresolved = "unresolved", LONG, "correct the name, or the name service of this machine";
+    /// A broker that cannot be reached.
+    BrokerUnreachable = "broker_unreachable", SHORT, "check its address, the firewall, the certificates on both sides, and whether the broker runs";
+    /// A broker that does not let this node do what it must.
+    BrokerRefuses = "broker_refuses", UNTIL_SETTLED, "check password, certificate and permissions";
+    /// State that cannot be saved.
+    NotSaved = "not_saved", UNTIL_SETTLED, "free space on the disk, and make `state_dir` writable for the node's user";
+}
+
+impl TroubleKind {
+    /// The kind of a name.
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.iter().copied().find(|kind| kind.as_str() == name)
+    }
+
+    /// True if it is noted for each message, so that its rate tells something.
+    fn is_counted(self) -> bool {
+        matches!(self, Self::Malformed | Self::NotFused | Self::NotPermitted | Self::Overload)
+    }
+
+    /// True if an aggregator with this trouble about a vehicle does not use the vehicle's reports.
+    pub fn refuses_reports(self) -> bool {
+        matches!(self, Self::Untimely | Self::Malformed | Self::NotPermitted)
+    }
+
+    /// True if a node with this trouble of its own does not do its work.
+    pub fn is_disabling(self) -> bool {
+        matches!(self, Self::ReportsRefused | Self::Camera | Self::NoPose)
+    }
+
+    /// True if this trouble, of whatever host, may be why a node finds no leader or gets no rounds.
+    pub fn is_separating(self) -> bool {
+        matches!(
+            self,
+            Self::WrongKey
+                | Self::OtherCell
+                | Self::NotAdmitted
+                | Self::Unresolved
+                | Self::BrokerUnreachable
+                | Self::BrokerRefuses
+        )
+    }
+}
+
+/// Minimum time between two lines of the log about the same trouble.
+const LOG_INTERVAL: Duration = Duration::from_secs(3600);
+
+/// Minimum time between two changes of a cause's words: figures move all the time.
+const TEXT_INTERVAL: Duration = Duration::from_secs(10);
+
+/// Maximum troubles that are kept about the same vehicle or host, and those that may be about others than the node.
+const MAX_ABOUT_ONE: usize = 4;
+const MAX_ABOUT_OTHERS: usize = MAX_TROUBLES - 4;
+
+/// The troubles that a node knows of.
+#[derive(Debug, Clone, Default)]
+pub struct TroubleRegister {
+    /// By whom they are about and their kind; a lapsed entry stays until its room is needed, so that a trouble that comes
+    /// and goes is not logged each time.
+    entries: BTreeMap<(Option<String>, TroubleKind), Entry>,
+}
+
+#[derive(Debug, Clone)]
+struct Entry {
+    shown: Trouble,
+    shown_at: Timestamp,
+    /// Number of times that it was seen since then.
+    times: u64,
+    seen_at: Timestamp,
+    logged_at: Timestamp,
+    is_settled: bool,
+}
+
+impl Entry {
+    fn is_present(&self, kind: TroubleKind, now: Timestamp) -> bool {
+        !self.is_settled && now.since(self.seen_at) < kind.lasts()
+    }
+}
+
+impl TroubleRegister {
+    /// Notes a trouble of the node itself, or about another; returns it if it is news for the log.
+    pub fn note(&mut self, kind: TroubleKind, about: Option<&str>, cause: &str, now: Timestamp) -> Option<Trouble> {
+        self.relay(kind, about, cause, kind.remedy(), now)
+    }
+
+    /// Notes a trouble with a remedy that another node gives.
+    pub fn relay(
+        &mut self,
+        kind: TroubleKind,
+        about: Option<&str>,
+        cause: &str,
+        remedy: &str,
+        now: Timestamp,
+    ) -> Option<Trouble> {
+        let about = about.map(|about| plain_text(about, MAX_NAME_BYTES)).filter(|about| !about.is_empty());
+        let key = (about, kind);
+        let words = |per_second: u64| {
+            let rate = if per_second > 0 { format!(", {per_second} a second") } else { String::new() };
+            Trouble {
+                kind: kind.as_str().into(),
+                about: key.0.clone(),
+                cause: plain_text(cause, MAX_TROUBLE_TEXT - rate.len()) + &rate,
+                remedy: plain_text(remedy, MAX_TROUBLE_TEXT),
+            }
+        };
+        if let Some(entry) = self.entries.get_mut(&key) {
+            entry.times += 1;
+            let age = now.since(entry.shown_at);
+            if !entry.is_present(kind, now) {
+                (entry.shown, entry.shown_at, entry.times) = (words(0), now, 0);
+            } else if age >= TEXT_INTERVAL {
+                let per_second = if kind.is_counted() { entry.times / age.as_secs() } else { 0 };
+                (entry.shown, entry.shown_at, entry.times) = (words(per_second), now, 0);
+            }
+            (entry.seen_at, entry.is_settled) = (now, false);
+            let is_news = now.since(entry.logged_at) >= LOG_INTERVAL;
+            return is_news.then(|| {
+                entry.logged_at = now;
+                entry.shown.clone()
+            });
+        }
+        let shown = words(0);
+        self.make_room(key.0.as_deref(), now).then(|| {
+            let entry = Entry {
+                shown: shown.clone(),
+                shown_at: now,
+                times: 0,
+                seen_at: now,
+                logged_at: now,
+                is_settled: false,
+            };
+            self.entries.insert(key, entry);
+            shown
+        })
+    }
+
+    /// Notes that a trouble is over.
+    pub fn settle(&mut self, kind: TroubleKind, about: Option<&str>) {
+        if let Some(entry) = self.entries.get_mut(&(about.map(str::to_owned), kind)) {
+            entry.is_settled = true;
+        }
+    }
+
+    /// The present troubles: the node's own first, then by vehicle or host.
+    pub fn present(&self, now: Timestamp) -> Vec<Trouble> {
+        self.entries
+            .iter()
+            .filter(|((_, kind), entry)| entry.is_present(*kind, now))
+            .map(|(_, entry)| entry.shown.clone())
+            .take(MAX_TROUBLES)
+            .collect()
+    }
+
+    /// True if there is room for one more entry: lapsed ones give way, the longest unseen first.
+    fn make_room(&mut self, about: Option<&str>, now: Timestamp) -> bool {
+        let Some(about) = about else { return true };
+        loop {
+            let others = self.entries.iter().filter(|((other, _), _)| other.is_some());
+            let same = others.clone().filter(|((other, _), _)| other.as_deref() == Some(about));
+            let is_crowded = same.clone().count() >= MAX_ABOUT_ONE;
+            if !is_crowded && others.clone().count() < MAX_ABOUT_OTHERS {
+                return true;
+            }
+            let lapsed = |((_, kind), entry): &(&(Option<String>, TroubleKind), &Entry)| !entry.is_present(*kind, now);
+            let seen_at = |(_, entry): &(&(Option<String>, TroubleKind), &Entry)| entry.seen_at;
+            let oldest = if is_crowded {
+                same.filter(lapsed).min_by_key(seen_at)
+            } else {
+                others.filter(lapsed).min_by_key(seen_at)
+            };
+            let Some(key) = oldest.map(|(key, _)| key.clone()) else { return false };
+            self.entries.remove(&key);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: u64 = 1_000_000;
+
+    fn at(s: u64) -> Timestamp {
+        Timestamp(s * SECOND)
+    }
+
+    fn shown(register: &TroubleRegister, now: Timestamp) -> Vec<String> {
+        let text = |trouble: Trouble| format!("{}: {}", trouble.about.unwrap_or_default(), trouble.cause);
+        register.present(now).into_iter().map(text).collect()
+    }
+
+    #[test]
+    fn a_trouble_is_logged_once_and_hourly_and_is_over_when_nobody_sees_it_any_more() {
+        let mut register = TroubleRegister::default();
+        let mut lines = 0;
+        for s in 0..7300 {
+            let news = register.note(TroubleKind::Malformed, Some("watson"), &format!("{s} reports"), at(s));
+            lines += usize::from(news.is_some());
+        }
+        assert_eq!(lines, 3);
+        assert_eq!(shown(&register, at(7300)), ["watson: 7290 reports, 1 a second"], "words change every ten seconds");
+        assert!(register.present(at(7310)).is_empty());
+        assert!(register.note(TroubleKind::Malformed, Some("watson"), "9 reports", at(7400)).is_none());
+        assert_eq!(shown(&register, at(7400)), ["watson: 9 reports"], "it is back, and was logged within the hour");
+    }
+
+    #[test]
+    fn what_lasts_is_over_when_its_part_says_so() {
+        let mut register = TroubleRegister::default();
+        assert!(register.note(TroubleKind::Camera, None, "no frame for 5 s", at(1)).is_some());
+        assert_eq!(register.present(at(100_000)).len(), 1);
+        register.settle(TroubleKind::Camera, None);
+        assert!(register.present(at(100_000)).is_empty());
+    }
+
+    /// Names come from outside: whoever invents them displaces neither the node's own troubles nor those of others.
+    #[test]
+    fn invented_names_find_no_room_and_leave_none_of_theirs_behind() {
+        let mut register = TroubleRegister::default();
+        register.note(TroubleKind::ClockOff, Some("gauss"), "its clock is 5.0 s ahead", at(0));
+        for n in 0..1000 {
+            register.note(TroubleKind::Malformed, Some(&format!("v{n}")), "a\nb\u{202E}", at(0));
+        }
+        register.note(TroubleKind::Camera, None, "no frame", at(1));
+        let present = register.present(at(1));
+        assert_eq!(present.len(), MAX_ABOUT_OTHERS + 1);
+        assert_eq!((present[0].kind.as_str(), present[0].about.as_deref()), ("camera", None));
+        assert_eq!(present[1].about.as_deref(), Some("gauss"));
+        assert_eq!(present[2].cause, "a b ");
+        register.note(TroubleKind::Malformed, Some("late"), "x", at(60));
+        assert_eq!(shown(&register, at(60)), [": no frame", "late: x"], "lapsed ones give way");
+    }
+
+    #[test]
+    fn every_kind_has_a_name_of_its_own_a_remedy_that_fits_and_a_line_in_the_manual() {
+        let manual = include_str!("../docs/troubleshooting.md");
+        for kind in TroubleKind::ALL {
+            assert!(manual.contains(&format!("\n| `{}` |", kind.as_str())), "{kind:?}");
+            assert_eq!(TroubleKind::named(kind.as_str()), Some(*kind));
+            assert!((10..MAX_TROUBLE_TEXT).contains(&kind.remedy().len()), "{kind:?}");
+        }
+    }
+}

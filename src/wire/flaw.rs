@@ -1,0 +1,147 @@
+//! What is wrong with a payload that was rejected, for people: the field and its fault.
+//!
+//! A payload that can be used is never looked at here.
+
+use std::fmt;
+
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+use super::codec::read;
+use super::{InvalidValue, Limits, ObjectReport, RejectReason, SCHEMA_VERSION};
+use crate::model::names::MAX_NAME_BYTES;
+
+/// The reason why a payload was rejected, with the field that is to blame.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Flaw {
+    /// The reason.
+    pub reason: RejectReason,
+    /// Path of the field, as `objects[3].x_m`; empty for the whole payload.
+    pub field: String,
+    /// The fault, a predicate.
+    pub fault: String,
+}
+
+impl Flaw {
+    /// A flaw of a field; without fault where there is none to tell.
+    pub fn new(reason: RejectReason, field: impl Into<String>, fault: impl Into<String>) -> Self {
+        Self { reason, field: field.into(), fault: fault.into() }
+    }
+
+    /// The flaw of a report in any encoding that was rejected for `reason` when it was decoded.
+    pub fn of_report(bytes: &[u8], reason: RejectReason, limits: &Limits) -> Self {
+        match (reason, bytes.trim_ascii_start().first()) {
+            (RejectReason::TooLarge, _) => {
+                Self::new(reason, "", format!("is longer than {} bytes", limits.payload_bytes))
+            }
+            (RejectReason::NodeMismatch, _) => Self::new(reason, "node", "is another node than the topic's"),
+            (_, Some(b'{')) => Self::of_json(bytes, reason, limits).unwrap_or_else(|| Self::new(reason, "", "")),
+            _ => {
+                let report = read::<ObjectReport>(bytes).ok();
+                let invalid = report.as_ref().and_then(|report| report.check_values(limits).err());
+                let shown = serde_json::to_value(&report).unwrap_or_default();
+                invalid.map_or_else(
+                    || Self::new(reason, "", ""),
+                    |InvalidValue { field, reason }| Self::of_value(&shown, reason, field),
+                )
+            }
+        }
+    }
+
+    /// The flaw of a report in JSON; `None` if it has none.
+    pub(crate) fn of_json(text: &[u8], reason: RejectReason, limits: &Limits) -> Option<Self> {
+        let line = || serde_json::from_slice(text).unwrap_or_default();
+        let report: ObjectReport = match read_json(text) {
+            Ok(report) => report,
+            Err(_) if reason == RejectReason::UnknownSchema => {
+                return Some(Self::of_value(&line(), reason, "schema".into()));
+            }
+            Err((field, fault)) => return Some(Self::new(reason, field, fault)),
+        };
+        let InvalidValue { field, reason } = report.check_values(limits).err()?;
+        Some(Self::of_value(&line(), reason, field))
+    }
+
+    /// The flaw of a value that is no valid one.
+    fn of_value(payload: &Value, reason: RejectReason, field: String) -> Self {
+        let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
+        let value = payload.pointer(&pointer).cloned().unwrap_or_default();
+        let fault = match reason {
+            RejectReason::UnknownSchema => format!("is {value}, not {SCHEMA_VERSION}"),
+            RejectReason::ConfidenceOutOfRange => format!("is not within 0 to 1: {value}"),
+            RejectReason::NotFinite if field.ends_with("covariance_m2") => format!("is no covariance: {value}"),
+            // JSON has no such number; other encodings do.
+            RejectReason::NotFinite if value.is_null() => "is not a finite number".into(),
+            RejectReason::TooManyObjects => "has too many entries".into(),
+            RejectReason::InvalidLabel => {
+                format!("is empty, longer than {MAX_NAME_BYTES} bytes, or has control characters")
+            }
+            _ => format!("is out of bounds: {value}"),
+        };
+        Self::new(reason, field, fault)
+    }
+}
+
+impl fmt::Display for Flaw {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match (self.field.as_str(), self.fault.as_str()) {
+            (_, "") => write!(f, "{}", self.reason),
+            ("", fault) => f.write_str(fault),
+            (field, fault) => write!(f, "{field}: {fault}"),
+        }
+    }
+}
+
+/// Reads JSON.
+///
+/// # Errors
+/// The path of the value that cannot be read, and its fault.
+pub(crate) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Result<T, (String, String)> {
+    let mut source = serde_json::Deserializer::from_slice(text);
+    let value = serde_path_to_error::deserialize(&mut source).map_err(|error| {
+        // Beyond a broken name, the path is unknown.
+        let path = error.path().to_string();
+        (path.trim_matches(['.', '?']).to_owned(), fault(text, error.inner()))
+    })?;
+    source.end().map_err(|error| (String::new(), fault(text, &error)))?;
+    Ok(value)
+}
+
+/// The fault that a reader of JSON found. Its line is always the first.
+fn fault(text: &[u8], error: &serde_json::Error) -> String {
+    // The column is at the first letter of a word or next to it.
+    let around = text.get(error.column().saturating_sub(3)..).unwrap_or_default();
+    let around = around.get(.."-Infinity".len() + 2).unwrap_or(around);
+    let is_near = |word: &str| around.windows(word.len()).any(|part| part == word.as_bytes());
+    match ["NaN", "Infinity"].into_iter().find(|word| error.is_syntax() && is_near(word)) {
+        Some(word) => format!("is {word}"),
+        None => error.to_string().replace(" at line 1 column ", ", at column "),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::names::NodeName;
+    use crate::model::time::Timestamp;
+    use crate::wire::{Encoding, PerceivedObject, encode};
+
+    #[test]
+    fn the_field_is_named_in_every_encoding() {
+        let object = |x_m| PerceivedObject::new("cup", 0.5, x_m, 2.0);
+        let report = ObjectReport {
+            objects: vec![object(1.0), object(f64::NAN)],
+            ..ObjectReport::new(NodeName::from_static("watson"), 1, Timestamp(5))
+        };
+        let limits = Limits::default();
+        for encoding in [Encoding::Cbor, Encoding::Compact] {
+            let flaw = Flaw::of_report(&encode(&report, encoding), RejectReason::NotFinite, &limits);
+            assert_eq!(flaw.to_string(), "objects[1].x_m: is not a finite number", "{encoding:?}");
+        }
+        let json = br#"{"schema":1,"node":"watson","seq":1,"captured_at_us":5,"objects":[{"label":"cup","confidence":0.5,"x_m":NaN,"y_m":2}]}"#;
+        assert_eq!(Flaw::of_report(json, RejectReason::NotFinite, &limits).to_string(), "objects[0].x_m: is NaN");
+        for (junk, reason) in [(&b"junk"[..], RejectReason::Malformed), (b"", RejectReason::Malformed)] {
+            assert_eq!(Flaw::of_report(junk, reason, &limits).to_string(), "malformed");
+        }
+    }
+}
