@@ -78,7 +78,7 @@ trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
 	cargo test --profile $(PROFILE) --locked --test trials -- --ignored --exact trials --nocapture
 
-joining: PACKAGES += iproute2
+joining: PACKAGES += iproute2 mosquitto-clients
 joining: setup ## three machines, in network namespaces, become a cell by the commands of the README
 	cargo test --locked --test joining -- --ignored --exact machines::three_machines_become_a_cell_by_the_commands_of_the_readme
 

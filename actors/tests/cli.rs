@@ -186,13 +186,13 @@ fn a_node_ends_well_while_its_camera_runs() {
 }
 
 #[test]
-fn a_vehicle_without_a_camera_is_told_that_it_only_follows() {
+fn a_vehicle_without_a_camera_is_told_that_only_programs_report() {
     let mut node = ecod_node();
     node.args(["--role", "cav", "--name", "blind", "--broker", "127.0.0.1:1", "--stop-at-eof"]);
     node.stdin(Stdio::piped()).stderr(Stdio::piped());
     let mut node = node.spawn().unwrap();
     let mut log = BufReader::new(node.stderr.take().unwrap()).lines();
-    assert!(log.any(|line| line.unwrap().contains("only follows")));
+    assert!(log.any(|line| line.unwrap().contains("only programs beside it report")));
     drop(node.stdin.take());
     assert!(node.wait().unwrap().success());
 }

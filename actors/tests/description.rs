@@ -122,21 +122,33 @@ async fn all_follow(nodes: &[&NodeHandle]) {
     }
 }
 
-/// Has a node report a label at `slot-1` and a car elsewhere, ten times a second.
-fn reporting(node: &NodeHandle) -> tokio::task::JoinHandle<()> {
+/// Has a node report a label at `slot-1`, vote for it, and report a car elsewhere, ten times a second.
+fn reporting(name: &'static str, node: &NodeHandle) -> tokio::task::JoinHandle<()> {
     let gateway = node.slots().gateway.clone();
     tokio::spawn(async move {
         for seq in 1.. {
             let seen = |label: &str, x_m, y_m| PerceivedObject::new(label, 0.9, x_m, y_m);
-            let report = ObjectReport {
-                objects: vec![seen("ABC123", 3.1, 0.0), seen("car", 40.0, 7.0)],
-                ..ObjectReport::new(NodeName::from_static("gauss"), seq, clock::now())
-            };
-            let (kind, report) = (ReportKind::Detections, Arc::new(report));
-            gateway.send(GatewayMessage::PublishReport { kind, report });
+            let sign = PerceivedObject { landmark: Some("slot-1".into()), ..seen("ABC123", 3.1, 0.0) };
+            let kinds = [
+                (ReportKind::Detections, vec![sign.clone(), seen("car", 40.0, 7.0)]),
+                (ReportKind::VoteDetections, vec![sign]),
+            ];
+            for (kind, objects) in kinds {
+                let name = NodeName::from_static(name);
+                let report = Arc::new(ObjectReport { objects, ..ObjectReport::new(name, seq, clock::now()) });
+                gateway.send(GatewayMessage::PublishReport { kind, report });
+            }
             sleep(Duration::from_millis(100)).await;
         }
     })
+}
+
+/// Votes of a vehicle that count as right, as a node knows of them.
+fn right_votes(node: &NodeHandle, voter: &str) -> u64 {
+    let newest = node.newest_reputations();
+    let newest = newest.borrow();
+    let reputations = newest.as_ref().map(|newest| &newest.message.reputations);
+    reputations.and_then(|all| all.get(&NodeName::new(voter).unwrap())).map_or(0, |reputation| reputation.correct)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -156,12 +168,18 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
         first.starts_with("version 1, hash ") && first.ends_with(", known locations: 2, set by euclid\n"),
         "{first}"
     );
-    let reports = reporting(&gauss);
+    let reports = [reporting("gauss", &gauss), reporting("euclid", &euclid)];
     let is_seen = |map: &GlobalMap| {
         map.landmarks.iter().any(|state| state.label.as_deref() == Some("ABC123")) && !map.objects.is_empty()
     };
     let before = map_where(&gauss, "with what it sees", is_seen).await;
     let car = before.objects[0].id;
+    let voted = async {
+        while right_votes(&gauss, "gauss") < 5 {
+            sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(PATIENCE, voted).await.expect("votes count");
 
     let (all, mut taken) = ([&gauss, &euclid, &edge], Vec::new());
     for change in 2..=6 {
@@ -169,7 +187,7 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
         let text = described(&["other", "slot-1", &name], tracked);
         let set = set(text, if change % 2 == 0 { &euclid } else { &edge }).await;
         assert!(set.starts_with(&format!("version {change}, ")), "{set}");
-        let at = newest_round(&all);
+        let (at, votes) = (newest_round(&all), right_votes(&gauss, "gauss"));
         let has_new = |map: &GlobalMap| places(map).contains(&name.as_str());
         let [at_gauss, at_euclid, at_edge] = all.map(|node| map_where(node, "of the new places", has_new));
         let (now, at_euclid, at_edge) = tokio::join!(at_gauss, at_euclid, at_edge);
@@ -178,6 +196,18 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
         assert_eq!(now.landmarks[1].label.as_deref(), Some("ABC123"), "kept without a gap");
         assert!(now.objects.iter().any(|object| object.id == car), "the same track");
         assert_eq!(now.epoch, before.epoch, "nothing restarted");
+        let mut verdicts = gauss.newest_verdicts();
+        let after = verdicts.wait_for(|newest| newest.as_ref().is_some_and(|newest| newest.message.round >= now.round));
+        let after = timeout(PATIENCE, after).await.expect("verdicts").unwrap().clone().unwrap().message;
+        let verdict = after.verdicts.iter().find(|verdict| &*verdict.landmark == "slot-1").unwrap();
+        assert_eq!(verdict.label.as_deref(), Some("ABC123"), "the votes are kept: {verdict:?}");
+        let more = async {
+            while right_votes(&gauss, "gauss") <= votes {
+                assert!(right_votes(&gauss, "gauss") >= votes, "reputations are kept");
+                sleep(Duration::from_millis(20)).await;
+            }
+        };
+        timeout(PATIENCE, more).await.expect("votes count on");
     }
     println!("rounds from each answer to the change at gauss, euclid and the edge: {taken:?}");
     assert!(taken.iter().flatten().all(|rounds| *rounds <= 2), "{taken:?}");
@@ -190,7 +220,7 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
     let lines = String::from_utf8(other.stdout).unwrap();
     assert!(other.status.code() == Some(1) && lines.contains("landmarks.new-6: cell {"), "{lines}");
 
-    reports.abort();
+    reports.iter().for_each(tokio::task::JoinHandle::abort);
     for node in [gauss, euclid, edge] {
         node.stop().await;
     }
@@ -236,6 +266,35 @@ async fn whoever_joins_later_and_whatever_order_candidates_start_in_the_latest_v
             map_where(&euclid, "alone", |map| places(map) == ["second"]).await;
             euclid.stop().await;
             std::fs::remove_file(of_edge.path().join("lot-1.edge.description.json")).unwrap();
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn sides_of_a_split_that_meet_use_the_later_version_and_of_equal_ones_the_greater_hash() {
+    for of_euclid in [&["b"][..], &["b", "c"]] {
+        let edge = start("edge", Role::Edge, &[]).await;
+        let euclid = start("euclid", Role::Auto, &[]).await;
+        for node in [&edge, &euclid] {
+            map_where(node, "alone", |_| true).await;
+        }
+        let stamp = |told: &str| told.split_once(", known").unwrap().0.to_owned();
+        let mut stamps = [stamp(&set(described(&["a"], ""), &edge).await), String::new()];
+        for place in of_euclid {
+            stamps[1] = stamp(&set(described(&[place], ""), &euclid).await);
+        }
+        let of_edge = stamps[0] > stamps[1];
+        let winner = if of_edge { &stamps[0] } else { &stamps[1] };
+        let place = if of_edge { "a" } else { of_euclid[of_euclid.len() - 1] };
+        assert!(winner.starts_with(&format!("version {}, hash ", of_euclid.len())), "{stamps:?}");
+        let gauss = start("gauss", Role::Cav, &[&edge, &euclid]).await;
+        let all = ["edge", "euclid", "gauss"].map(|node| format!("# {node}: {winner}"));
+        for node in [&edge, &euclid, &gauss] {
+            shows(node, &all.each_ref().map(String::as_str)).await;
+            map_where(node, "of the winner", |map| places(map) == [place]).await;
+        }
+        for node in [gauss, euclid, edge] {
+            node.stop().await;
         }
     }
 }

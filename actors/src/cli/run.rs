@@ -148,7 +148,7 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     #[cfg(feature = "camera")]
     if config.role == Role::Cav && config.camera.is_none() && config.record.is_none() {
-        tracing::warn!("no [camera] is configured: this vehicle reports nothing and only follows");
+        tracing::warn!("no [camera] is configured: of this vehicle, only programs beside it report");
     }
     let mut node = node::start(config).await?;
     if let Some(manager) = ServiceManager::from_environment() {

@@ -115,6 +115,23 @@ async fn a_detector_at_the_door_of_any_node_is_heard_whoever_leads() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_report_at_a_door_reaches_the_leader_and_its_standby_once() {
+    let cell = Cell::of_four().await;
+    let lidar = Program::connect("lidar", cell.door("euclid"), &[]).await;
+    // Each aggregator counts what it rejects by sender.
+    let report = br#"{"schema":1,"node":"euclid--lidar","seq":1,"captured_at_us":1,"objects":[]}"#;
+    assert_eq!(lidar.ask("detections/euclid--lidar", report.to_vec()).await.0, "Success");
+    let taken = |name: &str| -> u64 {
+        let rejects = cell.node(name).counters().rejects_by_source();
+        rejects.iter().filter(|count| count.source == "euclid--lidar").map(|count| count.times).sum()
+    };
+    cell.until("edge and gauss have it", |_| taken("edge") > 0 && taken("gauss") > 0).await;
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    assert_eq!(["edge", "gauss", "noether", "euclid"].map(taken), [1, 1, 0, 0]);
+    cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_program_sees_statuses_reputations_and_the_reports_of_all() {
     let cell = Cell::of_four().await;
     let lidar = Program::connect("lidar", cell.door("gauss"), &[]).await;

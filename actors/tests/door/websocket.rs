@@ -6,6 +6,7 @@ use std::time::Duration;
 use ecod::wire::Role;
 use ecod_actors::telemetry::counters::Event;
 use futures_util::{SinkExt, StreamExt};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
@@ -120,6 +121,23 @@ async fn a_page_of_another_site_is_refused_with_the_reason() {
     let (status, text) = open(door, &[]).await.err().unwrap();
     assert!(status == 400 && text.contains("`mqtt`"), "{status} {text}");
     cell.until("all are counted", |cell| cell.node("edge").counters().events(Event::ClientUntrusted) == 3).await;
+    cell.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_browser_at_a_door_is_told_that_no_page_is_there() {
+    let (cell, door) = edge().await;
+    let mut browser = TcpStream::connect(door).await.unwrap();
+    browser.write_all(b"GET / HTTP/1.1\r\nHost: localhost:1883\r\nConnection: keep-alive\r\n\r\n").await.unwrap();
+    let mut answer = String::new();
+    timeout(Duration::from_secs(3), browser.read_to_string(&mut answer)).await.expect("answered").unwrap();
+    let (head, text) = answer.split_once("\r\n\r\n").unwrap();
+    assert!(head.starts_with("HTTP/1.1 426 ") && head.ends_with(&format!("Content-Length: {}", text.len())), "{head}");
+    assert!(text.contains("MQTT") && text.contains("http://127.0.0.1:8080/"), "{text}");
+    let mut endless = TcpStream::connect(door).await.unwrap();
+    endless.write_all(b"GET /").await.unwrap();
+    let sending = async { while endless.write_all(&[b'x'; 1024]).await.is_ok() {} };
+    timeout(Duration::from_secs(3), sending).await.expect("a request without end is cut off");
     cell.stop().await;
 }
 

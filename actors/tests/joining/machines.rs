@@ -2,7 +2,8 @@
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
-use std::path::PathBuf;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use tempfile::TempDir;
@@ -10,9 +11,32 @@ use tempfile::TempDir;
 use crate::network::{Bridged, namespace};
 use crate::{Running, said, until};
 
+/// Stands for systemd, which namespaces lack: a service runs by the command of its unit, and is noted as enabled.
+const SYSTEMCTL: &str = r#"#!/bin/sh
+set -e
+files=${0%/bin/systemctl}
+unit=/etc/systemd/system/$2.service
+case $1 in
+enable) grep -q '^WantedBy=multi-user.target' "$unit" && touch "$files/enabled" ;;
+restart)
+    command=$(sed -n 's,^ExecStart=/usr/bin/,,p' "$unit")
+    $command --map-log "$files/maps" </dev/null >/dev/null 2>"$files/log" &
+    echo $! >"$files/service" ;;
+*) exit 1 ;;
+esac
+"#;
+
 struct Machine {
     number: usize,
     files: TempDir,
+}
+
+impl Drop for Machine {
+    fn drop(&mut self) {
+        if let Ok(service) = fs::read_to_string(self.files.path().join("service")) {
+            Command::new("kill").args(["-KILL", service.trim()]).status().ok();
+        }
+    }
 }
 
 impl Machine {
@@ -20,15 +44,36 @@ impl Machine {
         let files = tempfile::tempdir().unwrap();
         let copied = Command::new("cp").args(["-a", "/etc"]).arg(files.path()).status().unwrap();
         assert!(copied.success());
-        fs::create_dir(files.path().join("lib")).unwrap();
+        for directory in ["lib", "run", "bin"] {
+            fs::create_dir(files.path().join(directory)).unwrap();
+        }
         Self { number, files }
+    }
+
+    /// A machine with the package's unit, and a systemd that runs it.
+    fn with_service(number: usize) -> Self {
+        let machine = Self::new(number);
+        let (files, unit) = (machine.files.path(), "../packaging/systemd/ecod-node.service");
+        fs::create_dir_all(files.join("run/systemd/system")).unwrap();
+        fs::create_dir_all(files.join("etc/systemd/system")).unwrap();
+        let unit = Path::new(env!("CARGO_MANIFEST_DIR")).join(unit);
+        fs::copy(unit, files.join("etc/systemd/system/ecod-node.service")).unwrap();
+        let systemctl = files.join("bin/systemctl");
+        fs::write(&systemctl, SYSTEMCTL).unwrap();
+        fs::set_permissions(&systemctl, fs::Permissions::from_mode(0o755)).unwrap();
+        machine
+    }
+
+    fn is_enabled(&self) -> bool {
+        self.files.path().join("enabled").exists()
     }
 
     /// A command of the README as root of this machine has it.
     fn command(&self, line: &str) -> Command {
         let program = PathBuf::from(env!("CARGO_BIN_EXE_ecod-node"));
-        let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
-        let own = r#"mount --bind "$0/etc" /etc && mount --bind "$0/lib" /var/lib && exec "$@""#;
+        let (system, programs) = (self.files.path().join("bin"), program.parent().unwrap());
+        let path = format!("{}:{}:{}", system.display(), programs.display(), std::env::var("PATH").unwrap());
+        let own = r#"mount --bind "$0/etc" /etc && mount --bind "$0/lib" /var/lib && mount --bind "$0/run" /run && exec "$@""#;
         let mut command = Command::new("ip");
         command.args(["netns", "exec", &namespace(self.number), "sh", "-c", own]).arg(self.files.path());
         for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
@@ -82,6 +127,13 @@ fn describing(machine: &Machine) -> String {
     line.strip_suffix(" cell.toml").expect(line).to_owned() + " /etc/cell.toml"
 }
 
+/// The command of the manual that prints a map at a door with certificates.
+fn reading() -> String {
+    let page = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/protocol.md")).unwrap();
+    let line = page.lines().find(|line| line.starts_with("mosquitto_sub ") && line.contains("--cert node.pem"));
+    format!("env -C /etc/ecod {} -W 20", line.expect("a command"))
+}
+
 /// The commands of the README that make a cell, without its comments.
 fn commands() -> [String; 3] {
     let readme = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../README.md")).unwrap();
@@ -93,10 +145,11 @@ fn commands() -> [String; 3] {
 #[test]
 #[ignore = "needs root for network namespaces: make joining"]
 fn three_machines_become_a_cell_by_the_commands_of_the_readme() {
-    let network = Bridged::new(3).unwrap();
-    let machines @ [edge, gauss, euclid] = &[0, 1, 2].map(Machine::new);
+    let _network = Bridged::new(3).unwrap();
+    // The first is without the package, and told how to start its node.
+    let machines @ [edge, gauss, euclid] = &[Machine::new(0), Machine::with_service(1), Machine::with_service(2)];
     let [init, invite, join] = commands();
-    let mut nodes = vec![edge.start(&edge.run(&init))];
+    let leader = edge.start(&edge.run(&init));
 
     let mut command = edge.command(&invite);
     let mut host = Running(command.stdout(Stdio::piped()).stderr(Stdio::inherit()).spawn().unwrap());
@@ -104,7 +157,8 @@ fn three_machines_become_a_cell_by_the_commands_of_the_readme() {
     let tokens = lines.filter_map(|line| Some(line.unwrap().trim().strip_prefix("sudo ecod-node join ")?.to_owned()));
     let tokens: Vec<_> = tokens.take(2).collect();
     for (machine, token) in [euclid, gauss].into_iter().zip(&tokens) {
-        nodes.push(machine.start(&machine.run(&join.replace("TOKEN", token))));
+        let told = machine.run(&join.replace("TOKEN", token));
+        assert!(told.contains("the service ecod-node is enabled and runs") && machine.is_enabled(), "{told}");
     }
     assert!(host.0.wait().unwrap().success(), "all have joined");
     until("maps of the edge on all machines", || machines.iter().all(|machine| machine.has_maps_of("edge")));
@@ -114,6 +168,10 @@ fn three_machines_become_a_cell_by_the_commands_of_the_readme() {
     until("maps with the described places on all machines", || {
         machines.iter().all(|machine| machine.has_place("slot-0"))
     });
+    for machine in machines {
+        let map = machine.run(&reading());
+        assert!(map.contains("\"aggregator\":\"edge\"") && map.contains("\"id\":\"slot-0\""), "at its door: {map}");
+    }
     let shown = "sudo ecod-node cell show --config /etc/ecod/node.toml";
     until("each machine shows that all use it", || {
         machines.iter().all(|machine| {
@@ -122,11 +180,9 @@ fn three_machines_become_a_cell_by_the_commands_of_the_readme() {
         })
     });
 
-    nodes.remove(0);
+    drop(leader);
     until("the other two go on", || {
         let led_by = |leader| [gauss, euclid].iter().all(|machine| machine.has_maps_of(leader));
         led_by("gauss") || led_by("euclid")
     });
-    drop(nodes);
-    drop(network);
 }

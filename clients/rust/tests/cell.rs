@@ -384,6 +384,54 @@ fn example(name: &str) -> PathBuf {
     build.join("examples").join(name)
 }
 
+/// The program that a page of the documentation shows, if it is this example but for its first lines.
+fn is_shown(page: &str, example: &str) -> bool {
+    let read = |path: &str| std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap();
+    let source = read(&format!("examples/{example}.rs"));
+    let (_, program) = source.split_once("\n\n").unwrap();
+    read(page).contains(&format!("```rust,no_run\n{program}```\n"))
+}
+
+#[test]
+fn the_documented_programs_do_what_they_say() {
+    for (page, name) in [
+        ("../../docs/programs.md", "maps_and_reports"),
+        ("README.md", "maps_and_reports"),
+        ("README.md", "report_frames"),
+    ] {
+        assert!(is_shown(page, name), "{page} shows another {name}");
+    }
+    for (name, says) in [("maps_and_reports", true), ("report_frames", false)] {
+        let mut config = config("edge", Role::Edge);
+        config.landmarks.clear();
+        let node = Node::start(config);
+        let cell = Cell::connect(node.settings("display")).unwrap();
+        let mut program =
+            Command::new(example(name)).env("ECOD_BROKER", &node.door).stdout(Stdio::piped()).spawn().unwrap();
+        let began = Instant::now();
+        let shows = |map: &GlobalMap| {
+            let by_euclid =
+                |object: &ecod_client::FusedObject| object.contributors.iter().any(|by| by.as_str() == "euclid");
+            map.objects.iter().any(|object| by_euclid(object) && (object.x_m - 12.4).abs() < 0.1)
+        };
+        for map in cell.maps().timeout(SOON) {
+            if shows(&map.unwrap()) {
+                break;
+            }
+            assert!(
+                began.elapsed() < SOON && program.try_wait().unwrap().is_none(),
+                "{name}: its report is not on the map"
+            );
+        }
+        if says {
+            let line = BufReader::new(program.stdout.take().unwrap()).lines().next().unwrap().unwrap();
+            assert!(line.parse::<u64>().is_ok(), "{name}: {line}");
+        }
+        program.kill().unwrap();
+        program.wait().unwrap();
+    }
+}
+
 #[test]
 fn the_planner_goes_brakes_for_what_is_ahead_and_brakes_without_maps() {
     let mut config = config("edge", Role::Edge);

@@ -1,9 +1,10 @@
 //! Queue from the parts of a node to the recorder. Sending never waits.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::SyncSender;
+use std::sync::mpsc::{SyncSender, TrySendError};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
+use ecod::aggregator::Command;
 use ecod::leadership::Leadership;
 use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
@@ -55,6 +56,11 @@ impl LogItem {
         !matches!(self, Self::Round(_))
     }
 
+    /// True for a change of the aggregator's settings.
+    fn is_change(&self) -> bool {
+        matches!(self, Self::Journal(JournalEvent::Command(Command::Configure { .. })))
+    }
+
     /// True if an exact rerun of the aggregator needs it.
     pub(crate) fn is_of_journal(&self) -> bool {
         matches!(self, Self::Report(..) | Self::Journal(_))
@@ -70,6 +76,8 @@ struct Shared {
     queue: RwLock<Option<SyncSender<LogEntry>>>,
     /// Journal entries that were lost and are not yet noted in the log.
     missing: AtomicU64,
+    /// The latest change of settings that found the queue full: all later rounds depend on it.
+    change: Mutex<Option<LogEntry>>,
     aggregator_state: Mutex<AggregatorState>,
     counters: Arc<Counters>,
 }
@@ -88,14 +96,27 @@ impl LogSender {
         Self(Arc::new(Shared { counters, ..Shared::default() }))
     }
 
-    /// Queues an item. A full queue drops and counts it.
+    /// Queues an item. A full queue drops and counts it, but for the latest change of settings, which waits beside the queue.
     pub fn send(&self, at: Timestamp, item: LogItem) {
         let queue = self.0.queue.read().unwrap_or_else(PoisonError::into_inner);
         let Some(queue) = &*queue else { return };
-        let is_of_journal = item.is_of_journal();
-        if queue.try_send(LogEntry { at, item }).is_err() {
-            self.count_lost(1, u64::from(is_of_journal));
+        let Err(TrySendError::Full(entry) | TrySendError::Disconnected(entry)) = queue.try_send(LogEntry { at, item })
+        else {
+            return;
+        };
+        let lost = if entry.item.is_change() { self.change().replace(entry) } else { Some(entry) };
+        if let Some(lost) = lost {
+            self.count_lost(1, u64::from(lost.item.is_of_journal()));
         }
+    }
+
+    /// Takes the change of settings that waits beside the queue, if its time has come.
+    pub(crate) fn take_change(&self, now: Timestamp) -> Option<LogEntry> {
+        self.change().take_if(|change| change.at <= now)
+    }
+
+    fn change(&self) -> MutexGuard<'_, Option<LogEntry>> {
+        self.0.change.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Counts lost entries, and those of the journal that the log must note.
@@ -117,8 +138,11 @@ impl LogSender {
         &self.0.counters
     }
 
-    /// Replaces the queue; `None` disconnects the recorder.
+    /// Replaces the queue; `None` disconnects the recorder. One that begins has the present settings.
     pub(crate) fn connect(&self, queue: Option<SyncSender<LogEntry>>) {
+        if queue.is_some() {
+            self.change().take();
+        }
         *self.0.queue.write().unwrap_or_else(PoisonError::into_inner) = queue;
     }
 }

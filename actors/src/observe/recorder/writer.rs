@@ -87,7 +87,11 @@ impl LogWriter {
         }
     }
 
+    /// Writes an entry, after a change of settings that did not get into the queue before it.
     fn write(&mut self, entry: &LogEntry) {
+        if let Some(change) = self.recording.take_change(entry.at) {
+            self.write(&change);
+        }
         #[cfg(feature = "foxglove")]
         if let Some(live) = &mut self.live {
             live.show(entry);
@@ -297,6 +301,43 @@ mod tests {
         };
         let files = files(directory.path()).unwrap();
         assert_eq!([known(&files[0]), known(&files[1])], [vec![], landmarks]);
+    }
+
+    #[test]
+    fn a_change_of_settings_that_finds_the_queue_full_is_written_at_its_place() {
+        let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
+        let mut writer = writer(in_directory(directory.path()), &counters);
+        let (sender, queue) = sync_channel(1);
+        writer.recording.connect(Some(sender));
+        let change = |id| {
+            let landmarks = vec![LandmarkConfig::at(id, 1.0, 2.0)];
+            LogItem::Journal(JournalEvent::Command(Command::Configure { fusion: Box::default(), landmarks }))
+        };
+        let tick = || LogItem::Journal(JournalEvent::Command(Command::Tick));
+        let items = [(1, tick()), (3, change("superseded")), (4, change("slot-0")), (4, tick())];
+        for (seconds, item) in items {
+            writer.recording.send(Timestamp(seconds * 1_000_000), item);
+        }
+        writer.write(&queue.recv().unwrap());
+        writer.write(&second(2, tick()));
+        writer.write(&second(5, tick()));
+        writer.flush();
+        let messages = messages(&files(directory.path()).unwrap()[0]);
+        let journal = messages.iter().filter(|message| message.schema == SchemaName::JournalEntry);
+        let events = journal.map(|message| serde_json::from_slice::<JournalEntry>(&message.json).unwrap());
+        let told: Vec<_> = events
+            .map(|JournalEntry { at_us, event }| match event {
+                JournalEvent::Command(Command::Configure { landmarks, .. }) => {
+                    (at_us.0 / 1_000_000, landmarks[0].id.to_string())
+                }
+                JournalEvent::Missing { entries } => (at_us.0 / 1_000_000, format!("{entries} missing")),
+                _ => (at_us.0 / 1_000_000, "tick".into()),
+            })
+            .collect();
+        let told: Vec<_> = told.iter().map(|(at, event)| (*at, event.as_str())).collect();
+        assert_eq!(told, [(1, "2 missing"), (1, "tick"), (2, "tick"), (4, "slot-0"), (5, "tick")]);
+        assert_eq!(counters.events(Event::RecordDropped), 2);
+        assert_eq!(writer.identity.landmarks[0].id.as_str(), "slot-0", "later files have it, too");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! MQTT over WebSocket (MQTT 5, section 6): the same port, told apart by the first byte of a client.
 
-use std::io::{self, ErrorKind};
+use std::io::{self, Cursor, ErrorKind};
 use std::net::IpAddr;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use std::task::{Context, Poll, ready};
 
 use bytes::Bytes;
 use futures_util::{Sink, Stream};
-use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf};
+use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, BufReader, ReadBuf};
 use tokio_tungstenite::tungstenite::handshake::server::{ErrorResponse, Request, Response};
 use tokio_tungstenite::tungstenite::http::header::{HOST, ORIGIN, SEC_WEBSOCKET_PROTOCOL};
 use tokio_tungstenite::tungstenite::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, Uri};
@@ -22,6 +22,14 @@ use super::client_rejection::ClientRejection;
 
 /// First byte of an HTTP request. No MQTT client begins so.
 pub(super) const FIRST_BYTE: u8 = b'G';
+
+/// Maximum bytes of an HTTP request, and of the buffer that reads it.
+const MAX_REQUEST_BYTES: u64 = 16 * 1024;
+const REQUEST_BUFFER_BYTES: usize = 1024;
+
+/// Answer to a browser that asks for a page (RFC 9110, section 15.5.22).
+const NO_PAGE: &str = "no page is here: programs speak MQTT at this port, and pages MQTT over WebSocket. The node's own page is at \
+                       `dashboard.listen`, http://127.0.0.1:8080/ by default\n";
 
 /// Maximum bytes of one WebSocket message: it is held until it is complete. An MQTT packet may be spread over several.
 const MAX_MESSAGE_BYTES: usize = 64 * 1024;
@@ -47,12 +55,28 @@ pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
     stream: S,
     wire_bytes: Arc<AtomicUsize>,
 ) -> Result<WebSocketBytes<impl AsyncRead + AsyncWrite + Unpin>, ClientRejection> {
-    let (reader, writer) = tokio::io::split(stream);
+    let (reader, mut writer) = tokio::io::split(stream);
     let counter = Arc::clone(&wire_bytes);
     let reader = InspectReader::new(reader, move |bytes| {
         counter.fetch_add(bytes.len(), Ordering::Relaxed);
     });
-    let stream = tokio::io::join((&[FIRST_BYTE][..]).chain(reader), writer);
+    let mut reader = BufReader::with_capacity(REQUEST_BUFFER_BYTES, reader.take(MAX_REQUEST_BYTES));
+    let mut request = vec![FIRST_BYTE];
+    while !request.ends_with(b"\r\n\r\n") {
+        if reader.read_until(b'\n', &mut request).await? == 0 {
+            return Err(ClientRejection::Malformed);
+        }
+    }
+    reader.get_mut().set_limit(u64::MAX);
+    if !asks_for_upgrade(&request) {
+        let head = "HTTP/1.1 426 Upgrade Required\r\nUpgrade: websocket\r\nConnection: Upgrade, close\r\n";
+        let length = NO_PAGE.len();
+        let answer = format!("{head}Content-Type: text/plain\r\nContent-Length: {length}\r\n\r\n{NO_PAGE}");
+        writer.write_all(answer.as_bytes()).await?;
+        writer.shutdown().await?;
+        return Err(ClientRejection::Malformed);
+    }
+    let stream = tokio::io::join(Cursor::new(request).chain(reader), writer);
     let config = WebSocketConfig::default()
         .read_buffer_size(CHUNK_BYTES)
         .write_buffer_size(0)
@@ -68,6 +92,15 @@ pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
         Err(Error::Io(error)) => Err(error.into()),
         Err(_) => Err(ClientRejection::Malformed),
     }
+}
+
+/// True if an HTTP request asks for another protocol than HTTP.
+fn asks_for_upgrade(request: &[u8]) -> bool {
+    let name = b"upgrade:";
+    request
+        .split(|byte| *byte == b'\n')
+        .filter_map(|line| line.get(..name.len()))
+        .any(|line| line.eq_ignore_ascii_case(name))
 }
 
 /// Decides about a handshake.
