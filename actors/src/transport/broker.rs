@@ -29,6 +29,8 @@ pub use door::{Door, DoorSetup};
 pub use embedded::{BrokerConfig, BrokerError, EmbeddedBroker, MqttBroker};
 pub use permissions::AccessPolicy;
 pub use principal::LeaderCheck;
+#[cfg(fuzzing)]
+pub use websocket::read_websocket;
 
 /// State of an embedded broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -26,7 +26,11 @@ use serde::{Deserialize, Serialize};
 use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 
 pub use guest::{JoinError, Joined, redeem};
+#[cfg(fuzzing)]
+pub use host::read_request;
 pub use host::{Host, Visit};
+#[cfg(fuzzing)]
+pub use token::token_is_read_as_written;
 pub use token::{Token, TokenError};
 
 /// Maximum length of the host's answer in bytes. A revocation list is the longest part.

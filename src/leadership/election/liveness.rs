@@ -152,13 +152,14 @@ impl Following {
 
     /// Third deadline: the leader is lost.
     ///
-    /// Others that heard the leader well after this node prove the link broken, not the leader. Then their evidence is
-    /// enough, and may be as old as the leader's slowest beat makes it.
+    /// Others that heard the leader well after this node prove the link broken, not the leader. The same holds if they heard
+    /// it well after the beat that should have said that it hears this node. Then their evidence is enough, and may be as
+    /// old as the leader's slowest beat makes it.
     pub(super) fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
         let direct_timeout_at = self.direct_timeout_at(config);
         let late = self.telling_interval().map(overdue);
         let margin = late.unwrap_or(if self.given_up { config.beat() } else { self.beat_interval });
-        let hears_us_until = self.bidirectional_at + late.map_or(margin, |late| self.beat_interval + late);
+        let hears_us_until = self.bidirectional_at + self.beat_interval + margin;
         if self.indirect_heard_at > (self.direct_at + margin).min(hears_us_until) {
             direct_timeout_at.max(self.indirect_heard_at + config.response_timeout())
         } else if late.is_some() {
@@ -201,5 +202,20 @@ mod tests {
                 assert!(deadlines.is_sorted(), "{beat_interval:?} {has_rounds} {given_up}: {deadlines:?}");
             }
         }
+    }
+
+    #[test]
+    fn a_last_round_that_all_heard_keeps_a_standby_no_longer() {
+        let config = ElectionConfig::default();
+        let epoch = Epoch::new(1, NodeName::from_static("edge"));
+        let mut leader = Following::new(epoch, Vec::new(), config.beat(), ms(0), Timestamp::default());
+        // A beat is due with the round: 50 ms after the last one, and a little late.
+        leader.take_round(config.beat(), ms(53));
+        leader.indirect_heard_at = ms(52);
+        assert_eq!(leader.lost_at(&config), ms(53) + config.standby_silence());
+        // Others that hear the leader when it no longer says that it hears this node prove the way to it broken.
+        leader.take_round(config.beat(), ms(90));
+        leader.indirect_heard_at = ms(110);
+        assert_eq!(leader.lost_at(&config), ms(110) + config.response_timeout());
     }
 }

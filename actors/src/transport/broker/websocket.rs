@@ -227,6 +227,22 @@ fn io_error(error: Error) -> io::Error {
     }
 }
 
+/// The content of what a client sends after its first byte, if its handshake is accepted. Only built for the fuzz targets.
+#[cfg(fuzzing)]
+pub fn read_websocket(sent: Vec<u8>) -> Option<Vec<u8>> {
+    use futures_util::FutureExt;
+
+    let read = async {
+        let stream = tokio::io::join(io::Cursor::new(sent), tokio::io::sink());
+        let mut client = accept(stream, Arc::default()).await.ok()?;
+        let mut content = Vec::new();
+        // What came before a client broke the rules was passed on.
+        let _ = client.read_to_end(&mut content).await;
+        Some(content)
+    };
+    read.now_or_never().expect("bytes that are there are not waited for")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

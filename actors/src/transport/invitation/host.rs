@@ -201,6 +201,18 @@ impl Host {
     }
 }
 
+/// The key that is to be certified, in DER, of a guest's message that is complete. Only built for the fuzz targets.
+#[cfg(fuzzing)]
+pub fn read_request(sent: &[u8]) -> Option<Vec<u8>> {
+    use futures_util::FutureExt;
+    use rcgen::PublicKeyData;
+
+    let read = read_line::<Request>(&mut &*sent, MAX_REQUEST_BYTES).now_or_never();
+    let request = read.expect("bytes that are there are not waited for").ok()?;
+    let signing = CertificateSigningRequestParams::from_pem(&request.request).ok()?;
+    Some(signing.public_key.der_bytes().to_vec())
+}
+
 /// One conversation; gives the node that has kept what it got, and the serial number of its certificate.
 async fn receive(
     tls: TlsAcceptor,

@@ -35,11 +35,16 @@ const CHECKSUM_BYTES: usize = 4;
 
 impl fmt::Display for Token {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut bytes = postcard::to_allocvec(self).map_err(|_| fmt::Error)?;
-        let hash = digest(&SHA256, &bytes);
-        bytes.extend_from_slice(&hash.as_ref()[..CHECKSUM_BYTES]);
-        write!(f, "{PREFIX}{}", BASE64_URL_SAFE_NO_PAD.encode(bytes))
+        let content = postcard::to_allocvec(self).map_err(|_| fmt::Error)?;
+        f.write_str(&text_of(content))
     }
+}
+
+/// The text of a token with this content.
+fn text_of(mut content: Vec<u8>) -> String {
+    let hash = digest(&SHA256, &content);
+    content.extend_from_slice(&hash.as_ref()[..CHECKSUM_BYTES]);
+    PREFIX.to_owned() + &BASE64_URL_SAFE_NO_PAD.encode(content)
 }
 
 impl fmt::Debug for Token {
@@ -60,6 +65,13 @@ impl FromStr for Token {
         }
         postcard::from_bytes(content).map_err(|_| TokenError)
     }
+}
+
+/// True if a token with this content, if it is one, is read as it is written. Only built for the fuzz targets.
+#[cfg(fuzzing)]
+pub fn token_is_read_as_written(content: &[u8]) -> bool {
+    let token: Result<Token, _> = text_of(content.to_vec()).parse();
+    token.map_or(true, |token| token.to_string().parse() == Ok(token))
 }
 
 #[cfg(test)]
