@@ -10,9 +10,9 @@ use ecod::model::geometry::Pose;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::pace::{Pace, PaceConfig, PaceMode};
-use ecod::perception::camera::Intrinsics;
+use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::landmark::{Landmark, LandmarkIndex};
-use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
+use ecod::perception::projection::{Cut, ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
 use ecod::wire::{Encoding, Limits, ObjectReport, PerceivedObject, WirePose, decode_report, encode};
 use nalgebra::Point2;
 
@@ -82,16 +82,19 @@ fn projections(figures: &mut Figures) {
     for (name, ranging) in
         [("box_height", Ranging::BoxHeight), ("box_width", Ranging::BoxWidth), ("paper", Ranging::Paper)]
     {
-        let size = ObjectSize { width_m: 1.8, height_m: 1.5, relative_sigma: 0.05 };
+        let size = ObjectSize { width_m: 1.8, height_m: 1.5, length_m: None, relative_sigma: 0.05 };
         let sizes = ObjectSizes { labels: [("car".into(), size)].into(), default: Some(size) };
-        let projection =
-            Projection::new(ProjectionConfig { ranging, sizes, ..ProjectionConfig::default() }, intrinsics);
+        let projection = Projection::new(
+            ProjectionConfig { ranging, sizes, ..ProjectionConfig::default() },
+            intrinsics,
+            Mount::default(),
+        );
         let costs = [100, 1_000, 10_000, 100_000, 1_000_000].map(|count| {
             let detections: Vec<_> = (0..count).map(detection).collect();
             let times = times(if count > 100_000 { 7 } else { 51 }, || {
                 for detection in &detections {
                     // A clipped box is left out, as by a projector.
-                    std::hint::black_box(projection.place(detection, None, &camera).ok());
+                    std::hint::black_box(projection.place(detection, Cut::default(), None, &camera).ok());
                 }
             });
             let per_detection_ns = times[0].as_secs_f64() * 1e9 / count as f64;

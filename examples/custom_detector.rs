@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::names::NodeName;
-use ecod::perception::camera::Intrinsics;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::perception::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ecod::wire::Role;
@@ -108,15 +107,9 @@ async fn main() -> anyhow::Result<()> {
 
 /// One frame of a ball straight ahead, as the default optics show it.
 fn draw(directory: &Path) -> anyhow::Result<PathBuf> {
-    let OpticsConfig { width_px, height_px, horizontal_fov_deg, vertical_fov_deg, .. } = OpticsConfig::default();
-    let camera = Intrinsics::from_field_of_view(
-        width_px,
-        height_px,
-        horizontal_fov_deg.to_radians(),
-        vertical_fov_deg.to_radians(),
-    );
+    let camera = OpticsConfig::default().lens()?.intrinsics;
     let grey = Scalar::new(120.0, 120.0, 120.0, 0.0);
-    let mut image = Mat::new_rows_cols_with_default(height_px as i32, width_px as i32, CV_8UC3, grey)?;
+    let mut image = Mat::new_rows_cols_with_default(camera.height as i32, camera.width as i32, CV_8UC3, grey)?;
     let centre = Point::new(camera.cx as i32, camera.cy as i32);
     // A disc of radius r covers 2r + 1 pixels.
     let radius_px = (camera.fx * BALL_M / 2.0 - 0.5).round() as i32;

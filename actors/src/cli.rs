@@ -17,6 +17,8 @@ mod run;
 mod schema;
 mod shell;
 mod top;
+#[cfg(feature = "camera")]
+mod trial;
 
 use std::io::{ErrorKind, Write};
 use std::process::ExitCode;
@@ -63,6 +65,9 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Try it on your own video, images or camera: starts a cell with a page, without a configuration
+    #[cfg(feature = "camera")]
+    Try(trial::TryArguments),
     /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes
     Doctor(doctor::DoctorArguments),
     /// Join a cell as an observer and show it in the terminal
@@ -157,6 +162,9 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     let level = match &cli.command {
         _ if is_service => "info,rmqtt=warn,rmqtt_net=warn",
         Some(Command::Top(_)) => "off",
+        // Nothing of a trial is to outlive it.
+        #[cfg(feature = "camera")]
+        Some(Command::Try(_)) => "warn,ecod_actors::actors::reputation_keeper=error",
         // The command tells of refusals itself.
         Some(Command::Cell(_)) => "warn,rumqttc=off",
         _ => "warn",
@@ -166,6 +174,8 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]
         Some(Command::Calibrate(arguments)) => calibrate::run(&arguments),
+        #[cfg(feature = "camera")]
+        Some(Command::Try(arguments)) => trial::run(&arguments),
         Some(Command::Doctor(arguments)) => doctor::run(&arguments),
         Some(Command::Top(arguments)) => top::run(&arguments),
         Some(Command::Record(arguments)) => record::run(&arguments),

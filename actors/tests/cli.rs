@@ -141,6 +141,24 @@ fn startup_errors_are_plain_and_name_what_is_wrong() {
     }
 }
 
+#[cfg(feature = "camera")]
+#[test]
+fn ranging_by_the_ground_asks_for_the_height_of_the_camera() {
+    let mut file = tempfile::NamedTempFile::new().unwrap();
+    let camera = "source = { kind = \"images\", path = \"frames\" }\ndetector = { kind = \"coco\" }";
+    writeln!(file, "[camera]\n{camera}\nprojection = {{ ranging = \"ground\" }}").unwrap();
+    let printed = |height: &str| {
+        let mut command = ecod_node();
+        command.arg("--config").arg(file.path()).arg("--print-config").env("ECOD_CAMERA__MOUNT__HEIGHT_M", height);
+        command.output().unwrap()
+    };
+    assert!(printed("1.2").status.success(), "{}", stderr(&printed("1.2")));
+    let unknown = ecod_node().arg("--config").arg(file.path()).arg("--print-config").output().unwrap();
+    assert_eq!(unknown.status.code(), Some(2));
+    assert!(stderr(&unknown).contains("`camera.mount.height_m`"), "{}", stderr(&unknown));
+    assert_eq!(printed("-1").status.code(), Some(2));
+}
+
 #[test]
 fn an_observer_that_cannot_record_says_so_and_ends() {
     let file = tempfile::NamedTempFile::new().unwrap();

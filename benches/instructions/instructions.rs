@@ -10,7 +10,7 @@ use ecod::model::geometry::Pose;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::pace::Pace;
-use ecod::perception::projection::Projection;
+use ecod::perception::projection::{Cut, Projection};
 use ecod::vote::Vote;
 use ecod::wire::{Encoding, Limits, ObjectReport, decode_report};
 use ecod_instructions as workload;
@@ -20,7 +20,7 @@ use gungraun::{library_benchmark, library_benchmark_group, main};
 #[bench::of_1000_boxes(workload::boxes())]
 fn projection((projection, camera, detections): (Projection, Pose, Vec<Detection>)) -> Projection {
     for detection in &detections {
-        black_box(projection.place(detection, None, &camera).ok());
+        black_box(projection.place(detection, Cut::default(), None, &camera).ok());
     }
     projection
 }

@@ -10,7 +10,7 @@ use ecod::model::geometry::Pose;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::pace::{Pace, PaceConfig};
-use ecod::perception::camera::Intrinsics;
+use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::landmark::{Landmark, LandmarkIndex};
 use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
 use ecod::vote::{Vote, VoteConfig};
@@ -25,10 +25,14 @@ const LANDMARKS: usize = 256;
 /// A thousand boxes, and what places them.
 pub fn boxes() -> (Projection, Pose, Vec<Detection>) {
     let intrinsics = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
-    let size = ObjectSize { width_m: 1.8, height_m: 1.5, relative_sigma: 0.05 };
+    let size = ObjectSize { width_m: 1.8, height_m: 1.5, length_m: None, relative_sigma: 0.05 };
     let sizes = ObjectSizes { labels: [("car".into(), size)].into(), default: Some(size) };
     let config = ProjectionConfig { ranging: Ranging::BoxHeight, sizes, ..ProjectionConfig::default() };
-    (Projection::new(config, intrinsics), Pose::new(0.6, 0.5, 2.9), (0..1000).map(detection).collect())
+    (
+        Projection::new(config, intrinsics, Mount::default()),
+        Pose::new(0.6, 0.5, 2.9),
+        (0..1000).map(detection).collect(),
+    )
 }
 
 fn detection(index: usize) -> Detection {

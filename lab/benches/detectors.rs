@@ -9,8 +9,8 @@ use anyhow::Context;
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::geometry::Pose;
 use ecod::model::time::Timestamp;
-use ecod::perception::camera::Intrinsics;
-use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig};
+use ecod::perception::camera::{Intrinsics, Mount};
+use ecod::perception::projection::{Cut, ObjectSize, ObjectSizes, Projection, ProjectionConfig};
 use ecod_actors::camera::corner_pose::locate_target;
 use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::coco::{CocoConfig, CocoDetector};
@@ -45,7 +45,8 @@ fn corners(figures: &mut Figures) -> anyhow::Result<()> {
     let intrinsics = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
     let side_m = 0.05;
     let sizes = ObjectSizes { default: Some(ObjectSize::square(side_m)), ..ObjectSizes::default() };
-    let projection = Projection::new(ProjectionConfig { sizes, ..ProjectionConfig::default() }, intrinsics);
+    let projection =
+        Projection::new(ProjectionConfig { sizes, ..ProjectionConfig::default() }, intrinsics, Mount::default());
     let targets: Vec<[Point2<f64>; 4]> = (0..1000).map(target).collect();
     println!("\n{:<36} {:>9} {:>14}", "projector", "targets", "µs/target");
     let mut costs = Vec::new();
@@ -59,7 +60,12 @@ fn corners(figures: &mut Figures) -> anyhow::Result<()> {
                 corners: Some(*corners),
             };
             let middle = locate_target(corners, side_m, &intrinsics)?;
-            std::hint::black_box(projection.place(&detection, Some(&middle), &Pose::new(0.61, 0.46, 2.88))?);
+            std::hint::black_box(projection.place(
+                &detection,
+                Cut::default(),
+                Some(&middle),
+                &Pose::new(0.61, 0.46, 2.88),
+            )?);
         }
         let cost_us = start.elapsed().as_secs_f64() * 1e6 / count as f64;
         println!("{:<36} {count:>9} {cost_us:>14.2}", "corners");

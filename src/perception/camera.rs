@@ -2,9 +2,9 @@
 //!
 //! Camera frame: x to the right, y downwards, z along the axis, metres. Pixels: origin at the upper left corner of the
 //! image, x to the right, y downwards. Lens distortion is removed where images are handled; pixels here are
-//! undistorted.
+//! undistorted. Level frame: the camera as origin, forward along the heading of its axis, left, up, metres.
 
-use nalgebra::{Point2, Point3};
+use nalgebra::{Matrix3, Point2, Point3, Vector3};
 
 use crate::model::geometry::Pose;
 
@@ -39,6 +39,12 @@ impl Intrinsics {
         }
     }
 
+    /// A camera of square pixels without distortion whose axis goes through the middle of the image.
+    pub fn with_square_pixels(width: u32, height: u32, horizontal_rad: f64) -> Self {
+        let camera = Self::from_field_of_view(width, height, horizontal_rad, horizontal_rad);
+        Self { fy: camera.fx, ..camera }
+    }
+
     /// Bearing of an image column in radians off the axis, counter-clockwise (left) positive.
     pub fn bearing(&self, x_px: f64) -> f64 {
         ((self.cx - x_px) / self.fx).atan()
@@ -54,6 +60,11 @@ impl Intrinsics {
         self.bearing(0.0) - self.bearing(f64::from(self.width))
     }
 
+    /// The direction of a pixel in the camera frame, not normalised: z is 1.
+    pub fn ray(&self, pixel: &Point2<f64>) -> Vector3<f64> {
+        Vector3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
+    }
+
     /// The pixel of a point in the camera frame; `None` behind the camera.
     pub fn project(&self, point: &Point3<f64>) -> Option<Point2<f64>> {
         (point.z > 0.0)
@@ -61,7 +72,10 @@ impl Intrinsics {
     }
 }
 
-/// The mount of the camera on its vehicle.
+/// The mount of the camera on its vehicle, which stands on level ground.
+///
+/// Angles are right-handed about the forward, left and up axes of the vehicle (ISO 8855, ROS REP 103), and turn in the
+/// order pan, pitch, roll.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Mount {
     /// Metres ahead of the vehicle's reference point.
@@ -70,6 +84,12 @@ pub struct Mount {
     pub left_m: f64,
     /// Angle of the axis from the vehicle's heading in radians, counter-clockwise.
     pub pan_rad: f64,
+    /// Height above the ground in metres, if it is known.
+    pub height_m: Option<f64>,
+    /// Angle of the axis below the horizon in radians.
+    pub pitch_rad: f64,
+    /// Angle in radians by which the camera leans to its right.
+    pub roll_rad: f64,
 }
 
 impl Mount {
@@ -79,6 +99,27 @@ impl Mount {
             position: vehicle.transform(self.forward_m, self.left_m),
             heading_rad: vehicle.heading_rad + self.pan_rad,
         }
+    }
+
+    /// True if the axis is not level, or the camera leans.
+    pub fn is_tilted(&self) -> bool {
+        self.pitch_rad != 0.0 || self.roll_rad != 0.0
+    }
+
+    /// The rotation from the camera frame to the level frame.
+    pub fn to_level(&self) -> Matrix3<f64> {
+        let ((sin_pitch, cos_pitch), (sin_roll, cos_roll)) = (self.pitch_rad.sin_cos(), self.roll_rad.sin_cos());
+        Matrix3::new(
+            -sin_roll * sin_pitch,
+            -cos_roll * sin_pitch,
+            cos_pitch,
+            -cos_roll,
+            sin_roll,
+            0.0,
+            -sin_roll * cos_pitch,
+            -cos_roll * cos_pitch,
+            -sin_pitch,
+        )
     }
 }
 
@@ -95,5 +136,16 @@ mod tests {
         assert_eq!(camera.bearing(320.0), 0.0);
         let pixel = camera.project(&Point3::new(0.5, 0.0, 1.0)).expect("in front");
         assert!((camera.bearing(pixel.x) + 0.5f64.atan()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_pitched_camera_looks_down_and_a_rolled_one_leans_to_its_right() {
+        let axis = Vector3::z();
+        let pitched = Mount { pitch_rad: 0.3, ..Mount::default() }.to_level() * axis;
+        assert!((pitched - Vector3::new(0.3f64.cos(), 0.0, -(0.3f64.sin()))).norm() < 1e-12);
+        let right = Vector3::x();
+        let rolled = Mount { roll_rad: 0.3, ..Mount::default() }.to_level() * right;
+        assert!((rolled - Vector3::new(0.0, -(0.3f64.cos()), -(0.3f64.sin()))).norm() < 1e-12);
+        assert_eq!(Mount::default().to_level() * Vector3::new(1.0, 2.0, 3.0), Vector3::new(3.0, -1.0, -2.0));
     }
 }

@@ -7,27 +7,36 @@
 //! Each [`Ranging`] finds the distance in its own way, in a file of its own. All but [`Ranging::Paper`] are exact for a
 //! pinhole camera, under the assumptions about the object that it states.
 
+mod auto;
 mod box_height;
 mod box_width;
+mod coco_sizes;
 mod config;
 mod corners;
+mod estimate;
+mod ground;
+mod level_sight;
 mod paper;
 
-use nalgebra::Point3;
+use nalgebra::{Matrix3, Point3};
 
 pub use config::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
+use ground::HalfDepth;
 
 use crate::model::detection::Detection;
 use crate::model::geometry::{Covariance, Pose};
 use crate::model::names::Label;
-use crate::perception::camera::Intrinsics;
+use crate::perception::camera::{Intrinsics, Mount};
 use crate::wire::PerceivedObject;
 
 /// The reason why a detection has no position.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ProjectionError {
     /// Neither a size for the label nor a default size is configured.
-    #[error("no known size for label {0:?} and no default size")]
+    #[error(
+        "no known size for label {0:?} and no default size: set camera.projection.sizes, or camera.mount.height_m to \
+         range it by the ground"
+    )]
     UnknownSize(Label),
     /// The box has no area, is not finite, or gives no distance.
     #[error("the box of {0:?} gives no distance")]
@@ -35,6 +44,9 @@ pub enum ProjectionError {
     /// The image's edge cuts the object: the box does not show its whole extent.
     #[error("the image's edge cuts the box of {0:?}")]
     Clipped(Label),
+    /// The foot of the box is above the horizon, or so near it that the ground gives no distance.
+    #[error("the foot of {0:?} is not clearly below the horizon: check camera.mount.pitch_deg if it stands near")]
+    AboveHorizon(Label),
     /// The target's corners give no position in front of the camera.
     #[error("the corners of {0:?} give no position in front of the camera")]
     InvalidCorners(Label),
@@ -47,9 +59,21 @@ impl ProjectionError {
             Self::UnknownSize(_) => "unknown_size",
             Self::DegenerateBox(_) => "degenerate_box",
             Self::Clipped(_) => "clipped",
+            Self::AboveHorizon(_) => "above_horizon",
             Self::InvalidCorners(_) => "invalid_corners",
         }
     }
+}
+
+/// The edges of the image that cut a box, so that it does not show the whole object.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Cut {
+    /// The upper edge.
+    pub upper: bool,
+    /// The lower edge.
+    pub lower: bool,
+    /// The left or the right edge.
+    pub side: bool,
 }
 
 /// The projection of one camera's detections to the world.
@@ -57,12 +81,14 @@ impl ProjectionError {
 pub struct Projection {
     config: ProjectionConfig,
     intrinsics: Intrinsics,
+    mount: Mount,
+    to_level: Matrix3<f64>,
 }
 
 impl Projection {
     /// A projection for a camera; `config` is taken as valid.
-    pub fn new(config: ProjectionConfig, intrinsics: Intrinsics) -> Self {
-        Self { config, intrinsics }
+    pub fn new(config: ProjectionConfig, intrinsics: Intrinsics, mount: Mount) -> Self {
+        Self { config, intrinsics, mount, to_level: mount.to_level() }
     }
 
     /// The configuration.
@@ -75,51 +101,44 @@ impl Projection {
         &self.intrinsics
     }
 
-    /// Checks that the image's edge does not cut the side of the box that gives the distance. Call it with the box in the
-    /// raw image, before distortion is removed.
-    ///
-    /// # Errors
-    /// [`ProjectionError::Clipped`].
-    pub fn check_unclipped(&self, detection: &Detection) -> Result<(), ProjectionError> {
+    /// The edges of the image that cut a box in the raw image, before distortion is removed. The corners of a target show
+    /// the whole of it.
+    pub fn cut(&self, detection: &Detection) -> Cut {
+        if detection.corners.is_some() && self.config.ranging.uses_corners() {
+            return Cut::default();
+        }
         let bounds = &detection.bounding_box;
-        let is_clipped = match self.config.ranging {
-            Ranging::Corners if detection.corners.is_some() => false,
-            Ranging::Corners | Ranging::BoxHeight => box_height::is_clipped(bounds, &self.intrinsics),
-            Ranging::BoxWidth => box_width::is_clipped(bounds, &self.intrinsics),
-            Ranging::Paper => false,
-        };
-        if is_clipped { Err(ProjectionError::Clipped(detection.label.clone())) } else { Ok(()) }
+        let (width, height) = (f64::from(self.intrinsics.width), f64::from(self.intrinsics.height));
+        Cut {
+            upper: bounds.y_min < EDGE_PX,
+            lower: bounds.y_max > height - EDGE_PX,
+            side: bounds.x_min < EDGE_PX || bounds.x_max > width - EDGE_PX,
+        }
     }
 
-    /// Places a detection from `camera` whose distortion has been removed; see also [`Self::check_unclipped`].
+    /// Places a detection from `camera` whose distortion has been removed; for `cut` see [`Self::cut`].
     ///
-    /// `target` is the middle of the detection's solved corners in the camera frame, in metres; only [`Ranging::Corners`]
-    /// uses it.
+    /// `target` is the middle of the detection's solved corners in the camera frame, in metres; only [`Ranging::Auto`] and
+    /// [`Ranging::Corners`] use it.
     ///
     /// # Errors
     /// [`ProjectionError`] if the detection gives no position.
     pub fn place(
         &self,
         detection: &Detection,
+        cut: Cut,
         target: Option<&Point3<f64>>,
         camera: &Pose,
     ) -> Result<PerceivedObject, ProjectionError> {
-        let label = &detection.label;
-        if !detection.bounding_box.is_valid() {
+        let (label, bounds) = (&detection.label, &detection.bounding_box);
+        if !bounds.is_valid() {
             return Err(ProjectionError::DegenerateBox(label.clone()));
         }
-        let size = self.config.sizes.of(label).ok_or_else(|| ProjectionError::UnknownSize(label.clone()))?;
-        let (bounds, intrinsics) = (&detection.bounding_box, &self.intrinsics);
-        let sight = match (self.config.ranging, target) {
-            (Ranging::Corners, Some(target)) => corners::line_of_sight(detection, target)?,
-            (Ranging::Corners | Ranging::BoxHeight, _) => box_height::line_of_sight(bounds, size, intrinsics),
-            (Ranging::BoxWidth, _) => box_width::line_of_sight(bounds, size, intrinsics),
-            (Ranging::Paper, _) => paper::line_of_sight(detection, size, intrinsics)?,
-        };
+        let sight = self.line_of_sight_to(detection, cut, target)?;
         let direction_rad = camera.heading_rad + sight.bearing_rad;
         let (sin, cos) = direction_rad.sin_cos();
         let position = (camera.position.x + sight.distance_m * cos, camera.position.y + sight.distance_m * sin);
-        let covariance = self.covariance(&sight, size, direction_rad);
+        let covariance = self.covariance(&sight, direction_rad);
         if !(position.0.is_finite() && position.1.is_finite() && covariance.is_valid()) {
             return Err(ProjectionError::DegenerateBox(label.clone()));
         }
@@ -129,17 +148,62 @@ impl Projection {
         })
     }
 
-    /// First-order error propagation along and across the line of sight.
-    ///
-    /// Along it, d ∝ size / extent: σ_d/d is the root of the sum of both squared relative errors, and both edges of the
-    /// extent have pixel noise. Across it, pixel noise and heading error turn the line of sight. The camera's position
-    /// error and the floor add to both.
-    fn covariance(&self, sight: &LineOfSight, size: &ObjectSize, direction_rad: f64) -> Covariance {
-        let ProjectionConfig { pixel_sigma_px, heading_sigma_rad, position_sigma_m, floor_m, .. } = self.config;
-        let edges = std::f64::consts::SQRT_2 * pixel_sigma_px / sight.extent_px;
+    fn line_of_sight_to(
+        &self,
+        detection: &Detection,
+        cut: Cut,
+        target: Option<&Point3<f64>>,
+    ) -> Result<LineOfSight, ProjectionError> {
+        let (label, bounds) = (&detection.label, &detection.bounding_box);
+        let known = self.config.sizes.of(label);
+        let size = known.ok_or_else(|| ProjectionError::UnknownSize(label.clone()));
+        let whole = |is_cut| if is_cut { Err(ProjectionError::Clipped(label.clone())) } else { Ok(()) };
+        let degenerate = || ProjectionError::DegenerateBox(label.clone());
+        match (self.config.ranging, target) {
+            (Ranging::Auto | Ranging::Corners, Some(target)) => corners::line_of_sight(detection, target, size?, self),
+            (Ranging::Auto, None) if self.mount.height_m.is_some() => auto::line_of_sight(detection, cut, known, self),
+            (Ranging::Ground, _) => {
+                whole(cut.lower)?;
+                let (foot, head) = box_height::foot_and_head(bounds, self);
+                let half = HalfDepth::of(known, bounds, &foot, self);
+                let estimate = ground::from_foot(&foot, half, self);
+                let estimate = estimate.ok_or_else(|| ProjectionError::AboveHorizon(label.clone()))?;
+                Ok(estimate.along(&foot, half.middle_sigma_m(estimate.distance_m, cut, &head, self)))
+            }
+            (Ranging::BoxWidth, _) => {
+                whole(cut.side)?;
+                Ok(box_width::line_of_sight(bounds, size?, self))
+            }
+            (Ranging::Paper, _) => paper::line_of_sight(detection, size?, self),
+            (Ranging::Auto | Ranging::Corners | Ranging::BoxHeight, _) => {
+                whole(cut.upper || cut.lower)?;
+                box_height::line_of_sight(bounds, size?, self).ok_or_else(degenerate)
+            }
+        }
+    }
+
+    /// The line of sight to a point `forward_m` ahead of and `left_m` left of the camera, as judged by an extent in the
+    /// image.
+    fn line_of_sight(&self, forward_m: f64, left_m: f64, extent_px: f64, size: &ObjectSize) -> LineOfSight {
+        self.sized(left_m.atan2(forward_m), forward_m.hypot(left_m), extent_px, size)
+    }
+
+    /// A line of sight whose distance is judged by an extent in the image: d ∝ size / extent. σ_d/d is the root of the sum
+    /// of both squared relative errors, and both edges of the extent have pixel noise.
+    fn sized(&self, bearing_rad: f64, distance_m: f64, extent_px: f64, size: &ObjectSize) -> LineOfSight {
+        let pixel_sigma_px = self.config.pixel_sigma_px;
+        let edges = std::f64::consts::SQRT_2 * pixel_sigma_px / extent_px;
+        let along_m = distance_m * edges.hypot(size.relative_sigma);
+        LineOfSight { bearing_rad, distance_m, along_m, turn_rad: pixel_sigma_px / self.intrinsics.fx }
+    }
+
+    /// First-order error propagation along and across the line of sight. The heading's error turns it; the errors of the
+    /// camera's position and the floor add to both.
+    fn covariance(&self, sight: &LineOfSight, direction_rad: f64) -> Covariance {
+        let ProjectionConfig { heading_sigma_rad, position_sigma_m, floor_m, .. } = self.config;
         let everywhere = position_sigma_m.hypot(floor_m);
-        let along_m = (sight.distance_m * edges.hypot(size.relative_sigma)).hypot(everywhere);
-        let turn_rad = (pixel_sigma_px / self.intrinsics.fx).hypot(heading_sigma_rad);
+        let along_m = sight.along_m.hypot(everywhere);
+        let turn_rad = sight.turn_rad.hypot(heading_sigma_rad);
         Covariance::along_bearing(direction_rad, along_m, (sight.distance_m * turn_rad).hypot(everywhere))
     }
 }
@@ -153,15 +217,10 @@ struct LineOfSight {
     /// Off the axis, counter-clockwise positive.
     bearing_rad: f64,
     distance_m: f64,
-    /// Extent in the image that gives the distance.
-    extent_px: f64,
-}
-
-impl LineOfSight {
-    /// The line of sight to a point `forward_m` ahead of and `left_m` left of the camera.
-    fn to(forward_m: f64, left_m: f64, extent_px: f64) -> Self {
-        Self { bearing_rad: left_m.atan2(forward_m), distance_m: forward_m.hypot(left_m), extent_px }
-    }
+    /// Standard deviation of the distance.
+    along_m: f64,
+    /// Standard deviation of the bearing, without that of the heading.
+    turn_rad: f64,
 }
 
 #[cfg(test)]

@@ -1,14 +1,15 @@
-//! The known locations in view of a camera: near enough to be read, inside the image, not turned away, not hidden.
+//! The known locations in view of a camera: near enough to be read, inside the image, not turned away, not hidden. A
+//! camera whose height is known has the rows of the image judged by the ground, others by the columns alone.
 //!
 //! A report lists them as `seen`, so that a location in view without a detection is known to be empty. A false claim does
 //! more harm than a missing one: a location must meet every condition.
 
-use nalgebra::{Point2, Point3, Vector2};
+use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
 
 use crate::config::config_section;
 use crate::model::geometry::{Pose, wrap_angle};
 use crate::model::names::LandmarkId;
-use crate::perception::camera::Intrinsics;
+use crate::perception::camera::{Intrinsics, Mount};
 use crate::perception::landmark::Landmark;
 use crate::perception::projection::ObjectSizes;
 use crate::wire::PerceivedObject;
@@ -36,30 +37,53 @@ config_section! {
     }
 }
 
+/// A camera where it stands.
+#[derive(Debug, Clone, Copy)]
+pub struct PosedCamera {
+    pose: Pose,
+    intrinsics: Intrinsics,
+    from_level: Matrix3<f64>,
+    height_m: Option<f64>,
+}
+
+impl PosedCamera {
+    /// The camera of a vehicle, with the pose of the camera itself.
+    pub fn new(pose: Pose, mount: &Mount, intrinsics: Intrinsics) -> Self {
+        Self { pose, intrinsics, from_level: mount.to_level().transpose(), height_m: mount.height_m }
+    }
+
+    /// The pixel of a point on the ground, or as high as the camera if its height is not known; `None` behind the camera.
+    fn pixel(&self, point: &Point2<f64>) -> Option<Point2<f64>> {
+        let (range_m, bearing_rad) = self.pose.range_bearing(point);
+        let up_m = -self.height_m.unwrap_or(0.0);
+        let level = Vector3::new(range_m * bearing_rad.cos(), range_m * bearing_rad.sin(), up_m);
+        self.intrinsics.project(&Point3::from(self.from_level * level))
+    }
+}
+
 /// The landmarks in view of `camera`, in their order. The perceived `objects` hide landmarks behind them, with the widths
 /// in `sizes` for listed labels.
 pub fn landmarks_in_view(
     landmarks: &[Landmark],
-    camera: &Pose,
-    intrinsics: &Intrinsics,
+    camera: &PosedCamera,
     objects: &[PerceivedObject],
     sizes: &ObjectSizes,
     config: &ViewConfig,
 ) -> Vec<LandmarkId> {
     let occluder = |object: &PerceivedObject| {
         let landmark = object.landmark.as_ref().and_then(|id| landmarks.iter().find(|landmark| landmark.id == *id));
-        Occluder::new(object, landmark.and_then(|landmark| landmark.facing_rad), camera, sizes, config)
+        Occluder::new(object, landmark.and_then(|landmark| landmark.facing_rad), &camera.pose, sizes, config)
     };
     let occluders: Vec<Occluder> = objects.iter().map(occluder).collect();
     let in_view = |landmark: &&Landmark| {
-        let (range_m, bearing_rad) = camera.range_bearing(&landmark.position);
+        let (range_m, bearing_rad) = camera.pose.range_bearing(&landmark.position);
         range_m <= config.max_range_m
-            && is_readable(landmark, camera, intrinsics, config)
+            && is_readable(landmark, camera, config)
             && !occluders.iter().any(|occluder| {
                 occluder.hides(
                     range_m,
                     bearing_rad,
-                    visible_width_share(landmark.facing_rad, camera, &landmark.position),
+                    visible_width_share(landmark.facing_rad, &camera.pose, &landmark.position),
                     config,
                 )
             })
@@ -68,8 +92,8 @@ pub fn landmarks_in_view(
 }
 
 /// True if a target that faces as the landmark does is inside the image and large enough.
-fn is_readable(landmark: &Landmark, camera: &Pose, intrinsics: &Intrinsics, config: &ViewConfig) -> bool {
-    let to_camera = camera.position - landmark.position;
+fn is_readable(landmark: &Landmark, camera: &PosedCamera, config: &ViewConfig) -> bool {
+    let to_camera = camera.pose.position - landmark.position;
     let towards_camera_rad = to_camera.y.atan2(to_camera.x);
     let facing_rad = landmark.facing_rad.unwrap_or(towards_camera_rad);
     if wrap_angle(towards_camera_rad - facing_rad).abs() > config.max_yaw_rad {
@@ -77,19 +101,14 @@ fn is_readable(landmark: &Landmark, camera: &Pose, intrinsics: &Intrinsics, conf
     }
     // The left end as seen from the side that the target faces.
     let half_width = Vector2::new(facing_rad.sin(), -facing_rad.cos()) * (config.target_width_m / 2.0);
-    let columns =
-        [landmark.position + half_width, landmark.position - half_width].map(|end| column(&end, camera, intrinsics));
-    let [Some(left_px), Some(right_px)] = columns else { return false };
-    right_px - left_px >= config.min_target_px
-        && left_px >= config.margin_px
-        && right_px <= f64::from(intrinsics.width) - config.margin_px
-}
-
-/// The image column of a world point; `None` behind the camera.
-fn column(point: &Point2<f64>, camera: &Pose, intrinsics: &Intrinsics) -> Option<f64> {
-    let (range_m, bearing_rad) = camera.range_bearing(point);
-    let in_camera = Point3::new(-range_m * bearing_rad.sin(), 0.0, range_m * bearing_rad.cos());
-    intrinsics.project(&in_camera).map(|pixel| pixel.x)
+    let ends = [landmark.position + half_width, landmark.position - half_width].map(|end| camera.pixel(&end));
+    let [Some(left), Some(right)] = ends else { return false };
+    let (width, height) = (f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
+    let is_on_rows = |end: &Point2<f64>| (0.0..=height).contains(&end.y);
+    right.x - left.x >= config.min_target_px
+        && left.x >= config.margin_px
+        && right.x <= width - config.margin_px
+        && (camera.height_m.is_none() || [left, right].iter().all(is_on_rows))
 }
 
 /// A perceived object that hides landmarks behind it.
@@ -151,7 +170,23 @@ mod tests {
     /// Seen from the origin, looking east with a field of view of 62.2°.
     fn seen(landmarks: &[Landmark], objects: &[PerceivedObject], sizes: &ObjectSizes) -> Vec<LandmarkId> {
         let camera = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
-        landmarks_in_view(landmarks, &Pose::new(0.0, 0.0, 0.0), &camera, objects, sizes, &ViewConfig::default())
+        let camera = PosedCamera::new(Pose::new(0.0, 0.0, 0.0), &Mount::default(), camera);
+        landmarks_in_view(landmarks, &camera, objects, sizes, &ViewConfig::default())
+    }
+
+    #[test]
+    fn a_camera_of_known_height_and_pitch_sees_places_on_the_ground_inside_its_rows() {
+        let intrinsics = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
+        let config = ViewConfig { min_target_px: 0.0, ..ViewConfig::default() };
+        let ahead = [1.0, 3.0, 9.0].map(|x_m| landmark(&format!("{x_m} m"), x_m, 0.0, None));
+        let seen = |height_m, pitch_deg: f64| {
+            let mount = Mount { height_m, pitch_rad: pitch_deg.to_radians(), ..Mount::default() };
+            let camera = PosedCamera::new(Pose::new(0.0, 0.0, 0.0), &mount, intrinsics);
+            landmarks_in_view(&ahead, &camera, &[], &ObjectSizes::default(), &config)
+        };
+        assert_eq!(seen(None, 0.0), ["1 m", "3 m", "9 m"]);
+        assert_eq!(seen(Some(1.2), 0.0), ["3 m", "9 m"], "the ground below the image is not in view");
+        assert_eq!(seen(Some(1.2), 40.0), ["1 m", "3 m"], "nor is what is above it");
     }
 
     fn sees(x_m: f64, y_m: f64, facing_rad: Option<f64>, objects: &[PerceivedObject]) -> bool {
@@ -204,8 +239,8 @@ mod tests {
         let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 0.8);
         let config = ViewConfig { max_range_m: 2.0, min_target_px: 0.0, ..ViewConfig::default() };
         let landmarks = [landmark("near", 1.9, 0.0, None), landmark("far", 2.1, 0.0, None)];
-        let pose = Pose::new(0.0, 0.0, 0.0);
-        assert_eq!(landmarks_in_view(&landmarks, &pose, &camera, &[], &ObjectSizes::default(), &config), ["near"]);
+        let camera = PosedCamera::new(Pose::new(0.0, 0.0, 0.0), &Mount::default(), camera);
+        assert_eq!(landmarks_in_view(&landmarks, &camera, &[], &ObjectSizes::default(), &config), ["near"]);
     }
 
     #[test]

@@ -19,6 +19,7 @@ use tokio::task::{JoinHandle, spawn_blocking};
 use crate::camera::detect::Detect;
 use crate::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus, Opener};
 use crate::camera::image_size::{ImageSize, SizeMismatch};
+use crate::camera::lens::Lens;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
@@ -34,8 +35,8 @@ pub struct DetectorArguments {
     pub capture: CaptureConfig,
     /// The detection algorithm.
     pub detect: Box<dyn Detect>,
-    /// Image size of the camera's optics, to which detections are scaled.
-    pub optics: ImageSize,
+    /// The camera's lens, to whose image size detections are scaled.
+    pub lens: Lens,
     /// Receiver of the detections.
     pub projector: ActorSlot<ProjectorMessage>,
     /// Records some of the frames.
@@ -54,7 +55,7 @@ pub struct Detector;
 pub struct DetectorState {
     /// Absent only while a frame is being processed.
     detect: Option<Box<dyn Detect>>,
-    optics: ImageSize,
+    lens: Lens,
     /// The size mismatch of the last frame.
     mismatch: Option<SizeMismatch>,
     /// True if the last frame failed; only the first failure in a row is logged.
@@ -75,11 +76,11 @@ impl Actor for Detector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DetectorArguments { open, capture, detect, optics, projector, images, counters, spans } = arguments;
+        let DetectorArguments { open, capture, detect, lens, projector, images, counters, spans } = arguments;
         let capture = Capture::start(open, capture)?;
         let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters), spans));
         let detect = Some(detect);
-        Ok(DetectorState { detect, optics, mismatch: None, failing: false, projector, images, counters, pump })
+        Ok(DetectorState { detect, lens, mismatch: None, failing: false, projector, images, counters, pump })
     }
 
     async fn handle(
@@ -106,9 +107,9 @@ impl Actor for Detector {
         match outcome {
             Ok(mut detections) => {
                 state.failing = false;
-                if state.scale(size, &mut detections) {
+                if let Some(lens) = state.scale(size, &mut detections) {
                     state.counters.count(Event::FrameDetected);
-                    state.projector.send(ProjectorMessage::Report { detections, captured_at });
+                    state.projector.send(ProjectorMessage::Report { detections, lens, captured_at });
                 } else {
                     state.counters.count(Event::FrameFailed);
                 }
@@ -126,16 +127,20 @@ impl Actor for Detector {
 }
 
 impl DetectorState {
-    /// Scales the detections to the size of the optics; false for a frame of another shape.
-    fn scale(&mut self, frame: ImageSize, detections: &mut [Detection]) -> bool {
-        let mismatch = self.optics.fit(frame, detections).err();
+    /// The detections' lens, with them scaled to its image size; none for a frame of a shape that the lens does not take.
+    fn scale(&mut self, frame: ImageSize, detections: &mut [Detection]) -> Option<Lens> {
+        let scaled = self.lens.of_frames(frame).and_then(|lens| {
+            ImageSize::from(&lens.intrinsics).fit(frame, detections)?;
+            Ok(lens)
+        });
+        let mismatch = scaled.as_ref().err().copied();
         match &mismatch {
             Some(error) => self.counters.troubles().note(TroubleKind::Camera, &error.to_string()),
             None if self.mismatch.is_some() => self.counters.troubles().settle(TroubleKind::Camera, None),
             None => {}
         }
         self.mismatch = mismatch;
-        mismatch.is_none()
+        scaled.ok()
     }
 }
 

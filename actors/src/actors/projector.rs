@@ -22,6 +22,7 @@ use ecod::wire::{ObjectReport, ReportKind};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::JoinSet;
 
+use crate::camera::lens::Lens;
 use crate::camera::perception::Perception;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
@@ -107,7 +108,7 @@ impl Actor for Projector {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         match message {
-            ProjectorMessage::Report { detections, captured_at } => state.report(detections, captured_at),
+            ProjectorMessage::Report { detections, lens, captured_at } => state.report(detections, &lens, captured_at),
             ProjectorMessage::Configure { perception, standing, origin, algorithms } => {
                 state.perception = perception.continuing(&state.perception);
                 (state.standing, state.algorithms) = (standing, algorithms);
@@ -145,13 +146,14 @@ impl ProjectorState {
         }
     }
 
-    fn report(&mut self, detections: Vec<Detection>, captured_at: Timestamp) {
+    fn report(&mut self, detections: Vec<Detection>, lens: &Lens, captured_at: Timestamp) {
         let pose = self.poses.as_ref().map_or(self.standing, |poses| poses.at(captured_at));
         let Some(pose) = pose else {
             self.counters.troubles().note(TroubleKind::NoPose, "no pose is known near the time of the camera's frames");
             return self.counters.count(Event::FrameWithoutPose);
         };
         self.perception.set_pose(pose);
+        self.perception.set_lens(lens);
         let found = detections.len();
         let span = tracing::info_span!("project");
         let mut report = span.in_scope(|| self.perception.report(detections, captured_at));

@@ -162,7 +162,7 @@ impl Calibration {
     pub fn lens(&self) -> Lens {
         let Self { image_width: width, image_height: height, fx, fy, cx, cy, distortion, .. } = *self;
         let distorts = distortion.iter().any(|k| *k != 0.0);
-        Lens { intrinsics: Intrinsics { width, height, fx, fy, cx, cy }, distortion: distorts.then_some(distortion) }
+        Lens { distortion: distorts.then_some(distortion), ..Lens::ideal(Intrinsics { width, height, fx, fy, cx, cy }) }
     }
 
     /// Reads a calibration file.

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use ecod::config::{ConfigError, check_range};
 use ecod::perception::camera::{Intrinsics, Mount};
-use ecod::perception::projection::ProjectionConfig;
+use ecod::perception::projection::{ProjectionConfig, Ranging};
 use ecod::perception::view::ViewConfig;
 use serde::{Deserialize, Serialize};
 
@@ -23,10 +23,11 @@ pub struct CameraConfig {
     /// Stall timeout and retries of the source.
     #[serde(default)]
     pub capture: CaptureConfig,
-    /// Image size and field of view. Frames of the same aspect ratio are scaled; others are rejected.
+    /// Image size and field of view. Frames of the same aspect ratio are scaled. Others are rejected, unless only a field
+    /// of view is given: it then holds for frames of any shape.
     #[serde(default)]
     pub optics: OpticsConfig,
-    /// Position of the camera on the vehicle.
+    /// Position and attitude of the camera on the vehicle.
     #[serde(default)]
     pub mount: MountConfig,
     /// Detector of objects in frames.
@@ -52,17 +53,20 @@ fn yes() -> bool {
 pub struct OpticsConfig {
     /// Calibration file of `ecod-node calibrate`, which replaces the other keys. Default none.
     pub calibration: Option<PathBuf>,
-    /// Image width in pixels. Default 640.
-    pub width_px: u32,
-    /// Image height in pixels. Default 480.
-    pub height_px: u32,
+    /// Image width in pixels. Default none: without `height_px`, frames may have any shape.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub width_px: Option<u32>,
+    /// Image height in pixels. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub height_px: Option<u32>,
     /// Horizontal field of view in degrees. Default 62.2, the Raspberry Pi Camera Module 2.
     pub horizontal_fov_deg: f64,
-    /// Vertical field of view in degrees. Default 48.8, the Raspberry Pi Camera Module 2.
-    pub vertical_fov_deg: f64,
+    /// Vertical field of view in degrees. Default none: pixels are square.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub vertical_fov_deg: Option<f64>,
 }
 
-/// Position of the camera on the vehicle.
+/// Position and attitude of the camera on the vehicle.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MountConfig {
@@ -72,11 +76,18 @@ pub struct MountConfig {
     pub left_m: f64,
     /// Angle of the axis from the vehicle's heading in degrees, counter-clockwise. Default 0.
     pub pan_deg: f64,
+    /// Height of the camera above the ground in metres. Default none: the ground gives no distances.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub height_m: Option<f64>,
+    /// Angle of the axis below the horizon in degrees. Default 0.
+    pub pitch_deg: f64,
+    /// Angle in degrees by which the camera leans to its right. Default 0.
+    pub roll_deg: f64,
 }
 
 impl Default for OpticsConfig {
     fn default() -> Self {
-        Self { calibration: None, width_px: 640, height_px: 480, horizontal_fov_deg: 62.2, vertical_fov_deg: 48.8 }
+        Self { calibration: None, width_px: None, height_px: None, horizontal_fov_deg: 62.2, vertical_fov_deg: None }
     }
 }
 
@@ -94,13 +105,13 @@ impl CameraConfig {
             let least = format!("above 1 / capture.stall_timeout_s, {}", 1.0 / self.capture.stall_timeout_s);
             return Err(ConfigError::new("source.fps", fps, least));
         }
-        check_range("optics.width_px", f64::from(self.optics.width_px), 16.0, 16_384.0)?;
-        check_range("optics.height_px", f64::from(self.optics.height_px), 16.0, 16_384.0)?;
-        check_range("optics.horizontal_fov_deg", self.optics.horizontal_fov_deg, 1.0, 175.0)?;
-        check_range("optics.vertical_fov_deg", self.optics.vertical_fov_deg, 1.0, 175.0)?;
-        check_range("mount.forward_m", self.mount.forward_m, -100.0, 100.0)?;
-        check_range("mount.left_m", self.mount.left_m, -100.0, 100.0)?;
-        check_range("mount.pan_deg", self.mount.pan_deg, -360.0, 360.0)?;
+        self.optics.validate().map_err(|error| error.within("optics"))?;
+        self.mount.validate().map_err(|error| error.within("mount"))?;
+        if self.projection.ranging == Ranging::Ground && self.mount.height_m.is_none() {
+            let allowed =
+                "the camera's height above the ground, by which `projection.ranging = \"ground\"` places objects";
+            return Err(ConfigError::new("mount.height_m", "nothing", allowed));
+        }
         self.detector.validate().map_err(|error| error.within("detector"))?;
         self.projection.validate().map_err(|error| error.within("projection"))?;
         self.view.validate().map_err(|error| error.within("view"))
@@ -108,25 +119,54 @@ impl CameraConfig {
 }
 
 impl OpticsConfig {
-    /// Intrinsics and distortion, from the calibration file if there is one.
+    fn validate(&self) -> Result<(), ConfigError> {
+        for (key, size_px) in [("width_px", self.width_px), ("height_px", self.height_px)] {
+            size_px.map_or(Ok(()), |size_px| check_range(key, f64::from(size_px), 16.0, 16_384.0))?;
+        }
+        check_range("horizontal_fov_deg", self.horizontal_fov_deg, 1.0, 175.0)?;
+        self.vertical_fov_deg.map_or(Ok(()), |angle_deg| check_range("vertical_fov_deg", angle_deg, 1.0, 175.0))
+    }
+
+    /// Intrinsics and distortion, from the calibration file if there is one. Without a size they are those of a frame of
+    /// 640x480.
     ///
     /// # Errors
     /// [`CalibrationError`] when the file cannot be used.
     pub fn lens(&self) -> Result<Lens, CalibrationError> {
-        match &self.calibration {
-            Some(path) => Ok(Calibration::read(path)?.lens()),
-            None => Ok(Lens::ideal(Intrinsics::from_field_of_view(
-                self.width_px,
-                self.height_px,
-                self.horizontal_fov_deg.to_radians(),
-                self.vertical_fov_deg.to_radians(),
-            ))),
+        if let Some(path) = &self.calibration {
+            return Ok(Calibration::read(path)?.lens());
         }
+        let (width, height) = (self.width_px.unwrap_or(640), self.height_px.unwrap_or(480));
+        let horizontal_rad = self.horizontal_fov_deg.to_radians();
+        let intrinsics = match self.vertical_fov_deg {
+            Some(angle_deg) => Intrinsics::from_field_of_view(width, height, horizontal_rad, angle_deg.to_radians()),
+            None => Intrinsics::with_square_pixels(width, height, horizontal_rad),
+        };
+        let is_any_shape = self.width_px.is_none() && self.height_px.is_none() && self.vertical_fov_deg.is_none();
+        Ok(Lens { is_any_shape, ..Lens::ideal(intrinsics) })
+    }
+}
+
+impl MountConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        check_range("forward_m", self.forward_m, -100.0, 100.0)?;
+        check_range("left_m", self.left_m, -100.0, 100.0)?;
+        check_range("pan_deg", self.pan_deg, -360.0, 360.0)?;
+        self.height_m.map_or(Ok(()), |height_m| check_range("height_m", height_m, 0.01, 1000.0))?;
+        check_range("pitch_deg", self.pitch_deg, -90.0, 90.0)?;
+        check_range("roll_deg", self.roll_deg, -180.0, 180.0)
     }
 }
 
 impl From<MountConfig> for Mount {
     fn from(mount: MountConfig) -> Self {
-        Self { forward_m: mount.forward_m, left_m: mount.left_m, pan_rad: mount.pan_deg.to_radians() }
+        Self {
+            forward_m: mount.forward_m,
+            left_m: mount.left_m,
+            pan_rad: mount.pan_deg.to_radians(),
+            height_m: mount.height_m,
+            pitch_rad: mount.pitch_deg.to_radians(),
+            roll_rad: mount.roll_deg.to_radians(),
+        }
     }
 }

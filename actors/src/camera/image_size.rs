@@ -37,20 +37,30 @@ impl ImageSize {
         Self { width: image.cols().unsigned_abs(), height: image.rows().unsigned_abs() }
     }
 
+    /// Checks that a frame of this size can be scaled to this one.
+    ///
+    /// # Errors
+    /// [`SizeMismatch`] for another aspect ratio.
+    pub fn check_shape(self, frame: Self) -> Result<(), SizeMismatch> {
+        let [x, y] = self.scale(frame);
+        let is_scaled = x.is_finite() && y.is_finite() && (x / y - 1.0).abs() <= ASPECT_TOLERANCE;
+        if is_scaled { Ok(()) } else { Err(SizeMismatch { frame, optics: self }) }
+    }
+
+    fn scale(self, frame: Self) -> [f64; 2] {
+        [(self.width, frame.width), (self.height, frame.height)].map(|(to, from)| f64::from(to) / f64::from(from))
+    }
+
     /// Scales detections from a frame's size to this one.
     ///
     /// # Errors
     /// [`SizeMismatch`] for another aspect ratio; the detections are then unchanged.
     pub fn fit(self, frame: Self, detections: &mut [Detection]) -> Result<(), SizeMismatch> {
+        self.check_shape(frame)?;
         if frame == self {
             return Ok(());
         }
-        let scale =
-            [(self.width, frame.width), (self.height, frame.height)].map(|(to, from)| f64::from(to) / f64::from(from));
-        let [x, y] = scale;
-        if !(x.is_finite() && y.is_finite()) || (x / y - 1.0).abs() > ASPECT_TOLERANCE {
-            return Err(SizeMismatch { frame, optics: self });
-        }
+        let [x, y] = self.scale(frame);
         for Detection { bounding_box, corners, .. } in detections {
             bounding_box.x_min *= x;
             bounding_box.x_max *= x;

@@ -6,6 +6,8 @@ use nalgebra::Point2;
 use opencv::calib3d;
 use opencv::core::{Mat, Matx33d, Point2d, Vector};
 
+use crate::camera::image_size::{ImageSize, SizeMismatch};
+
 /// A calibrated camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lens {
@@ -13,12 +15,32 @@ pub struct Lens {
     pub intrinsics: Intrinsics,
     /// OpenCV's k1, k2, p1, p2, k3; `None` for an ideal lens.
     pub distortion: Option<[f64; 5]>,
+    /// True if frames may have any shape: the horizontal field of view is that of all of them.
+    pub is_any_shape: bool,
 }
 
 impl Lens {
     /// A lens without distortion.
     pub fn ideal(intrinsics: Intrinsics) -> Self {
-        Self { intrinsics, distortion: None }
+        Self { intrinsics, distortion: None, is_any_shape: false }
+    }
+
+    /// The lens for frames of this size: this one if they have its shape.
+    ///
+    /// # Errors
+    /// [`SizeMismatch`] for frames of another shape, unless the lens takes any.
+    pub fn of_frames(&self, frame: ImageSize) -> Result<Self, SizeMismatch> {
+        let size = ImageSize::from(&self.intrinsics);
+        match size.check_shape(frame) {
+            Err(_) if self.is_any_shape && frame.width > 0 && frame.height > 0 => {
+                let height = f64::from(frame.height) * f64::from(size.width) / f64::from(frame.width);
+                let horizontal_rad = self.intrinsics.horizontal_field_of_view();
+                let intrinsics =
+                    Intrinsics::with_square_pixels(size.width, height.round().max(1.0) as u32, horizontal_rad);
+                Ok(Self { intrinsics, ..*self })
+            }
+            outcome => outcome.map(|()| *self),
+        }
     }
 
     /// Undistorts boxes and corners. A box is undistorted at the midpoints of its edges.
@@ -93,12 +115,26 @@ mod tests {
             corners: Some(bent),
         };
         let mut detections = vec![Detection { corners: None, ..seen.clone() }, seen];
-        Lens { intrinsics: camera(), distortion: Some(DISTORTION) }.undistort(&mut detections).unwrap();
+        Lens { distortion: Some(DISTORTION), ..Lens::ideal(camera()) }.undistort(&mut detections).unwrap();
         for (straight, ideal) in detections[1].corners.unwrap().iter().zip(ideal) {
             assert!((straight - ideal).norm() < 0.05, "{straight} {ideal}");
         }
         assert_eq!(detections[0].bounding_box, detections[1].bounding_box);
         assert!((detections[0].bounding_box.center() - BoundingBox::around(&ideal).center()).norm() < 1.0);
+    }
+
+    #[test]
+    fn a_field_of_view_alone_holds_for_frames_of_any_shape() {
+        let horizontal_rad = 70f64.to_radians();
+        let narrow = Lens::ideal(Intrinsics::with_square_pixels(640, 480, horizontal_rad));
+        let wide = ImageSize { width: 1920, height: 1080 };
+        assert!(narrow.of_frames(wide).is_err());
+        let any = Lens { is_any_shape: true, ..narrow };
+        assert_eq!(any.of_frames(ImageSize { width: 1280, height: 960 }), Ok(any));
+        let Intrinsics { width, height, fx, fy, cy, .. } = any.of_frames(wide).unwrap().intrinsics;
+        assert_eq!((width, height, cy), (640, 360, 180.0));
+        assert!((fx - 320.0 / (horizontal_rad / 2.0).tan()).abs() < 1e-9 && fx == fy);
+        assert!(any.of_frames(ImageSize { width: 640, height: 0 }).is_err());
     }
 
     #[test]

@@ -10,8 +10,8 @@ use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::perception::camera::Mount;
 use ecod::perception::landmark::{LandmarkGate, LandmarkIndex};
-use ecod::perception::projection::{Projection, ProjectionConfig, ProjectionError, Ranging};
-use ecod::perception::view::{ViewConfig, landmarks_in_view};
+use ecod::perception::projection::{Cut, Projection, ProjectionConfig, ProjectionError};
+use ecod::perception::view::{PosedCamera, ViewConfig, landmarks_in_view};
 use ecod::wire::{ObjectReport, PerceivedObject};
 use nalgebra::Point2;
 
@@ -91,7 +91,7 @@ impl Perception {
         gate: LandmarkGate,
     ) -> Self {
         let camera = vehicle_camera.mount.camera_pose(&vehicle_camera.pose);
-        let projection = Projection::new(projection, vehicle_camera.lens.intrinsics);
+        let projection = Projection::new(projection, vehicle_camera.lens.intrinsics, vehicle_camera.mount);
         Self { vehicle_camera, camera, projection, view, gate, seq: 0, discarded: DiscardCounts::default() }
     }
 
@@ -107,23 +107,27 @@ impl Perception {
         self.camera = self.vehicle_camera.mount.camera_pose(&pose);
     }
 
+    /// Sets the lens of the next frames.
+    pub fn set_lens(&mut self, lens: &Lens) {
+        if self.vehicle_camera.lens != *lens {
+            self.vehicle_camera.lens = *lens;
+            let (config, mount) = (self.projection.config().clone(), self.vehicle_camera.mount);
+            self.projection = Projection::new(config, lens.intrinsics, mount);
+        }
+    }
+
     /// The report of one frame. Detections without a position are discarded and counted.
     pub fn report(&mut self, mut detections: Vec<Detection>, captured_at: Timestamp) -> ObjectReport {
         self.discarded.is_size_missing = false;
-        detections.retain(|detection| match self.projection.check_unclipped(detection) {
-            Ok(()) => true,
-            Err(error) => {
-                self.discarded.count(error.as_str(), &error);
-                false
-            }
-        });
+        let cuts: Vec<Cut> = detections.iter().map(|detection| self.projection.cut(detection)).collect();
         if let Err(error) = self.vehicle_camera.lens.undistort(&mut detections) {
             tracing::warn!(%error, "cannot remove distortion");
         }
-        let objects: Vec<_> = detections.iter().filter_map(|detection| self.place(detection)).collect();
-        let landmarks = self.vehicle_camera.landmarks.landmarks();
-        let (lens, sizes) = (&self.vehicle_camera.lens, &self.projection.config().sizes);
-        let seen = landmarks_in_view(landmarks, &self.camera, &lens.intrinsics, &objects, sizes, &self.view);
+        let objects: Vec<_> =
+            detections.iter().zip(cuts).filter_map(|(detection, cut)| self.place(detection, cut)).collect();
+        let VehicleCamera { landmarks, mount, lens, .. } = &self.vehicle_camera;
+        let (camera, sizes) = (PosedCamera::new(self.camera, mount, lens.intrinsics), &self.projection.config().sizes);
+        let seen = landmarks_in_view(landmarks.landmarks(), &camera, &objects, sizes, &self.view);
         self.seq += 1;
         ObjectReport {
             pose: Some(self.camera.into()),
@@ -145,8 +149,8 @@ impl Perception {
         self.discarded.is_size_missing.then(|| format!("detections have no size and are not reported: {labels}"))
     }
 
-    fn place(&mut self, detection: &Detection) -> Option<PerceivedObject> {
-        let corners = detection.corners.filter(|_| self.projection.config().ranging == Ranging::Corners);
+    fn place(&mut self, detection: &Detection, cut: Cut) -> Option<PerceivedObject> {
+        let corners = detection.corners.filter(|_| self.projection.config().ranging.uses_corners());
         let side_m = self.projection.config().sizes.of(&detection.label).map(|size| size.width_m);
         let target = corners.zip(side_m).map(|(c, side)| locate_target(&c, side, &self.vehicle_camera.lens.intrinsics));
         let target = match target.transpose() {
@@ -156,7 +160,7 @@ impl Perception {
                 None
             }
         };
-        let placed = self.projection.place(detection, target.as_ref(), &self.camera);
+        let placed = self.projection.place(detection, cut, target.as_ref(), &self.camera);
         let placed = placed.map_err(|error| self.discarded.count_unplaced(&error)).ok()?;
         // Receivers reject a report with one invalid object, so this is checked per object.
         placed.validate().map_err(|reason| self.discarded.count(reason.as_str(), &reason)).ok()?;
@@ -177,7 +181,7 @@ impl Perception {
 mod tests {
     use ecod::model::detection::BoundingBox;
     use ecod::perception::camera::Intrinsics;
-    use ecod::perception::projection::{ObjectSize, ObjectSizes};
+    use ecod::perception::projection::{ObjectSize, ObjectSizes, Ranging};
 
     use super::*;
 
@@ -187,7 +191,7 @@ mod tests {
         let vehicle_camera = VehicleCamera {
             node: NodeName::from_static("euclid"),
             pose: Pose::new(0.0, 0.0, 0.0),
-            mount: Mount { forward_m: 0.0, left_m: 0.0, pan_rad: 0.0 },
+            mount: Mount::default(),
             lens: Lens::ideal(camera),
             landmarks: Arc::new(LandmarkIndex::new(Vec::new(), 0.5)),
         };
@@ -215,7 +219,7 @@ mod tests {
         let vehicle_camera = VehicleCamera {
             node: NodeName::from_static("cam"),
             pose: Pose::new(0.0, 0.0, 0.0),
-            mount: Mount { forward_m: 0.0, left_m: 0.0, pan_rad: 0.0 },
+            mount: Mount::default(),
             lens: Lens::ideal(camera),
             landmarks: Arc::new(LandmarkIndex::new(Vec::new(), 0.5)),
         };
@@ -230,10 +234,10 @@ mod tests {
             corners: None,
         };
         for _ in 0..3 {
-            perception.report(vec![seen("person"), seen("car")], Timestamp(1));
+            perception.report(vec![seen("plate"), seen("car")], Timestamp(1));
         }
-        perception.report(vec![seen("dog")], Timestamp(2));
-        let words = "detections have no size and are not reported: 1 of dog, 3 of person";
+        perception.report(vec![seen("cart")], Timestamp(2));
+        let words = "detections have no size and are not reported: 1 of cart, 3 of plate";
         assert_eq!(perception.without_size().as_deref(), Some(words));
         perception.report(vec![seen("car")], Timestamp(3));
         assert_eq!(perception.without_size(), None);

@@ -78,7 +78,7 @@ struct JoinArguments {
     seeds: Vec<String>,
 }
 
-fn ip_and_port(text: &str) -> Result<SocketAddr, &'static str> {
+pub(super) fn ip_and_port(text: &str) -> Result<SocketAddr, &'static str> {
     text.parse().map_err(|_| "must be an IP address and a port, such as 0.0.0.0:1883")
 }
 
@@ -92,8 +92,13 @@ pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
 
 /// Runs a node until it is told to stop or gives up.
 pub(super) fn run_node(config: NodeConfig, stop_at_eof: bool) -> Result<(), Failure> {
+    run_to_end(serve(config, stop_at_eof))
+}
+
+/// Runs what serves one node or several, on threads of its own.
+pub(super) fn run_to_end(serve: impl Future<Output = anyhow::Result<()>>) -> Result<(), Failure> {
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads for the node")?;
-    let served = runtime.block_on(serve(config, stop_at_eof));
+    let served = runtime.block_on(serve);
     // A detector may block for good; a restart of the node must not wait for it.
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     #[cfg(feature = "camera")]
@@ -199,7 +204,7 @@ impl ObserverArguments {
 }
 
 /// Waits for the end of standard input. Its reading thread is abandoned, since it cannot be woken.
-async fn input_ended() {
+pub(super) async fn input_ended() {
     let (ended, end) = oneshot::channel();
     std::thread::spawn(move || {
         let copied = std::io::copy(&mut std::io::stdin().lock(), &mut std::io::sink());

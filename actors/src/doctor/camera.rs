@@ -44,13 +44,15 @@ async fn frame(camera: &CameraConfig) -> Finding {
         // The receiver is gone after the timeout.
         let _ = sender.send(size);
     });
-    let (width, height) = (camera.optics.width_px, camera.optics.height_px);
+    let lens = camera.optics.lens().ok();
     match tokio::time::timeout(TIMEOUT, answer).await {
-        Ok(Ok(Ok(size))) if size.width * height != size.height * width && camera.optics.calibration.is_none() => {
-            let seen = format!("frames of {}x{}, but optics of {width}x{height}", size.width, size.height);
-            Finding::broken(check, seen, "set `camera.optics` to the size of the frames, or calibrate")
-        }
-        Ok(Ok(Ok(size))) => Finding::fine(check, format!("frames of {}x{}", size.width, size.height)),
+        Ok(Ok(Ok(size))) => match lens.map(|lens| lens.of_frames(size)) {
+            Some(Err(mismatch)) => {
+                let seen = format!("frames of {size}, but optics of {}", mismatch.optics);
+                Finding::broken(check, seen, "set `camera.optics` to the size of the frames, or calibrate")
+            }
+            _ => Finding::fine(check, format!("frames of {size}")),
+        },
         Ok(Ok(Err(error))) => Finding::broken(check, error.to_string(), fix),
         Ok(Err(_)) | Err(_) => Finding::broken(check, format!("no frame within {TIMEOUT:?}"), fix),
     }

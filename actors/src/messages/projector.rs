@@ -6,6 +6,7 @@ use ecod::model::geometry::Pose;
 use ecod::model::origin::{GeographicOrigin, StatedPose};
 use ecod::model::time::Timestamp;
 
+use crate::camera::lens::Lens;
 use crate::camera::perception::Perception;
 
 /// Requests to the projector.
@@ -15,6 +16,8 @@ pub enum ProjectorMessage {
     Report {
         /// Detections in pixels.
         detections: Vec<Detection>,
+        /// Lens of the frame.
+        lens: Lens,
         /// Time of capture.
         captured_at: Timestamp,
     },

@@ -9,7 +9,6 @@ use ecod::model::geometry::Pose;
 use ecod::perception::landmark::LandmarkIndex;
 
 use crate::actors::detector::DetectorArguments;
-use crate::camera::image_size::ImageSize;
 use crate::camera::perception::{Perception, VehicleCamera};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::projector::ProjectorMessage;
@@ -79,7 +78,7 @@ pub fn detector(
         open: Arc::new(move || source.open(timeout)),
         capture: camera.capture.clone(),
         detect: camera.detector.build().context("key `camera.detector`")?,
-        optics: ImageSize::from(&lens.intrinsics),
+        lens,
         projector,
         images,
         counters,

@@ -57,10 +57,10 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
         capture: CaptureConfig::default(),
         optics: OpticsConfig {
             calibration: None,
-            width_px: intrinsics.width,
-            height_px: intrinsics.height,
+            width_px: Some(intrinsics.width),
+            height_px: Some(intrinsics.height),
             horizontal_fov_deg: 2.0 * half_angle(intrinsics.width, intrinsics.fx).to_degrees(),
-            vertical_fov_deg: 2.0 * half_angle(intrinsics.height, intrinsics.fy).to_degrees(),
+            vertical_fov_deg: Some(2.0 * half_angle(intrinsics.height, intrinsics.fy).to_degrees()),
         },
         mount: MountConfig::default(),
         detector: DetectorConfig::Placard(PlacardConfig::default()),

@@ -1,22 +1,18 @@
 //! Ranging by the width of the box.
 
-use super::{EDGE_PX, LineOfSight, ObjectSize};
-use crate::model::detection::BoundingBox;
-use crate::perception::camera::Intrinsics;
+use nalgebra::Point2;
 
-/// True if the image's left or right edge cuts the box.
-pub(super) fn is_clipped(bounds: &BoundingBox, camera: &Intrinsics) -> bool {
-    bounds.x_min < EDGE_PX || bounds.x_max > f64::from(camera.width) - EDGE_PX
-}
+use super::{LineOfSight, ObjectSize, Projection};
+use crate::model::detection::BoundingBox;
 
 /// An isosceles triangle with the width as its base and the camera at its tip: d = s / (2 tan(α/2)). The line of sight
 /// halves the angle between the bearings of the two edges.
-pub(super) fn line_of_sight(bounds: &BoundingBox, size: &ObjectSize, camera: &Intrinsics) -> LineOfSight {
-    let (left, right) = (camera.bearing(bounds.x_min), camera.bearing(bounds.x_max));
+pub(super) fn line_of_sight(bounds: &BoundingBox, size: &ObjectSize, projection: &Projection) -> LineOfSight {
+    let bearing = |x_px| {
+        let ray = projection.to_level * projection.intrinsics.ray(&Point2::new(x_px, bounds.center().y));
+        ray.y.atan2(ray.x)
+    };
+    let (left, right) = (bearing(bounds.x_min), bearing(bounds.x_max));
     let half_alpha = (left - right) / 2.0;
-    LineOfSight {
-        bearing_rad: (left + right) / 2.0,
-        distance_m: size.width_m / (2.0 * half_alpha.tan()),
-        extent_px: bounds.width(),
-    }
+    projection.sized((left + right) / 2.0, size.width_m / (2.0 * half_alpha.tan()), bounds.width(), size)
 }

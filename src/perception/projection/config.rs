@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::coco_sizes;
 use crate::config::{ConfigError, check_range, config_section};
 use crate::model::names::Label;
 
@@ -11,18 +12,30 @@ use crate::model::names::Label;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Ranging {
+    /// [`Ranging::Corners`] where a detection has corners. Otherwise [`Ranging::Ground`] and [`Ranging::BoxHeight`],
+    /// weighted by their covariance where both hold; without the height of the camera, the latter alone.
+    #[default]
+    Auto,
     /// From the four corners of a square target, at any yaw; the most exact. Detections without corners are ranged by
     /// [`Ranging::BoxHeight`].
-    #[default]
     Corners,
     /// z = f_y · height / box height: exact for an upright object at any yaw.
     BoxHeight,
     /// d = s / (2 tan(α/2)) with α the angle between the bearings of the two edges: exact for a width perpendicular to
     /// the line of sight, too far for one that is turned away.
     BoxWidth,
+    /// Where the foot of the box meets the ground: for objects that stand on level ground, with the camera's height known.
+    Ground,
     /// The paper's formulas (PACE client, Algorithm 1) to the letter, with their errors: d = s / tan α with α spread
     /// evenly over the columns, and bearings from the left edge of the image. `projection/paper.rs` explains them.
     Paper,
+}
+
+impl Ranging {
+    /// True if the corners of a detection count.
+    pub fn uses_corners(self) -> bool {
+        matches!(self, Self::Auto | Self::Corners)
+    }
 }
 
 /// The true size of a kind of object.
@@ -33,6 +46,10 @@ pub struct ObjectSize {
     pub width_m: f64,
     /// Height in metres; the side of a square target.
     pub height_m: f64,
+    /// Length in metres, the horizontal extent across the width; default the width. It matters where the ground gives the
+    /// distance.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub length_m: Option<f64>,
     /// Relative standard deviation of sizes of this kind and of the focal length together; default 0.02. Too small
     /// makes positions over-confident along the line of sight; too large makes them count less in fusion.
     #[serde(default = "default_relative_sigma")]
@@ -42,12 +59,15 @@ pub struct ObjectSize {
 impl ObjectSize {
     /// A square of the given side, with the default uncertainty.
     pub fn square(side_m: f64) -> Self {
-        Self { width_m: side_m, height_m: side_m, relative_sigma: default_relative_sigma() }
+        Self { width_m: side_m, height_m: side_m, length_m: None, relative_sigma: default_relative_sigma() }
     }
 
     fn validate(&self) -> Result<(), ConfigError> {
         check_range("width_m", self.width_m, 1e-4, 1e3)?;
         check_range("height_m", self.height_m, 1e-4, 1e3)?;
+        if let Some(length_m) = self.length_m {
+            check_range("length_m", length_m, 0.0, 1e3)?;
+        }
         check_range("relative_sigma", self.relative_sigma, 0.0, 1.0)
     }
 }
@@ -56,16 +76,17 @@ impl ObjectSize {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObjectSizes {
-    /// Size of labels that are not listed, such as decoded texts. Default none: their detections have no position.
+    /// Size of labels that are not listed, such as decoded texts. Default none: labels of COCO have their usual sizes, and
+    /// others no position, unless the ground gives one.
     pub default: Option<ObjectSize>,
     /// Sizes of listed labels; default none.
     pub labels: BTreeMap<Label, ObjectSize>,
 }
 
 impl ObjectSizes {
-    /// The size of a label, listed or default.
+    /// The size of a label: listed, default, or usual for a label of COCO.
     pub fn of(&self, label: &str) -> Option<&ObjectSize> {
-        self.labels.get(label).or(self.default.as_ref())
+        self.labels.get(label).or(self.default.as_ref()).or_else(|| coco_sizes::of(label))
     }
 
     /// The first size that cannot be in metres, in words: no object of a road is as large.
@@ -94,16 +115,22 @@ impl ObjectSizes {
 config_section! {
     /// Settings of projection.
     pub struct ProjectionConfig {
-        /// The way of ranging; default `corners`. `box_height` needs upright objects, `box_width` objects that face the
-        /// camera; `paper` has the published formulas with their errors.
+        /// The way of ranging; default `auto`: from corners, otherwise from the box's height and, if the camera's height
+        /// is known, the ground. `box_height` needs upright objects, `box_width` objects that face the camera, `ground`
+        /// objects on level ground; `paper` has the published formulas with their errors.
         pub ranging: Ranging = Ranging::default();
-        /// True sizes of objects; default none.
+        /// True sizes of objects; default none but the usual ones of COCO's labels.
         pub sizes: ObjectSizes = ObjectSizes::default(), checked by ObjectSizes::validate;
         /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach 0.5, neural
         /// detectors 3 and more.
         pub pixel_sigma_px: f64 = 1.0, in 0.0 to 1e3;
         /// Standard deviation of the camera's heading in radians; default 0.01.
         pub heading_sigma_rad: f64 = 0.01, in 0.0 to std::f64::consts::PI;
+        /// Standard deviation of the camera's pitch and roll in radians; default 0.0175 (1°). It covers a mount that was
+        /// measured by hand and a road that is not level.
+        pub tilt_sigma_rad: f64 = 0.0175, in 0.0 to 1.0;
+        /// Standard deviation of the camera's height above the ground at the object in metres; default 0.02. Bumps count.
+        pub height_sigma_m: f64 = 0.02, in 0.0 to 1e3;
         /// Standard deviation of the camera's position in metres, each axis; default 0.005.
         pub position_sigma_m: f64 = 0.005, in 0.0 to 1e3;
         /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps covariances away from zero.

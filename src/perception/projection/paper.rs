@@ -9,16 +9,15 @@
 //! - The angle is spread evenly over the columns; a flat sensor spreads its tangent evenly.
 //! - tan α takes the far leg of a right triangle, 2 tan(α/2) the base of an isosceles one.
 
-use super::{LineOfSight, ObjectSize, ProjectionError};
+use super::{LineOfSight, ObjectSize, Projection, ProjectionError};
 use crate::model::detection::Detection;
-use crate::perception::camera::Intrinsics;
 
 pub(super) fn line_of_sight(
     detection: &Detection,
     size: &ObjectSize,
-    camera: &Intrinsics,
+    projection: &Projection,
 ) -> Result<LineOfSight, ProjectionError> {
-    let gamma = camera.angle_per_pixel();
+    let gamma = projection.intrinsics.angle_per_pixel();
     let width_px = detection.bounding_box.width();
     let alpha = gamma * width_px;
     let distance_m = size.width_m / alpha.tan();
@@ -26,5 +25,5 @@ pub(super) fn line_of_sight(
         return Err(ProjectionError::DegenerateBox(detection.label.clone()));
     }
     let x_center = detection.bounding_box.x_min + 0.5 * width_px;
-    Ok(LineOfSight { bearing_rad: -(gamma * x_center), distance_m, extent_px: width_px })
+    Ok(projection.sized(-(gamma * x_center), distance_m, width_px, size))
 }

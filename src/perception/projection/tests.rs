@@ -1,6 +1,8 @@
 use nalgebra::{Point2, Point3, Vector2};
 use proptest::prelude::*;
 
+mod ground;
+
 use super::*;
 use crate::model::detection::BoundingBox;
 
@@ -12,7 +14,7 @@ fn camera() -> Intrinsics {
 
 fn projection(ranging: Ranging) -> Projection {
     let sizes = ObjectSizes { default: Some(ObjectSize::square(SIDE_M)), ..ObjectSizes::default() };
-    Projection::new(ProjectionConfig { ranging, sizes, ..ProjectionConfig::default() }, camera())
+    Projection::new(ProjectionConfig { ranging, sizes, ..ProjectionConfig::default() }, camera(), Mount::default())
 }
 
 fn detection(bounding_box: BoundingBox) -> Detection {
@@ -47,19 +49,19 @@ proptest! {
         let expected = pose.transform(range_m * bearing_rad.cos(), range_m * bearing_rad.sin());
         // Parallel to the image for the height, square to the sight for the width.
         for (ranging, yaw_rad) in [(Ranging::BoxHeight, 0.0), (Ranging::BoxWidth, bearing_rad)] {
-            let placed = projection(ranging).place(&detection(board(range_m, bearing_rad, yaw_rad)), None, &pose).unwrap();
+            let placed = projection(ranging).place(&detection(board(range_m, bearing_rad, yaw_rad)), Cut::default(), None, &pose).unwrap();
             prop_assert!(offset_m(&placed, expected) <= 1e-9, "{ranging:?}");
         }
         let target = Point3::new(-range_m * bearing_rad.sin(), 0.1, range_m * bearing_rad.cos());
         let seen = detection(board(range_m, bearing_rad, 0.7));
-        let placed = projection(Ranging::Corners).place(&seen, Some(&target), &pose).unwrap();
+        let placed = projection(Ranging::Corners).place(&seen, Cut::default(), Some(&target), &pose).unwrap();
         prop_assert!(offset_m(&placed, expected) <= 1e-9);
     }
 
     #[test]
     fn paper_ranging_is_the_published_algorithm(pose in poses(), x_min in 0.0..500.0f64, w in 1.0..130.0f64) {
         let seen = detection(BoundingBox { x_min, y_min: 100.0, x_max: x_min + w, y_max: 150.0 });
-        let placed = projection(Ranging::Paper).place(&seen, None, &pose).unwrap();
+        let placed = projection(Ranging::Paper).place(&seen, Cut::default(), None, &pose).unwrap();
 
         // Algorithm 1 of the paper, line by line, in its own units.
         let gamma_deg = 62.2 / 640.0;
@@ -80,9 +82,9 @@ proptest! {
     ) {
         let seen = detection(board(range_m, bearing_rad, 0.3));
         for ranging in [Ranging::Corners, Ranging::BoxHeight, Ranging::BoxWidth, Ranging::Paper] {
-            let here = projection(ranging).place(&seen, None, &pose).unwrap();
+            let here = projection(ranging).place(&seen, Cut::default(), None, &pose).unwrap();
             let moved = Pose::new(pose.position.x + shift, pose.position.y - shift, pose.heading_rad + turn_rad);
-            let there = projection(ranging).place(&seen, None, &moved).unwrap();
+            let there = projection(ranging).place(&seen, Cut::default(), None, &moved).unwrap();
 
             let turn = nalgebra::Rotation2::new(turn_rad);
             let offset = Vector2::new(here.x_m, here.y_m) - pose.position.coords;
@@ -101,7 +103,7 @@ proptest! {
         let [x_min, y_min, x_max, y_max] = edges;
         let seen = detection(BoundingBox { x_min, y_min, x_max, y_max });
         for ranging in [Ranging::Corners, Ranging::BoxHeight, Ranging::BoxWidth, Ranging::Paper] {
-            if let Ok(placed) = projection(ranging).place(&seen, None, &Pose::new(0.0, 0.0, 1.0)) {
+            if let Ok(placed) = projection(ranging).place(&seen, Cut::default(), None, &Pose::new(0.0, 0.0, 1.0)) {
                 let covariance = placed.covariance().unwrap();
                 prop_assert!(placed.x_m.is_finite() && placed.y_m.is_finite());
                 prop_assert!(covariance.is_valid() && covariance.xx > 0.0 && covariance.yy > 0.0);
@@ -113,14 +115,20 @@ proptest! {
 #[test]
 fn yaw_leaves_the_range_by_height_alone_and_stretches_the_range_by_width() {
     let seen = detection(board(0.5, 0.0, 60f64.to_radians()));
-    let range = |ranging| projection(ranging).place(&seen, None, &Pose::new(0.0, 0.0, 0.0)).unwrap().x_m;
+    let range =
+        |ranging| projection(ranging).place(&seen, Cut::default(), None, &Pose::new(0.0, 0.0, 0.0)).unwrap().x_m;
     assert!((range(Ranging::BoxHeight) - 0.5).abs() < 0.03, "{}", range(Ranging::BoxHeight));
     assert!(range(Ranging::BoxWidth) > 0.95, "{}", range(Ranging::BoxWidth));
 }
 
 #[test]
 fn paper_ranging_turns_an_object_on_the_axis_half_a_field_of_view_clockwise() {
-    let placed = projection(Ranging::Paper).place(&detection(board(0.5, 0.0, 0.0)), None, &Pose::new(0.0, 0.0, 0.0));
+    let placed = projection(Ranging::Paper).place(
+        &detection(board(0.5, 0.0, 0.0)),
+        Cut::default(),
+        None,
+        &Pose::new(0.0, 0.0, 0.0),
+    );
     let placed = placed.unwrap();
     assert!((placed.y_m.atan2(placed.x_m) + 31.1f64.to_radians()).abs() < 1e-9);
 }
@@ -128,8 +136,12 @@ fn paper_ranging_turns_an_object_on_the_axis_half_a_field_of_view_clockwise() {
 #[test]
 fn uncertainty_grows_with_distance_and_lies_along_the_sight() {
     let at = |range_m| {
-        let placed =
-            projection(Ranging::BoxHeight).place(&detection(board(range_m, 0.0, 0.0)), None, &Pose::new(0.0, 0.0, 0.0));
+        let placed = projection(Ranging::BoxHeight).place(
+            &detection(board(range_m, 0.0, 0.0)),
+            Cut::default(),
+            None,
+            &Pose::new(0.0, 0.0, 0.0),
+        );
         placed.unwrap().covariance().unwrap()
     };
     assert!(at(2.0).xx > 4.0 * at(1.0).xx, "range error grows faster than the distance");
@@ -145,8 +157,12 @@ fn uncertainty_grows_with_distance_and_lies_along_the_sight() {
         ..ProjectionConfig::default()
     };
     let floor = exact.floor_m;
-    let placed =
-        Projection::new(exact, camera()).place(&detection(board(1.0, 0.0, 0.0)), None, &Pose::new(0.0, 0.0, 0.0));
+    let placed = Projection::new(exact, camera(), Mount::default()).place(
+        &detection(board(1.0, 0.0, 0.0)),
+        Cut::default(),
+        None,
+        &Pose::new(0.0, 0.0, 0.0),
+    );
     assert!((placed.unwrap().covariance().unwrap().yy - floor * floor).abs() < 1e-12);
 }
 
@@ -154,16 +170,20 @@ fn uncertainty_grows_with_distance_and_lies_along_the_sight() {
 fn each_unusable_detection_has_its_reason() {
     let origin = Pose::new(0.0, 0.0, 0.0);
     let reason = |projection: &Projection, seen: &Detection, target: Option<Point3<f64>>| {
-        projection.place(seen, target.as_ref(), &origin).expect_err("unusable").as_str()
+        projection.place(seen, projection.cut(seen), target.as_ref(), &origin).expect_err("unusable").as_str()
     };
     let whole = detection(board(0.5, 0.0, 0.0));
-    let sizeless = Projection::new(ProjectionConfig::default(), camera());
+    let sizeless = Projection::new(ProjectionConfig::default(), camera(), Mount::default());
     assert_eq!(reason(&sizeless, &whole, None), "unknown_size");
 
     let flat = detection(BoundingBox { x_max: whole.bounding_box.x_min, ..whole.bounding_box });
     assert_eq!(reason(&projection(Ranging::BoxWidth), &flat, None), "degenerate_box");
 
-    let clipped = |ranging, seen: &Detection| projection(ranging).check_unclipped(seen).is_err();
+    let clipped = |ranging, seen: &Detection| {
+        let projection = projection(ranging);
+        let placed = projection.place(seen, projection.cut(seen), None, &origin);
+        placed.is_err_and(|error| error.as_str() == "clipped")
+    };
     let cut_below = detection(BoundingBox { y_max: 480.0, ..whole.bounding_box });
     assert!(clipped(Ranging::BoxHeight, &cut_below) && !clipped(Ranging::BoxWidth, &cut_below));
     let cut_left = detection(BoundingBox { x_min: 0.0, ..whole.bounding_box });
@@ -172,6 +192,16 @@ fn each_unusable_detection_has_its_reason() {
     for target in [Point3::new(0.0, 0.0, -1.0), Point3::new(f64::NAN, 0.0, 1.0)] {
         assert_eq!(reason(&projection(Ranging::Corners), &whole, Some(target)), "invalid_corners");
     }
+}
+
+#[test]
+fn labels_of_coco_have_usual_sizes_unless_a_size_is_configured() {
+    let usual = ObjectSizes::default();
+    let person = usual.of("person").unwrap();
+    assert!((1.5..1.9).contains(&person.height_m) && person.relative_sigma > 0.05, "{person:?}");
+    assert_eq!(usual.of("QR1"), None);
+    let own = ObjectSizes { default: Some(ObjectSize::square(SIDE_M)), ..ObjectSizes::default() };
+    assert_eq!(own.of("person"), Some(&ObjectSize::square(SIDE_M)));
 }
 
 #[test]

@@ -107,3 +107,10 @@ fn the_numbering_is_coco_s() {
     assert_eq!(name(12), None);
     assert_eq!(anchors::all().len(), 1917);
 }
+
+#[test]
+fn every_label_has_a_usual_size() {
+    let sizes = ecod::perception::projection::ObjectSizes::default();
+    let without: Vec<_> = labels::all().filter(|(_, label)| sizes.of(label).is_none()).collect();
+    assert!(without.is_empty() && labels::all().count() == 80, "{without:?}");
+}

@@ -1,0 +1,244 @@
+//! `ecod-node try`: a cell from one's own pictures, without a configuration.
+
+use std::io::{IsTerminal, Write};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context, anyhow};
+use clap::Args;
+use ecod::aggregator::FusionConfig;
+use ecod::model::names::{Label, NodeName};
+use ecod::perception::projection::ProjectionConfig;
+use ecod::perception::view::ViewConfig;
+use ecod::tracking::TracksConfig;
+use futures_util::FutureExt;
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::Failure;
+use super::run::{input_ended, ip_and_port, run_to_end};
+use crate::camera::config::{CameraConfig, MountConfig, OpticsConfig};
+use crate::camera::detect::DetectorConfig;
+use crate::camera::detect::coco::CocoConfig;
+use crate::camera::frame_source::SourceConfig;
+use crate::camera::frame_source::capture::CaptureConfig;
+use crate::node::config::NodeConfig;
+use crate::node::{self, NodeHandle};
+use crate::observe::dashboard::DEFAULT_ADDRESS;
+use crate::telemetry::counters::Event;
+use crate::transport::gossip::{MembershipConfig, MulticastConfig};
+
+/// Flags of `try`.
+#[derive(Debug, Args)]
+pub(super) struct TryArguments {
+    /// Video files, played again and again
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    video: Vec<PathBuf>,
+    /// Directories of images, shown again and again in the order of their names
+    #[arg(long, value_name = "DIR", num_args = 1..)]
+    images: Vec<PathBuf>,
+    /// Numbers of cameras of this machine, 0 for /dev/video0
+    #[arg(long, value_name = "N", num_args = 1..)]
+    camera: Vec<u32>,
+    /// Addresses of network cameras, such as rtsp://192.168.1.20/stream1
+    #[arg(long, value_name = "URL", num_args = 1..)]
+    url: Vec<String>,
+    /// Write the configuration that is used; those of further vehicles are numbered, as in node-2.toml
+    #[arg(long, value_name = "FILE")]
+    save: Option<PathBuf>,
+    /// Address of the page. Default 127.0.0.1:8080, or a free port if that is in use
+    #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
+    dashboard: Option<SocketAddr>,
+    /// Stop when standard input ends, as when the parent process is gone
+    #[arg(long, hide = true)]
+    stop_at_eof: bool,
+}
+
+/// Distance in metres between vehicles: nothing is known of where they stand, and none must take another's objects for
+/// its own.
+const SPACING_M: f64 = 50.0;
+
+/// Guessed height of the camera in metres, between that on a dashboard and that in a hand.
+const CAMERA_HEIGHT_M: f64 = 1.5;
+
+/// Time between two figures of progress.
+const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
+
+pub(super) fn run(arguments: &TryArguments) -> Result<(), Failure> {
+    let configs = arguments.configs()?;
+    run_to_end(serve(configs, arguments.save.clone(), arguments.stop_at_eof))
+}
+
+impl TryArguments {
+    /// The frame sources with the names of their vehicles.
+    fn sources(&self) -> Vec<(String, SourceConfig)> {
+        let numbered = |kind: &str, index: usize| format!("{kind}-{}", index + 1);
+        let videos =
+            self.video.iter().enumerate().map(|(index, path)| {
+                (numbered("video", index), SourceConfig::Video { path: path.clone(), looping: true })
+            });
+        let images = self.images.iter().enumerate().map(|(index, path)| {
+            (numbered("images", index), SourceConfig::Images { path: path.clone(), fps: 5.0, looping: true })
+        });
+        let cameras = self.camera.iter().map(|number| {
+            let device = PathBuf::from(format!("/dev/video{number}"));
+            (format!("camera-{number}"), SourceConfig::V4l2 { device, width: None, height: None, fps: None })
+        });
+        let urls = self
+            .url
+            .iter()
+            .enumerate()
+            .map(|(index, url)| (numbered("url", index), SourceConfig::Url { url: url.clone() }));
+        videos.chain(images).chain(cameras).chain(urls).collect()
+    }
+
+    /// The configurations of the vehicles. The first serves the page, and the others are told of it once it runs.
+    fn configs(&self) -> Result<Vec<NodeConfig>, Failure> {
+        let sources = self.sources();
+        if sources.is_empty() {
+            let usage = anyhow!("give what to look at: --video FILE, --images DIR, --camera 0 or --url rtsp://...");
+            return Err(Failure::usage(usage));
+        }
+        let mut configs = Vec::new();
+        for (index, (name, source)) in sources.into_iter().enumerate() {
+            if let SourceConfig::Video { .. } | SourceConfig::Images { .. } = source {
+                source.open(PROGRESS_PERIOD).map(drop).map_err(Failure::usage)?;
+            }
+            let mut config = vehicle(NodeName::new(name).map_err(Failure::usage)?, source);
+            config.pose.y_m = -SPACING_M * index as f64;
+            (config.dashboard.enabled, config.dashboard.listen) = (index == 0, self.dashboard.filter(|_| index == 0));
+            config.validate().map_err(Failure::usage)?;
+            configs.push(config);
+        }
+        Ok(configs)
+    }
+}
+
+/// A vehicle that stands at the origin, with guesses for all that nobody said. The errors of the guesses count in the
+/// covariance of its objects.
+fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
+    let camera = CameraConfig {
+        source,
+        capture: CaptureConfig::default(),
+        optics: OpticsConfig::default(),
+        mount: MountConfig { height_m: Some(CAMERA_HEIGHT_M), ..MountConfig::default() },
+        detector: DetectorConfig::Coco(CocoConfig::default()),
+        projection: ProjectionConfig {
+            pixel_sigma_px: 4.0,
+            tilt_sigma_rad: 0.07,
+            height_sigma_m: 0.4,
+            ..ProjectionConfig::default()
+        },
+        view: ViewConfig::default(),
+        votes: false,
+    };
+    // A camera in a hand is no car, and things may be close to it.
+    let tracks =
+        TracksConfig { vehicle_radius_m: 0.1, vehicle_label: Label::new_static("camera"), ..TracksConfig::default() };
+    let loopback = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
+    NodeConfig {
+        name: Some(name),
+        cell: NodeName::from_static("try"),
+        listen: loopback,
+        membership: MembershipConfig {
+            bind: loopback,
+            multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
+            ..MembershipConfig::default()
+        },
+        fusion: FusionConfig { tracks, ..FusionConfig::default() },
+        camera: Some(camera),
+        ..NodeConfig::default()
+    }
+}
+
+/// Runs the vehicles until SIGINT or SIGTERM, or until one gives up.
+async fn serve(configs: Vec<NodeConfig>, save: Option<PathBuf>, stop_at_eof: bool) -> anyhow::Result<()> {
+    let mut nodes = Vec::new();
+    let outcome = tokio::select! {
+        outcome = start_and_watch(configs, save.as_deref(), &mut nodes) => outcome,
+        stopped = stop_signal() => stopped,
+        () = input_ended(), if stop_at_eof => Ok(()),
+    };
+    if std::io::stderr().is_terminal() {
+        eprintln!();
+    }
+    for node in nodes.into_iter().rev() {
+        node.stop().await;
+    }
+    outcome
+}
+
+async fn stop_signal() -> anyhow::Result<()> {
+    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    tokio::select! {
+        _ = interrupt.recv() => {}
+        _ = terminate.recv() => {}
+    }
+    Ok(())
+}
+
+async fn start_and_watch(
+    configs: Vec<NodeConfig>,
+    save: Option<&Path>,
+    nodes: &mut Vec<NodeHandle>,
+) -> anyhow::Result<()> {
+    for (index, mut config) in configs.into_iter().enumerate() {
+        config.membership.seeds =
+            nodes.first().and_then(NodeHandle::gossip_address).iter().map(ToString::to_string).collect();
+        let node = node::start(config.clone()).await?;
+        if index == 0 {
+            config.membership.bind = node.gossip_address();
+            let mut address = node.dashboard_address();
+            let page = address.wait_for(Option::is_some).await.context("the page ended")?.unwrap_or(DEFAULT_ADDRESS);
+            eprintln!("page: http://{page}/   (Ctrl-C ends)");
+        }
+        nodes.push(node);
+        if let Some(path) = save {
+            let path = numbered(path, index);
+            let text = config.to_toml().context("the configuration cannot be written as TOML")?;
+            std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
+        }
+    }
+    watch(nodes).await
+}
+
+/// `node.toml`, `node-2.toml`, `node-3.toml` …
+fn numbered(path: &Path, index: usize) -> PathBuf {
+    if index == 0 {
+        return path.to_owned();
+    }
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    let extension = path.extension().map(|extension| format!(".{}", extension.to_string_lossy())).unwrap_or_default();
+    path.with_file_name(format!("{stem}-{}{extension}", index + 1))
+}
+
+/// Tells of progress until a node gives up.
+async fn watch(nodes: &mut [NodeHandle]) -> anyhow::Result<()> {
+    let sum = |nodes: &[NodeHandle], event| nodes.iter().map(|node| node.counters().events(event)).sum::<u64>();
+    let mut ticks = tokio::time::interval(PROGRESS_PERIOD);
+    let (mut frames, mut shown) = (0, String::new());
+    loop {
+        ticks.tick().await;
+        for node in nodes.iter_mut() {
+            node.failed().now_or_never().unwrap_or(Ok(()))?;
+        }
+        let detected = sum(nodes, Event::FrameDetected);
+        let rate = (detected - std::mem::replace(&mut frames, detected)) as f64 / PROGRESS_PERIOD.as_secs_f64();
+        let map = nodes.first().and_then(|node| node.newest_map().borrow().as_ref().map(|map| map.map.objects.len()));
+        let objects = map.map_or_else(|| "no map yet".to_owned(), |objects| format!("{objects} objects on the map"));
+        let line = format!(
+            "{rate:.0} frames/s, {objects}, {} detections without a place",
+            sum(nodes, Event::DetectionUnplaced)
+        );
+        let mut output = std::io::stderr().lock();
+        // Progress that cannot be shown is no reason to end.
+        let _ = if output.is_terminal() {
+            write!(output, "\r\x1b[K{line}").and_then(|()| output.flush())
+        } else if line != shown {
+            writeln!(output, "{line}")
+        } else {
+            Ok(())
+        };
+        shown = line;
+    }
+}

@@ -1,0 +1,120 @@
+//! `ecod-node try` as a newcomer meets it: pictures in, objects on the map, no configuration.
+#![cfg(feature = "camera")]
+
+use std::fs;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use opencv::core::{BORDER_CONSTANT, Mat, Scalar, copy_make_border};
+use opencv::imgcodecs;
+use serde_json::Value;
+
+/// Maximum time for anything.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+fn ecod_node() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+    for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+        command.env_remove(key);
+    }
+    command.env_remove("RUST_LOG");
+    command.stdin(Stdio::null());
+    command
+}
+
+/// A directory with this photograph as its only image, in a frame, so that nothing in it is cut.
+fn album(directory: &Path, photograph: &str) -> String {
+    let album = directory.join(photograph);
+    fs::create_dir(&album).unwrap();
+    let path = format!("{}/tests/data/photos/{photograph}.jpg", env!("CARGO_MANIFEST_DIR"));
+    let (image, mut framed) = (imgcodecs::imread(&path, imgcodecs::IMREAD_COLOR).unwrap(), Mat::default());
+    copy_make_border(&image, &mut framed, 120, 120, 160, 160, BORDER_CONSTANT, Scalar::all(128.0)).unwrap();
+    assert!(imgcodecs::imwrite_def(&*album.join("0.png").to_string_lossy(), &framed).unwrap());
+    album.to_str().unwrap().to_owned()
+}
+
+/// A running program, killed when dropped.
+struct Trial(Child);
+
+impl Drop for Trial {
+    fn drop(&mut self) {
+        self.0.kill().ok();
+        self.0.wait().unwrap();
+    }
+}
+
+/// Labels and distances from the first vehicle of the objects on the map that the page shows.
+fn objects(page: &str) -> Option<Vec<(String, f64)>> {
+    let mut stream = TcpStream::connect(page).ok()?;
+    write!(stream, "GET /api/picture HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n").ok()?;
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).ok()?;
+    let body = &answer[answer.find('{')?..=answer.rfind('}')?];
+    let picture: Value = serde_json::from_str(body).ok()?;
+    let object = |object: &Value| {
+        let (x_m, y_m) = (object["x_m"].as_f64().unwrap(), object["y_m"].as_f64().unwrap());
+        (object["label"].as_str().unwrap().to_owned(), x_m.hypot(y_m))
+    };
+    Some(picture["map"]["message"]["objects"].as_array()?.iter().map(object).collect())
+}
+
+#[test]
+fn photographs_of_two_cameras_become_objects_on_one_map() {
+    let directory = tempfile::tempdir().unwrap();
+    let albums = ["chelsea", "astronaut"].map(|photograph| album(directory.path(), photograph));
+    let saved = directory.path().join("node.toml");
+    let mut command = ecod_node();
+    command.arg("try").arg("--images").args(&albums).args(["--dashboard", "127.0.0.1:0"]).arg("--save").arg(&saved);
+    let mut trial = Trial(command.stderr(Stdio::piped()).spawn().unwrap());
+    let mut lines = BufReader::new(trial.0.stderr.take().unwrap()).lines().map_while(Result::ok);
+    let page = lines.find_map(|line| Some(line.strip_prefix("page: http://")?.split('/').next()?.to_owned())).unwrap();
+    let rest = std::thread::spawn(move || lines.collect::<Vec<_>>());
+
+    let deadline = Instant::now() + PATIENCE;
+    let mut found = Vec::new();
+    while !["cat", "person"].iter().all(|label| found.iter().any(|(seen, _)| seen == label)) {
+        assert!(Instant::now() < deadline, "on the map are only {found:?}");
+        std::thread::sleep(Duration::from_millis(200));
+        found = objects(&page).unwrap_or(found);
+    }
+    let distance = |label: &str| found.iter().find(|(seen, _)| seen == label).unwrap().1;
+    assert!(distance("cat") < 3.0, "a cat that fills the picture: {found:?}");
+    assert!((45.0..55.0).contains(&distance("person")), "before the other camera, 50 m away: {found:?}");
+
+    kill(Pid::from_raw(trial.0.id().cast_signed()), Signal::SIGINT).unwrap();
+    assert!(trial.0.wait().unwrap().success());
+    let progress = rest.join().unwrap();
+    assert!(
+        progress.iter().any(|line| line.contains("frames/s") && line.contains("objects on the map")),
+        "{progress:?}"
+    );
+
+    for (name, images) in [("node.toml", &albums[0]), ("node-2.toml", &albums[1])] {
+        let path = directory.path().join(name);
+        let printed = ecod_node().arg("--config").arg(&path).arg("--print-config").output().unwrap();
+        let text = String::from_utf8(printed.stdout).unwrap();
+        assert!(printed.status.success() && text.contains(images) && text.contains("height_m = 1.5"), "{text}");
+    }
+}
+
+#[test]
+fn what_cannot_be_shown_is_told_in_one_line_with_a_remedy() {
+    let directory = tempfile::tempdir().unwrap();
+    let nothing = directory.path().to_str().unwrap();
+    for (arguments, parts) in [
+        (vec!["try"], vec!["--video FILE", "--images DIR", "--camera 0"]),
+        (vec!["try", "--video", "no-such.mp4"], vec!["no-such.mp4"]),
+        (vec!["try", "--images", nothing], vec![nothing, "no images found"]),
+        (vec!["try", "--url", "192.168.1.20"], vec!["rtsp://"]),
+    ] {
+        let Output { status, stderr, .. } = ecod_node().args(&arguments).output().unwrap();
+        let error = String::from_utf8(stderr).unwrap();
+        assert_eq!(status.code(), Some(2), "{arguments:?}: {error}");
+        assert!(parts.iter().all(|part| error.contains(part)) && error.trim_end().lines().count() == 1, "{error}");
+    }
+}

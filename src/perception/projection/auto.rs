@@ -1,0 +1,45 @@
+//! Ranging by all that a box without corners tells: its foot on the ground, its height, and its head.
+
+use super::ground::{self, HalfDepth};
+use super::{Cut, LineOfSight, ObjectSize, Projection, ProjectionError, box_height, box_width};
+use crate::model::detection::Detection;
+
+/// The line of sight to the middle of an object on the ground.
+///
+/// Foot and height are weighted by their covariance. If they contradict each other, the object does not stand on the
+/// ground, or the ground is not level, and its height alone counts. A head above the image leaves the foot. A foot below it
+/// leaves the head or the width, whichever says more.
+pub(super) fn line_of_sight(
+    detection: &Detection,
+    cut: Cut,
+    size: Option<&ObjectSize>,
+    projection: &Projection,
+) -> Result<LineOfSight, ProjectionError> {
+    let (label, bounds) = (&detection.label, &detection.bounding_box);
+    let unknown_size = || ProjectionError::UnknownSize(label.clone());
+    let clipped = || ProjectionError::Clipped(label.clone());
+    let (foot, head) = box_height::foot_and_head(bounds, projection);
+    let half = HalfDepth::of(size, bounds, &foot, projection);
+    let on_ground = || ground::from_foot(&foot, half, projection);
+    let estimate = match (cut.lower, cut.upper, size) {
+        (false, false, Some(size)) => {
+            let upright = box_height::upright(&foot, &head, size, half);
+            let upright = upright.ok_or_else(|| ProjectionError::DegenerateBox(label.clone()))?;
+            on_ground().and_then(|grounded| grounded.combined_with(&upright)).unwrap_or(upright)
+        }
+        (false, false, None) => on_ground().ok_or_else(unknown_size)?,
+        (false, true, _) => on_ground().ok_or_else(clipped)?,
+        (true, upper, Some(size)) => {
+            let from_head = if upper { None } else { ground::from_head(&head, size, half, projection) };
+            let by_head = from_head.map(|estimate| {
+                estimate.along(&head, half.middle_sigma_m(estimate.distance_m, cut, &head, projection))
+            });
+            let by_width = || box_width::line_of_sight(bounds, &half.seen_width(size), projection);
+            let ways = [by_head, (!cut.side).then(by_width)];
+            let best = ways.into_iter().flatten().min_by(|a, b| a.along_m.total_cmp(&b.along_m));
+            return best.ok_or_else(clipped);
+        }
+        (true, _, None) => return Err(clipped()),
+    };
+    Ok(estimate.along(&foot, half.middle_sigma_m(estimate.distance_m, cut, &head, projection)))
+}
