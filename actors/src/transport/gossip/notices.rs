@@ -17,7 +17,7 @@ pub(crate) struct Notices(Vec<Notice>);
 
 impl Notices {
     /// Adds a notice.
-    pub(crate) fn add(&mut self, about: impl ToString, kind: TroubleKind, cause: impl Into<String>) {
+    pub(crate) fn add(&mut self, about: &impl ToString, kind: TroubleKind, cause: impl Into<String>) {
         self.0.push(Notice { about: about.to_string(), kind, cause: cause.into() });
     }
 

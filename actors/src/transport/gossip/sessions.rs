@@ -312,7 +312,7 @@ impl Sessions {
     /// Notes a greeting under another key.
     fn note_other_key(&mut self, from: SocketAddr) {
         let cause = format!("heard cell {} with another key, or none, from {}", self.cell, from.ip());
-        self.notices.add(from.ip(), TroubleKind::WrongKey, cause);
+        self.notices.add(&from.ip(), TroubleKind::WrongKey, cause);
     }
 
     /// Notes a cell with nearly this one's name. Numbered cells may be neighbours, unless this node has found nobody.
@@ -321,7 +321,7 @@ impl Sessions {
         let Some(other) = self.near_cells.name_of(tag, &self.cell) else { return };
         if !are_numbered(other, &self.cell) || arrival.is_alone {
             let cause = format!("heard cell {other} from {}, this is {}", arrival.from.ip(), self.cell);
-            self.notices.add(arrival.from.ip(), TroubleKind::OtherCell, cause);
+            self.notices.add(&arrival.from.ip(), TroubleKind::OtherCell, cause);
         }
     }
 
