@@ -76,7 +76,7 @@ pub(crate) const ROWS: &[Row] = &[
         run: |target| Box::pin(forged_evidence(target)),
     },
     Row {
-        attack: "a description that is set again and again, also after it is undone",
+        attack: "a description that is set again and again, also after the revocation",
         means: Means::Candidate,
         on_brokers: false,
         deeds: (5, "looks"),
@@ -90,7 +90,7 @@ pub(crate) const ROWS: &[Row] = &[
 const PAUSE: Duration = Duration::from_millis(20);
 
 /// Terms that a cell has reached soon after its start.
-const TERMS: [u64; 3] = [1, 2, 3];
+pub(crate) const TERMS: [u64; 3] = [1, 2, 3];
 
 async fn flood(target: Target) -> anyhow::Result<()> {
     let map = publish(&format!("ecod/v1/{CELL}/global_detections"), &vec![b'x'; 8_000_000]);

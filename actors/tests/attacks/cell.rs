@@ -35,8 +35,10 @@ const KEY: &str = "5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5
 /// The nodes: the edge, a candidate, and the vehicle whose map log is read.
 pub(crate) const NODES: [(&str, Role); 3] = [("edge", Role::Edge), ("v01", Role::Auto), ("v02", Role::Cav)];
 
-/// The vehicle, and the node that may lead, whose certificates the attackers hold.
+/// The vehicle, and the node that may lead, whose certificates the attackers hold. Some rows take more vehicles than follow
+/// the leader honestly.
 pub(crate) const VEHICLE: &str = "gauss";
+pub(crate) const VEHICLES: [&str; 3] = [VEHICLE, "noether", "hopper"];
 pub(crate) const CANDIDATE: &str = "turing";
 
 /// The node that leads, and the vehicle whose map log is read.
@@ -67,7 +69,7 @@ pub(crate) struct Cell {
     nodes: Vec<Node>,
     /// The nodes' network namespaces; without any, all are on loopback.
     network: Option<Bridged>,
-    vehicle: TlsConfig,
+    vehicles: [TlsConfig; VEHICLES.len()],
     candidate: TlsConfig,
     foreign: TlsConfig,
     directory: TempDir,
@@ -98,8 +100,9 @@ impl Victim {
 pub(crate) struct Target {
     /// Number of its deeds so far, in the row's unit.
     pub(crate) deeds: Arc<AtomicU64>,
-    /// The attacked broker.
+    /// The attacked broker, and that of the candidate which does not lead.
     pub(crate) broker: SocketAddr,
+    pub(crate) standby: SocketAddr,
     /// Where the nodes gossip.
     pub(crate) gossip: Vec<SocketAddr>,
     /// The attacker's own address, another than the cell's.
@@ -112,6 +115,8 @@ pub(crate) struct Target {
     pub(crate) candidate: Arc<ClientConfig>,
     /// The same certificate for a membership.
     pub(crate) credentials: Arc<Credentials>,
+    /// Certificates of [`VEHICLES`] for memberships.
+    pub(crate) vehicles: Vec<Arc<Credentials>>,
     /// A certificate of another CA, for [`key_holder::NAME`](crate::key_holder::NAME).
     pub(crate) foreign: Arc<Credentials>,
     /// Directory of the CA's files, `pki`, and of each node's, for whoever defends the cell.
@@ -134,7 +139,8 @@ impl Cell {
         fs::write(home.join("frames/0.ppm"), grey_frame())?;
         fs::write(home.join("detections.jsonl"), DETECTIONS)?;
         let mut authority = Authority::init(&home.join("pki"), &NodeName::new(CELL)?, clock::now())?;
-        let vehicle = issue(&mut authority, VEHICLE, Role::Cav)?;
+        let [gauss, noether, hopper] = VEHICLES.map(|name| issue(&mut authority, name, Role::Cav));
+        let vehicles = [gauss?, noether?, hopper?];
         let candidate = issue(&mut authority, CANDIDATE, Role::Auto)?;
         let mut elsewhere = Authority::init(&home.join("elsewhere"), &NodeName::new(CELL)?, clock::now())?;
         let foreign = issue(&mut elsewhere, key_holder::NAME, Role::Edge)?;
@@ -170,7 +176,7 @@ impl Cell {
             command.stderr(File::create(directory.join("node.log"))?).current_dir(&directory);
             nodes.push(Node { name, broker, gossip, process: Process::start(&mut command)? });
         }
-        Ok(Self { nodes, network, vehicle, candidate, foreign, directory })
+        Ok(Self { nodes, network, vehicles, candidate, foreign, directory })
     }
 
     /// Waits until maps hold the reports of all honest vehicles, and have done so for a while.
@@ -200,12 +206,19 @@ impl Cell {
         Ok(Target {
             deeds: Arc::default(),
             broker: self.nodes[usize::from(victim == Victim::Standby)].broker,
+            standby: self.nodes[1].broker,
             gossip: self.nodes.iter().map(|node| node.gossip).collect(),
             from: self.network.as_ref().map_or(ELSEWHERE, |_| network::HARNESS),
             key: KEY,
-            vehicle: client(&self.vehicle, VEHICLE)?,
+            vehicle: client(&self.vehicles[0], VEHICLE)?,
             candidate: client(&self.candidate, CANDIDATE)?,
             credentials: load(&self.candidate, CANDIDATE)?,
+            vehicles: self
+                .vehicles
+                .iter()
+                .zip(VEHICLES)
+                .map(|(files, name)| load(files, name))
+                .collect::<Result<_, _>>()?,
             foreign: load(&self.foreign, key_holder::NAME)?,
             home: self.directory.path().to_owned(),
         })

@@ -4,7 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use futures_util::future::join_all;
+use ecod::leadership::election::Body;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::wire::Role;
+use ecod_actors::transport::pki::Credentials;
+use futures_util::future::{join_all, try_join_all};
 use futures_util::{SinkExt, StreamExt};
 use rustls::ClientConfig;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -15,12 +20,32 @@ use tokio_tungstenite::client_async;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 
-use crate::cell::{CELL, Target, VEHICLE};
+use crate::cell::{CELL, LEADER, NODES, Target, VEHICLE, VEHICLES};
 use crate::client::{log_in, log_in_as, publish, secure, send_for_ever, subscribe};
+use crate::insider::Insider;
 use crate::packets::{packet, text};
-use crate::row::{Means, Row, UNHARMED};
+use crate::row::{Bar, Means, Row, UNHARMED};
 
 pub(crate) const ROWS: &[Row] = &[
+    Row {
+        attack: "three of five followers say that they cannot log in at the leader's broker",
+        means: Means::Vehicle,
+        on_brokers: false,
+        deeds: (100, "messages"),
+        // They may move the lead, and cost nobody a map.
+        bar: Bar { is_replaced: None, ..UNHARMED },
+        quick: false,
+        run: |target| Box::pin(no_login(target, &[LEADER])),
+    },
+    Row {
+        attack: "the same of all candidates",
+        means: Means::Vehicle,
+        on_brokers: false,
+        deeds: (100, "messages"),
+        bar: UNHARMED,
+        quick: false,
+        run: |target| Box::pin(no_login(target, &[LEADER, NODES[1].0])),
+    },
     Row {
         attack: "30 connections flood with 255 kB",
         means: Means::Vehicle,
@@ -249,4 +274,18 @@ async fn log_in_by_websocket(target: &Target) -> anyhow::Result<TlsStream<TcpStr
     let answer = socket.next().await.context("no answer to the login")??;
     anyhow::ensure!(answer.into_data()[..] == [0x20, 2, 0, 0], "the login was refused");
     Ok(socket.into_inner())
+}
+
+/// Vehicles follow the leader, and say that its broker, or others, cannot be reached.
+async fn no_login(target: Target, at: &'static [&'static str]) -> anyhow::Result<()> {
+    let say = |(name, credentials): (&'static str, &Arc<Credentials>)| {
+        let (target, credentials) = (target.clone(), Arc::clone(credentials));
+        async move {
+            let insider = Insider::join(&target, (name, Role::Cav), Some(credentials)).await?;
+            let no_login = at.iter().copied().map(NodeName::from_static).collect();
+            let followed = Epoch::new(1, NodeName::from_static(LEADER));
+            insider.repeat(1, Some(followed), Body::Status { over: None, no_login }).await
+        }
+    };
+    try_join_all(VEHICLES.into_iter().zip(&target.vehicles).map(say)).await.map(drop)
 }
