@@ -9,13 +9,21 @@
 //! signature, and nobody else can change the cell. Nodes that never lead follow.
 //!
 //! Call [`DescriptionExchange::hear`] for every authenticated stamp, [`DescriptionExchange::take`] for every body,
-//! [`DescriptionExchange::lead`] and [`DescriptionExchange::retain`] as leadership and membership change, and
-//! [`DescriptionExchange::tick`] about twice in [`PUBLISH_INTERVAL`]. Equal inputs give equal effects.
+//! [`DescriptionExchange::lead`] and [`DescriptionExchange::retain`] as leadership and membership change,
+//! [`DescriptionExchange::revoke`] when certificates are revoked, and [`DescriptionExchange::tick`] about twice in
+//! [`PUBLISH_INTERVAL`]. Equal inputs give equal effects.
 //!
 //! # Merge
 //!
 //! The greater [`DescriptionStamp`] stays: the later version, of two equal ones the greater hash. So all sides of a
 //! split agree when they meet, whatever the order. A version that is far ahead changes nothing and is counted.
+//!
+//! # Revocation
+//!
+//! Whoever makes a description states it first: at least one other candidate has it from there. When the certificate of
+//! that node is revoked, such a candidate publishes the description before in a new version, which all take.
+
+mod history;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -24,6 +32,7 @@ use std::time::Duration;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{CellDescription, ContentHash, DescriptionStamp, MAX_INTEGER, SCHEMA_VERSION};
+pub use history::{AttributedDescription, DescriptionHistory};
 
 /// Largest rise of the version that one message may state. A cell uses one version for each change by a person.
 pub const MAX_VERSION_STEP: u64 = 1 << 20;
@@ -82,10 +91,14 @@ enum Leader {
 }
 
 /// Word of a node about its description.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Statement {
-    stamp: DescriptionStamp,
-    may_lead: bool,
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Statement {
+    /// Version and hash.
+    pub stamp: DescriptionStamp,
+    /// True if the node may lead.
+    pub may_lead: bool,
+    /// Its certificate in base64; none in a cell without certificates.
+    pub certificate: Option<String>,
 }
 
 /// One node's part in the exchange of descriptions; see the module.
@@ -93,7 +106,7 @@ struct Statement {
 pub struct DescriptionExchange {
     name: NodeName,
     may_lead: bool,
-    current: Option<Arc<CellDescription>>,
+    history: DescriptionHistory,
     /// Last word of each node.
     statements: BTreeMap<NodeName, Statement>,
     /// Bodies that no candidate has stated yet, oldest first.
@@ -110,11 +123,11 @@ pub struct DescriptionExchange {
 
 impl DescriptionExchange {
     /// The exchange of a node that starts with what it had saved.
-    pub fn new(name: NodeName, may_lead: bool, saved: Option<Arc<CellDescription>>) -> Self {
+    pub fn new(name: NodeName, may_lead: bool, saved: DescriptionHistory) -> Self {
         Self {
             name,
             may_lead,
-            current: saved,
+            history: saved,
             statements: BTreeMap::new(),
             unproven: VecDeque::new(),
             adopted: VecDeque::new(),
@@ -127,28 +140,28 @@ impl DescriptionExchange {
 
     /// The description that counts here.
     pub fn current(&self) -> Option<&Arc<CellDescription>> {
-        self.current.as_ref()
+        self.history.current.as_ref().map(|current| &current.description)
+    }
+
+    /// The same with those before, as it is to be saved.
+    pub fn history(&self) -> &DescriptionHistory {
+        &self.history
     }
 
     /// Its stamp; version 0 without one.
     pub fn stamp(&self) -> DescriptionStamp {
-        self.current.as_ref().map(|current| current.stamp()).unwrap_or_default()
+        self.current().map(|current| current.stamp()).unwrap_or_default()
     }
 
     /// Takes the authenticated word of a node about its description.
-    pub fn hear(
-        &mut self,
-        from: &NodeName,
-        may_lead: bool,
-        stamp: DescriptionStamp,
-        now: Timestamp,
-    ) -> Vec<DescriptionEffect> {
+    pub fn hear(&mut self, from: &NodeName, statement: Statement, now: Timestamp) -> Vec<DescriptionEffect> {
+        let Statement { stamp, may_lead, .. } = statement;
         let is_leader = self.leader == Leader::Other(from.clone());
         if stamp.version > self.highest_plausible() && !is_leader {
             return vec![DescriptionEffect::CountImplausible { from: from.clone() }];
         }
         if self.statements.len() < MAX_NODES || self.statements.contains_key(from) {
-            self.statements.insert(from.clone(), Statement { stamp, may_lead });
+            self.statements.insert(from.clone(), statement);
         }
         if may_lead && stamp > self.stamp() {
             self.adopt_proven(now);
@@ -177,18 +190,55 @@ impl DescriptionExchange {
     /// Sets the cell's description at this node, which may lead. Nothing happens if the content is that of the present
     /// one.
     pub fn set(&mut self, text: String, hash: ContentHash, now: Timestamp) -> Vec<DescriptionEffect> {
-        if !self.may_lead || self.current.as_ref().is_some_and(|current| current.text == text) {
+        if !self.may_lead || self.current().is_some_and(|current| current.text == text) {
             return Vec::new();
         }
-        let of_candidates = self.statements.values().filter(|statement| statement.may_lead);
-        let known = of_candidates.map(|statement| statement.stamp.version).max().unwrap_or(0);
-        // Those that have what this node has must be able to take it, whatever somebody else has stated.
-        let version = known.max(self.stamp().version).saturating_add(1).min(self.highest_plausible());
-        let set_by = self.name.clone();
-        let description = Arc::new(CellDescription { schema: SCHEMA_VERSION, version, hash, set_by, text });
-        self.adopt(Arc::clone(&description), self.name.clone());
+        let description = self.described(self.next_version(), hash, text);
+        self.adopt(AttributedDescription { description: Arc::clone(&description), stated_by: None }, self.name.clone());
         self.publish(description, now);
         self.finish(now)
+    }
+
+    /// Drops the descriptions and the word of nodes whose certificates were revoked. A node that may lead goes back to the
+    /// latest other description, or to none: an empty text, whose hash is `empty`. It gets a new version, so that nodes that
+    /// have not read the revocation list take it, too.
+    pub fn revoke(
+        &mut self,
+        is_revoked: impl Fn(&str) -> bool,
+        empty: ContentHash,
+        now: Timestamp,
+    ) -> Vec<DescriptionEffect> {
+        let version = self.next_version();
+        self.statements.retain(|_, statement| !statement.certificate.as_deref().is_some_and(&is_revoked));
+        // Descriptions of the revoked do not delay the right one.
+        self.adopted.clear();
+        if self.may_lead && self.history.drop_revoked(is_revoked) {
+            let before = self.history.current.take().map_or_else(
+                || AttributedDescription {
+                    description: self.described(version, empty, String::new()),
+                    stated_by: None,
+                },
+                |AttributedDescription { description, stated_by }| {
+                    let description = CellDescription { version, ..CellDescription::clone(&description) }.into();
+                    AttributedDescription { description, stated_by }
+                },
+            );
+            self.is_due = true;
+            self.adopt(before, self.name.clone());
+        }
+        self.finish(now)
+    }
+
+    fn described(&self, version: u64, hash: ContentHash, text: String) -> Arc<CellDescription> {
+        CellDescription { schema: SCHEMA_VERSION, version, hash, set_by: self.name.clone(), text }.into()
+    }
+
+    /// The version of a change here. Those that have what this node has must be able to take it, whatever somebody else has
+    /// stated.
+    fn next_version(&self) -> u64 {
+        let of_candidates = self.statements.values().filter(|statement| statement.may_lead);
+        let known = of_candidates.map(|statement| statement.stamp.version).max().unwrap_or(0);
+        known.max(self.stamp().version).saturating_add(1).min(self.highest_plausible())
     }
 
     /// Notes who leads.
@@ -235,11 +285,12 @@ impl DescriptionExchange {
     fn adopt_proven(&mut self, now: Timestamp) {
         let stated = |body: &Arc<CellDescription>| {
             let states = |statement: &Statement| statement.may_lead && statement.stamp == body.stamp();
-            self.statements.iter().find(|(_, statement)| states(statement)).map(|(node, _)| node.clone())
+            self.statements.iter().find(|(_, statement)| states(statement))
         };
         let newer = self.unproven.iter().filter(|body| body.stamp() > self.stamp());
         let proven = newer.filter_map(|body| Some((Arc::clone(body), stated(body)?)));
-        let Some((body, node)) = proven.max_by_key(|(body, _)| body.stamp()) else { return };
+        let Some((description, (node, statement))) = proven.max_by_key(|(body, _)| body.stamp()) else { return };
+        let (node, stated_by) = (node.clone(), statement.certificate.clone());
         let is_throttled = |first: &Timestamp| now.since(*first) < ADOPTION_INTERVAL * MAX_ADOPTIONS as u32;
         if self.adopted.len() == MAX_ADOPTIONS {
             if self.adopted.front().is_some_and(is_throttled) {
@@ -248,12 +299,12 @@ impl DescriptionExchange {
             self.adopted.pop_front();
         }
         self.adopted.push_back(now);
-        self.adopt(body, node);
+        self.adopt(AttributedDescription { description, stated_by }, node);
     }
 
-    fn adopt(&mut self, description: Arc<CellDescription>, stated_by: NodeName) {
-        let stamp = description.stamp();
-        self.current = Some(Arc::clone(&description));
+    fn adopt(&mut self, next: AttributedDescription, stated_by: NodeName) {
+        let (description, stamp) = (Arc::clone(&next.description), next.description.stamp());
+        self.history.replace(next);
         self.unproven.retain(|body| body.stamp() > stamp);
         self.published = None;
         self.effects.push(DescriptionEffect::Adopt { description, stated_by });
@@ -267,7 +318,7 @@ impl DescriptionExchange {
 
     /// Publishes what somebody lacks: the leader to all, another candidate to a leader that is behind.
     fn finish(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
-        if let Some(description) = self.current.clone()
+        if let Some(description) = self.current().cloned()
             && self.may_lead
             && self.is_lacking(description.stamp())
             && self.published.is_none_or(|(at, times)| now.since(at) >= interval_after(times))

@@ -17,7 +17,11 @@ fn described(version: u64, text: &str) -> Arc<CellDescription> {
 }
 
 fn node(own: &str) -> DescriptionExchange {
-    DescriptionExchange::new(name(own), true, None)
+    DescriptionExchange::new(name(own), true, DescriptionHistory::default())
+}
+
+fn word(may_lead: bool, stamp: DescriptionStamp) -> Statement {
+    Statement { stamp, may_lead, certificate: None }
 }
 
 fn adopts(effects: &[DescriptionEffect]) -> bool {
@@ -35,10 +39,10 @@ fn a_body_is_taken_on_a_candidates_word_alone_in_either_order() {
         let mut euclid = node("euclid");
         let taken: Vec<_> = if is_body_first {
             assert_eq!(euclid.take(Arc::clone(&new), at(0)), []);
-            assert_eq!(euclid.hear(&name("gauss"), false, new.stamp(), at(1)), [], "a vehicle that never leads");
-            euclid.hear(&name("edge"), true, new.stamp(), at(2))
+            assert_eq!(euclid.hear(&name("gauss"), word(false, new.stamp()), at(1)), [], "a vehicle that never leads");
+            euclid.hear(&name("edge"), word(true, new.stamp()), at(2))
         } else {
-            assert_eq!(euclid.hear(&name("edge"), true, new.stamp(), at(0)), []);
+            assert_eq!(euclid.hear(&name("edge"), word(true, new.stamp()), at(0)), []);
             assert!(!adopts(&euclid.take(described(1, "forged"), at(1))), "nobody stated it");
             euclid.take(Arc::clone(&new), at(2))
         };
@@ -55,7 +59,7 @@ fn all_agree_after_a_split_in_whatever_order_they_meet() {
         let mut euclid = node("euclid");
         for index in 0..sides.len() {
             let side = &sides[(index + turn) % sides.len()];
-            euclid.hear(&name(&format!("n{index}")), true, side.stamp(), at(0));
+            euclid.hear(&name(&format!("n{index}")), word(true, side.stamp()), at(0));
             euclid.take(Arc::clone(side), at(0));
         }
         assert_eq!(euclid.stamp(), winner, "turn {turn}");
@@ -64,49 +68,49 @@ fn all_agree_after_a_split_in_whatever_order_they_meet() {
 
 #[test]
 fn a_change_here_is_the_next_version_and_goes_out_at_once() {
-    let mut euclid = DescriptionExchange::new(name("euclid"), true, Some(described(6, "old")));
-    euclid.hear(&name("edge"), true, described(8, "unseen").stamp(), at(0));
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, DescriptionHistory::of(Some(described(6, "old"))));
+    euclid.hear(&name("edge"), word(true, described(8, "unseen").stamp()), at(0));
     let effects = euclid.set("new".into(), ContentHash([7; 32]), at(1));
     assert!(matches!(&effects[..], [Adopt { .. }, Publish { description }] if description.version == 9));
     assert_eq!(euclid.set("new".into(), ContentHash([7; 32]), at(2)), [], "it is that already");
     let effects = euclid.set("new".into(), ContentHash([8; 32]), at(3));
     assert_eq!(effects, [], "whoever set it: the hash is also of its setter");
-    let mut gauss = DescriptionExchange::new(name("gauss"), false, None);
+    let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(None));
     assert_eq!(gauss.set("new".into(), ContentHash([7; 32]), at(1)), [], "it only follows");
 }
 
 #[test]
 fn a_version_far_ahead_is_counted_and_changes_nothing() {
-    let mut euclid = DescriptionExchange::new(name("euclid"), true, Some(described(6, "old")));
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, DescriptionHistory::of(Some(described(6, "old"))));
     let far = described(6 + MAX_VERSION_STEP + 1, "far");
-    assert_eq!(euclid.hear(&name("edge"), true, far.stamp(), at(0)), [CountImplausible { from: name("edge") }]);
+    assert_eq!(euclid.hear(&name("edge"), word(true, far.stamp()), at(0)), [CountImplausible { from: name("edge") }]);
     assert!(!adopts(&euclid.take(far, at(0))));
     euclid.set("new".into(), ContentHash([7; 32]), at(1));
     assert_eq!(euclid.stamp().version, 7);
     let first = DescriptionStamp { version: MAX_FIRST_VERSION + 1, ..Default::default() };
-    assert_eq!(node("gauss").hear(&name("edge"), true, first, at(0)), [CountImplausible { from: name("edge") }]);
+    assert_eq!(node("gauss").hear(&name("edge"), word(true, first), at(0)), [CountImplausible { from: name("edge") }]);
 }
 
 #[test]
 fn a_version_that_is_set_can_be_taken_by_all_whatever_somebody_has_stated() {
     let held = described(6, "old");
-    let [mut euclid, mut gauss] =
-        ["euclid", "gauss"].map(|own| DescriptionExchange::new(name(own), true, Some(Arc::clone(&held))));
+    let [mut euclid, mut gauss] = ["euclid", "gauss"]
+        .map(|own| DescriptionExchange::new(name(own), true, DescriptionHistory::of(Some(Arc::clone(&held)))));
     let boast = DescriptionStamp { version: 6 + MAX_VERSION_STEP, hash: ContentHash::default() };
-    euclid.hear(&name("liar"), true, boast, at(0));
+    euclid.hear(&name("liar"), word(true, boast), at(0));
     euclid.set("new".into(), ContentHash([7; 32]), at(1));
     let set = Arc::clone(euclid.current().unwrap());
-    gauss.hear(&name("euclid"), true, set.stamp(), at(2));
+    gauss.hear(&name("euclid"), word(true, set.stamp()), at(2));
     assert!(adopts(&gauss.take(set, at(3))));
 }
 
 #[test]
 fn who_was_away_for_long_takes_the_leaders() {
     let far = described(6 + 3 * MAX_VERSION_STEP, "far");
-    let mut euclid = DescriptionExchange::new(name("euclid"), true, Some(described(6, "old")));
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, DescriptionHistory::of(Some(described(6, "old"))));
     euclid.lead(Some(&name("edge")), at(0));
-    assert!(!adopts(&euclid.hear(&name("gauss"), true, far.stamp(), at(1))));
-    euclid.hear(&name("edge"), true, far.stamp(), at(2));
+    assert!(!adopts(&euclid.hear(&name("gauss"), word(true, far.stamp()), at(1))));
+    euclid.hear(&name("edge"), word(true, far.stamp()), at(2));
     assert!(adopts(&euclid.take(far, at(3))));
 }
 
@@ -117,7 +121,7 @@ fn ever_new_descriptions_are_adopted_one_a_second_and_the_latest_in_the_end() {
     for version in 1..=100 {
         let new = described(version, "new");
         let now = at(version * 10);
-        euclid.hear(&name("liar"), true, new.stamp(), now);
+        euclid.hear(&name("liar"), word(true, new.stamp()), now);
         adopted += u32::from(adopts(&euclid.take(new, now)));
     }
     assert_eq!(adopted, 8, "in a second");
@@ -128,22 +132,23 @@ fn ever_new_descriptions_are_adopted_one_a_second_and_the_latest_in_the_end() {
 #[test]
 fn the_leader_repeats_it_while_somebody_lacks_it_and_no_longer() {
     let held = described(3, "held");
-    let mut edge = DescriptionExchange::new(name("edge"), true, Some(Arc::clone(&held)));
+    let mut edge = DescriptionExchange::new(name("edge"), true, DescriptionHistory::of(Some(Arc::clone(&held))));
     assert!(publishes(&edge.lead(Some(&name("edge")), at(0))), "its brokers may not have it");
     assert!(!publishes(&edge.tick(at(1500))));
-    assert!(publishes(&edge.hear(&name("euclid"), false, DescriptionStamp::default(), at(1600))));
+    assert!(publishes(&edge.hear(&name("euclid"), word(false, DescriptionStamp::default()), at(1600))));
     assert!(!publishes(&edge.tick(at(3500))), "not that often");
     assert!(publishes(&edge.tick(at(3600))));
-    edge.hear(&name("euclid"), false, held.stamp(), at(3700));
+    edge.hear(&name("euclid"), word(false, held.stamp()), at(3700));
     assert!(!publishes(&edge.tick(at(9000))));
     assert!(publishes(&edge.take(described(2, "displaced"), at(9100))), "an earlier one took its place");
 }
 
 #[test]
 fn a_node_that_never_has_it_costs_the_others_little() {
-    let mut edge = DescriptionExchange::new(name("edge"), true, Some(described(3, "held")));
+    let mut edge = DescriptionExchange::new(name("edge"), true, DescriptionHistory::of(Some(described(3, "held"))));
     edge.lead(Some(&name("edge")), at(0));
-    let is_repeated = |ms: &u64| publishes(&edge.hear(&name("liar"), false, DescriptionStamp::default(), at(*ms)));
+    let is_repeated =
+        |ms: &u64| publishes(&edge.hear(&name("liar"), word(false, DescriptionStamp::default()), at(*ms)));
     let times = (0..600_000).step_by(500).filter(is_repeated).count();
     assert!((15..=25).contains(&times), "{times} in ten minutes");
     edge.set("new".into(), ContentHash([7; 32]), at(600_000));
@@ -153,15 +158,18 @@ fn a_node_that_never_has_it_costs_the_others_little() {
 #[test]
 fn a_candidate_that_does_not_lead_tells_a_leader_that_is_behind() {
     let held = described(3, "held");
-    let mut euclid = DescriptionExchange::new(name("euclid"), true, Some(Arc::clone(&held)));
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, DescriptionHistory::of(Some(Arc::clone(&held))));
     assert!(!publishes(&euclid.lead(Some(&name("edge")), at(0))), "the leader has not said what it has");
-    assert!(publishes(&euclid.hear(&name("edge"), true, DescriptionStamp::default(), at(100))));
-    euclid.hear(&name("edge"), true, held.stamp(), at(200));
-    euclid.hear(&name("gauss"), false, DescriptionStamp::default(), at(300));
+    assert!(publishes(&euclid.hear(&name("edge"), word(true, DescriptionStamp::default()), at(100))));
+    euclid.hear(&name("edge"), word(true, held.stamp()), at(200));
+    euclid.hear(&name("gauss"), word(false, DescriptionStamp::default()), at(300));
     assert!(!publishes(&euclid.tick(at(5000))), "the rest is the leader's");
-    let mut gauss = DescriptionExchange::new(name("gauss"), false, Some(held));
+    let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(Some(held)));
     gauss.lead(Some(&name("edge")), at(0));
-    assert!(!publishes(&gauss.hear(&name("edge"), true, DescriptionStamp::default(), at(100))), "it never publishes");
+    assert!(
+        !publishes(&gauss.hear(&name("edge"), word(true, DescriptionStamp::default()), at(100))),
+        "it never publishes"
+    );
 }
 
 #[test]
@@ -171,6 +179,83 @@ fn bodies_that_nobody_states_take_bounded_room() {
     euclid.take(Arc::clone(&stated), at(0));
     (2..100).for_each(|version| drop(euclid.take(described(version, "junk"), at(0))));
     assert_eq!(euclid.unproven.len(), MAX_UNPROVEN);
-    euclid.hear(&name("edge"), true, stated.stamp(), at(1));
+    euclid.hear(&name("edge"), word(true, stated.stamp()), at(1));
     assert!(adopts(&euclid.take(stated, at(2))), "the leader repeats it");
+}
+
+/// Word of a node with this certificate.
+fn certified(certificate: &str, stamp: DescriptionStamp) -> Statement {
+    Statement { certificate: Some(certificate.into()), ..word(true, stamp) }
+}
+
+const EMPTY: ContentHash = ContentHash([0xee; 32]);
+
+#[test]
+fn a_description_goes_with_the_certificate_of_the_candidate_that_made_it() {
+    let right = described(6, "right");
+    let mut edge = DescriptionExchange::new(name("edge"), true, DescriptionHistory::of(Some(Arc::clone(&right))));
+    let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(Some(right)));
+    edge.lead(Some(&name("edge")), at(0));
+    // It sets one after the other, in the name of the edge. A vehicle has them from the edge.
+    for (version, text) in [(7, "false"), (8, "worse")] {
+        let forged = described(version, text);
+        edge.hear(&name("turing"), certified("turing's", forged.stamp()), at(version));
+        assert!(adopts(&edge.take(Arc::clone(&forged), at(version))));
+        gauss.hear(&name("edge"), certified("edge's", forged.stamp()), at(version));
+        assert!(adopts(&gauss.take(forged, at(version))));
+    }
+    assert_eq!(edge.revoke(|certificate| certificate == "euclid's", EMPTY, at(100)), [], "another's");
+    // What was saved counts after a restart.
+    let saved = serde_json::to_string(edge.history()).unwrap();
+    assert_eq!(serde_json::from_str::<CellDescription>(&saved).unwrap(), **edge.current().unwrap());
+    edge = DescriptionExchange::new(name("edge"), true, serde_json::from_str(&saved).unwrap());
+    edge.lead(Some(&name("edge")), at(200));
+    let effects = edge.revoke(|certificate| certificate == "turing's", EMPTY, at(300));
+    assert!(adopts(&effects) && publishes(&effects), "{effects:?}");
+    let restored = Arc::clone(edge.current().unwrap());
+    assert_eq!((restored.version, &*restored.text), (9, "right"));
+    gauss.hear(&name("edge"), certified("edge's", restored.stamp()), at(300));
+    assert!(adopts(&gauss.take(restored, at(300))), "also by nodes that have not read the list");
+    assert_eq!(edge.revoke(|certificate| certificate == "turing's", EMPTY, at(400)), [], "once");
+}
+
+#[test]
+fn a_burst_of_descriptions_does_not_delay_the_right_one_after_the_revocation() {
+    let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(None));
+    for version in 1..=MAX_ADOPTIONS as u64 {
+        let forged = described(version, "false");
+        gauss.hear(&name("edge"), certified("edge's", forged.stamp()), at(version));
+        assert!(adopts(&gauss.take(forged, at(version))));
+    }
+    gauss.revoke(|certificate| certificate == "turing's", EMPTY, at(100));
+    let right = described(MAX_ADOPTIONS as u64 + 1, "right");
+    gauss.hear(&name("edge"), certified("edge's", right.stamp()), at(101));
+    assert!(adopts(&gauss.take(right, at(101))));
+}
+
+#[test]
+fn without_an_earlier_description_the_nodes_own_settings_count_again() {
+    let mut edge = node("edge");
+    let forged = described(7, "false");
+    edge.hear(&name("turing"), certified("turing's", forged.stamp()), at(0));
+    edge.take(Arc::clone(&forged), at(0));
+    // A word that was on its way.
+    let late = described(8, "late");
+    edge.hear(&name("turing"), certified("turing's", late.stamp()), at(1));
+    assert!(adopts(&edge.revoke(|certificate| certificate == "turing's", EMPTY, at(2))));
+    assert!(!adopts(&edge.take(late, at(3))), "nobody states it any more");
+    let empty = edge.current().unwrap();
+    assert_eq!((empty.version, &*empty.text, empty.hash, empty.set_by.as_str()), (9, "", EMPTY, "edge"));
+}
+
+#[test]
+fn many_descriptions_of_one_certificate_displace_no_other_earlier_one() {
+    let mut edge = DescriptionExchange::new(name("edge"), true, DescriptionHistory::of(Some(described(1, "right"))));
+    for version in 2..40 {
+        let (liar, forged) = (if version % 2 == 0 { "turing" } else { "euclid" }, described(version, "false"));
+        edge.hear(&name(liar), certified(liar, forged.stamp()), at(version * 10_000));
+        assert!(adopts(&edge.take(forged, at(version * 10_000))));
+    }
+    assert!(adopts(&edge.revoke(|_| true, EMPTY, at(500_000))));
+    assert_eq!(edge.current().unwrap().text, "right");
 }

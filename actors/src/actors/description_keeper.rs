@@ -9,10 +9,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::description::{DescriptionEffect, DescriptionExchange, PUBLISH_INTERVAL};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use ecod::description::{DescriptionEffect, DescriptionExchange, DescriptionHistory, PUBLISH_INTERVAL, Statement};
 use ecod::leadership::Leadership;
 use ecod::model::names::NodeName;
-use ecod::wire::{CellDescription, RejectReason};
+use ecod::model::time::Timestamp;
+use ecod::wire::{CellDescription, DescriptionStamp, RejectReason};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
@@ -25,6 +28,7 @@ use crate::platform::state_file::StateFile;
 use crate::platform::state_writer::StateWriter;
 use crate::telemetry::counters::{Counters, OTHERS};
 use crate::transport::gossip::Member;
+use crate::transport::pki::{Credentials, LoadedCredentials};
 
 /// Callback that has a node use a description. It must not block.
 pub type DescriptionSink = Arc<dyn Fn(Arc<CellDescription>) + Send + Sync>;
@@ -39,6 +43,8 @@ pub struct DescriptionKeeperArguments {
     pub held: Option<Arc<CellDescription>>,
     /// Where it is saved, if anywhere.
     pub file: Option<StateFile>,
+    /// The node's certificates, with the revocation list.
+    pub credentials: Option<Arc<Credentials>>,
     /// Has the node use a description.
     pub apply: DescriptionSink,
     /// The other nodes.
@@ -60,6 +66,9 @@ pub struct DescriptionKeeperState {
     exchange: DescriptionExchange,
     name: NodeName,
     writer: StateWriter,
+    credentials: Option<Arc<Credentials>>,
+    /// The revocation list that was applied.
+    applied: Option<Arc<LoadedCredentials>>,
     apply: DescriptionSink,
     members: watch::Receiver<Vec<Member>>,
     leadership: watch::Receiver<Leadership>,
@@ -87,6 +96,7 @@ impl Actor for DescriptionKeeper {
             may_lead,
             held,
             file,
+            credentials,
             apply,
             members,
             mut leadership,
@@ -95,15 +105,21 @@ impl Actor for DescriptionKeeper {
         } = arguments;
         leadership.mark_changed();
         myself.send_interval(TICK, || DescriptionKeeperMessage::Tick);
+        let stamp = held.as_ref().map(|held| held.stamp());
+        let is_of_held = |saved: &DescriptionHistory| saved.current.as_ref().map(|it| it.description.stamp()) == stamp;
+        let saved = file.as_ref().and_then(|file| file.load(|_: &DescriptionHistory| true)).filter(is_of_held);
+        let history = saved.unwrap_or_else(|| DescriptionHistory::of(held.clone()));
         let mut writer = StateWriter::new(file, "description of the cell");
         if held.is_some() {
             // One that the node was started with is not on the disk yet.
             writer.note_change();
         }
         Ok(DescriptionKeeperState {
-            exchange: DescriptionExchange::new(name.clone(), may_lead, held),
+            exchange: DescriptionExchange::new(name.clone(), may_lead, history),
             name,
             writer,
+            credentials,
+            applied: None,
             apply,
             members,
             leadership,
@@ -125,9 +141,7 @@ impl Actor for DescriptionKeeper {
             state.carry_out(effects);
         }
         let effects = match message {
-            DescriptionKeeperMessage::Hear { from, may_lead, stamp } => {
-                state.exchange.hear(&from, may_lead, stamp, now)
-            }
+            DescriptionKeeperMessage::Hear { from, may_lead, stamp } => state.hear(&from, may_lead, stamp, now),
             DescriptionKeeperMessage::Take { delivery } if is_intact(&delivery.message) => {
                 state.exchange.take(Arc::clone(&delivery.message), now)
             }
@@ -149,8 +163,11 @@ impl Actor for DescriptionKeeper {
                 state.exchange.tick(now)
             }
         };
-        let has_adopted = effects.iter().any(|effect| matches!(effect, DescriptionEffect::Adopt { .. }));
+        let has_adopted = effects.iter().any(is_adoption);
         state.carry_out(effects);
+        if has_adopted || is_tick {
+            state.drop_revoked(has_adopted, now);
+        }
         if has_adopted || is_tick {
             state.save().await;
         }
@@ -159,6 +176,42 @@ impl Actor for DescriptionKeeper {
 }
 
 impl DescriptionKeeperState {
+    /// Takes a node's word. With certificates, one counts only beside its certificate, by which it can be revoked.
+    fn hear(
+        &mut self,
+        from: &NodeName,
+        may_lead: bool,
+        stamp: DescriptionStamp,
+        now: Timestamp,
+    ) -> Vec<DescriptionEffect> {
+        let members = self.members.borrow();
+        let member = members.iter().find(|member| member.name == *from);
+        let certificate = member.and_then(|member| member.certificate.as_ref()).map(|it| BASE64.encode(it));
+        drop(members);
+        if self.credentials.is_some() && certificate.is_none() {
+            return Vec::new();
+        }
+        self.exchange.hear(from, Statement { stamp, may_lead, certificate }, now)
+    }
+
+    /// Goes back to the description before those of revoked nodes, when the list has changed. The last word of a node may
+    /// also come after the list.
+    fn drop_revoked(&mut self, has_adopted: bool, now: Timestamp) {
+        let Some(loaded) = self.credentials.as_ref().map(|credentials| credentials.current()) else { return };
+        let is_revoked = |certificate: &str| BASE64.decode(certificate).is_ok_and(|der| loaded.has_revoked(&der));
+        let is_new = self.applied.as_ref().is_none_or(|applied| !Arc::ptr_eq(applied, &loaded));
+        let current = self.exchange.history().current.as_ref().filter(|_| has_adopted);
+        if !is_new && !current.and_then(|current| current.stated_by.as_deref()).is_some_and(is_revoked) {
+            return;
+        }
+        let effects = self.exchange.revoke(is_revoked, content_hash(&self.name, ""), now);
+        if effects.iter().any(is_adoption) {
+            tracing::warn!("the description was a revoked node's: the one before counts again");
+        }
+        self.carry_out(effects);
+        self.applied = Some(loaded);
+    }
+
     fn carry_out(&mut self, effects: Vec<DescriptionEffect>) {
         for effect in effects {
             match effect {
@@ -179,8 +232,12 @@ impl DescriptionKeeperState {
     }
 
     async fn save(&mut self) {
-        if let Some(held) = self.exchange.current() {
-            self.writer.save(|| CellDescription::clone(held)).await;
+        if self.exchange.current().is_some() {
+            self.writer.save(|| self.exchange.history().clone()).await;
         }
     }
+}
+
+fn is_adoption(effect: &DescriptionEffect) -> bool {
+    matches!(effect, DescriptionEffect::Adopt { .. })
 }

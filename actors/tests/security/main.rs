@@ -3,6 +3,7 @@
 mod brokers;
 mod certificates;
 mod claims;
+mod descriptions;
 mod evidence;
 mod false_rounds;
 mod fixture;

@@ -217,6 +217,7 @@ impl NodeBuilder {
             may_lead: self.config.may_lead(),
             held: self.held.description.clone(),
             file: self.state_file("description"),
+            credentials: self.security.credentials.clone(),
             // A supervisor that has ended needs no settings.
             apply: Arc::new(move |description| _ = supervisor.cast(NodeMessage::Describe { description })),
             members: self.members(),

@@ -1,10 +1,12 @@
 //! Proof of a node's certificate outside TLS: the membership's handshake uses the same files, CA and revocation list.
 
+use std::time::Duration;
+
 use ring::signature::{ECDSA_P256_SHA256_ASN1, UnparsedPublicKey};
-use rustls::SignatureScheme;
 use rustls::crypto::ring::sign::any_ecdsa_type;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
 use rustls::sign::Signer;
+use rustls::{CertificateError, SignatureScheme};
 use x509_parser::certificate::X509Certificate;
 use x509_parser::prelude::FromDer;
 
@@ -41,6 +43,20 @@ impl LoadedCredentials {
         let verified = self.clients.verify_client_cert(&CertificateDer::from(certificate), &[], wall);
         verified.map(|_| subject).map_err(Distrust::Untrusted)
     }
+
+    /// True if the cell's CA has revoked a certificate, which may have expired.
+    pub(crate) fn has_revoked(&self, certificate: &[u8]) -> bool {
+        let Some(began) = began(certificate) else { return false };
+        let verified = self.clients.verify_client_cert(&CertificateDer::from(certificate), &[], began);
+        verified.is_err_and(|error| error == rustls::Error::InvalidCertificate(CertificateError::Revoked))
+    }
+}
+
+/// Time at which a certificate's validity begins.
+pub(super) fn began(certificate: &[u8]) -> Option<UnixTime> {
+    let (_, parsed) = X509Certificate::from_der(certificate).ok()?;
+    let began = u64::try_from(parsed.validity().not_before.timestamp()).ok()?;
+    Some(UnixTime::since_unix_epoch(Duration::from_secs(began)))
 }
 
 /// Signer with a node's key; `None` for a key other than ECDSA P-256.

@@ -8,11 +8,11 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use ecod::model::names::NodeName;
 use ecod::wire::{LedgerShare, LedgerSignature};
-use rustls::pki_types::{CertificateDer, UnixTime};
+use rustls::pki_types::CertificateDer;
 use x509_parser::certificate::X509Certificate;
 use x509_parser::prelude::FromDer;
 
-use super::attestation::is_signed_with;
+use super::attestation::{began, is_signed_with};
 use super::{CertificateSubject, Credentials, LoadedCredentials};
 
 /// Signer and verifier of evidence, with the certificates of one node.
@@ -149,9 +149,7 @@ fn signatory(certificate: &str, loaded: &LoadedCredentials) -> Option<Signatory>
     let certificate = CertificateDer::from(BASE64.decode(certificate).ok()?);
     let subject = CertificateSubject::of(&certificate).ok()?;
     let (_, parsed) = X509Certificate::from_der(&certificate).ok()?;
-    let began = u64::try_from(parsed.validity().not_before.timestamp()).ok()?;
-    let in_its_time = UnixTime::since_unix_epoch(Duration::from_secs(began));
-    loaded.clients.verify_client_cert(&certificate, &[], in_its_time).ok()?;
+    loaded.clients.verify_client_cert(&certificate, &[], began(&certificate)?).ok()?;
     Some(Signatory { subject, public_key: parsed.public_key().subject_public_key.data.to_vec() })
 }
 
