@@ -200,7 +200,9 @@ impl ReputationKeeperState {
     fn lead(&mut self, epoch: Epoch, last_round: u64) {
         let newest = self.arguments.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.message));
         let mut store = self.arguments.reputations.open();
-        if let Some(newest) = newest.filter(|newest| newest.aggregator.as_ref() != Some(&self.arguments.name)) {
+        // Where evidence is counted, a false leader's reputations are not to stay when it is revoked.
+        let others = newest.filter(|newest| newest.aggregator.as_ref() != Some(&self.arguments.name));
+        if let Some(newest) = others.filter(|_| !store.by_evidence) {
             store.standing.clone_from(&newest.reputations);
         }
         self.arguments.fuser.send(FuserMessage::Resume { reputations: store.standing.clone() });

@@ -23,7 +23,7 @@ use crate::key_holder;
 use crate::network::{self, Bridged};
 use crate::ports::Ports;
 use crate::process::{Process, command};
-use crate::row::Outcome;
+use crate::row::{Means, Outcome};
 
 /// The program under test, unless the environment names another.
 const PROGRAM: &str = env!("CARGO_BIN_EXE_ecod-node");
@@ -234,7 +234,7 @@ impl Cell {
     }
 
     /// Measurements since a mark.
-    pub(crate) fn outcome(&mut self, from: Timestamp) -> anyhow::Result<Outcome> {
+    pub(crate) fn outcome(&mut self, from: Timestamp, means: Means) -> anyhow::Result<Outcome> {
         let time = clock::now().since(from);
         let ended = self.ended()?;
         let maps = self.maps(from)?;
@@ -245,7 +245,7 @@ impl Cell {
             longest_gap_ms: longest_gap_ms(&maps, from),
             is_replaced: maps.last().is_some_and(|line| line.map.aggregator != LEADER),
             rss_mb: if ended.is_empty() { self.peak_memory_mb()? } else { 0 },
-            believed_lies: maps.iter().filter(|line| !line.map.is_true()).count() + self.believers()?,
+            believed_lies: maps.iter().filter(|line| !line.map.is_true()).count() + self.believers(means)?,
             ended,
             deeds: 0,
             fault: None,
@@ -262,10 +262,10 @@ impl Cell {
         Ok(lines.into_iter().filter(|line| line.received_at_us >= since).collect())
     }
 
-    /// Number of nodes that keep evidence about the vehicles of [`inverted`](crate::shares::inverted).
-    fn believers(&self) -> anyhow::Result<usize> {
+    /// Number of honest nodes that keep evidence about the vehicles of [`inverted`](crate::shares::inverted).
+    fn believers(&self, means: Means) -> anyhow::Result<usize> {
         let mut believers = 0;
-        for node in &self.nodes {
+        for node in self.nodes.iter().filter(|node| means != Means::Leader || node.name != LEADER) {
             let files = fs::read_dir(self.directory.path().join(node.name).join("state"))?;
             let states = files.map(|file| Ok(fs::read(file?.path())?)).collect::<anyhow::Result<Vec<_>>>()?;
             let is_forged = |state: &Vec<u8>| state.windows(6).any(|text| text == b"\"liar\"");

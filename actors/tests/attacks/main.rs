@@ -128,7 +128,7 @@ async fn run(row: &Row, victim: Victim, time: Duration, machine: &mut Machine) -
     machine.sleep(time).await?;
     let fault = attacker.stop().map(|error| format!("{error:#}"));
     machine.sleep(AFTERMATH).await?;
-    Ok(Outcome { deeds: deeds.load(Ordering::Relaxed), fault, ..cell.outcome(from)? })
+    Ok(Outcome { deeds: deeds.load(Ordering::Relaxed), fault, ..cell.outcome(from, row.means)? })
 }
 
 /// An attack under way, on threads of its own.

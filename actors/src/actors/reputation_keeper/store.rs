@@ -25,7 +25,7 @@ pub struct ReputationStore {
     pub ledger: ReputationLedger,
     /// In VOTE's `paper` mode, the reputations themselves.
     pub standing: BTreeMap<NodeName, Reputation>,
-    by_evidence: bool,
+    pub(super) by_evidence: bool,
     restored: bool,
 }
 
