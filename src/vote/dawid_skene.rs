@@ -176,20 +176,27 @@ impl DawidSkene {
         if votes.len() < 2 {
             return;
         }
-        let accuracy = self.fleet_accuracy();
-        let log_probability = |coupling| -> f64 {
-            let posterior = self.posterior_by(coupling, votes, candidates);
-            let of_vote = |vote: &WeightedVote| {
-                let others = self.leave_one_out_by(coupling, &posterior, vote);
-                let stating = |&(truth, p): &(LabelIndex, f64)| p * self.stating(coupling, vote, truth, accuracy);
-                vote.independence * others.iter().map(stating).sum::<f64>().max(1e-9).ln()
-            };
-            votes.iter().map(of_vote).sum()
-        };
-        let saved = log_probability(Coupling::Free) - log_probability(Coupling::Tied);
+        let saved = self.log_probability(Coupling::Free, votes, candidates)
+            - self.log_probability(Coupling::Tied, votes, candidates);
         let predicted: f64 = votes.iter().map(|vote| vote.independence).sum();
         let kept = (-predicted / SAVING_MEMORY_VOTES).exp();
         self.saving = (kept * self.saving.0 + saved, kept * self.saving.1 + predicted);
+    }
+
+    /// Log of the probability of a landmark's votes, each predicted from the others, and their number.
+    pub(super) fn prediction(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> f64 {
+        if votes.len() < 2 { 0.0 } else { self.log_probability(self.coupling(), votes, candidates) }
+    }
+
+    fn log_probability(&self, coupling: Coupling, votes: &[WeightedVote], candidates: &[LabelIndex]) -> f64 {
+        let accuracy = self.fleet_accuracy();
+        let posterior = self.posterior_by(coupling, votes, candidates);
+        let of_vote = |vote: &WeightedVote| {
+            let others = self.leave_one_out_by(coupling, &posterior, vote);
+            let stating = |&(truth, p): &(LabelIndex, f64)| p * self.stating(coupling, vote, truth, accuracy);
+            vote.independence * others.iter().map(stating).sum::<f64>().max(1e-9).ln()
+        };
+        votes.iter().map(of_vote).sum()
     }
 
     /// Forgets the evidence on the coupling.

@@ -4,6 +4,9 @@ use super::{START_SWEEPS, WeightedVoting};
 use crate::vote::calibration::Calibration;
 use crate::vote::dependence::Dependence;
 
+/// Log loss per vote, in nats, by which passes may predict votes worse than their start.
+const MAX_LOSS: f64 = 0.01;
+
 impl WeightedVoting {
     /// Judges all stored votes as online but in the order of the landmarks' names, then `passes` times together (Dawid &
     /// Skene 1979).
@@ -22,10 +25,30 @@ impl WeightedVoting {
         let online = std::mem::replace(&mut self.dependence, dependence);
         let settled = std::mem::replace(&mut self.calibration, calibration);
         self.start_again(START_SWEEPS);
+        let in_turn = (self.model.clone(), self.calibration.clone(), self.landmarks.clone());
+        let before = self.log_probability();
         (0..passes).for_each(|_| self.judge_together());
+        let after = self.log_probability();
+        let votes: usize = self.landmarks.values().map(|landmark_votes| landmark_votes.votes.len()).sum();
+        if before - after > MAX_LOSS * votes as f64 {
+            (self.model, self.calibration, self.landmarks) = in_turn;
+        }
         self.dependence = online;
         let calibration = std::mem::replace(&mut self.calibration, settled);
         self.calibration.take_live(calibration);
+    }
+
+    /// Log of the probability of all votes, each predicted from the other votes on the landmark and those on others.
+    fn log_probability(&mut self) -> f64 {
+        let mut sum = 0.0;
+        for landmark_votes in self.landmarks.values() {
+            let votes = landmark_votes.weighted_votes();
+            self.model.add_live(&votes, &landmark_votes.posterior, -1.0);
+            self.model.refresh(votes.iter().map(|vote| vote.vehicle));
+            sum += self.model.prediction(&votes, &landmark_votes.candidates());
+            self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
+        }
+        sum
     }
 
     /// One pass: judges every landmark by the same evidence, then replaces the live evidence.
