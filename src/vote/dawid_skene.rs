@@ -16,8 +16,17 @@ pub(super) struct VehicleEvidence {
     pub(super) inherited: Confusion,
     /// Cumulative sum of the drop in the vehicle's rate of right votes.
     shortfall: f64,
-    /// Log-odds of being right minus those of the fleet on the same classes.
-    advantage: f64,
+    /// Log-odds of being right minus those of the fleet on the same classes, by coupling.
+    advantage: [f64; 2],
+}
+
+/// How the probabilities of the classes hang together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Coupling {
+    /// Each class has its own, with priors.
+    Free,
+    /// A vehicle is right equally often on every class, and wrong labels are equally likely: the one-coin model.
+    Tied,
 }
 
 impl VehicleEvidence {
@@ -60,6 +69,8 @@ pub(super) struct WeightedVote {
 ///
 /// A vehicle's probability of stating `l` where `t` is true has a Dirichlet prior. The prior's mean is the fleet's
 /// confusion, shifted in log-odds by the vehicle's overall reliability. That reliability is shrunk towards the fleet's.
+/// The fleet's confusion has a Dirichlet prior too, whose mean is one accuracy for all classes. Classes are judged one by
+/// one only if that predicts votes better; see [`Coupling`].
 #[derive(Debug, Clone, Default)]
 pub(super) struct DawidSkene {
     config: WeightedConfig,
@@ -70,10 +81,24 @@ pub(super) struct DawidSkene {
     /// Expected number of landmarks of each label.
     shares: Vec<f64>,
     log_shares: Vec<f64>,
+    /// Fading log loss that [`Coupling::Free`] saved in the prediction of votes, in nats, and number of these votes.
+    saving: (f64, f64),
 }
 
 /// Weight, in votes, of the assumed accuracy against the fleet's record of a class.
 const FLEET_PRIOR_VOTES: f64 = 1.0;
+/// The same against the fleet's record, as a share of all its votes: a class that few votes are about keeps close to the
+/// accuracy of all.
+const FLEET_PRIOR_SHARE: f64 = 0.05;
+/// Factor on the weight of the fleet's reliability while the classes are tied.
+const TIED_PRIOR_FACTOR: f64 = 4.0;
+/// Log loss per vote that classes judged one by one must save, in nats. A model that is wrong otherwise, such as about
+/// items that are hard for all, feigns smaller savings (Miller & Dunson 2019).
+const MIN_SAVING: f64 = 0.01;
+/// Saving in all, in nats, that may be chance.
+const CHANCE_SAVING: f64 = 5.0;
+/// Votes over which savings fade to 1/e.
+const SAVING_MEMORY_VOTES: f64 = 20_000.0;
 /// Drop in the rate of right votes that is tolerated.
 const SHORTFALL_SLACK: f64 = 0.2;
 /// Cumulative drop beyond it, in votes, that is a change: about seven wrong votes of a vehicle with 80 % right ones.
@@ -132,14 +157,51 @@ impl DawidSkene {
         (correct + FLEET_PRIOR_VOTES * self.config.assumed_accuracy) / (total + FLEET_PRIOR_VOTES)
     }
 
-    fn fleet_row(&self, truth: LabelIndex) -> f64 {
-        self.live.row(truth) + self.settled.row(truth) + FLEET_PRIOR_VOTES
+    fn fleet(&self, truth: LabelIndex, stated: LabelIndex, accuracy: f64) -> f64 {
+        let tied = if truth == stated { accuracy } else { (1.0 - accuracy) / self.wrong_labels() };
+        let row = self.live.row(truth) + self.settled.row(truth);
+        let count = self.live.cell(truth, stated) + self.settled.cell(truth, stated);
+        let prior = FLEET_PRIOR_VOTES + FLEET_PRIOR_SHARE * (self.live.total() + self.settled.total());
+        (count + prior * tied) / (row + prior)
     }
 
-    fn fleet(&self, truth: LabelIndex, stated: LabelIndex, accuracy: f64) -> f64 {
-        let prior = if truth == stated { accuracy } else { (1.0 - accuracy) / self.wrong_labels() };
-        let count = self.live.cell(truth, stated) + self.settled.cell(truth, stated);
-        (count + FLEET_PRIOR_VOTES * prior) / self.fleet_row(truth)
+    fn coupling(&self) -> Coupling {
+        let (saved, votes) = self.saving;
+        if saved > CHANCE_SAVING + MIN_SAVING * votes { Coupling::Free } else { Coupling::Tied }
+    }
+
+    /// Adds to the evidence on the coupling how well each predicts every one of a landmark's votes from the others. The
+    /// model must not contain the votes yet: the sums are prequential (Dawid 1984).
+    pub(super) fn compare_couplings(&mut self, votes: &[WeightedVote], candidates: &[LabelIndex]) {
+        if votes.len() < 2 {
+            return;
+        }
+        let saved = self.log_probability(Coupling::Free, votes, candidates)
+            - self.log_probability(Coupling::Tied, votes, candidates);
+        let predicted: f64 = votes.iter().map(|vote| vote.independence).sum();
+        let kept = (-predicted / SAVING_MEMORY_VOTES).exp();
+        self.saving = (kept * self.saving.0 + saved, kept * self.saving.1 + predicted);
+    }
+
+    /// Log of the probability of a landmark's votes, each predicted from the others, and their number.
+    pub(super) fn prediction(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> f64 {
+        if votes.len() < 2 { 0.0 } else { self.log_probability(self.coupling(), votes, candidates) }
+    }
+
+    fn log_probability(&self, coupling: Coupling, votes: &[WeightedVote], candidates: &[LabelIndex]) -> f64 {
+        let accuracy = self.fleet_accuracy();
+        let posterior = self.posterior_by(coupling, votes, candidates);
+        let of_vote = |vote: &WeightedVote| {
+            let others = self.leave_one_out_by(coupling, &posterior, vote);
+            let stating = |&(truth, p): &(LabelIndex, f64)| p * self.stating(coupling, vote, truth, accuracy);
+            vote.independence * others.iter().map(stating).sum::<f64>().max(1e-9).ln()
+        };
+        votes.iter().map(of_vote).sum()
+    }
+
+    /// Forgets the evidence on the coupling.
+    pub(super) fn clear_coupling(&mut self) {
+        self.saving = (0.0, 0.0);
     }
 
     /// Recomputes the shares of the classes and the advantages of `vehicles`; call it before [`Self::posterior`] when
@@ -150,16 +212,19 @@ impl DawidSkene {
         for vehicle in vehicles {
             let evidence = &self.vehicles[vehicle];
             let expected = |rows: &Confusion| -> f64 { rows.rows().map(|(t, n)| n * self.fleet(t, t, accuracy)).sum() };
-            let counted = evidence.votes();
-            let fleet = if counted > 1e-9 {
-                ((expected(&evidence.live) + expected(&evidence.settled) + expected(&evidence.inherited)) / counted)
-                    .clamp(1e-6, 1.0 - 1e-6)
+            let (correct, votes) = (evidence.correct(), evidence.votes());
+            let free = if votes > 1e-9 {
+                (expected(&evidence.live) + expected(&evidence.settled) + expected(&evidence.inherited)) / votes
             } else {
-                accuracy.clamp(1e-6, 1.0 - 1e-6)
+                accuracy
             };
             let prior = self.config.vehicle_prior_votes;
-            let own = ((evidence.correct() + prior * fleet) / (evidence.votes() + prior)).clamp(1e-6, 1.0 - 1e-6);
-            self.vehicles[vehicle].advantage = log_odds(own) - log_odds(fleet);
+            let advantage = |fleet: f64, prior: f64| {
+                let fleet = fleet.clamp(1e-6, 1.0 - 1e-6);
+                let own = ((correct + prior * fleet) / (votes + prior)).clamp(1e-6, 1.0 - 1e-6);
+                log_odds(own) - log_odds(fleet)
+            };
+            self.vehicles[vehicle].advantage = [advantage(free, prior), advantage(accuracy, TIED_PRIOR_FACTOR * prior)];
         }
     }
 
@@ -178,33 +243,48 @@ impl DawidSkene {
         }
     }
 
-    /// As [`Self::log_of_stating`], but at most as much as where the stated label is true: no vote counts against its
+    /// Logarithm of [`Self::stating`], but at most as much as where the stated label is true: no vote counts against its
     /// own label. Otherwise the model has a mirrored solution, in which the honest majority consists of consistent liars.
-    fn log_likelihood(&self, vote: &WeightedVote, truth: LabelIndex, accuracy: f64) -> f64 {
-        let own = self.log_of_stating(vote, vote.label, accuracy);
-        if truth == vote.label { own } else { own.min(self.log_of_stating(vote, truth, accuracy)) }
+    fn log_likelihood(&self, coupling: Coupling, vote: &WeightedVote, truth: LabelIndex, accuracy: f64) -> f64 {
+        let own = self.stating(coupling, vote, vote.label, accuracy);
+        if truth == vote.label { own.ln() } else { own.min(self.stating(coupling, vote, truth, accuracy)).ln() }
     }
 
     /// The posterior without `vote`, given all votes but this one.
     pub(super) fn leave_one_out(&self, posterior: &[(LabelIndex, f64)], vote: &WeightedVote) -> Vec<(LabelIndex, f64)> {
+        self.leave_one_out_by(self.coupling(), posterior, vote)
+    }
+
+    fn leave_one_out_by(
+        &self,
+        coupling: Coupling,
+        posterior: &[(LabelIndex, f64)],
+        vote: &WeightedVote,
+    ) -> Vec<(LabelIndex, f64)> {
         let accuracy = self.fleet_accuracy();
-        let own = self.log_likelihood(vote, vote.label, accuracy);
+        let own = self.log_likelihood(coupling, vote, vote.label, accuracy);
         let others: Vec<_> = posterior
             .iter()
             .map(|&(label, p)| {
-                let lead = vote.weight * vote.independence * (own - self.log_likelihood(vote, label, accuracy));
-                (label, p * lead.min(500.0).exp())
+                let lead = own - self.log_likelihood(coupling, vote, label, accuracy);
+                (label, p * (vote.weight * vote.independence * lead).min(500.0).exp())
             })
             .collect();
         let total: f64 = others.iter().map(|(_, p)| p).sum();
         if total > 0.0 { others.into_iter().map(|(label, p)| (label, p / total)).collect() } else { posterior.to_vec() }
     }
 
-    /// Natural logarithm of the probability that the vehicle states the vote's label where `truth` is the true one.
-    fn log_of_stating(&self, vote: &WeightedVote, truth: LabelIndex, accuracy: f64) -> f64 {
+    /// Probability that the vehicle states the vote's label where `truth` is the true one.
+    fn stating(&self, coupling: Coupling, vote: &WeightedVote, truth: LabelIndex, accuracy: f64) -> f64 {
         let evidence = &self.vehicles[vote.vehicle];
+        let [free, tied] = evidence.advantage;
+        let shifted = |right: f64, advantage: f64| 1.0 / (1.0 + (-(log_odds(right) + advantage)).exp());
+        if coupling == Coupling::Tied {
+            let right = shifted(accuracy.clamp(1e-6, 1.0 - 1e-6), tied);
+            return if truth == vote.label { right } else { (1.0 - right) / self.wrong_labels() }.max(1e-12);
+        }
         let right = self.fleet(truth, truth, accuracy).clamp(1e-6, 1.0 - 1e-6);
-        let assumed_right = 1.0 / (1.0 + (-(log_odds(right) + evidence.advantage)).exp());
+        let assumed_right = shifted(right, free);
         let assumed = if truth == vote.label {
             assumed_right
         } else {
@@ -216,11 +296,20 @@ impl DawidSkene {
         let evidence = [&evidence.live, &evidence.settled, &evidence.inherited];
         let count: f64 = evidence.iter().map(|e| e.cell(truth, vote.label)).sum();
         let row: f64 = evidence.iter().map(|e| e.row(truth)).sum();
-        ((count + prior * assumed) / (row + prior)).max(1e-12).ln()
+        ((count + prior * assumed) / (row + prior)).max(1e-12)
     }
 
     /// Probability of each of `candidates` given the votes; newcomers together are limited to their share.
     pub(super) fn posterior(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> Vec<(LabelIndex, f64)> {
+        self.posterior_by(self.coupling(), votes, candidates)
+    }
+
+    fn posterior_by(
+        &self,
+        coupling: Coupling,
+        votes: &[WeightedVote],
+        candidates: &[LabelIndex],
+    ) -> Vec<(LabelIndex, f64)> {
         let newcomer = self.newcomer_factor(votes);
         let accuracy = self.fleet_accuracy();
         let mut logs: Vec<f64> = candidates
@@ -228,7 +317,7 @@ impl DawidSkene {
             .map(|&truth| {
                 let said = |vote: &WeightedVote| {
                     let factor = if self.is_newcomer(vote.vehicle) { newcomer } else { 1.0 };
-                    factor * vote.weight * vote.independence * self.log_likelihood(vote, truth, accuracy)
+                    factor * vote.weight * vote.independence * self.log_likelihood(coupling, vote, truth, accuracy)
                 };
                 self.log_shares[usize::from(truth)] + votes.iter().map(said).sum::<f64>()
             })
@@ -293,6 +382,7 @@ impl DawidSkene {
 
     /// Forgets all evidence that is not live.
     pub(super) fn clear_settled(&mut self) {
+        self.clear_coupling();
         self.settled = Confusion::default();
         for evidence in &mut self.vehicles {
             evidence.settled = Confusion::default();

@@ -66,6 +66,8 @@ pub(super) struct AgreementGroups {
     pub(super) main: Vec<usize>,
     /// Vehicles outside it whose votes are at most half their own.
     pub(super) copies: Vec<usize>,
+    /// Number of vehicles whose votes are at most half their own.
+    pub(super) dependent: usize,
 }
 
 /// Pairwise agreement of vehicles and what follows from it.
@@ -195,7 +197,8 @@ impl Dependence {
         let influences: Vec<f64> = (0..vehicles).map(influence).collect();
         let pairs: Vec<_> = self.pairs.iter().map(|(&(one, other), &pair)| (one, other, pair)).collect();
         let belonging = main_group(&influences, &pairs);
-        let mut rhos = vec![0.0; pairs.len()];
+        let typical = typical_agreement(&belonging, &pairs);
+        let mut rhos: Vec<f64> = pairs.iter().map(|(_, _, pair)| pair.excess(typical, self.significance)).collect();
         let mut factors = vec![0.5; vehicles];
         for _ in 0..FACTOR_STEPS {
             factors = next_factors(&factors, &belonging, &pairs, &rhos);
@@ -208,10 +211,11 @@ impl Dependence {
             self.partners[one].push((other, rho));
             self.partners[other].push((one, rho));
         }
-        let is_copy =
-            |v: usize| present[v] && belonging[v] < 0.1 && self.independence(v, |other| present[other]) <= 0.5;
+        let is_dependent = |v: usize| present[v] && self.independence(v, |other| present[other]) <= 0.5;
+        let is_copy = |v: usize| belonging[v] < 0.1 && is_dependent(v);
         AgreementGroups {
             main: (0..vehicles).filter(|&v| belonging[v] >= 0.5).collect(),
+            dependent: (0..vehicles).filter(|&v| is_dependent(v)).count(),
             copies: (0..vehicles).filter(|&v| is_copy(v)).collect(),
         }
     }
@@ -236,6 +240,14 @@ fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
         belonging = support.iter().zip(influences).map(|(s, influence)| influence * s.max(0.0) / most).collect();
     }
     belonging
+}
+
+/// Mean agreement κ within the main group, of pairs in proportion to their comparisons; at least 0.
+fn typical_agreement(belonging: &[f64], pairs: &[(usize, usize, Pair)]) -> f64 {
+    let weight = |(one, other, pair): &(usize, usize, Pair)| belonging[*one] * belonging[*other] * pair.compared;
+    let weights: f64 = pairs.iter().map(weight).sum();
+    let agreed: f64 = pairs.iter().map(|pair| weight(pair) * pair.2.kappa()).sum();
+    (agreed / weights.max(1e-9)).clamp(0.0, 0.99)
 }
 
 /// One step of alternating least squares for κ = r_i · r_j. Agreement counts as far as it is with the main group and not

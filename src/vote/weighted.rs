@@ -28,6 +28,10 @@ use crate::wire::{Reputation, Verdict};
 
 /// Least weight of a statement among the vehicle's own.
 const MIN_WEIGHT: f64 = 0.01;
+/// Share of the present vehicles from which dependent ones can have decided verdicts.
+const MANY_DEPENDENT: f64 = 0.2;
+/// Times that all landmarks are judged in turn where learning starts again.
+const START_SWEEPS: u32 = 3;
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the fresh votes.
 #[derive(Debug, Clone, Default)]
@@ -57,6 +61,8 @@ pub(super) struct WeightedVoting {
     evidence: Vec<Evidence>,
     /// Votes from then on become evidence.
     recorded_from: Timestamp,
+    /// Number of dependent vehicles when learning last started again because of them.
+    known_dependent: usize,
 }
 
 impl WeightedVoting {
@@ -98,10 +104,15 @@ impl WeightedVoting {
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
         landmark_votes.compare(&mut self.dependence, &mut self.calibration, |vehicle| vehicle);
         landmark_votes.weigh(&self.dependence, &self.calibration, weights);
+        let is_new = landmark_votes.votes.iter().any(|vote| !vote.judged);
         landmark_votes.votes.iter_mut().for_each(|vote| vote.judged = true);
         let votes = landmark_votes.weighted_votes();
         self.model.refresh(votes.iter().map(|vote| vote.vehicle));
-        landmark_votes.posterior = self.model.posterior(&votes, &landmark_votes.candidates());
+        let candidates = landmark_votes.candidates();
+        if is_new {
+            self.model.compare_couplings(&votes, &candidates);
+        }
+        landmark_votes.posterior = self.model.posterior(&votes, &candidates);
         landmark_votes.record_agreement(&self.model, &mut self.calibration);
         self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
         landmark_votes.counted = true;
@@ -111,7 +122,8 @@ impl WeightedVoting {
     /// Finds the vehicles that depend on each other.
     ///
     /// If the main group is thought wrong more often than right and its copies right, then verdicts that the copies
-    /// made themselves taught that. Such evidence is void: learning starts again.
+    /// made themselves taught that. Such evidence is void: learning starts again. It also does where many vehicles turn out
+    /// to be dependent, whose agreement has passed for reliability.
     fn fit_dependence(&mut self) {
         let mut present = vec![false; self.names.len()];
         self.landmarks.values().flat_map(|l| &l.votes).for_each(|vote| present[vote.vehicle] = true);
@@ -121,8 +133,12 @@ impl WeightedVoting {
         };
         if trust(&groups.copies) > 0.5 && trust(&groups.main) < 0.5 && !groups.main.is_empty() {
             self.model.clear_settled();
-            let (dependence, calibration) = (self.dependence.clone(), self.calibration.clone());
-            self.start_from_majorities(&dependence, &calibration);
+            self.start_from_majorities();
+        } else if groups.dependent as f64 >= MANY_DEPENDENT * present.iter().filter(|present| **present).count() as f64
+            && groups.dependent > 2 * self.known_dependent
+        {
+            self.known_dependent = groups.dependent;
+            self.start_again(START_SWEEPS);
         }
     }
 

@@ -1,11 +1,17 @@
 //! Batch estimation: all stored votes are judged together, whatever their order of arrival.
 
-use super::WeightedVoting;
+use super::{START_SWEEPS, WeightedVoting};
 use crate::vote::calibration::Calibration;
 use crate::vote::dependence::Dependence;
 
+/// Log loss per vote, in nats, by which passes may predict votes worse than their start.
+const MAX_LOSS: f64 = 0.01;
+
 impl WeightedVoting {
-    /// Judges all stored votes `passes` times, starting from majorities (Dawid & Skene 1979).
+    /// Judges all stored votes as online but in the order of the landmarks' names, then `passes` times together (Dawid &
+    /// Skene 1979).
+    ///
+    /// Judging in turn is the better start: each landmark is judged without its own votes in the evidence.
     pub(super) fn judge_all(&mut self, passes: u32) {
         let mut dependence = Dependence::of_stored();
         let mut calibration = Calibration::new(self.config.calibration_votes);
@@ -16,38 +22,83 @@ impl WeightedVoting {
             landmark_votes.compare(&mut dependence, &mut calibration, |vehicle| by_name[vehicle]);
         }
         dependence.fit(&vec![true; self.names.len()]);
-        self.start_from_majorities(&dependence, &calibration);
-        for _ in 0..passes {
-            self.model.refresh(0..self.names.len());
-            let weights = calibration.weights();
-            for landmark_votes in self.landmarks.values_mut() {
-                landmark_votes.weigh(&dependence, &calibration, &weights);
-                landmark_votes.posterior =
-                    self.model.posterior(&landmark_votes.weighted_votes(), &landmark_votes.candidates());
-            }
-            calibration.clear_live();
-            self.landmarks
-                .values_mut()
-                .for_each(|landmark_votes| landmark_votes.record_agreement(&self.model, &mut calibration));
-            self.model.clear_live();
-            for landmark_votes in self.landmarks.values_mut() {
-                self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, 1.0);
-                landmark_votes.published = None;
-                landmark_votes.publish(0.0);
-            }
+        let online = std::mem::replace(&mut self.dependence, dependence);
+        let settled = std::mem::replace(&mut self.calibration, calibration);
+        self.start_again(START_SWEEPS);
+        let in_turn = (self.model.clone(), self.calibration.clone(), self.landmarks.clone());
+        let before = self.log_probability();
+        (0..passes).for_each(|_| self.judge_together());
+        let after = self.log_probability();
+        let votes: usize = self.landmarks.values().map(|landmark_votes| landmark_votes.votes.len()).sum();
+        if before - after > MAX_LOSS * votes as f64 {
+            (self.model, self.calibration, self.landmarks) = in_turn;
         }
+        self.dependence = online;
+        let calibration = std::mem::replace(&mut self.calibration, settled);
         self.calibration.take_live(calibration);
     }
 
+    /// Log of the probability of all votes, each predicted from the other votes on the landmark and those on others.
+    fn log_probability(&mut self) -> f64 {
+        let mut sum = 0.0;
+        for landmark_votes in self.landmarks.values() {
+            let votes = landmark_votes.weighted_votes();
+            self.model.add_live(&votes, &landmark_votes.posterior, -1.0);
+            self.model.refresh(votes.iter().map(|vote| vote.vehicle));
+            sum += self.model.prediction(&votes, &landmark_votes.candidates());
+            self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
+        }
+        sum
+    }
+
+    /// One pass: judges every landmark by the same evidence, then replaces the live evidence.
+    fn judge_together(&mut self) {
+        self.model.refresh(0..self.names.len());
+        let weights = self.calibration.weights();
+        for landmark_votes in self.landmarks.values_mut() {
+            landmark_votes.weigh(&self.dependence, &self.calibration, &weights);
+            landmark_votes.posterior =
+                self.model.posterior(&landmark_votes.weighted_votes(), &landmark_votes.candidates());
+        }
+        self.calibration.clear_live();
+        self.landmarks
+            .values_mut()
+            .for_each(|landmark_votes| landmark_votes.record_agreement(&self.model, &mut self.calibration));
+        self.model.clear_live();
+        for landmark_votes in self.landmarks.values_mut() {
+            self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, 1.0);
+            landmark_votes.published = None;
+            landmark_votes.publish(0.0);
+        }
+    }
+
+    /// Forgets all live evidence and every verdict, and judges all landmarks in turn, `sweeps` times.
+    pub(super) fn start_again(&mut self, sweeps: u32) {
+        self.model.clear_live();
+        self.model.clear_coupling();
+        self.calibration.clear_live();
+        for landmark_votes in self.landmarks.values_mut() {
+            (landmark_votes.published, landmark_votes.counted) = (None, false);
+            for vote in &mut landmark_votes.votes {
+                (vote.agreement, vote.judged) = (None, false);
+            }
+        }
+        let landmarks: Vec<_> = self.landmarks.keys().cloned().collect();
+        for _ in 0..sweeps {
+            let weights = self.calibration.weights();
+            landmarks.iter().for_each(|landmark| self.judge(landmark, &weights));
+        }
+    }
+
     /// Replaces all live evidence by that of the weighted majorities.
-    pub(super) fn start_from_majorities(&mut self, dependence: &Dependence, calibration: &Calibration) {
-        let weights = calibration.weights();
+    pub(super) fn start_from_majorities(&mut self) {
+        let weights = self.calibration.weights();
         self.model.clear_live();
         self.calibration.clear_live();
         for landmark_votes in self.landmarks.values_mut() {
             landmark_votes.published = None;
             landmark_votes.counted = true;
-            landmark_votes.weigh(dependence, calibration, &weights);
+            landmark_votes.weigh(&self.dependence, &self.calibration, &weights);
             landmark_votes.votes.iter_mut().for_each(|vote| vote.agreement = None);
             landmark_votes.posterior = landmark_votes.majority();
             self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, 1.0);
