@@ -96,10 +96,13 @@ impl StalenessFilter {
     /// The first round of a leadership is fresh: its clock is not known. After a time without rounds, since the start too,
     /// it is not, because it may have waited; then a stream has to be live for [`LIVE_STREAM_TIME`] first.
     pub fn is_fresh(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> bool {
-        if received_at.since(std::mem::replace(&mut self.newest_at, received_at)) > MAX_ROUND_AGE {
+        let has_resumed = received_at.since(std::mem::replace(&mut self.newest_at, received_at)) > MAX_ROUND_AGE;
+        if has_resumed {
             self.resumed_at = Some(received_at);
         }
-        let known = self.delay.take().filter(|(of, _)| of == epoch).map(|(_, delay)| delay);
+        // A delay that was not learnt before a silence is none after it: rounds that waited may have begun it.
+        let is_known = |(of, delay): &(Epoch, LeadersDelay)| of == epoch && (delay.is_learnt || !has_resumed);
+        let known = self.delay.take().filter(is_known).map(|(_, delay)| delay);
         let has_waited = self.resumed_at.is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_ROUND_AGE);
         let mut delay = known.unwrap_or_else(|| LeadersDelay::new(!has_waited, fused_at, received_at));
         let waited = delay.observe(fused_at, received_at);
@@ -219,5 +222,15 @@ mod tests {
         // Nothing tells how long the first of them waited. Once they are known to be live, they may be late again.
         assert!((27..40).all(|n| is_fresh(100 * n, 5, 2)));
         assert!((40..60).all(|n| is_fresh(100 * n, 5, 2 + 600 * (n % 2))));
+    }
+
+    #[test]
+    fn a_node_that_runs_for_a_moment_between_two_stops_learns_no_delay_from_them() {
+        let (old, new) = (NodeName::from_static("euclid"), NodeName::from_static("edge"));
+        let (old, new, mut filter) = (Epoch::new(1, old), Epoch::new(2, new), StalenessFilter::new(ms(0)));
+        assert!((0..20).all(|round| filter.is_fresh(&old, ms(100 * round), ms(100 * round + 2))));
+        // Stopped until 5 s, for a moment, and until 6.1 s: of the moment, the older rounds alone passed other checks.
+        assert!((20..41).all(|round| !filter.is_fresh(&new, ms(100 * round), ms(5000))));
+        assert!(!filter.is_fresh(&new, ms(5060), ms(6100)), "a round of 1.04 s ago");
     }
 }
