@@ -73,7 +73,8 @@ fn photographs_of_two_cameras_become_objects_on_one_map() {
     let mut trial = Trial(command.stderr(Stdio::piped()).spawn().unwrap());
     let mut lines = BufReader::new(trial.0.stderr.take().unwrap()).lines().map_while(Result::ok);
     let page = lines.find_map(|line| Some(line.strip_prefix("page: http://")?.split('/').next()?.to_owned())).unwrap();
-    let rest = std::thread::spawn(move || lines.collect::<Vec<_>>());
+    let (sender, progress) = std::sync::mpsc::channel();
+    std::thread::spawn(move || lines.try_for_each(|line| sender.send(line)));
 
     let deadline = Instant::now() + PATIENCE;
     let mut found = Vec::new();
@@ -82,17 +83,15 @@ fn photographs_of_two_cameras_become_objects_on_one_map() {
         std::thread::sleep(Duration::from_millis(200));
         found = objects(&page).unwrap_or(found);
     }
+    let told = |line: &String| line.contains("frames/s") && line.contains("objects on the map");
+    let next_line = || progress.recv_timeout(deadline.saturating_duration_since(Instant::now())).ok();
+    assert!(std::iter::from_fn(next_line).any(|line| told(&line)), "progress is told of");
     let distance = |label: &str| found.iter().find(|(seen, _)| seen == label).unwrap().1;
     assert!(distance("cat") < 3.0, "a cat that fills the picture: {found:?}");
     assert!((45.0..55.0).contains(&distance("person")), "before the other camera, 50 m away: {found:?}");
 
     kill(Pid::from_raw(trial.0.id().cast_signed()), Signal::SIGINT).unwrap();
     assert!(trial.0.wait().unwrap().success());
-    let progress = rest.join().unwrap();
-    assert!(
-        progress.iter().any(|line| line.contains("frames/s") && line.contains("objects on the map")),
-        "{progress:?}"
-    );
 
     for (name, images) in [("node.toml", &albums[0]), ("node-2.toml", &albums[1])] {
         let path = directory.path().join(name);

@@ -66,7 +66,7 @@ const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
 
 pub(super) fn run(arguments: &TryArguments) -> Result<(), Failure> {
     let configs = arguments.configs()?;
-    run_to_end(serve(configs, arguments.save.clone(), arguments.stop_at_eof))
+    run_to_end(serve(configs, arguments.save.as_deref(), arguments.stop_at_eof))
 }
 
 impl TryArguments {
@@ -152,10 +152,10 @@ fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
 }
 
 /// Runs the vehicles until SIGINT or SIGTERM, or until one gives up.
-async fn serve(configs: Vec<NodeConfig>, save: Option<PathBuf>, stop_at_eof: bool) -> anyhow::Result<()> {
+async fn serve(configs: Vec<NodeConfig>, save: Option<&Path>, stop_at_eof: bool) -> anyhow::Result<()> {
     let mut nodes = Vec::new();
     let outcome = tokio::select! {
-        outcome = start_and_watch(configs, save.as_deref(), &mut nodes) => outcome,
+        outcome = start_and_watch(configs, save, &mut nodes) => outcome,
         stopped = stop_signal() => stopped,
         () = input_ended(), if stop_at_eof => Ok(()),
     };

@@ -33,10 +33,10 @@ fn kinds(height_m: f64) -> Vec<(&'static str, ObjectSize)> {
     vec![kind("person", 0.5, 0.3, 1.7, 0.06), kind("bicycle", 0.6, 1.7, 1.1, 0.1), kind("car", 1.8, 4.5, 1.5, 0.06)]
 }
 
-fn projection(ranging: Ranging, mount: Mount, config: ProjectionConfig) -> Projection {
+fn projection(ranging: Ranging, mount: Mount, config: &ProjectionConfig) -> Projection {
     let labels = kinds(mount.height_m.unwrap_or(1.2)).into_iter().map(|(label, size)| (label.into(), size)).collect();
     let sizes = ObjectSizes { labels, ..ObjectSizes::default() };
-    Projection::new(ProjectionConfig { ranging, sizes, ..config }, camera(), mount)
+    Projection::new(ProjectionConfig { ranging, sizes, ..config.clone() }, camera(), mount)
 }
 
 /// The box around an upright cuboid on the ground, as far as it is in the image; `None` if its foot is not.
@@ -120,7 +120,7 @@ fn boxes_in_whole_pixels_are_placed_within_two_percent_of_the_range_at_any_heigh
                 let (mount, mut street) = (mount(height_m, pitch_deg, roll_deg), Street::new(height_m));
                 let config =
                     ProjectionConfig { pixel_sigma_px: 0.5, tilt_sigma_rad: 1e-4, ..ProjectionConfig::default() };
-                let projection = projection(ranging, mount, config);
+                let projection = projection(ranging, mount, &config);
                 let mut errors = Vec::new();
                 for _ in 0..400 {
                     let (mut detection, at) = street.next(&mount, 0.0, 20.0);
@@ -150,7 +150,7 @@ fn coverage(ranging: Ranging, height_m: f64, pitch_deg: f64, tilt_sigma_rad: f64
         floor_m: 1e-4,
         ..ProjectionConfig::default()
     };
-    let projection = projection(ranging, stated, config.clone());
+    let projection = projection(ranging, stated, &config);
     let (mut covered, mut all) = (0, 0);
     for _ in 0..3000 {
         let mut off = |sigma: f64| sigma * street.normal();
@@ -204,7 +204,7 @@ fn range_m(projection: &Projection, detection: &Detection) -> Result<f64, Projec
 #[test]
 fn a_person_cut_by_the_lower_or_the_upper_edge_is_still_placed() {
     let mount = mount(1.2, 5.0, 0.0);
-    let both = projection(Ranging::Auto, mount, ProjectionConfig::default());
+    let both = projection(Ranging::Auto, mount, &ProjectionConfig::default());
     let whole = person_ahead(6.0, &mount);
     for (name, bounds, tolerance_m) in [
         ("no feet", BoundingBox { y_max: 720.0, ..whole.bounding_box }, 1.0),
@@ -221,7 +221,7 @@ fn a_person_cut_by_the_lower_or_the_upper_edge_is_still_placed() {
     let nothing = BoundingBox { x_min: 0.0, ..neither.bounding_box };
     let nothing = Detection { bounding_box: nothing, ..neither };
     assert_eq!(range_m(&both, &nothing).unwrap_err().as_str(), "clipped");
-    let ground = projection(Ranging::Ground, mount, ProjectionConfig::default());
+    let ground = projection(Ranging::Ground, mount, &ProjectionConfig::default());
     let no_feet = Detection { bounding_box: BoundingBox { y_max: 720.0, ..whole.bounding_box }, ..whole };
     assert_eq!(range_m(&ground, &no_feet).unwrap_err().as_str(), "clipped");
 }
@@ -236,14 +236,14 @@ fn a_foot_at_or_above_the_horizon_has_no_place_on_the_ground_but_one_by_its_heig
         let y_max = horizon_px - above_px;
         let bounding_box = BoundingBox { y_min: y_max - height_px, y_max, ..person.bounding_box };
         let raised = Detection { bounding_box, ..person.clone() };
-        let ground = projection(Ranging::Ground, mount, ProjectionConfig::default());
+        let ground = projection(Ranging::Ground, mount, &ProjectionConfig::default());
         assert_eq!(range_m(&ground, &raised).unwrap_err().as_str(), "above_horizon");
-        let both = projection(Ranging::Auto, mount, ProjectionConfig::default());
+        let both = projection(Ranging::Auto, mount, &ProjectionConfig::default());
         let found = range_m(&both, &raised).unwrap();
         assert!((found - 9.0).abs() < 0.9, "{found}");
     }
     let unknown = Detection { label: "QR1".into(), ..person_ahead(9.0, &mount) };
-    let ground = projection(Ranging::Ground, mount, ProjectionConfig::default());
+    let ground = projection(Ranging::Ground, mount, &ProjectionConfig::default());
     assert!((range_m(&ground, &unknown).unwrap() - 9.0).abs() < 0.3, "the ground needs no size");
 }
 
@@ -251,8 +251,8 @@ fn a_foot_at_or_above_the_horizon_has_no_place_on_the_ground_but_one_by_its_heig
 fn a_person_on_a_platform_is_placed_by_its_height_and_a_bump_costs_little() {
     let mount = mount(1.2, 5.0, 0.0);
     let config = ProjectionConfig { tilt_sigma_rad: 0.005, ..ProjectionConfig::default() };
-    let both = projection(Ranging::Auto, mount, config.clone());
-    let ground = projection(Ranging::Ground, mount, config);
+    let both = projection(Ranging::Auto, mount, &config);
+    let ground = projection(Ranging::Ground, mount, &config);
     let (label, size) = kinds(1.2)[0];
     for (raised_m, ground_error_m) in [(0.6, 4.0), (0.05, 0.2)] {
         // Seen from as much lower.
@@ -267,15 +267,15 @@ fn a_person_on_a_platform_is_placed_by_its_height_and_a_bump_costs_little() {
 #[test]
 fn without_a_height_or_with_corners_nothing_changes() {
     let config = ProjectionConfig::default();
-    let level = projection(Ranging::Auto, Mount::default(), config.clone());
-    let by_height = projection(Ranging::BoxHeight, Mount::default(), config.clone());
+    let level = projection(Ranging::Auto, Mount::default(), &config);
+    let by_height = projection(Ranging::BoxHeight, Mount::default(), &config);
     let person = person_ahead(6.0, &mount(1.2, 5.0, 0.0));
     let pose = Pose::new(1.0, 2.0, 0.3);
     let place = |projection: &Projection| projection.place(&person, projection.cut(&person), None, &pose);
     assert_eq!(place(&level), place(&by_height));
     let target = Point3::new(0.3, 0.2, 4.0);
-    let posed = projection(Ranging::Auto, mount(1.2, 0.0, 0.0), config.clone());
-    let corners = projection(Ranging::Corners, Mount::default(), config);
+    let posed = projection(Ranging::Auto, mount(1.2, 0.0, 0.0), &config);
+    let corners = projection(Ranging::Corners, Mount::default(), &config);
     let place = |projection: &Projection| projection.place(&person, Cut::default(), Some(&target), &pose);
     assert_eq!(place(&posed), place(&corners));
 }
@@ -286,12 +286,12 @@ fn a_tilted_camera_of_unknown_height_ranges_upright_objects_and_corners_alike() 
     let (label, size) = kinds(1.2)[0];
     let at = Point2::new(6.0, -0.5);
     let detection = seen(label, &size, at, 0.0, &mount(1.2, 8.0, 5.0)).unwrap();
-    let by_height = projection(Ranging::BoxHeight, tilted, ProjectionConfig::default());
+    let by_height = projection(Ranging::BoxHeight, tilted, &ProjectionConfig::default());
     let found = range_m(&by_height, &detection).unwrap();
     assert!((found - at.coords.norm()).abs() < 0.3, "{found}");
     let level = Vector3::new(at.x, at.y, -0.4);
     let target = Point3::from(tilted.to_level().transpose() * level);
-    let corners = projection(Ranging::Corners, tilted, ProjectionConfig::default());
+    let corners = projection(Ranging::Corners, tilted, &ProjectionConfig::default());
     let placed = corners.place(&detection, Cut::default(), Some(&target), &Pose::new(0.0, 0.0, 0.0)).unwrap();
     assert!(offset_m(&placed, at) < 1e-9);
 }
