@@ -218,10 +218,8 @@ impl LeadershipNode {
                 }
             }
             Input::Troubled { troubles } => {
-                if self.status.troubles != troubles {
-                    self.status.troubles = troubles;
-                    self.is_status_told = false;
-                }
+                self.is_status_told &= self.status.troubles == troubles;
+                self.status.troubles = troubles;
             }
             Input::Leave => self.feed(ElectionInput::Leave, now),
         }
@@ -397,8 +395,7 @@ impl LeadershipNode {
         if now < preparation.check_at {
             return;
         }
-        let waited = now.since(preparation.since);
-        if (preparation.has_evidence || waited >= LEDGER_TIMEOUT) && self.health.is_fit() {
+        if (preparation.has_evidence || now.since(preparation.since) >= LEDGER_TIMEOUT) && self.health.is_fit() {
             self.preparation = None;
             self.feed(ElectionInput::Prepared, now);
         } else {
@@ -430,8 +427,7 @@ impl LeadershipNode {
         let is_reached = self.members.elsewhere().next().is_none()
             || self.monitor.reaches_others(self.links.plane(), is_private, no_other);
         if !is_reached && !std::mem::replace(&mut self.was_out_of_reach, true) {
-            let members = self.members.elsewhere().cloned().collect();
-            self.log(Notice::OutOfReach { members });
+            self.log(Notice::OutOfReach { members: self.members.elsewhere().cloned().collect() });
         }
         is_reached
     }
@@ -486,9 +482,7 @@ impl LeadershipNode {
         let state = if self.leadership.is_leading() { NodeState::Aggregating } else { NodeState::Following };
         let (term, aggregator) = (epoch.map_or(0, |epoch| epoch.term), epoch.map(|epoch| &epoch.leader));
         let fit = (!self.is_vehicle_only).then(|| self.health.is_fit());
-        let NodeStatus { state: told_state, epoch: told_term, aggregator: told_aggregator, fit: told_fit, .. } =
-            &self.status;
-        let told = (*told_state, *told_term, told_aggregator.as_ref(), *told_fit);
+        let told = (self.status.state, self.status.epoch, self.status.aggregator.as_ref(), self.status.fit);
         if !self.is_status_told || told != (state, term, aggregator, fit) {
             let aggregator = aggregator.cloned();
             self.status = NodeStatus { state, epoch: term, aggregator, fit, ..self.status.clone() };

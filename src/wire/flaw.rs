@@ -34,8 +34,13 @@ impl Flaw {
             (RejectReason::TooLarge, _) => {
                 Self::new(reason, "", format!("is longer than {} bytes", limits.payload_bytes))
             }
-            (RejectReason::NodeMismatch, _) => Self::new(reason, "node", "is another node than the topic's"),
-            (_, Some(b'{')) => Self::of_json(bytes, reason, limits).unwrap_or_else(|| Self::new(reason, "", "")),
+            (RejectReason::NodeMismatch, _) => {
+                let named = read::<ObjectReport>(bytes).map(|report| format!("it names {}", report.node));
+                Self::new(reason, "", named.unwrap_or_default())
+            }
+            (_, first) if first == Some(&b'{') || bytes.is_ascii() => {
+                Self::of_json(bytes, reason, limits).unwrap_or_else(|| Self::new(reason, "", ""))
+            }
             _ => {
                 let report = read::<ObjectReport>(bytes).ok();
                 let invalid = report.as_ref().and_then(|report| report.check_values(limits).err());
@@ -140,8 +145,12 @@ mod tests {
         }
         let json = br#"{"schema":1,"node":"watson","seq":1,"captured_at_us":5,"objects":[{"label":"cup","confidence":0.5,"x_m":NaN,"y_m":2}]}"#;
         assert_eq!(Flaw::of_report(json, RejectReason::NotFinite, &limits).to_string(), "objects[0].x_m: is NaN");
-        for (junk, reason) in [(&b"junk"[..], RejectReason::Malformed), (b"", RejectReason::Malformed)] {
-            assert_eq!(Flaw::of_report(junk, reason, &limits).to_string(), "malformed");
+        for (junk, told) in [(&b"junk"[..], "expected value, at column 1"), (b"\xff\xfe", "malformed")] {
+            assert_eq!(Flaw::of_report(junk, RejectReason::Malformed, &limits).to_string(), told);
         }
+        let mismatch = Flaw::of_report(&encode(&report, Encoding::Json), RejectReason::NodeMismatch, &limits);
+        assert_eq!(mismatch.to_string(), "node_mismatch", "a report that cannot be read names nobody");
+        let readable = encode(&ObjectReport { objects: vec![object(1.0)], ..report }, Encoding::Json);
+        assert_eq!(Flaw::of_report(&readable, RejectReason::NodeMismatch, &limits).to_string(), "it names watson");
     }
 }

@@ -199,7 +199,8 @@ async fn a_claim_of_another_name_is_refused_aloud() {
         let is_told = text.contains("node_mismatch (it names gauss)");
         assert!(reason == "PayloadFormatInvalid" && is_told, "{reason} {text}");
         let without_seq = format!(r#"{{"schema":1,"node":"{own}","captured_at_us":1,"objects":[]}}"#).into_bytes();
-        for (payload, flaw) in [(without_seq, "missing field `seq`"), (b"garbage".to_vec(), "expected value at line 1")]
+        for (payload, flaw) in
+            [(without_seq, "missing field `seq`"), (b"garbage".to_vec(), "expected value, at column 1")]
         {
             let (_, text) = program.ask(&format!("detections/{own}"), payload).await;
             assert!(text.contains("malformed") && text.contains(flaw), "{text}");

@@ -320,12 +320,8 @@ impl Inbox {
         }
         if status.node != self.node {
             let status = Arc::new(status);
-            return Ok(self.deliver(
-                via,
-                Incoming::Status { status, via: via.address.clone() },
-                Origin::Claimed,
-                received_at,
-            ));
+            let message = Incoming::Status { status, via: via.address.clone() };
+            return Ok(self.deliver(via, message, Origin::Claimed, received_at));
         }
         Ok(if status.state == NodeState::Offline {
             PacketOutcome::DeclaredOffline

@@ -193,8 +193,8 @@ impl DoorState {
         }
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
             let flaw = Flaw::of_report(payload, reason, &setup.limits);
-            let text =
-                format!("the report on {topic} is not usable: {flaw} ({reason}); see docs/protocol.md#rejections");
+            let told = if flaw.fault.is_empty() { String::new() } else { format!(" ({flaw})") };
+            let text = format!("the report on {topic} is not usable: {reason}{told}; see docs/protocol.md#rejections");
             Refusal::new(RefusalReason::Rejected(reason), text)
         })?;
         if !(setup.fuses)(kind) {
