@@ -185,7 +185,7 @@ impl DawidSkene {
         self.saving = (kept * self.saving.0 + saved, kept * self.saving.1 + predicted);
     }
 
-    /// Log of the probability of a landmark's votes, each predicted from the others, and their number.
+    /// Log of the probability of a landmark's votes, each predicted from the others.
     pub(super) fn prediction(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> f64 {
         if votes.len() < 2 { 0.0 } else { self.log_probability(self.coupling(), votes, candidates) }
     }
