@@ -13,7 +13,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -41,6 +41,9 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 	cargo build --release --locked --bin ecod-node --bin ecod-lab
 	cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node --sets "$(SETS)" --passes $(PASSES) \
 	    --work $(BUILD)/eval-labels $(if $(filter examples/crowd_labels,$(SETS)),--write-table docs/algorithms.md)
+
+eval-generated: setup ## VOTE beside the majority on 200 generated label sets
+	cargo test --release --locked -p ecod --test vote_generated -- --include-ignored --nocapture
 
 eval-tracks: setup ## tracks in generated traffic beside single vehicles and late fusion; table and drawing go into docs/
 	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \

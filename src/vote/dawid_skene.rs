@@ -83,6 +83,8 @@ pub(super) struct DawidSkene {
     log_shares: Vec<f64>,
     /// Fading log loss that [`Coupling::Free`] saved in the prediction of votes, in nats, and number of these votes.
     saving: (f64, f64),
+    /// The same by the ledger of other aggregators.
+    inherited_saving: (f64, f64),
 }
 
 /// Weight, in votes, of the assumed accuracy against the fleet's record of a class.
@@ -166,7 +168,7 @@ impl DawidSkene {
     }
 
     fn coupling(&self) -> Coupling {
-        let (saved, votes) = self.saving;
+        let (saved, votes) = (self.saving.0 + self.inherited_saving.0, self.saving.1 + self.inherited_saving.1);
         if saved > CHANCE_SAVING + MIN_SAVING * votes { Coupling::Free } else { Coupling::Tied }
     }
 
@@ -183,7 +185,7 @@ impl DawidSkene {
         self.saving = (kept * self.saving.0 + saved, kept * self.saving.1 + predicted);
     }
 
-    /// Log of the probability of a landmark's votes, each predicted from the others, and their number.
+    /// Log of the probability of a landmark's votes, each predicted from the others.
     pub(super) fn prediction(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> f64 {
         if votes.len() < 2 { 0.0 } else { self.log_probability(self.coupling(), votes, candidates) }
     }
@@ -197,6 +199,22 @@ impl DawidSkene {
             vote.independence * others.iter().map(stating).sum::<f64>().max(1e-9).ln()
         };
         votes.iter().map(of_vote).sum()
+    }
+
+    /// Replaces the evidence on the coupling that comes from a ledger. It holds (correct, incorrect) by vehicle and label.
+    pub(super) fn inherit_coupling(&mut self, vehicles: impl Iterator<Item = Vec<(f64, f64)>>) {
+        self.inherited_saving = (0.0, 0.0);
+        for labels in vehicles {
+            let (correct, votes) = labels.iter().fold((0.0, 0.0), |(c, n), label| (c + label.0, n + label.0 + label.1));
+            let rate = (correct + self.config.assumed_accuracy) / (votes + 1.0);
+            let prior = self.config.class_prior_votes;
+            for (correct, incorrect) in labels {
+                let own = (correct + prior * rate) / (correct + incorrect + prior);
+                let saved = correct * (own / rate).ln() + incorrect * ((1.0 - own) / (1.0 - rate)).ln();
+                self.inherited_saving.0 += saved;
+                self.inherited_saving.1 += correct + incorrect;
+            }
+        }
     }
 
     /// Forgets the evidence on the coupling.
@@ -383,6 +401,7 @@ impl DawidSkene {
     /// Forgets all evidence that is not live.
     pub(super) fn clear_settled(&mut self) {
         self.clear_coupling();
+        self.inherited_saving = (0.0, 0.0);
         self.settled = Confusion::default();
         for evidence in &mut self.vehicles {
             evidence.settled = Confusion::default();

@@ -1,0 +1,184 @@
+//! VOTE beside the majority on generated label sets: over balance of the classes, habits of the annotators, number of
+//! labels and confidences.
+//!
+//! All sets: `make eval-generated`. A set is drawn anew until it has enough items. VOTE falls short where it is below the
+//! expected majority by more than half a point and two standard errors of the difference, item by item.
+
+mod sets;
+
+use std::collections::BTreeMap;
+use std::thread;
+use std::time::Duration;
+
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::vote::{Vote, VoteConfig, WeightedConfig};
+use ecod::wire::{ObjectReport, PerceivedObject, Verdict};
+use sets::{Item, Kind};
+
+const START: Timestamp = Timestamp(1_700_000_000_000_000);
+/// Points below the majority, or of passes below one pass, that are allowed.
+const TOLERANCE: f64 = 0.5;
+const SETS: u64 = 200;
+const PASSES: u32 = 30;
+/// Sets that fall short: a quarter of the annotators copies or always states one class, and few pairs share enough items
+/// for their agreement to be told from that of good ones.
+const KNOWN_SHORT: [u64; 6] = [24, 72, 82, 135, 161, 164];
+
+/// A sum of differences of items.
+#[derive(Debug, Clone, Copy, Default)]
+struct Difference {
+    items: f64,
+    sum: f64,
+    squares: f64,
+}
+
+impl Difference {
+    fn add(&mut self, difference: f64) {
+        self.items += 1.0;
+        self.sum += difference;
+        self.squares += difference * difference;
+    }
+
+    /// Mean in points.
+    fn points(&self) -> f64 {
+        100.0 * self.sum / self.items
+    }
+
+    fn standard_error(&self) -> f64 {
+        100.0 * (self.squares / self.items - (self.sum / self.items).powi(2)).max(0.0).sqrt() / self.items.sqrt()
+    }
+
+    fn falls_short(&self) -> bool {
+        self.points() < -TOLERANCE - 2.0 * self.standard_error()
+    }
+}
+
+/// One pass and passes beside the majority, and passes beside one pass.
+struct Score {
+    majority: f64,
+    online: Difference,
+    passes: Difference,
+    passes_beside_online: Difference,
+}
+
+impl Score {
+    fn falls_short(&self) -> bool {
+        [self.online, self.passes, self.passes_beside_online].iter().any(Difference::falls_short)
+    }
+
+    fn row(&self, number: u64, kind: &Kind) -> String {
+        let of = |d: Difference| format!("{:+.2} ± {:.2}", d.points(), d.standard_error());
+        let (majority, online, passes) = (self.majority, of(self.online), of(self.passes));
+        let beside = of(self.passes_beside_online);
+        format!(
+            "set {number}: majority {majority:.2} %, online {online}, passes {passes}, passes - online {beside}; {kind:?}"
+        )
+    }
+}
+
+/// Chance that the most frequent label, drawn at random on a tie, is right.
+fn chance_of_majority(item: &Item) -> f64 {
+    let mut votes: BTreeMap<usize, usize> = BTreeMap::new();
+    item.labels.iter().for_each(|label| *votes.entry(label.class).or_default() += 1);
+    let most = votes.values().max().copied().unwrap_or(0);
+    let first = votes.values().filter(|n| **n == most).count();
+    if votes.get(&item.truth) == Some(&most) { 1.0 / first as f64 } else { 0.0 }
+}
+
+fn landmark(place: usize) -> String {
+    format!("item-{place:05}")
+}
+
+/// As with annotators: an item after the other, none goes stale.
+fn vote_on(items: &[Item]) -> Vote {
+    let weighted =
+        WeightedConfig { freshness_s: 1e9, smoothing_share: 0.0, hysteresis: 0.0, ..WeightedConfig::default() };
+    let limits = VoteConfig { max_landmarks: 100_000, max_vehicles: 10_000, ..VoteConfig::default() };
+    let mut vote = Vote::new(VoteConfig { weighted, ..limits }, Vec::new());
+    for (place, item) in items.iter().enumerate() {
+        let now = START + Duration::from_millis(100 * place as u64);
+        for label in &item.labels {
+            let class = format!("class-{}", label.class);
+            let object = PerceivedObject {
+                landmark: Some(landmark(place).as_str().into()),
+                ..PerceivedObject::new(class.as_str(), label.confidence, 0.0, 0.0)
+            };
+            let node = NodeName::new(format!("annotator-{}", label.annotator)).unwrap();
+            let report = ObjectReport { objects: vec![object], ..ObjectReport::new(node, place as u64, now) };
+            vote.observe(&report, now).unwrap();
+        }
+        vote.close(now);
+    }
+    vote
+}
+
+fn right(items: &[Item], verdicts: &[Verdict]) -> Vec<f64> {
+    assert_eq!(items.len(), verdicts.len());
+    let is_right = |(item, verdict): (&Item, &Verdict)| {
+        f64::from(verdict.label.as_deref() == Some(format!("class-{}", item.truth).as_str()))
+    };
+    items.iter().zip(verdicts).map(is_right).collect()
+}
+
+/// The score of a kind over as many sets as have `items` items.
+fn score(number: u64, items: usize) -> Score {
+    let kind = sets::kind(number);
+    let mut majority = Difference::default();
+    let [mut online, mut passes, mut passes_beside_online] = [Difference::default(); 3];
+    let mut draw = 0;
+    while majority.items < items as f64 {
+        let set = kind.generate(1000 * number + draw, items);
+        draw += 1;
+        let mut vote = vote_on(&set);
+        let one_pass = right(&set, &vote.verdicts());
+        let refined = right(&set, &vote.refine(PASSES));
+        for ((item, one_pass), refined) in set.iter().zip(one_pass).zip(refined) {
+            let of_majority = chance_of_majority(item);
+            majority.add(of_majority);
+            online.add(one_pass - of_majority);
+            passes.add(refined - of_majority);
+            passes_beside_online.add(refined - one_pass);
+        }
+    }
+    Score { majority: majority.points(), online, passes, passes_beside_online }
+}
+
+/// Scores sets on all processors; prints those that fall short and the means.
+fn check(numbers: &[u64], items: usize) {
+    let threads = thread::available_parallelism().map_or(1, usize::from);
+    let of_thread = |thread: usize| {
+        let numbers = numbers.iter().skip(thread).step_by(threads);
+        numbers.map(|&number| (number, score(number, items))).collect::<Vec<_>>()
+    };
+    let scores: BTreeMap<u64, Score> = thread::scope(|scope| {
+        let running: Vec<_> = (0..threads).map(|thread| scope.spawn(move || of_thread(thread))).collect();
+        running.into_iter().flat_map(|thread| thread.join().unwrap()).collect()
+    });
+    let mean = |of: fn(&Score) -> Difference| {
+        scores.values().map(|score| of(score).points()).sum::<f64>() / scores.len() as f64
+    };
+    println!("{} sets: online {:+.2}, passes {:+.2} points", scores.len(), mean(|s| s.online), mean(|s| s.passes));
+    let short: Vec<_> = scores
+        .iter()
+        .filter(|(_, score)| score.falls_short())
+        .map(|(&number, score)| (number, score.row(number, &sets::kind(number))))
+        .collect();
+    let rows: Vec<_> = short.iter().map(|(_, row)| row.as_str()).collect();
+    println!("{} of {} sets fall short:\n{}", short.len(), scores.len(), rows.join("\n"));
+    let unknown: Vec<_> = short.iter().filter(|(number, _)| !KNOWN_SHORT.contains(number)).collect();
+    assert!(unknown.is_empty(), "{unknown:#?}");
+}
+
+#[test]
+fn unbalanced_classes_few_labels_and_lazy_annotators_leave_votes_at_least_as_right_as_the_majority() {
+    // Each balance meets each habit about once in 56; every ninth meets all of both.
+    let numbers: Vec<u64> = (1..SETS).step_by(9).collect();
+    check(&numbers, 600);
+}
+
+#[test]
+#[ignore = "takes minutes; `make eval-generated`"]
+fn no_more_generated_sets_than_known_are_judged_worse_than_by_the_majority() {
+    check(&(0..SETS).collect::<Vec<_>>(), 1000);
+}
