@@ -47,7 +47,7 @@ eval-generated: setup ## VOTE beside the majority on 200 generated label sets
 
 eval-tracks: setup ## tracks in generated traffic beside single vehicles and late fusion; table and drawing go into docs/
 	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
-	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/evaluation.md --svg docs/tracks.svg)
+	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/evaluation.md --svg docs/tracks.svg --reliability docs/reliability.svg)
 
 # DIR holds copies of the repositories that docs/measurements.md names; all that is missing is told.
 eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI, WILDTRACK, CF, SP

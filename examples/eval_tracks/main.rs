@@ -1,14 +1,15 @@
 //! Tracks in generated traffic, beside the best vehicle alone, all reports together, and late fusion.
 //!
 //! `make eval-tracks`, or `cargo run --release --example eval_tracks -- [--seeds tuning|report] [--count N] [--seconds S]
-//! [--observers 2,4,8] [--write-table FILE] [--svg FILE] [--recordings DIR]`
+//! [--observers 2,4,8] [--write-table FILE] [--svg FILE] [--reliability FILE] [--recordings DIR]`
 //!
 //! Parameters are chosen on the seeds `tuning` and figures reported on the seeds `report`; `--count` takes the first
-//! of them. `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
+//! of them. `--reliability` draws how often ECOD's objects are right by what they state. `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
 //! `ecod-lab eval`.
 
 mod baselines;
 mod plot;
+mod reliability;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -25,7 +26,7 @@ use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind, SCHEMA_VERSION};
-use ecod_lab::eval::tracks::{AP_DISTANCES_M, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
+use ecod_lab::eval::tracks::{AP_DISTANCES_M, Calibration, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
 use ecod_lab::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -35,20 +36,34 @@ use baselines::{Latest, Tracker, found, suppressed};
 
 const TUNING: Range<u64> = 1..5;
 const REPORT: Range<u64> = 1001..1005;
-const OBSERVERS: [usize; 6] = [2, 4, 8, 16, 32, 50];
+const OBSERVERS: [usize; 7] = [1, 2, 4, 8, 16, 32, 50];
 
 /// Ways to make a map of the same reports.
 pub(crate) const METHODS: [&str; 4] = ["best vehicle", "union", "late fusion", "ecod"];
 
 /// Columns of the table.
-pub(crate) const FIGURES: [&str; 9] =
-    ["AP@0.5", "AP@1", "AP@2", "AP@4", "best F1", "MODA", "HOTA", "IDF1", "switches per object"];
+pub(crate) const FIGURES: [&str; 11] = [
+    "AP@0.5",
+    "AP@1",
+    "AP@2",
+    "AP@4",
+    "best F1",
+    "MODA",
+    "HOTA",
+    "IDF1",
+    "calibration error",
+    "best threshold",
+    "switches per object",
+];
+
+/// Number of figures that are percentages; they come first.
+const PERCENTAGES: usize = 9;
 
 /// The figures of one method, in the order of [`FIGURES`].
 pub(crate) type Figures = [f64; FIGURES.len()];
 
 const USAGE: &str = "eval_tracks [--seeds tuning|report] [--count N] [--seconds S] [--observers 2,4,8] [--write-table FILE] \
-                     [--svg FILE] [--recordings DIR]";
+                     [--svg FILE] [--reliability FILE] [--recordings DIR]";
 
 struct Options {
     seeds: Range<u64>,
@@ -57,6 +72,7 @@ struct Options {
     observers: Vec<usize>,
     table: Option<PathBuf>,
     svg: Option<PathBuf>,
+    reliability: Option<PathBuf>,
     recordings: Option<PathBuf>,
 }
 
@@ -68,6 +84,7 @@ fn options() -> anyhow::Result<Options> {
         observers: OBSERVERS.to_vec(),
         table: None,
         svg: None,
+        reliability: None,
         recordings: None,
     };
     let mut args = std::env::args().skip(1);
@@ -88,6 +105,7 @@ fn options() -> anyhow::Result<Options> {
             }
             "--write-table" => options.table = Some(value.into()),
             "--svg" => options.svg = Some(value.into()),
+            "--reliability" => options.reliability = Some(value.into()),
             "--recordings" => options.recordings = Some(value.into()),
             _ => bail!("unknown option {key}"),
         }
@@ -204,9 +222,10 @@ fn alone(recording: &TrafficRecording, name: &NodeName, mut judge: TrackEvaluati
 fn figures(scores: &TrackScores, truth_ids: usize) -> Figures {
     let at = &scores.at_best_f1;
     let [a, b, c, d] = scores.ap_pct.map(Option::unwrap_or_default);
-    let rest = [scores.best_f1_pct, at.moda_pct, at.hota_pct, at.idf1_pct].map(Option::unwrap_or_default);
-    let [f1, moda, hota, idf1] = rest;
-    [a, b, c, d, f1, moda, hota, idf1, at.id_switches as f64 / truth_ids.max(1) as f64]
+    let rest = [scores.best_f1_pct, at.moda_pct, at.hota_pct, at.idf1_pct, scores.calibration.confidence.ece_pct];
+    let [f1, moda, hota, idf1, error] = rest.map(Option::unwrap_or_default);
+    let switches = at.id_switches as f64 / truth_ids.max(1) as f64;
+    [a, b, c, d, f1, moda, hota, idf1, error, at.threshold, switches]
 }
 
 /// Where a recording is written to, line by line.
@@ -269,10 +288,12 @@ fn main() -> anyhow::Result<()> {
     let mut table = header();
     print!("{table}");
     let mut courses: Vec<(usize, [Figures; METHODS.len()])> = Vec::new();
+    let mut stated: Vec<(String, Vec<Calibration>)> = Vec::new();
     for Scene { name, config } in Scene::all(&options) {
         config.validate()?;
         let seeds: Vec<u64> = options.seeds.clone().take(options.count).collect();
         let mut mean = [[0.0; FIGURES.len()]; METHODS.len()];
+        let mut calibrations = Vec::new();
         for seed in &seeds {
             let mut rng = ChaCha8Rng::seed_from_u64(*seed);
             let recording = generate(&config, &mut || rng.random());
@@ -289,6 +310,7 @@ fn main() -> anyhow::Result<()> {
                 recording.truth.frames.iter().flat_map(|frame| frame.objects.iter().map(|object| object.id)).collect();
             let scores = run(&recording, config.observers, &mut write)?;
             written?;
+            calibrations.extend(scores.last().map(|ecod| ecod.calibration.clone()));
             for (method, scores) in scores.iter().enumerate() {
                 for (sum, figure) in mean[method].iter_mut().zip(figures(scores, ids.len())) {
                     *sum += figure / seeds.len() as f64;
@@ -296,12 +318,14 @@ fn main() -> anyhow::Result<()> {
             }
         }
         for (method, figures) in METHODS.iter().zip(&mean) {
-            let (shares, switches) = figures.split_at(FIGURES.len() - 1);
-            let shares: Vec<String> = shares.iter().map(|figure| format!("{figure:.1}")).collect();
-            let row = format!("| {name} | {method} | {} | {:.2} |\n", shares.join(" | "), switches[0]);
+            let (shares, others) = figures.split_at(PERCENTAGES);
+            let shares = shares.iter().map(|figure| format!("{figure:.1}"));
+            let cells: Vec<String> = shares.chain(others.iter().map(|figure| format!("{figure:.2}"))).collect();
+            let row = format!("| {name} | {method} | {} |\n", cells.join(" | "));
             print!("{row}");
             table.push_str(&row);
         }
+        stated.push((name.clone(), calibrations));
         if name == config.observers.to_string() {
             courses.push((config.observers, mean));
         }
@@ -311,6 +335,9 @@ fn main() -> anyhow::Result<()> {
     }
     if let Some(path) = &options.svg {
         plot::draw(path, &courses)?;
+    }
+    if let Some(path) = &options.reliability {
+        reliability::draw(path, &stated)?;
     }
     Ok(())
 }

@@ -31,9 +31,9 @@ const MEMORY: f64 = 400.0;
 /// Number of looks between two fits.
 const REFIT: u32 = 25;
 
-const BINS: usize = 24;
+const BINS: usize = 48;
 const BIN_NATS: f64 = 0.4;
-const MIN_NATS: f64 = -4.8;
+const MIN_NATS: f64 = -9.6;
 
 /// Learnt relation between confidence and probability of one vehicle.
 #[derive(Debug, Clone)]
@@ -54,7 +54,7 @@ pub(super) fn log_odds(confidence: f64) -> f64 {
 }
 
 fn bounded(confidence: f64) -> f64 {
-    confidence.clamp(0.01, 0.99)
+    confidence.clamp(1e-4, 1.0 - 1e-4)
 }
 
 impl Calibration {

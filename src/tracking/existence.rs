@@ -4,7 +4,8 @@
 //! object adds the log-likelihood ratio of "exists" to "is clutter". Here frames are not independent: the cause of a
 //! false alarm or a miss is still there a tenth of a second later. So hits and misses follow a Markov chain and their
 //! sum is bounded. n confidences with correlation ρ weigh as n/(1+ρ(n−1)) (the design effect; Kish, "Survey Sampling",
-//! 1965).
+//! 1965). Vehicles err alike, too, so that existence counts a part of their evidence only. The odds before any evidence are
+//! those of the cell's own tracks ([`BaseRate`]).
 
 use nalgebra::Vector2;
 
@@ -27,6 +28,24 @@ const MAX_SEQUENCE_NATS: f64 = 2.5;
 /// Maximum evidence of one vehicle for an object, nats: a few others together outweigh it.
 const MAX_SENSOR_NATS: f64 = 8.0;
 
+/// Shares of the evidence that are independent from vehicle to vehicle: of the sequence, and of the confidences.
+const SEQUENCE_WEIGHT: f64 = 0.53;
+const CONFIDENCE_WEIGHT: f64 = 0.235;
+
+/// The same of a sequence against the object by a vehicle that states its view. A few that look and find nothing outweigh
+/// one that is sure.
+const DENIAL_WEIGHT: f64 = 0.95;
+
+/// Evidence for each e-folding of the time for which an object was detected, nats: the lives of false alarms have a long
+/// tail (Lomax).
+const PERSISTENCE_NATS: f64 = 0.88;
+
+/// Scale of these lives, seconds.
+const PERSISTENCE_S: f64 = 0.1;
+
+/// Time in seconds beyond which a false alarm stays as long as an object.
+const MAX_PERSISTENCE_S: f64 = 1.0;
+
 /// Minimum number of looks before a vehicle's statement is judged.
 const MIN_JUDGED_LOOKS: u32 = 5;
 
@@ -48,6 +67,8 @@ pub(super) struct SensorHistory {
     judged_at: Timestamp,
     /// Evidence of the sequence of hits and misses, nats.
     sequence: f64,
+    /// Whether the vehicle stated its view at the last miss.
+    is_view_stated: bool,
     /// Fading sums of the log-odds of confidences and of their weights.
     score: f64,
     weight: f64,
@@ -71,12 +92,73 @@ impl DetectionRates {
     /// Rates of a real object in an unknown view.
     pub(super) const PRIOR: Self = Self { after_hit: 0.9, after_miss: 0.15 };
 
-    /// Rates of clutter.
+    /// Usual rates of clutter.
     const CLUTTER: Self = Self { after_hit: 0.5, after_miss: 0.02 };
 
     /// The rate after a hit or a miss.
     pub(super) fn after(&self, was_hit: bool) -> f64 {
         if was_hit { self.after_hit } else { self.after_miss }
+    }
+}
+
+/// Rates of an object and of clutter at a look.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LookRates {
+    pub(super) object: DetectionRates,
+    pub(super) clutter: DetectionRates,
+    /// Whether the vehicle states its view; otherwise it may not have looked there.
+    pub(super) is_view_stated: bool,
+}
+
+impl LookRates {
+    /// Usual rates.
+    pub(super) const PRIOR: Self =
+        Self { object: DetectionRates::PRIOR, clutter: DetectionRates::CLUTTER, is_view_stated: false };
+
+    /// Ratio of the probabilities of a look's result, if an object is there and if it is clutter.
+    fn ratio(&self, was_hit: bool, is_hit: bool) -> f64 {
+        let [object, clutter] = [self.object, self.clutter].map(|rates| rates.after(was_hit));
+        if is_hit { object / clutter } else { (1.0 - object) / (1.0 - clutter) }
+    }
+}
+
+/// Rates at which a vehicle detects clutter again, learnt on tracks by the probability that they are clutter.
+#[derive(Debug, Clone)]
+pub(super) struct ClutterRates {
+    /// Detections and looks, after a hit and after a miss.
+    after_hit: (f64, f64),
+    after_miss: (f64, f64),
+}
+
+impl Default for ClutterRates {
+    fn default() -> Self {
+        let DetectionRates { after_hit, after_miss } = DetectionRates::CLUTTER;
+        let usual = |rate: f64| (rate * Self::USUAL_LOOKS, Self::USUAL_LOOKS);
+        Self { after_hit: usual(after_hit), after_miss: usual(after_miss) }
+    }
+}
+
+impl ClutterRates {
+    /// Number of looks that the usual rates count as.
+    const USUAL_LOOKS: f64 = 100.0;
+
+    /// Number of looks beyond which older ones are forgotten.
+    const MEMORY: f64 = 400.0;
+
+    /// The rates.
+    pub(super) fn rates(&self) -> DetectionRates {
+        let rate = |(hits, looks): (f64, f64)| hits / looks;
+        DetectionRates { after_hit: rate(self.after_hit), after_miss: rate(self.after_miss) }
+    }
+
+    /// Learns from a look at a track that is clutter with a probability; `was_hit` is the result of the look before.
+    pub(super) fn learn(&mut self, probability: f64, was_hit: bool, is_hit: bool) {
+        let (hits, looks) = if was_hit { &mut self.after_hit } else { &mut self.after_miss };
+        *hits += probability * f64::from(u8::from(is_hit));
+        *looks += probability;
+        let kept = (Self::MEMORY / *looks).min(1.0);
+        *hits *= kept;
+        *looks *= kept;
     }
 }
 
@@ -94,6 +176,7 @@ impl SensorHistory {
             unjudged: Statement::default(),
             judged_at: at,
             sequence: 0.0,
+            is_view_stated: false,
             score: 0.0,
             weight: 0.0,
         }
@@ -102,11 +185,10 @@ impl SensorHistory {
     /// Records a detection whose confidence is worth `nats`. `rates` are `None` for the detection that spawns a track:
     /// it is no evidence that a known object was found again.
     #[inline]
-    pub(super) fn hit(&mut self, at: Timestamp, position: Vector2<f64>, nats: f64, rates: Option<DetectionRates>) {
+    pub(super) fn hit(&mut self, at: Timestamp, position: Vector2<f64>, nats: f64, rates: Option<LookRates>) {
         let share = self.look(at);
         if let Some(rates) = rates {
-            let ratio = rates.after(self.was_hit) / DetectionRates::CLUTTER.after(self.was_hit);
-            self.add(share * ratio.ln());
+            self.add(share * rates.ratio(self.was_hit, true).ln());
         }
         self.score += nats;
         self.weight += 1.0;
@@ -121,10 +203,10 @@ impl SensorHistory {
     }
 
     /// Records a look at the object in view without a detection.
-    pub(super) fn miss(&mut self, at: Timestamp, rates: DetectionRates) {
+    pub(super) fn miss(&mut self, at: Timestamp, rates: LookRates) {
         let share = self.look(at);
-        let ratio = (1.0 - rates.after(self.was_hit)) / (1.0 - DetectionRates::CLUTTER.after(self.was_hit));
-        self.add(share * ratio.ln().min(0.0));
+        self.add(share * rates.ratio(self.was_hit, false).ln().min(0.0));
+        self.is_view_stated = rates.is_view_stated;
         self.was_hit = false;
     }
 
@@ -154,8 +236,22 @@ impl SensorHistory {
         self.sequence = (self.sequence + nats).clamp(-MAX_SEQUENCE_NATS, MAX_SEQUENCE_NATS);
     }
 
-    /// Evidence of the vehicle for the object at `at`, nats.
+    /// Evidence of the vehicle for the object at `at` if it stood alone, nats.
     pub(super) fn nats(&self, at: Timestamp) -> f64 {
+        let (sequence, confidence) = self.evidence(at);
+        (sequence + confidence).min(MAX_SENSOR_NATS)
+    }
+
+    /// Its part in the evidence of all, nats.
+    pub(super) fn shared_nats(&self, at: Timestamp) -> f64 {
+        let (sequence, confidence) = self.evidence(at);
+        let denies = sequence < 0.0 && self.is_view_stated;
+        let sequence_weight = if denies { DENIAL_WEIGHT } else { SEQUENCE_WEIGHT };
+        sequence_weight * sequence + CONFIDENCE_WEIGHT * confidence
+    }
+
+    /// Evidence of the sequence and of the confidences, nats.
+    fn evidence(&self, at: Timestamp) -> (f64, f64) {
         let kept = (-at.since(self.last_look).as_secs_f64() / MEMORY_S).exp();
         let weight = kept * self.weight;
         let confidence = if weight > 1e-3 {
@@ -164,7 +260,54 @@ impl SensorHistory {
         } else {
             0.0
         };
-        (kept * self.sequence + confidence).min(MAX_SENSOR_NATS)
+        (kept * self.sequence, confidence)
+    }
+}
+
+/// Evidence that an object was detected over `time_s` seconds, nats.
+pub(super) fn persistence_nats(time_s: f64) -> f64 {
+    PERSISTENCE_NATS * (time_s.min(MAX_PERSISTENCE_S) / PERSISTENCE_S).ln_1p()
+}
+
+/// Share of the tracks that are objects, learnt from the tracks themselves.
+///
+/// It is the mean of their existences, which in turn follow from it: one step a round of expectation maximisation
+/// (Saerens, Latinne, Decaestecker, "Adjusting the outputs of a classifier to new a priori probabilities", 2002).
+#[derive(Debug, Clone, Default)]
+pub(super) struct BaseRate {
+    /// Fading means of the number of tracks in a round and of the sum of their existences.
+    tracks: f64,
+    objects: f64,
+    at: Timestamp,
+}
+
+impl BaseRate {
+    /// Time constant in seconds with which rounds are forgotten.
+    const MEMORY_S: f64 = 5.0;
+
+    /// Usual share of objects, and the number of tracks that it counts as.
+    const USUAL: f64 = 0.33;
+    const USUAL_TRACKS: f64 = 5.0;
+
+    /// Log-odds of the usual share.
+    pub(super) fn usual_log_odds() -> f64 {
+        (Self::USUAL / (1.0 - Self::USUAL)).ln()
+    }
+
+    /// Log-odds that a track is an object.
+    pub(super) fn log_odds(&self) -> f64 {
+        let objects = Self::USUAL * Self::USUAL_TRACKS + self.objects;
+        let clutter = (1.0 - Self::USUAL) * Self::USUAL_TRACKS + (self.tracks - self.objects).max(0.0);
+        (objects / clutter).ln()
+    }
+
+    /// Learns from the existences of all tracks of a round.
+    pub(super) fn learn(&mut self, at: Timestamp, existences: impl Iterator<Item = f64>) {
+        let (tracks, objects) = existences.fold((0.0, 0.0), |(count, sum), existence| (count + 1.0, sum + existence));
+        let kept = (-at.since(self.at).as_secs_f64() / Self::MEMORY_S).exp();
+        self.tracks += (1.0 - kept) * (tracks - self.tracks);
+        self.objects += (1.0 - kept) * (objects - self.objects);
+        self.at = self.at.max(at);
     }
 }
 

@@ -8,6 +8,7 @@ use nalgebra::Matrix2;
 use super::calibration::Calibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
+use super::existence::{ClutterRates, DetectionRates, LookRates};
 use super::registration::Registration;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
 use crate::model::geometry::Covariance;
@@ -149,6 +150,7 @@ pub(super) struct SensorModel {
     pub(super) noise: NoiseModel,
     pub(super) calibration: Calibration,
     pub(super) coverage: Coverage,
+    pub(super) clutter: ClutterRates,
     pub(super) counts: TrustCounts,
 }
 
@@ -163,8 +165,14 @@ impl SensorModel {
             noise: NoiseModel::default(),
             calibration: Calibration::new(config.even_confidence),
             coverage: Coverage::default(),
+            clutter: ClutterRates::default(),
             counts,
         }
+    }
+
+    /// Rates at a look, with those of an object.
+    pub(super) fn look_rates(&self, object: DetectionRates) -> LookRates {
+        LookRates { object, clutter: self.clutter.rates(), is_view_stated: self.coverage.is_stated() }
     }
 
     /// Updates time, place and field of view from a report; true if the vehicle has jumped to another place.

@@ -78,6 +78,11 @@ impl TrackStore {
         self.tracks.iter()
     }
 
+    /// The same, mutable; they stay where they are.
+    pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = &mut Track> {
+        self.tracks.iter_mut()
+    }
+
     /// All tracks with their indices, the oldest first.
     pub(super) fn indexed(&self) -> impl Iterator<Item = (TrackIndex, &Track)> {
         self.tracks.iter().enumerate().map(|(index, track)| (TrackIndex(index as u32), track))

@@ -9,7 +9,7 @@ use uuid::Uuid;
 
 use super::config::TracksConfig;
 use super::detection_history::DetectionHistory;
-use super::existence::{SensorHistory, logistic};
+use super::existence::{BaseRate, SensorHistory, logistic, persistence_nats};
 use super::grid::IndexedTrack;
 use super::kinematics::{KinematicState, Measurement};
 use super::neighbours::Neighbours;
@@ -32,8 +32,12 @@ pub(super) const MIN_LABEL_SIMILARITY: f64 = 0.02;
 /// Maximum position error of a useful object, metres.
 const USABLE_M: f64 = 1.5;
 
-/// Log-odds of existence before any evidence.
-const PRIOR_NATS: f64 = 0.4;
+/// Rate at which the probability of a position error falls, in standard deviations: errors of associated detections have
+/// an exponential tail.
+const ERROR_RATE: f64 = 1.23;
+
+/// Log-odds of existence of a track without evidence, beside the base rate.
+const ALONE_NATS: f64 = -0.96;
 
 /// Rate at which objects disappear, per second.
 const DISAPPEARANCE_RATE: f64 = 0.02;
@@ -41,8 +45,8 @@ const DISAPPEARANCE_RATE: f64 = 0.02;
 /// Time constant in seconds with which an unseen object disappears.
 const UNSEEN_S: f64 = 2.0;
 
-/// Prior odds that a track is an object: most are clutter.
-const PRIOR_ODDS: f64 = 0.07;
+/// Power at which survival enters the odds of existence: tracks are kept for longer than their objects are likely there.
+const SURVIVAL_POWER: f64 = 3.1;
 
 /// State of one track.
 #[derive(Debug, Clone)]
@@ -65,6 +69,8 @@ pub(super) struct Track {
     pub(super) neighbours: Neighbours,
     /// Log-odds from another aggregator, which fade, and the time at which they came.
     inherited: Option<(f64, Timestamp)>,
+    /// Probability that the track never was an object, by the last estimate.
+    pub(super) clutter: Option<f64>,
 }
 
 impl Track {
@@ -84,6 +90,7 @@ impl Track {
             hits: 0,
             neighbours: Neighbours::default(),
             inherited: None,
+            clutter: None,
         }
     }
 
@@ -153,11 +160,20 @@ impl Track {
         common.max(MIN_LABEL_SIMILARITY)
     }
 
-    /// Log-odds of existence; `trust` weighs the evidence of each vehicle.
-    fn existence_nats(&self, at: Timestamp, trust: impl Fn(SensorId) -> f64) -> f64 {
-        let evidence: f64 = self.history.iter().map(|history| trust(history.sensor) * history.nats(at)).sum();
+    /// Estimates whether the track is of an object; returns the probability that it is still there. `base_rate` are the
+    /// log-odds of any track, `trust` weighs the evidence of each vehicle.
+    pub(super) fn estimate_existence(&mut self, at: Timestamp, base_rate: f64, trust: impl Fn(SensorId) -> f64) -> f64 {
+        let (mut evidence, mut detected) = (0.0, 0.0);
+        for history in self.history.iter() {
+            let trust = trust(history.sensor);
+            evidence += trust * history.shared_nats(at);
+            detected = if history.last_hit.is_some() { trust.max(detected) } else { detected };
+        }
+        let persistence = persistence_nats(self.last_seen.since(self.first_seen).as_secs_f64());
         let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
-        PRIOR_NATS + evidence + inherited
+        let nats = base_rate + ALONE_NATS + evidence + detected * persistence + inherited;
+        self.clutter = Some(logistic(-nats));
+        logistic(nats + SURVIVAL_POWER * self.survival(at).ln())
     }
 
     /// Probability that an object that existed is still there.
@@ -202,7 +218,8 @@ impl Track {
     /// Takes existence and attributes from another aggregator's object.
     pub(super) fn inherit(&mut self, object: &FusedObject, at: Timestamp) {
         let existence = object.existence.unwrap_or(object.confidence).clamp(0.01, 0.99);
-        self.inherited = Some(((existence / (1.0 - existence) / PRIOR_ODDS).ln() - PRIOR_NATS, at));
+        let alone = BaseRate::usual_log_odds() + ALONE_NATS;
+        self.inherited = Some(((existence / (1.0 - existence)).ln() - alone, at));
         self.first_seen = object.first_seen_us.map_or(self.first_seen, |first| first.min(self.first_seen));
         self.labels = object.scores.iter().map(|(label, score)| (label.clone(), *score)).collect();
         self.heading_rad = object.heading_rad;
@@ -214,17 +231,16 @@ impl Track {
         &self,
         now: Timestamp,
         config: &TracksConfig,
-        trust: impl Fn(SensorId) -> f64,
+        existence: f64,
         name: impl Fn(SensorId) -> Option<NodeName>,
     ) -> FusedObject {
         let covariance = self.state.covariance_at(now, config.density());
         let position = self.state.position_at(now);
-        let existence = with_prior_odds(logistic(self.existence_nats(now, trust))) * self.survival(now);
         let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
         let mut scores = BTreeMap::new();
         scores.extend(self.labels.iter().map(|(label, weight)| (label.clone(), weight / total.max(1e-9))));
-        let variance = covariance.trace() / 2.0;
-        let usable = 1.0 - (-USABLE_M * USABLE_M / (2.0 * variance)).exp();
+        let sigma_m = (covariance.trace() / 2.0).sqrt();
+        let usable = 1.0 - (-ERROR_RATE * USABLE_M / sigma_m).exp();
         let covariance = Covariance { xx: covariance.m11, xy: covariance.m12, yy: covariance.m22 };
         let confidence = existence * usable;
         let has_velocity = self.hits > 1;
@@ -257,10 +273,4 @@ impl Track {
         let sigma = (self.state.velocity_covariance().trace() / 2.0).sqrt();
         (velocity.norm() > (3.0 * sigma).max(1.0)).then(|| velocity.y.atan2(velocity.x))
     }
-}
-
-/// A probability at even prior odds, converted to [`PRIOR_ODDS`].
-fn with_prior_odds(probability: f64) -> f64 {
-    let probability = probability.clamp(0.0, 1.0);
-    PRIOR_ODDS * probability / (PRIOR_ODDS * probability + 1.0 - probability)
 }

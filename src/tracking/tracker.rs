@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::config::TracksConfig;
+use super::existence::BaseRate;
 use super::lifecycle::{adopt_map, merge, prune};
 use super::registration::{RegistrationFrame, register};
 use super::sensors::Sensors;
@@ -22,6 +23,7 @@ pub struct Tracker {
     config: TracksConfig,
     pub(super) sensors: Sensors,
     tracks: TrackStore,
+    base_rate: BaseRate,
     /// Reports of the open round with their times of capture.
     pending: Vec<(Timestamp, Arc<ObjectReport>)>,
     frame: TurningFrame,
@@ -38,6 +40,7 @@ impl Tracker {
         Self {
             sensors: Sensors::new(reputation),
             tracks: TrackStore::new(&config),
+            base_rate: BaseRate::default(),
             config,
             pending: Vec::new(),
             frame: TurningFrame::default(),
@@ -163,10 +166,15 @@ impl Tracker {
         (frames, evidence)
     }
 
-    fn objects(&self, now: Timestamp) -> Vec<FusedObject> {
+    fn objects(&mut self, now: Timestamp) -> Vec<FusedObject> {
         let trust = |id| self.sensors.fleet.trust(id);
         let name = |id| self.sensors.get(id).map(|sensor| sensor.node.clone());
-        let objects = self.tracks.iter().map(|track| track.object(now, &self.config, trust, name));
+        let base_rate = self.base_rate.log_odds();
+        let mut existences = Vec::with_capacity(self.tracks.len());
+        existences.extend(self.tracks.iter_mut().map(|track| track.estimate_existence(now, base_rate, trust)));
+        self.base_rate.learn(now, existences.iter().copied());
+        let tracks = self.tracks.iter().zip(existences);
+        let objects = tracks.map(|(track, existence)| track.object(now, &self.config, existence, name));
         let mut published = Vec::with_capacity(self.tracks.len());
         published.extend(objects.filter(|object| object.confidence >= self.config.min_confidence));
         published

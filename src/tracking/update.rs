@@ -7,7 +7,7 @@ use nalgebra::{Matrix2, Vector2};
 
 use super::calibration::log_odds;
 use super::config::TracksConfig;
-use super::existence::{DetectionRates, Statement};
+use super::existence::{DetectionRates, LookRates, Statement};
 use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::track_id;
 use super::occlusion::OcclusionMap;
@@ -153,7 +153,7 @@ impl<'a> ReportUpdate<'a> {
         }
         track.record_hit(at);
         if let Some(history) = track.history.for_hit(vehicle, at) {
-            history.hit(at, measurement.position, OWN_NATS, Some(DetectionRates::PRIOR));
+            history.hit(at, measurement.position, OWN_NATS, Some(LookRates::PRIOR));
         }
         self.tracks.note_speed(index);
     }
@@ -195,7 +195,11 @@ impl<'a> ReportUpdate<'a> {
             self.outcome.samples.push(RegistrationSample { track: index, reported: *reported, variance });
         }
         let rates = self.sensor.coverage.rates_at(reported).filter(|_| !self.occlusion.hides(reported));
+        let look_rates = self.sensor.look_rates(rates.unwrap_or(DetectionRates::PRIOR));
         let history = track.history.get(id);
+        if let (Some(history), Some(probability)) = (history, track.clutter) {
+            self.sensor.clutter.learn(probability, history.was_hit, true);
+        }
         let has_room = history.is_some() || track.history.has_room(id, at);
         let last_hit = history.filter(|history| history.was_hit).map(|history| history.confidence_log_odds);
         let was_hit = last_hit.is_some();
@@ -213,7 +217,7 @@ impl<'a> ReportUpdate<'a> {
         let nats = self.sensor.calibration.nats(detection.log_odds);
         let slot = if self.trust > 0.0 { track.history.for_hit(id, at) } else { track.history.for_look(id, at) };
         let due = slot.and_then(|history| {
-            history.hit(at, measurement.position, nats, Some(rates.unwrap_or(DetectionRates::PRIOR)));
+            history.hit(at, measurement.position, nats, Some(look_rates));
             history.confidence_log_odds = detection.log_odds;
             history.take_due(at)
         });
@@ -251,6 +255,10 @@ impl<'a> ReportUpdate<'a> {
                 continue;
             }
             let was_hit = history.is_some_and(|history| history.was_hit);
+            let look_rates = self.sensor.look_rates(rates);
+            if let (Some(_), Some(probability)) = (history, track.clutter) {
+                self.sensor.clutter.learn(probability, was_hit, false);
+            }
             if let Some(history) = history.filter(|history| history.was_hit) {
                 self.sensor.calibration.learn(history.confidence_log_odds, false);
             }
@@ -260,7 +268,7 @@ impl<'a> ReportUpdate<'a> {
                 self.sensor.coverage.learn(&position, was_hit, false);
             }
             let due = track.history.for_look(id, at).and_then(|history| {
-                history.miss(at, rates);
+                history.miss(at, look_rates);
                 history.take_due(at)
             });
             if had_detected && self.trust > 0.0 {
