@@ -34,8 +34,7 @@ pub(crate) fn draw(path: &Path, stated: &[(String, Vec<Calibration>)]) -> anyhow
     let existence = |calibration: &Calibration| {
         calibration.existence.as_ref().map(|existence| existence.bins.clone()).unwrap_or_default()
     };
-    let kinds: [(&str, &dyn Fn(&Calibration) -> Vec<ReliabilityBin>); 2] =
-        [("confidence", &confidence), ("existence", &existence)];
+    let kinds: [(&str, BinsOf); 2] = [("confidence", &confidence), ("existence", &existence)];
     for (panel, (kind, bins)) in panels.split_evenly((1, 2)).iter().zip(kinds) {
         let mut chart = ChartBuilder::on(panel)
             .margin(8)
@@ -63,6 +62,9 @@ pub(crate) fn draw(path: &Path, stated: &[(String, Vec<Calibration>)]) -> anyhow
     area.present()?;
     Ok(())
 }
+
+/// The bins of one kind of stated probability.
+type BinsOf<'a> = &'a dyn Fn(&Calibration) -> Vec<ReliabilityBin>;
 
 /// Stated and right percentages of the bins of several recordings together.
 fn pooled(bins: impl Iterator<Item = ReliabilityBin>) -> Vec<(f64, f64)> {
