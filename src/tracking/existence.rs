@@ -32,9 +32,10 @@ const MAX_SENSOR_NATS: f64 = 8.0;
 const SEQUENCE_WEIGHT: f64 = 0.53;
 const CONFIDENCE_WEIGHT: f64 = 0.235;
 
-/// The same of a sequence against the object by a vehicle that states its view. A few that look and find nothing outweigh
-/// one that is sure.
-const DENIAL_WEIGHT: f64 = 0.95;
+/// Additional share of a sequence against the object by a vehicle that states its view, and maximum of all of these, nats: a
+/// few that look and find nothing outweigh one that is sure, and many do not outweigh a few that see.
+const DENIAL_WEIGHT: f64 = 0.42;
+pub(super) const MAX_DENIAL_NATS: f64 = 4.2;
 
 /// Evidence for each e-folding of the time for which an object was detected, nats: the lives of false alarms have a long
 /// tail (Lomax).
@@ -242,12 +243,11 @@ impl SensorHistory {
         (sequence + confidence).min(MAX_SENSOR_NATS)
     }
 
-    /// Its part in the evidence of all, nats.
-    pub(super) fn shared_nats(&self, at: Timestamp) -> f64 {
+    /// Its part in the evidence of all, and what it denies beyond that, nats.
+    pub(super) fn shared_nats(&self, at: Timestamp) -> (f64, f64) {
         let (sequence, confidence) = self.evidence(at);
-        let denies = sequence < 0.0 && self.is_view_stated;
-        let sequence_weight = if denies { DENIAL_WEIGHT } else { SEQUENCE_WEIGHT };
-        sequence_weight * sequence + CONFIDENCE_WEIGHT * confidence
+        let denied = if self.is_view_stated { DENIAL_WEIGHT * (-sequence).max(0.0) } else { 0.0 };
+        (SEQUENCE_WEIGHT * sequence + CONFIDENCE_WEIGHT * confidence, denied)
     }
 
     /// Evidence of the sequence and of the confidences, nats.

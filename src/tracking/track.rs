@@ -9,7 +9,7 @@ use uuid::Uuid;
 
 use super::config::TracksConfig;
 use super::detection_history::DetectionHistory;
-use super::existence::{BaseRate, SensorHistory, logistic, persistence_nats};
+use super::existence::{BaseRate, MAX_DENIAL_NATS, SensorHistory, logistic, persistence_nats};
 use super::grid::IndexedTrack;
 use super::kinematics::{KinematicState, Measurement};
 use super::neighbours::Neighbours;
@@ -163,14 +163,17 @@ impl Track {
     /// Estimates whether the track is of an object; returns the probability that it is still there. `base_rate` are the
     /// log-odds of any track, `trust` weighs the evidence of each vehicle.
     pub(super) fn estimate_existence(&mut self, at: Timestamp, base_rate: f64, trust: impl Fn(SensorId) -> f64) -> f64 {
-        let (mut evidence, mut detected) = (0.0, 0.0);
+        let (mut evidence, mut denied, mut detected) = (0.0, 0.0, 0.0);
         for history in self.history.iter() {
             let trust = trust(history.sensor);
-            evidence += trust * history.shared_nats(at);
+            let (shared, denial) = history.shared_nats(at);
+            evidence += trust * shared;
+            denied += trust * denial;
             detected = if history.last_hit.is_some() { trust.max(detected) } else { detected };
         }
         let persistence = persistence_nats(self.last_seen.since(self.first_seen).as_secs_f64());
         let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
+        let evidence = evidence - denied.min(MAX_DENIAL_NATS);
         let nats = base_rate + ALONE_NATS + evidence + detected * persistence + inherited;
         self.clutter = Some(logistic(-nats));
         logistic(nats + SURVIVAL_POWER * self.survival(at).ln())
