@@ -95,24 +95,6 @@ fn one_node_that_cannot_log_in_moves_no_lead() {
     });
 }
 
-/// All followers can log in at no broker but their own, or say so: nobody would serve them better, and the lead stays.
-#[test]
-fn followers_that_can_log_in_nowhere_move_no_lead() {
-    for_seeds(seeds() / 10, |seed| {
-        let Some((mut world, leader)) = settled(seed).filter(|(world, _)| world.nodes.len() > 3) else { return };
-        check(&mut world, seed, |world| {
-            let (changes, nodes) = (world.led.len(), world.nodes.len());
-            for node in (0..nodes).filter(|node| *node != leader) {
-                for broker in (0..nodes).filter(|broker| *broker != node) {
-                    world.plan(0, Fault::NoLogin { node, broker });
-                }
-            }
-            world.run_for(20 * SECOND);
-            ensure(world.led.len() == changes, "the lead moved")
-        });
-    });
-}
-
 /// A cell in peace with a second candidate and three nodes at least, and its leader.
 fn settled(seed: u64) -> Option<(World, usize)> {
     let mut world = cell(seed);
