@@ -32,8 +32,8 @@ const MAX_SENSOR_NATS: f64 = 8.0;
 const SEQUENCE_WEIGHT: f64 = 0.53;
 const CONFIDENCE_WEIGHT: f64 = 0.235;
 
-/// Additional share of a sequence against the object by a vehicle that states its view, and maximum of all of these, nats: a
-/// few that look and find nothing outweigh one that is sure, and many do not outweigh a few that see.
+/// Additional share of a sequence against an object that one vehicle alone detects, by a vehicle that states its view, and
+/// maximum of all of these, nats: a few that look and find nothing outweigh one that is sure.
 const DENIAL_WEIGHT: f64 = 0.42;
 pub(super) const MAX_DENIAL_NATS: f64 = 4.2;
 

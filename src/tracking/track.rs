@@ -164,6 +164,7 @@ impl Track {
     /// log-odds of any track, `trust` weighs the evidence of each vehicle.
     pub(super) fn estimate_existence(&mut self, at: Timestamp, base_rate: f64, trust: impl Fn(SensorId) -> f64) -> f64 {
         let (mut evidence, mut denied, mut detected) = (0.0, 0.0, 0.0);
+        let has_one_witness = self.history.iter().filter(|history| history.last_hit.is_some()).nth(1).is_none();
         for history in self.history.iter() {
             let trust = trust(history.sensor);
             let (shared, denial) = history.shared_nats(at);
@@ -173,7 +174,7 @@ impl Track {
         }
         let persistence = persistence_nats(self.last_seen.since(self.first_seen).as_secs_f64());
         let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
-        let evidence = evidence - denied.min(MAX_DENIAL_NATS);
+        let evidence = if has_one_witness { evidence - denied.min(MAX_DENIAL_NATS) } else { evidence };
         let nats = base_rate + ALONE_NATS + evidence + detected * persistence + inherited;
         self.clutter = Some(logistic(-nats));
         logistic(nats + SURVIVAL_POWER * self.survival(at).ln())
