@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
+use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::actors::membership::{Membership, MembershipArguments};
@@ -194,7 +195,13 @@ async fn a_node_with_another_key_is_not_seen_and_counted() {
     let wrong = MembershipConfig { key: Some(Secret::new("another passphrase")), ..config(&[first.address]) };
     let second = Node::start("node-2", wrong).await;
     first.counts(FrameEvent::BadSeal, 2).await;
-    assert!(first.events().is_empty() && second.events().is_empty());
+    let kinds = |node: &Node| -> Vec<_> {
+        let kind = |event| if let MembershipEvent::Troubled { kind, .. } = event { Some(kind) } else { None };
+        node.events().into_iter().map(kind).collect()
+    };
+    for node in [first, second] {
+        assert!(kinds(&node).iter().all(|kind| *kind == Some(TroubleKind::WrongKey)), "{:?}", node.events());
+    }
 }
 
 #[tokio::test]
