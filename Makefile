@@ -79,7 +79,7 @@ sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of S
 
 trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
-	cargo test --profile $(PROFILE) --locked --test trials -- --ignored --exact trials --nocapture
+	cargo test --release --locked --test trials -- --ignored --exact trials --nocapture
 
 joining: PACKAGES += iproute2 mosquitto-clients
 joining: setup ## three machines, in network namespaces, become a cell by the commands of the README
@@ -91,11 +91,11 @@ clocks: setup ## real cells with wrong clocks that step, as vehicle and as leade
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
-	cargo test --profile $(PROFILE) --locked --test trials -- --ignored --exact soak::soak --nocapture
+	cargo test --release --locked --test trials -- --ignored --exact soak::soak --nocapture
 
 attack: PACKAGES += iproute2
 attack: setup ## attackers of all kinds against real cells, and a table; ROWS=text runs those named so, ATTACK=quick a part
-	cargo test --profile $(PROFILE) --locked --test attacks -- --ignored --exact attacks --nocapture
+	cargo test --release --locked --test attacks -- --ignored --exact attacks --nocapture
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
