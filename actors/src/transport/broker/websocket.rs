@@ -44,6 +44,8 @@ const MAX_EMPTY_BYTES: usize = 2 * MAX_MESSAGE_BYTES;
 pub(super) struct WebSocketBytes<S> {
     socket: WebSocketStream<S>,
     received: Bytes,
+    /// A client's fault that is told once what came before it was read.
+    fault: Option<io::Error>,
     /// All bytes from the client.
     wire_bytes: Arc<AtomicUsize>,
     /// Of these, those up to the last content.
@@ -84,7 +86,7 @@ pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
         .max_message_size(Some(MAX_MESSAGE_BYTES))
         .max_frame_size(Some(MAX_MESSAGE_BYTES));
     match accept_hdr_async_with_config(stream, answer, Some(config)).await {
-        Ok(socket) => Ok(WebSocketBytes { socket, received: Bytes::new(), wire_bytes, content_at: 0 }),
+        Ok(socket) => Ok(WebSocketBytes { socket, received: Bytes::new(), fault: None, wire_bytes, content_at: 0 }),
         Err(Error::Http(refusal)) => {
             let text = refusal.body().as_deref().map(String::from_utf8_lossy).unwrap_or_default();
             Err(ClientRejection::Untrusted(text.into_owned()))
@@ -186,10 +188,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocketBytes<S> {
         let began = buffer.filled().len();
         while buffer.remaining() > 0 {
             if self.received.is_empty() {
-                match self.poll_message(cx) {
+                let next = match self.fault.take() {
+                    Some(fault) => Poll::Ready(Err(fault)),
+                    None => self.poll_message(cx),
+                };
+                match next {
                     Poll::Ready(Ok(Some(bytes))) => self.received = bytes,
                     Poll::Ready(Ok(None)) => break,
-                    Poll::Ready(Err(error)) => return Poll::Ready(Err(error)),
+                    Poll::Ready(Err(fault)) if buffer.filled().len() > began => {
+                        self.fault = Some(fault);
+                        break;
+                    }
+                    Poll::Ready(Err(fault)) => return Poll::Ready(Err(fault)),
                     Poll::Pending if buffer.filled().len() > began => break,
                     Poll::Pending => return Poll::Pending,
                 }
