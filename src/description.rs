@@ -20,7 +20,7 @@
 //!
 //! # Revocation
 //!
-//! Whoever makes a description states it first: at least one other candidate has it from there. When the certificate of
+//! The maker of a description states it first: at least one other candidate has it from there. When the certificate of
 //! that node is revoked, such a candidate publishes the description before in a new version, which all take.
 
 mod history;

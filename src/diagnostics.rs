@@ -30,7 +30,7 @@ macro_rules! trouble_kinds {
                 }
             }
 
-            /// What mends it.
+            /// The remedy.
             pub fn remedy(self) -> &'static str {
                 match self {
                     $(Self::$kind => $remedy,)*

@@ -1,4 +1,4 @@
-//! What strangers send to `ecod-node invite`, and what a person pastes into `ecod-node join`.
+//! Requests of strangers to `ecod-node invite`, and texts that a person pastes into `ecod-node join`.
 //!
 //! The first byte of an input chooses what the rest is.
 

@@ -205,7 +205,7 @@ fn a_description_goes_with_the_certificate_of_the_candidate_that_made_it() {
         assert!(adopts(&gauss.take(forged, at(version))));
     }
     assert_eq!(edge.revoke(|certificate| certificate == "euclid's", EMPTY, at(100)), [], "another's");
-    // What was saved counts after a restart.
+    // Saved descriptions count after a restart.
     let saved = serde_json::to_string(edge.history()).unwrap();
     assert_eq!(serde_json::from_str::<CellDescription>(&saved).unwrap(), **edge.current().unwrap());
     edge = DescriptionExchange::new(name("edge"), true, serde_json::from_str(&saved).unwrap());

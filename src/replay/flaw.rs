@@ -1,4 +1,4 @@
-//! What is wrong with a line of a recording, for people.
+//! Faults of a line of a recording, in words.
 
 use super::records::Envelope;
 use crate::wire::flaw::read_json;

@@ -112,7 +112,7 @@ impl Coverage {
         self.stated.map_or(self.farthest_m, |view| view.range_m).min(Self::MAX_RANGE_M)
     }
 
-    /// Whether the vehicle states its field of view.
+    /// True if the vehicle states its field of view.
     pub(super) fn is_stated(&self) -> bool {
         self.stated.is_some()
     }

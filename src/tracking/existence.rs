@@ -68,7 +68,7 @@ pub(super) struct SensorHistory {
     judged_at: Timestamp,
     /// Evidence of the sequence of hits and misses, nats.
     sequence: f64,
-    /// Whether the vehicle stated its view at the last miss.
+    /// True if the vehicle stated its view at the last miss.
     is_view_stated: bool,
     /// Fading sums of the log-odds of confidences and of their weights.
     score: f64,
@@ -107,7 +107,7 @@ impl DetectionRates {
 pub(super) struct LookRates {
     pub(super) object: DetectionRates,
     pub(super) clutter: DetectionRates,
-    /// Whether the vehicle states its view; otherwise it may not have looked there.
+    /// True if the vehicle states its view; otherwise it may not have looked there.
     pub(super) is_view_stated: bool,
 }
 

@@ -1,4 +1,4 @@
-//! What is wrong with a payload that was rejected, for people: the field and its fault.
+//! Faults of a rejected payload, in words: the field and its fault.
 //!
 //! A payload that can be used is never looked at here.
 

@@ -14,7 +14,7 @@ pub struct Trouble {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(1)]
     pub about: Option<String>,
-    /// What is wrong, with its figures.
+    /// The cause, with its figures.
     #[n(2)]
     pub cause: String,
     /// What mends it.

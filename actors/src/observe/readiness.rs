@@ -81,7 +81,7 @@ pub struct Probe {
     pub timeliness: Timeliness,
 }
 
-/// What may separate the node from its cell, in words.
+/// Possible cause of the node's separation from its cell, in words.
 fn separating(troubles: &[Trouble]) -> Option<&str> {
     let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
     troubles.iter().find(kind).map(|trouble| trouble.cause.as_str())

@@ -108,7 +108,7 @@ pub enum MembershipEvent {
     Troubled {
         /// Name of the node, or address of the host.
         about: String,
-        /// What is wrong.
+        /// Kind of the trouble.
         kind: TroubleKind,
         /// The same in words.
         cause: String,

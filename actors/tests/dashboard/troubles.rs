@@ -1,4 +1,4 @@
-//! Whether nodes say by name what is wrong.
+//! Troubles, as nodes name them.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -38,7 +38,7 @@ fn report(node: &str, seq: u64, ahead_s: u64, x_m: &str) -> String {
     format!(r#"{{"schema":1,"node":"{node}","seq":{seq},"captured_at_us":{captured},"objects":[{object}]}}"#)
 }
 
-/// What the page of a node says is wrong: subject, kind and cause, each with who tells it.
+/// Troubles on the page of a node: subject, kind and cause, each with who tells it.
 async fn told(page: SocketAddr) -> Vec<[String; 4]> {
     let picture = get(page, "/api/picture").await.json();
     let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();

@@ -44,7 +44,7 @@ pub struct ElectionDriver {
     /// Nodes that declared more than their certificate allows.
     overreached: BTreeSet<NodeName>,
     name: NodeName,
-    /// What a leader said last of this node: the leader and its words.
+    /// The last word of a leader about this node: the leader and its words.
     complaint: Option<(NodeName, Trouble)>,
     /// Nodes at whose brokers this one has no login.
     no_login: Vec<NodeName>,

@@ -246,7 +246,7 @@ pub fn read_websocket(sent: Vec<u8>) -> Option<Vec<u8>> {
         let stream = tokio::io::join(io::Cursor::new(sent), tokio::io::sink());
         let mut client = accept(stream, Arc::default()).await.ok()?;
         let mut content = Vec::new();
-        // What came before a client broke the rules was passed on.
+        // Content before a client's fault was passed on.
         let _ = client.read_to_end(&mut content).await;
         Some(content)
     };

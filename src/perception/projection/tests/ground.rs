@@ -22,7 +22,7 @@ fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
     Mount { height_m: Some(height_m), pitch_rad, roll_rad, ..Mount::default() }
 }
 
-/// What a camera of this height meets.
+/// Objects that a camera of this height meets.
 fn kinds(height_m: f64) -> Vec<(&'static str, ObjectSize)> {
     let kind = |label, width_m, length_m, height_m, relative_sigma| {
         (label, ObjectSize { width_m, length_m: Some(length_m), height_m, relative_sigma })

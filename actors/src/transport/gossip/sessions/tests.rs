@@ -227,7 +227,7 @@ proptest! {
     }
 }
 
-/// What else was heard is named: a node with another key by its address, and a cell whose name is a slip away.
+/// Misfits are named: a node with another key by its address, and a cell whose name is a slip away.
 #[test]
 fn another_key_and_a_misspelt_cell_are_named() {
     let heard = |own: &'static str, other: (&'static str, &str), is_alone: bool| {
