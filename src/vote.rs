@@ -20,11 +20,13 @@ mod dawid_skene;
 mod dependence;
 mod label_table;
 mod landmark_votes;
+mod likelihood;
 mod method;
 mod paper;
 mod visibility;
 mod weighted;
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
@@ -197,11 +199,19 @@ impl Vote {
     fn one_per_landmark<'a>(&mut self, objects: &'a [PerceivedObject]) -> Vec<&'a PerceivedObject> {
         let mut best: BTreeMap<Option<&LandmarkId>, &PerceivedObject> = BTreeMap::new();
         for object in objects {
-            let kept = best.entry(object.landmark.as_ref()).or_insert(object);
-            let rank = |object: &PerceivedObject| (!self.is_sign(object), object.confidence);
-            if rank(object) > rank(kept) {
-                *kept = object;
-            }
+            match best.entry(object.landmark.as_ref()) {
+                Entry::Vacant(free) => *free.insert(object),
+                Entry::Occupied(mut kept) => {
+                    let landmark = object.landmark.as_ref().and_then(|id| self.landmarks.get(id)?.as_ref());
+                    let rank = |object: &PerceivedObject| {
+                        (!self.is_sign(landmark, self.voted_label(landmark, &object.label)), object.confidence)
+                    };
+                    if rank(object) > rank(kept.get()) {
+                        kept.insert(object);
+                    }
+                    continue;
+                }
+            };
         }
         self.ignored += (objects.len() - best.len()) as u64;
         best.into_values().collect()
@@ -216,8 +226,8 @@ impl Vote {
         }
         let landmark = known.and_then(Option::as_ref);
         let position = landmark.map_or(Point2::new(object.x_m, object.y_m), |l| l.position);
-        let synonym = landmark.and_then(|landmark| landmark.synonym(&object.label));
-        let label = synonym.or_else(|| self.config.synonyms.get(&object.label)).unwrap_or(&object.label).clone();
+        let label = self.voted_label(landmark, &object.label).clone();
+        let is_sign = self.is_sign(landmark, &label);
         let range_bearing = pose.map(|p| p.range_bearing(&position));
         let max_range_m = match self.config.mode {
             VoteMode::Paper => self.config.paper.max_range_m,
@@ -226,7 +236,7 @@ impl Vote {
         if range_bearing.is_some_and(|(distance_m, _)| distance_m > max_range_m) {
             return false;
         }
-        if self.is_sign(object) && self.is_behind_object(id, &label, &report.node, at) {
+        if is_sign && self.is_behind_object(id, &label, &report.node, at) {
             return true;
         }
         let vote = NewVote {
@@ -246,14 +256,20 @@ impl Vote {
         true
     }
 
-    /// True if an object is the vacancy sign of the landmark that it names.
-    fn is_sign(&self, object: &PerceivedObject) -> bool {
-        let landmark = object.landmark.as_ref().and_then(|id| self.landmarks.get(id)?.as_ref());
-        landmark.and_then(|landmark| landmark.vacancy.as_ref()).is_some_and(|sign| sign.label == object.label)
+    /// The label that a stated one counts as.
+    fn voted_label<'a>(&'a self, landmark: Option<&'a Landmark>, stated: &'a Label) -> &'a Label {
+        let synonym = landmark.and_then(|landmark| landmark.synonym(stated));
+        synonym.or_else(|| self.config.synonyms.get(stated)).unwrap_or(stated)
+    }
+
+    /// True if a voted label is that of the landmark's vacancy sign.
+    fn is_sign(&self, landmark: Option<&Landmark>, voted: &Label) -> bool {
+        let sign = landmark.and_then(|landmark| landmark.vacancy.as_ref());
+        sign.is_some_and(|sign| self.voted_label(landmark, &sign.label) == voted)
     }
 
     /// Notes that a vehicle read a landmark's vacancy sign. True if it is behind an object, and no vote against that: at
-    /// least as many other vehicles read an object there as read the sign.
+    /// least as many other vehicles read an object there as read the sign. Those do not count that were mostly wrong.
     fn is_behind_object(&mut self, landmark: &LandmarkId, sign: &Label, node: &NodeName, at: Timestamp) -> bool {
         let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
         let signs = self.signs.entry(landmark.clone()).or_default();
@@ -261,7 +277,7 @@ impl Vote {
         signs.retain(|_, read_at| at.since(*read_at) < freshness);
         let readings = self.method.get().readings(landmark);
         let objects = readings.iter().filter(|(label, _)| *label != sign).flat_map(|(_, nodes)| nodes);
-        let objects = objects.filter(|other| *other != node).count();
+        let objects = objects.filter(|other| *other != node && self.method.get().is_trusted(other)).count();
         objects > 0 && objects >= signs.len()
     }
 
@@ -275,7 +291,7 @@ impl Vote {
             let fresh = signs.iter().filter(|(node, at)| now.since(**at) < freshness && !votes.contains(*node));
             let fresh: Vec<_> = fresh.map(|(node, _)| node.clone()).collect();
             if !fresh.is_empty() {
-                readings.entry(sign.label.clone()).or_default().extend(fresh);
+                readings.entry(self.voted_label(known, &sign.label).clone()).or_default().extend(fresh);
             }
         }
         let sorted = readings.into_iter().map(|(label, mut nodes)| {

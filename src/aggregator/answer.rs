@@ -4,6 +4,8 @@
 //! label stands unless the vote is undecided, or PACE knows that the place is empty. Both rest on the same frames, so that
 //! neither adds certainty to the other: the answer is as sure as the less sure of them.
 
+use std::collections::BTreeMap;
+
 use crate::model::names::Label;
 use crate::wire::{LabelReading, LandmarkState, Verdict};
 
@@ -22,10 +24,12 @@ pub(super) fn agree(
         Some(label) => Some(label) == sign,
         None => !state.observers.is_empty(),
     };
-    if let Some(Decision { label, share, lead, mass }) = verdict.and_then(decision).filter(|_| !is_known_empty) {
+    if let Some(Decision { label, share, lead, mass, votes }) = verdict.and_then(decision).filter(|_| !is_known_empty) {
         match &state.label {
             Some(known) if known == label => state.confidence = state.confidence.min(share),
-            Some(_) if lead < MIN_LEAD => state.confidence = state.confidence.min(1.0 - share),
+            Some(known) if lead < MIN_LEAD && votes.contains_key(known) => {
+                state.confidence = state.confidence.min(votes[known] / mass);
+            }
             known => {
                 // Without PACE, few voters make nothing sure: Laplace's rule of succession for votes that all agree.
                 let sure = if known.is_some() { state.confidence } else { mass / (mass + 1.0) };
@@ -49,13 +53,15 @@ struct Decision<'a> {
     lead: f64,
     /// Weight of all votes.
     mass: f64,
+    /// Weight by label.
+    votes: &'a BTreeMap<Label, f64>,
 }
 
 fn decision(verdict: &Verdict) -> Option<Decision<'_>> {
     let mass: f64 = verdict.votes.values().sum();
     let label = verdict.label.as_ref().filter(|_| mass > 0.0)?;
     let share = (verdict.score / mass).clamp(0.0, 1.0);
-    Some(Decision { label, share, lead: verdict.margin / mass, mass })
+    Some(Decision { label, share, lead: verdict.margin / mass, mass, votes: &verdict.votes })
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 
 use super::config::WeightedConfig;
 use super::confusion::{Confusion, LabelIndex};
+use super::likelihood::{LandmarkPosterior, Likelihood, Posterior, normalise, probability};
 
 /// Evidence about one vehicle.
 #[derive(Debug, Clone, Default)]
@@ -63,6 +64,15 @@ pub(super) struct WeightedVote {
     pub(super) weight: f64,
     /// Part of the vote that does not depend on other vehicles, 0 to 1.
     pub(super) independence: f64,
+}
+
+/// What the fleet's mean vehicle states where one label is true.
+struct FleetRow {
+    truth: LabelIndex,
+    /// Log-odds that the statement is right.
+    log_odds: f64,
+    /// Probability of each label among wrong statements.
+    wrong: Posterior,
 }
 
 /// Confusion of each vehicle and of the fleet, and the shares of the classes.
@@ -172,33 +182,48 @@ impl DawidSkene {
         if saved > CHANCE_SAVING + MIN_SAVING * votes { Coupling::Free } else { Coupling::Tied }
     }
 
-    /// Adds to the evidence on the coupling how well each predicts every one of a landmark's votes from the others. The
-    /// model must not contain the votes yet: the sums are prequential (Dawid 1984).
-    pub(super) fn compare_couplings(&mut self, votes: &[WeightedVote], candidates: &[LabelIndex]) {
+    /// Judges new votes by the coupling that predicts votes better, after both have predicted every one of these votes from
+    /// the others. The model must not contain the votes yet: the evidence on the coupling is prequential (Dawid 1984).
+    pub(super) fn judge_new(&mut self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> LandmarkPosterior {
         if votes.len() < 2 {
-            return;
+            return self.judge(votes, candidates);
         }
-        let saved = self.log_probability(Coupling::Free, votes, candidates)
-            - self.log_probability(Coupling::Tied, votes, candidates);
+        let free = self.judge_by(Coupling::Free, votes, candidates);
+        let tied = self.judge_by(Coupling::Tied, votes, candidates);
         let predicted: f64 = votes.iter().map(|vote| vote.independence).sum();
         let kept = (-predicted / SAVING_MEMORY_VOTES).exp();
+        let saved = free.log_probability - tied.log_probability;
         self.saving = (kept * self.saving.0 + saved, kept * self.saving.1 + predicted);
+        if self.coupling() == Coupling::Free { free } else { tied }
     }
 
-    /// Log of the probability of a landmark's votes, each predicted from the others.
-    pub(super) fn prediction(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> f64 {
-        if votes.len() < 2 { 0.0 } else { self.log_probability(self.coupling(), votes, candidates) }
+    /// Judges votes that the model does not contain; newcomers together are limited to their share.
+    pub(super) fn judge(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> LandmarkPosterior {
+        self.judge_by(self.coupling(), votes, candidates)
     }
 
-    fn log_probability(&self, coupling: Coupling, votes: &[WeightedVote], candidates: &[LabelIndex]) -> f64 {
-        let accuracy = self.fleet_accuracy();
-        let posterior = self.posterior_by(coupling, votes, candidates);
-        let of_vote = |vote: &WeightedVote| {
-            let others = self.leave_one_out_by(coupling, &posterior, vote);
-            let stating = |&(truth, p): &(LabelIndex, f64)| p * self.stating(coupling, vote, truth, accuracy);
-            vote.independence * others.iter().map(stating).sum::<f64>().max(1e-9).ln()
-        };
-        votes.iter().map(of_vote).sum()
+    fn judge_by(&self, coupling: Coupling, votes: &[WeightedVote], candidates: &[LabelIndex]) -> LandmarkPosterior {
+        let likelihoods = self.likelihoods(coupling, votes, candidates);
+        let newcomer = self.newcomer_factor(votes);
+        let mut labels: Posterior = candidates.iter().map(|&label| (label, 0.0)).collect();
+        for (vote, likelihood) in votes.iter().zip(&likelihoods) {
+            let factor = if self.is_newcomer(vote.vehicle) { newcomer } else { 1.0 };
+            let weight = factor * vote.weight * vote.independence;
+            labels.iter_mut().zip(&likelihood.logs).for_each(|((_, log), said)| *log += weight * said);
+        }
+        labels.iter_mut().for_each(|(label, log)| *log += self.log_shares[usize::from(*label)]);
+        let most = labels.iter().map(|(_, log)| *log).fold(f64::NEG_INFINITY, f64::max);
+        labels.iter_mut().for_each(|(_, log)| *log = (*log - most).exp());
+        normalise(&mut labels);
+        let mut judged =
+            LandmarkPosterior { labels, agreements: Vec::with_capacity(votes.len()), log_probability: 0.0 };
+        for (vote, likelihood) in votes.iter().zip(&likelihoods) {
+            let others = likelihood.leave_out(vote, &judged.labels);
+            let predicted: f64 = others.iter().zip(&likelihood.stating).map(|((_, p), stating)| p * stating).sum();
+            judged.log_probability += vote.independence * predicted.max(1e-9).ln();
+            judged.agreements.push(probability(&others, vote.label));
+        }
+        judged
     }
 
     /// Replaces the evidence on the coupling that comes from a ledger. It holds (correct, incorrect) by vehicle and label.
@@ -261,89 +286,59 @@ impl DawidSkene {
         }
     }
 
-    /// Logarithm of [`Self::stating`], but at most as much as where the stated label is true: no vote counts against its
-    /// own label. Otherwise the model has a mirrored solution, in which the honest majority consists of consistent liars.
-    fn log_likelihood(&self, coupling: Coupling, vote: &WeightedVote, truth: LabelIndex, accuracy: f64) -> f64 {
-        let own = self.stating(coupling, vote, vote.label, accuracy);
-        if truth == vote.label { own.ln() } else { own.min(self.stating(coupling, vote, truth, accuracy)).ln() }
-    }
-
     /// The posterior without `vote`, given all votes but this one.
-    pub(super) fn leave_one_out(&self, posterior: &[(LabelIndex, f64)], vote: &WeightedVote) -> Vec<(LabelIndex, f64)> {
-        self.leave_one_out_by(self.coupling(), posterior, vote)
+    pub(super) fn leave_one_out(&self, posterior: &[(LabelIndex, f64)], vote: &WeightedVote) -> Posterior {
+        let candidates: Vec<_> = posterior.iter().map(|(label, _)| *label).collect();
+        let likelihoods = self.likelihoods(self.coupling(), std::slice::from_ref(vote), &candidates);
+        likelihoods.first().map_or_else(Vec::new, |likelihood| likelihood.leave_out(vote, posterior))
     }
 
-    fn leave_one_out_by(
-        &self,
-        coupling: Coupling,
-        posterior: &[(LabelIndex, f64)],
-        vote: &WeightedVote,
-    ) -> Vec<(LabelIndex, f64)> {
+    /// Likelihood of each vote under each of `candidates`, among which its label is.
+    fn likelihoods(&self, coupling: Coupling, votes: &[WeightedVote], candidates: &[LabelIndex]) -> Vec<Likelihood> {
         let accuracy = self.fleet_accuracy();
-        let own = self.log_likelihood(coupling, vote, vote.label, accuracy);
-        let others: Vec<_> = posterior
-            .iter()
-            .map(|&(label, p)| {
-                let lead = own - self.log_likelihood(coupling, vote, label, accuracy);
-                (label, p * (vote.weight * vote.independence * lead).min(500.0).exp())
-            })
-            .collect();
-        let total: f64 = others.iter().map(|(_, p)| p).sum();
-        if total > 0.0 { others.into_iter().map(|(label, p)| (label, p / total)).collect() } else { posterior.to_vec() }
-    }
-
-    /// Probability that the vehicle states the vote's label where `truth` is the true one.
-    fn stating(&self, coupling: Coupling, vote: &WeightedVote, truth: LabelIndex, accuracy: f64) -> f64 {
-        let evidence = &self.vehicles[vote.vehicle];
-        let [free, tied] = evidence.advantage;
-        let shifted = |right: f64, advantage: f64| 1.0 / (1.0 + (-(log_odds(right) + advantage)).exp());
-        if coupling == Coupling::Tied {
-            let right = shifted(accuracy.clamp(1e-6, 1.0 - 1e-6), tied);
-            return if truth == vote.label { right } else { (1.0 - right) / self.wrong_labels() }.max(1e-12);
-        }
-        let right = self.fleet(truth, truth, accuracy).clamp(1e-6, 1.0 - 1e-6);
-        let assumed_right = shifted(right, free);
-        let assumed = if truth == vote.label {
-            assumed_right
-        } else {
-            let shared = self.fleet(truth, vote.label, accuracy) / (1.0 - right);
-            let sharing = self.config.confusion_sharing;
-            (1.0 - assumed_right) * (sharing * shared + (1.0 - sharing) / self.wrong_labels())
+        let stating: Vec<Vec<f64>> = match coupling {
+            Coupling::Tied => votes.iter().map(|vote| self.stating_tied(vote, candidates, accuracy)).collect(),
+            Coupling::Free => {
+                let fleet: Vec<_> =
+                    candidates.iter().map(|&truth| self.fleet_row(truth, candidates, accuracy)).collect();
+                votes.iter().map(|vote| self.stating_free(vote, &fleet)).collect()
+            }
         };
+        votes.iter().zip(stating).map(|(vote, stating)| Likelihood::new(vote, candidates, stating)).collect()
+    }
+
+    fn stating_tied(&self, vote: &WeightedVote, candidates: &[LabelIndex], accuracy: f64) -> Vec<f64> {
+        let right = shifted(log_odds(accuracy.clamp(1e-6, 1.0 - 1e-6)), self.vehicles[vote.vehicle].advantage[1]);
+        let wrong = ((1.0 - right) / self.wrong_labels()).max(1e-12);
+        candidates.iter().map(|&truth| if truth == vote.label { right.max(1e-12) } else { wrong }).collect()
+    }
+
+    fn fleet_row(&self, truth: LabelIndex, candidates: &[LabelIndex], accuracy: f64) -> FleetRow {
+        let right = self.fleet(truth, truth, accuracy).clamp(1e-6, 1.0 - 1e-6);
+        let sharing = self.config.confusion_sharing;
+        let wrong = |stated| {
+            sharing * (self.fleet(truth, stated, accuracy) / (1.0 - right)) + (1.0 - sharing) / self.wrong_labels()
+        };
+        FleetRow {
+            truth,
+            log_odds: log_odds(right),
+            wrong: candidates.iter().map(|&stated| (stated, wrong(stated))).collect(),
+        }
+    }
+
+    fn stating_free(&self, vote: &WeightedVote, fleet: &[FleetRow]) -> Vec<f64> {
+        let known = &self.vehicles[vote.vehicle];
+        let evidence = [&known.live, &known.settled, &known.inherited];
         let prior = self.config.class_prior_votes;
-        let evidence = [&evidence.live, &evidence.settled, &evidence.inherited];
-        let count: f64 = evidence.iter().map(|e| e.cell(truth, vote.label)).sum();
-        let row: f64 = evidence.iter().map(|e| e.row(truth)).sum();
-        ((count + prior * assumed) / (row + prior)).max(1e-12)
-    }
-
-    /// Probability of each of `candidates` given the votes; newcomers together are limited to their share.
-    pub(super) fn posterior(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> Vec<(LabelIndex, f64)> {
-        self.posterior_by(self.coupling(), votes, candidates)
-    }
-
-    fn posterior_by(
-        &self,
-        coupling: Coupling,
-        votes: &[WeightedVote],
-        candidates: &[LabelIndex],
-    ) -> Vec<(LabelIndex, f64)> {
-        let newcomer = self.newcomer_factor(votes);
-        let accuracy = self.fleet_accuracy();
-        let mut logs: Vec<f64> = candidates
-            .iter()
-            .map(|&truth| {
-                let said = |vote: &WeightedVote| {
-                    let factor = if self.is_newcomer(vote.vehicle) { newcomer } else { 1.0 };
-                    factor * vote.weight * vote.independence * self.log_likelihood(coupling, vote, truth, accuracy)
-                };
-                self.log_shares[usize::from(truth)] + votes.iter().map(said).sum::<f64>()
-            })
-            .collect();
-        let most = logs.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        logs.iter_mut().for_each(|log| *log = (*log - most).exp());
-        let total: f64 = logs.iter().sum();
-        candidates.iter().zip(logs).map(|(&label, p)| (label, p / total)).collect()
+        let stating = |row: &FleetRow| {
+            let right = shifted(row.log_odds, known.advantage[0]);
+            let assumed =
+                if row.truth == vote.label { right } else { (1.0 - right) * probability(&row.wrong, vote.label) };
+            let count: f64 = evidence.iter().map(|e| e.cell(row.truth, vote.label)).sum();
+            let votes: f64 = evidence.iter().map(|e| e.row(row.truth)).sum();
+            ((count + prior * assumed) / (votes + prior)).max(1e-12)
+        };
+        fleet.iter().map(stating).collect()
     }
 
     /// Whether too few of a vehicle's votes are settled to trust it. Fresh votes do not prove it: a vehicle could send
@@ -432,6 +427,11 @@ impl DawidSkene {
 fn sharpened(posterior: &[(LabelIndex, f64)]) -> impl Iterator<Item = (LabelIndex, f64)> + '_ {
     let squares: f64 = posterior.iter().map(|(_, p)| p * p).sum();
     posterior.iter().map(move |&(label, p)| (label, p * p / squares.max(f64::MIN_POSITIVE)))
+}
+
+/// Probability whose log-odds are `log_odds + advantage`.
+fn shifted(log_odds: f64, advantage: f64) -> f64 {
+    1.0 / (1.0 + (-(log_odds + advantage)).exp())
 }
 
 fn log_odds(p: f64) -> f64 {

@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 
 use super::calibration::{Calibration, Weights};
 use super::confusion::LabelIndex;
-use super::dawid_skene::{DawidSkene, WeightedVote};
+use super::dawid_skene::WeightedVote;
 use super::dependence::Dependence;
+use super::likelihood::{LandmarkPosterior, Posterior, probability};
 use crate::model::time::Timestamp;
 
 /// Independent part of a vehicle's statements: one frame is much like the next.
@@ -91,7 +92,7 @@ impl StoredVote {
 pub(super) struct LandmarkVotes {
     pub(super) votes: Vec<StoredVote>,
     /// Probability of each label as of the last judgement.
-    pub(super) posterior: Vec<(LabelIndex, f64)>,
+    pub(super) posterior: Posterior,
     /// Whether the live evidence contains votes and posterior at present.
     pub(super) counted: bool,
     /// The label of the verdict.
@@ -143,15 +144,15 @@ impl LandmarkVotes {
         }
     }
 
-    /// Adds to the evidence on confidences how probable the others make the label of each vote.
-    pub(super) fn record_agreement(&mut self, model: &DawidSkene, calibration: &mut Calibration) {
+    /// Takes a judgement, and adds to the evidence on confidences how probable the others make the label of each vote.
+    pub(super) fn take(&mut self, judged: LandmarkPosterior, calibration: &mut Calibration) {
         if self.has_several_voters() {
-            for vote in &mut self.votes {
-                let agreement = probability(&model.leave_one_out(&self.posterior, &vote.weighted()), vote.label);
+            for (vote, agreement) in self.votes.iter_mut().zip(judged.agreements) {
                 calibration.count(vote.band, agreement, 1.0);
                 vote.agreement = Some(agreement);
             }
         }
+        self.posterior = judged.labels;
     }
 
     /// Publishes the most probable label, unless the published one is at most `hysteresis` behind.
@@ -169,7 +170,7 @@ impl LandmarkVotes {
     }
 
     /// Share of each label in the weighted votes; equal shares where all voters waver, so that no vote has weight.
-    pub(super) fn majority(&self) -> Vec<(LabelIndex, f64)> {
+    pub(super) fn majority(&self) -> Posterior {
         let total: f64 = self.votes.iter().map(|c| c.weight * c.independence).sum();
         let candidates = self.candidates();
         let equal = 1.0 / candidates.len() as f64;
@@ -197,9 +198,4 @@ impl LandmarkVotes {
     pub(super) fn has_several_voters(&self) -> bool {
         self.votes.len() > 1
     }
-}
-
-/// Probability of a label; 0 for one that is not listed.
-pub(super) fn probability(posterior: &[(LabelIndex, f64)], label: LabelIndex) -> f64 {
-    posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
 }

@@ -59,6 +59,11 @@ pub(super) trait VotingMethod {
         false
     }
 
+    /// False for a vehicle that was wrong more often than right.
+    fn is_trusted(&self, _node: &NodeName) -> bool {
+        true
+    }
+
     /// See [`super::Vote::begin_record`].
     fn begin_record(&mut self, _now: Timestamp) {}
 

@@ -109,11 +109,9 @@ impl WeightedVoting {
         let votes = landmark_votes.weighted_votes();
         self.model.refresh(votes.iter().map(|vote| vote.vehicle));
         let candidates = landmark_votes.candidates();
-        if is_new {
-            self.model.compare_couplings(&votes, &candidates);
-        }
-        landmark_votes.posterior = self.model.posterior(&votes, &candidates);
-        landmark_votes.record_agreement(&self.model, &mut self.calibration);
+        let judged =
+            if is_new { self.model.judge_new(&votes, &candidates) } else { self.model.judge(&votes, &candidates) };
+        landmark_votes.take(judged, &mut self.calibration);
         self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
         landmark_votes.counted = true;
         landmark_votes.publish(self.config.hysteresis);
@@ -266,10 +264,10 @@ impl VotingMethod for WeightedVoting {
     /// Judges the landmarks that changed, then some older ones in turn.
     fn close(&mut self, now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>) {
         self.expire(now);
-        let weights = self.calibration.weights();
         if self.dependence.is_due() {
             self.fit_dependence();
         }
+        let weights = self.calibration.weights();
         let mut changed = std::mem::take(&mut self.changed);
         for landmark in &changed {
             self.judge(landmark, &weights);
@@ -314,6 +312,10 @@ impl VotingMethod for WeightedVoting {
     fn is_proven(&self, node: &NodeName) -> bool {
         let is_proven = |vehicle: usize| !self.model.is_newcomer(vehicle) && self.model.reliability(vehicle) > 0.5;
         self.vehicles.get(node).is_some_and(|&vehicle| is_proven(vehicle))
+    }
+
+    fn is_trusted(&self, node: &NodeName) -> bool {
+        self.vehicles.get(node).is_none_or(|&vehicle| self.model.reliability(vehicle) > 0.5)
     }
 
     fn begin_record(&mut self, now: Timestamp) {

@@ -1,7 +1,7 @@
 //! Where PACE and VOTE both run, the map has one answer for each place.
 
 use super::*;
-use crate::perception::landmark::VacancySign;
+use crate::perception::landmark::{Synonym, VacancySign};
 
 /// A cell with one place that has a vacancy sign, and reports of both kinds ten times a second.
 struct Lot {
@@ -12,7 +12,8 @@ struct Lot {
 impl Lot {
     fn new() -> Self {
         let sign = VacancySign { label: "EMPTY".into(), position: Point2::new(0.9, 0.0) };
-        let landmarks = vec![Landmark { vacancy: Some(sign), ..landmarks()[0].clone() }];
+        let synonyms = vec![Synonym { from: "VACANT".into(), label: "EMPTY".into() }];
+        let landmarks = vec![Landmark { vacancy: Some(sign), synonyms, ..landmarks()[0].clone() }];
         let round = RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() };
         let config = FusionConfig { round, ..FusionConfig::default() };
         Self { cell: Aggregator::new(NodeName::from_static("edge"), 7, config, landmarks, at(0)), ms: 0 }
@@ -67,6 +68,23 @@ fn one_who_invents_a_plate_does_not_outvote_those_who_read_the_sign() {
     let fused = lot.read(20, &[honest[0], honest[1], honest[2], ("mallory", "MNOP101")]);
     assert_eq!(shown(&fused), (Some("EMPTY"), Some("EMPTY")));
     assert!(lot.wrong("mallory") > 5 && lot.wrong("gauss") == 0, "{:?}", lot.cell.reputations());
+}
+
+#[test]
+fn a_known_liar_does_not_outvote_the_only_one_who_reads_the_sign() {
+    let mut lot = Lot::new();
+    lot.read(20, &[("euclid", "EMPTY"), ("gauss", "EMPTY"), ("galileo", "EMPTY"), ("mallory", "MNOP101")]);
+    let fused = lot.read(10, &[("euclid", "EMPTY"), ("mallory", "MNOP101")]);
+    assert_eq!(shown(&fused), (Some("EMPTY"), Some("EMPTY")));
+}
+
+/// A vehicle states the sign by a synonym: it is still no vote against the plate before it.
+#[test]
+fn a_sign_by_its_synonym_is_no_vote_either() {
+    let mut lot = Lot::new();
+    let fused = lot.read(30, &[("euclid", "MNOP101"), ("galileo", "VACANT")]);
+    assert_eq!(shown(&fused), (Some("MNOP101"), Some("MNOP101")));
+    assert_eq!(readings(&fused)[0], ("EMPTY".into(), vec!["galileo".into()]));
 }
 
 /// Map and verdict say the same, whoever was right before: when the car leaves, when another comes, and where two differ.

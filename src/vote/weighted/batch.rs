@@ -41,11 +41,11 @@ impl WeightedVoting {
     /// Log of the probability of all votes, each predicted from the other votes on the landmark and those on others.
     fn log_probability(&mut self) -> f64 {
         let mut sum = 0.0;
-        for landmark_votes in self.landmarks.values() {
+        for landmark_votes in self.landmarks.values().filter(|landmark_votes| landmark_votes.has_several_voters()) {
             let votes = landmark_votes.weighted_votes();
             self.model.add_live(&votes, &landmark_votes.posterior, -1.0);
             self.model.refresh(votes.iter().map(|vote| vote.vehicle));
-            sum += self.model.prediction(&votes, &landmark_votes.candidates());
+            sum += self.model.judge(&votes, &landmark_votes.candidates()).log_probability;
             self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
         }
         sum
@@ -57,13 +57,12 @@ impl WeightedVoting {
         let weights = self.calibration.weights();
         for landmark_votes in self.landmarks.values_mut() {
             landmark_votes.weigh(&self.dependence, &self.calibration, &weights);
-            landmark_votes.posterior =
-                self.model.posterior(&landmark_votes.weighted_votes(), &landmark_votes.candidates());
         }
         self.calibration.clear_live();
-        self.landmarks
-            .values_mut()
-            .for_each(|landmark_votes| landmark_votes.record_agreement(&self.model, &mut self.calibration));
+        for landmark_votes in self.landmarks.values_mut() {
+            let judged = self.model.judge(&landmark_votes.weighted_votes(), &landmark_votes.candidates());
+            landmark_votes.take(judged, &mut self.calibration);
+        }
         self.model.clear_live();
         for landmark_votes in self.landmarks.values_mut() {
             self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, 1.0);

@@ -4,7 +4,7 @@ use super::{StoredVote, WeightedVoting};
 use crate::model::names::LandmarkId;
 use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
-use crate::vote::landmark_votes::probability;
+use crate::vote::likelihood::probability;
 
 impl WeightedVoting {
     /// Sets the next expiry of a landmark: when its oldest vote goes stale.
@@ -22,11 +22,8 @@ impl WeightedVoting {
     /// Removes the votes that are stale at `now`.
     pub(super) fn expire(&mut self, now: Timestamp) {
         let freshness = self.freshness();
-        while let Some((due, landmark)) = self.expiries.first().cloned() {
-            if due > now {
-                break;
-            }
-            self.expiries.pop_first();
+        while self.expiries.first().is_some_and(|(due, _)| *due <= now) {
+            let Some((_, landmark)) = self.expiries.pop_first() else { break };
             self.remove_votes(&landmark, |vote| vote.at + freshness <= now);
             self.schedule_expiry(&landmark);
         }
