@@ -32,7 +32,7 @@ use std::time::Duration;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{CellDescription, ContentHash, DescriptionStamp, MAX_INTEGER, SCHEMA_VERSION};
-pub use history::{AttributedDescription, DescriptionHistory};
+pub use history::{AttributedDescription, DescriptionHistory, MAX_AUTHORS};
 
 /// Largest rise of the version that one message may state. A cell uses one version for each change by a person.
 pub const MAX_VERSION_STEP: u64 = 1 << 20;
@@ -194,7 +194,10 @@ impl DescriptionExchange {
             return Vec::new();
         }
         let description = self.described(self.next_version(), hash, text);
-        self.adopt(AttributedDescription { description: Arc::clone(&description), stated_by: None }, self.name.clone());
+        self.adopt(
+            AttributedDescription { description: Arc::clone(&description), authors: Vec::new() },
+            self.name.clone(),
+        );
         self.publish(description, now);
         self.finish(now)
     }
@@ -216,11 +219,11 @@ impl DescriptionExchange {
             let before = self.history.current.take().map_or_else(
                 || AttributedDescription {
                     description: self.described(version, empty, String::new()),
-                    stated_by: None,
+                    authors: Vec::new(),
                 },
-                |AttributedDescription { description, stated_by }| {
+                |AttributedDescription { description, authors }| {
                     let description = CellDescription { version, ..CellDescription::clone(&description) }.into();
-                    AttributedDescription { description, stated_by }
+                    AttributedDescription { description, authors }
                 },
             );
             self.is_due = true;
@@ -283,14 +286,17 @@ impl DescriptionExchange {
 
     /// Adopts the greatest body that a candidate states, unless too many were adopted lately.
     fn adopt_proven(&mut self, now: Timestamp) {
-        let stated = |body: &Arc<CellDescription>| {
-            let states = |statement: &Statement| statement.may_lead && statement.stamp == body.stamp();
-            self.statements.iter().find(|(_, statement)| states(statement))
+        let authors = |stamp: DescriptionStamp| {
+            self.statements.iter().filter(move |(_, statement)| statement.may_lead && statement.stamp == stamp)
         };
         let newer = self.unproven.iter().filter(|body| body.stamp() > self.stamp());
-        let proven = newer.filter_map(|body| Some((Arc::clone(body), stated(body)?)));
-        let Some((description, (node, statement))) = proven.max_by_key(|(body, _)| body.stamp()) else { return };
-        let (node, stated_by) = (node.clone(), statement.certificate.clone());
+        let proven = newer.filter_map(|body| Some((Arc::clone(body), authors(body.stamp()).next()?.0.clone())));
+        let Some((description, node)) = proven.max_by_key(|(body, _)| body.stamp()) else { return };
+        let certificates = authors(description.stamp()).filter_map(|(_, statement)| statement.certificate.clone());
+        let mut authors: Vec<_> = certificates.take(MAX_AUTHORS + 1).collect();
+        if authors.len() > MAX_AUTHORS {
+            authors.clear();
+        }
         let is_throttled = |first: &Timestamp| now.since(*first) < ADOPTION_INTERVAL * MAX_ADOPTIONS as u32;
         if self.adopted.len() == MAX_ADOPTIONS {
             if self.adopted.front().is_some_and(is_throttled) {
@@ -299,7 +305,7 @@ impl DescriptionExchange {
             self.adopted.pop_front();
         }
         self.adopted.push_back(now);
-        self.adopt(AttributedDescription { description, stated_by }, node);
+        self.adopt(AttributedDescription { description, authors }, node);
     }
 
     fn adopt(&mut self, next: AttributedDescription, stated_by: NodeName) {

@@ -259,3 +259,17 @@ fn many_descriptions_of_one_certificate_displace_no_other_earlier_one() {
     assert!(adopts(&edge.revoke(|_| true, EMPTY, at(500_000))));
     assert_eq!(edge.current().unwrap().text, "right");
 }
+
+/// A node that comes late hears all candidates state the description: it goes with none of them alone.
+#[test]
+fn a_description_stays_when_one_of_those_that_pass_it_on_is_revoked() {
+    let right = described(6, "right");
+    let mut late = node("gauss");
+    for candidate in ["alpha", "edge", "turing"] {
+        late.hear(&name(candidate), certified(candidate, right.stamp()), at(0));
+    }
+    assert!(adopts(&late.take(Arc::clone(&right), at(1))));
+    assert_eq!(late.revoke(|certificate| certificate == "alpha", EMPTY, at(100)), []);
+    assert_eq!(late.current(), Some(&right));
+    assert!(adopts(&late.revoke(|_| true, EMPTY, at(200))), "all who may have made it");
+}
