@@ -239,9 +239,10 @@ impl Aggregator {
         self.windows[kind as usize].untimely_for(name, now)
     }
 
-    /// True if PACE knows a location of this id; `None` if it knows none at all, or does not run.
+    /// True if PACE knows a location of this id, or does not run; `None` if it knows none at all.
     pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
-        let landmarks = self.pace.as_ref()?.landmarks();
+        let Some(pace) = &self.pace else { return Some(true) };
+        let landmarks = pace.landmarks();
         (!landmarks.landmarks().is_empty()).then(|| landmarks.position_of(id).is_some())
     }
 

@@ -49,7 +49,7 @@ macro_rules! trouble_kinds {
 
 /// For what is seen with every report.
 const SHORT: Duration = Duration::from_secs(10);
-/// For what is seen with greetings, which are rare once a cell is complete.
+/// For what is seen with greetings, which are rare once a cell is complete, and with attempts to connect.
 const LONG: Duration = Duration::from_secs(60);
 /// For what lasts until its part says that it is over.
 const UNTIL_SETTLED: Duration = Duration::MAX;
@@ -77,12 +77,14 @@ trouble_kinds! {
     Description = "description", UNTIL_SETTLED, "`ecod-node cell diff` shows the difference";
     /// Messages that cannot be read.
     Malformed = "malformed", SHORT, "correct the program that sends them; docs/protocol.md has the fields and limits";
+    /// Other messages than reports that are not used.
+    MessageRefused = "message_refused", SHORT, "run one version of `ecod-node` on all nodes, each with the cell's key and a certificate of its own";
     /// Reports for an algorithm that the cell does not run.
     NotFused = "not_fused", SHORT, "set `fusion.algorithms` to what the cell is for, or report for the other algorithm";
     /// Messages beyond the rights of their sender, or without a signature that is due.
     NotPermitted = "not_permitted", SHORT, "report at the sender's own node, or give it the cell's key and a certificate of its own name and role";
     /// More messages than are taken.
-    Overload = "overload", SHORT, "send less often, or raise `mqtt.max_report_hz` or `broker.max_messages_hz`";
+    Overload = "overload", SHORT, "send less often, or raise `mqtt.max_report_hz` or `broker.max_messages_hz`; for more vehicles `fusion.window.max_vehicles`";
     /// A node of this cell with another key.
     WrongKey = "wrong_key", LONG, "copy the file of `membership.key_file` from one node to all";
     /// A node of a cell whose name is nearly this one's.
@@ -92,7 +94,7 @@ trouble_kinds! {
     /// A host name without an address.
     Unresolved = "unresolved", LONG, "correct the name, or the name service of this machine";
     /// A broker that cannot be reached.
-    BrokerUnreachable = "broker_unreachable", SHORT, "check its address, the firewall, the certificates on both sides, and whether the broker runs";
+    BrokerUnreachable = "broker_unreachable", LONG, "check its address, the firewall, the certificates on both sides, and whether the broker runs";
     /// A broker that does not let this node do what it must.
     BrokerRefuses = "broker_refuses", UNTIL_SETTLED, "check password, certificate and permissions";
     /// State that cannot be saved.
@@ -107,7 +109,12 @@ impl TroubleKind {
 
     /// True if it is noted for each message, so that its rate tells something.
     fn is_counted(self) -> bool {
-        matches!(self, Self::Malformed | Self::NotFused | Self::NotPermitted | Self::Overload)
+        matches!(self, Self::Malformed | Self::MessageRefused | Self::NotFused | Self::NotPermitted | Self::Overload)
+    }
+
+    /// True if hosts without the cell's key can cause it, from as many addresses as they like.
+    fn is_of_strangers(self) -> bool {
+        matches!(self, Self::WrongKey | Self::OtherCell)
     }
 
     /// True if an aggregator with this trouble about a vehicle does not use the vehicle's reports.
@@ -137,26 +144,38 @@ impl TroubleKind {
 /// Minimum time between two lines of the log about the same trouble.
 const LOG_INTERVAL: Duration = Duration::from_secs(3600);
 
-/// Minimum time between two changes of a cause's words: figures move all the time.
+/// The same for another cause of it.
+const NEW_CAUSE_INTERVAL: Duration = Duration::from_secs(60);
+
+/// Minimum time between two changes of a cause's figures, and of the words of what each message may cause.
 const TEXT_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Maximum troubles that are kept about the same vehicle or host, and those that may be about others than the node.
+/// Maximum troubles that are kept about the same vehicle or host, those that strangers may cause, and all that may be about
+/// others than the node.
 const MAX_ABOUT_ONE: usize = 4;
+const MAX_OF_STRANGERS: usize = 3;
 const MAX_ABOUT_OTHERS: usize = MAX_TROUBLES - 4;
+
+/// Who a trouble is about, if not the node, and its kind.
+type Key = (Option<String>, TroubleKind);
 
 /// The troubles that a node knows of.
 #[derive(Debug, Clone, Default)]
 pub struct TroubleRegister {
-    /// By whom they are about and their kind; a lapsed entry stays until its room is needed, so that a trouble that comes
-    /// and goes is not logged each time.
-    entries: BTreeMap<(Option<String>, TroubleKind), Entry>,
+    /// A lapsed entry stays until its room is needed, so that a trouble that comes and goes is not logged each time.
+    entries: BTreeMap<Key, Entry>,
+    /// When the log was last told that there is no room.
+    crowded_at: Option<Timestamp>,
 }
 
 #[derive(Debug, Clone)]
 struct Entry {
     shown: Trouble,
     shown_at: Timestamp,
-    /// Number of times that it was seen since then.
+    /// The cause that is shown, and the one that was logged, without their figures.
+    gist: String,
+    logged_gist: String,
+    /// Number of times that it was seen since it is shown.
     times: u64,
     seen_at: Timestamp,
     logged_at: Timestamp,
@@ -172,63 +191,72 @@ impl Entry {
 impl TroubleRegister {
     /// Notes a trouble of the node itself, or about another; returns it if it is news for the log.
     pub fn note(&mut self, kind: TroubleKind, about: Option<&str>, cause: &str, now: Timestamp) -> Option<Trouble> {
-        self.relay(kind, about, cause, kind.remedy(), now)
+        self.note_with(kind, about, || cause.to_owned(), kind.remedy(), now)
     }
 
-    /// Notes a trouble with a remedy that another node gives.
-    pub fn relay(
+    /// Notes a trouble with a remedy that another node may have given. The cause is asked for when its words are needed.
+    pub fn note_with(
         &mut self,
         kind: TroubleKind,
         about: Option<&str>,
-        cause: &str,
+        cause: impl FnOnce() -> String,
         remedy: &str,
         now: Timestamp,
     ) -> Option<Trouble> {
-        let about = about.map(|about| plain_text(about, MAX_NAME_BYTES)).filter(|about| !about.is_empty());
-        let key = (about, kind);
-        let words = |per_second: u64| {
-            let rate = if per_second > 0 { format!(", {per_second} a second") } else { String::new() };
-            Trouble {
-                kind: kind.as_str().into(),
-                about: key.0.clone(),
-                cause: plain_text(cause, MAX_TROUBLE_TEXT - rate.len()) + &rate,
-                remedy: plain_text(remedy, MAX_TROUBLE_TEXT),
-            }
+        let key = key(kind, about);
+        let shown = |cause: &str, suffix: &str| Trouble {
+            kind: kind.as_str().into(),
+            about: key.0.clone(),
+            cause: plain_text(cause, MAX_TROUBLE_TEXT - suffix.len()) + suffix,
+            remedy: plain_text(remedy, MAX_TROUBLE_TEXT),
         };
         if let Some(entry) = self.entries.get_mut(&key) {
             entry.times += 1;
-            let age = now.since(entry.shown_at);
-            if !entry.is_present(kind, now) {
-                (entry.shown, entry.shown_at, entry.times) = (words(0), now, 0);
-            } else if age >= TEXT_INTERVAL {
-                let per_second = if kind.is_counted() { entry.times / age.as_secs() } else { 0 };
-                (entry.shown, entry.shown_at, entry.times) = (words(per_second), now, 0);
-            }
+            let (is_present, age) = (entry.is_present(kind, now), now.since(entry.shown_at));
             (entry.seen_at, entry.is_settled) = (now, false);
-            let is_news = now.since(entry.logged_at) >= LOG_INTERVAL;
-            return is_news.then(|| {
-                entry.logged_at = now;
+            let is_due = !is_present || age >= TEXT_INTERVAL;
+            if is_due || !kind.is_counted() {
+                let cause = cause();
+                let gist = gist(&cause);
+                if is_due || gist != entry.gist {
+                    let per_second =
+                        if is_present && kind.is_counted() { entry.times / age.as_secs().max(1) } else { 0 };
+                    let rate = if per_second > 0 { format!(", {per_second} a second") } else { String::new() };
+                    (entry.shown, entry.shown_at, entry.gist, entry.times) = (shown(&cause, &rate), now, gist, 0);
+                }
+            }
+            let interval = if entry.gist == entry.logged_gist { LOG_INTERVAL } else { NEW_CAUSE_INTERVAL };
+            return (now.since(entry.logged_at) >= interval).then(|| {
+                (entry.logged_at, entry.logged_gist) = (now, entry.gist.clone());
                 entry.shown.clone()
             });
         }
-        let shown = words(0);
-        self.make_room(key.0.as_deref(), now).then(|| {
-            let entry = Entry {
-                shown: shown.clone(),
-                shown_at: now,
-                times: 0,
-                seen_at: now,
-                logged_at: now,
-                is_settled: false,
-            };
-            self.entries.insert(key, entry);
-            shown
-        })
+        if !self.make_room(&key, now) {
+            let is_told = self.crowded_at.is_some_and(|at| now.since(at) < LOG_INTERVAL);
+            return (!is_told).then(|| {
+                self.crowded_at = Some(now);
+                shown(&cause(), "; this and more troubles are not shown, for want of room")
+            });
+        }
+        let cause = cause();
+        let entry = Entry {
+            shown: shown(&cause, ""),
+            shown_at: now,
+            gist: gist(&cause),
+            logged_gist: gist(&cause),
+            times: 0,
+            seen_at: now,
+            logged_at: now,
+            is_settled: false,
+        };
+        let news = entry.shown.clone();
+        self.entries.insert(key, entry);
+        Some(news)
     }
 
     /// Notes that a trouble is over.
     pub fn settle(&mut self, kind: TroubleKind, about: Option<&str>) {
-        if let Some(entry) = self.entries.get_mut(&(about.map(str::to_owned), kind)) {
+        if let Some(entry) = self.entries.get_mut(&key(kind, about)) {
             entry.is_settled = true;
         }
     }
@@ -243,27 +271,40 @@ impl TroubleRegister {
             .collect()
     }
 
-    /// True if there is room for one more entry: lapsed ones give way, the longest unseen first.
-    fn make_room(&mut self, about: Option<&str>, now: Timestamp) -> bool {
-        let Some(about) = about else { return true };
-        loop {
-            let others = self.entries.iter().filter(|((other, _), _)| other.is_some());
-            let same = others.clone().filter(|((other, _), _)| other.as_deref() == Some(about));
-            let is_crowded = same.clone().count() >= MAX_ABOUT_ONE;
-            if !is_crowded && others.clone().count() < MAX_ABOUT_OTHERS {
-                return true;
-            }
-            let lapsed = |((_, kind), entry): &(&(Option<String>, TroubleKind), &Entry)| !entry.is_present(*kind, now);
-            let seen_at = |(_, entry): &(&(Option<String>, TroubleKind), &Entry)| entry.seen_at;
-            let oldest = if is_crowded {
-                same.filter(lapsed).min_by_key(seen_at)
-            } else {
-                others.filter(lapsed).min_by_key(seen_at)
-            };
-            let Some(key) = oldest.map(|(key, _)| key.clone()) else { return false };
-            self.entries.remove(&key);
+    /// True if there is room for one more entry: lapsed ones of the crowd that it belongs to give way, the longest unseen
+    /// first.
+    fn make_room(&mut self, (about, kind): &Key, now: Timestamp) -> bool {
+        if about.is_none() {
+            return true;
         }
+        let crowds: [(usize, &dyn Fn(&Key) -> bool); 3] = [
+            (MAX_ABOUT_ONE, &|(other, _)| other == about),
+            (MAX_OF_STRANGERS, &|(_, other)| kind.is_of_strangers() && other.is_of_strangers()),
+            (MAX_ABOUT_OTHERS, &|(other, _)| other.is_some()),
+        ];
+        crowds.into_iter().all(|(most, is_in)| {
+            while self.entries.keys().filter(|key| is_in(key)).count() >= most {
+                let lapsed = self.entries.iter().filter(|(key, entry)| is_in(key) && !entry.is_present(key.1, now));
+                let oldest = lapsed.min_by_key(|(_, entry)| entry.seen_at);
+                let Some(key) = oldest.map(|(key, _)| key.clone()) else { return false };
+                self.entries.remove(&key);
+            }
+            true
+        })
     }
+}
+
+fn key(kind: TroubleKind, about: Option<&str>) -> Key {
+    let name = |about| match plain_text(about, MAX_NAME_BYTES) {
+        name if name.is_empty() => "without a name".to_owned(),
+        name => name,
+    };
+    (about.map(name), kind)
+}
+
+/// A cause without its figures.
+fn gist(cause: &str) -> String {
+    cause.chars().filter(|letter| !letter.is_ascii_digit() && !matches!(letter, '.' | '-')).collect()
 }
 
 #[cfg(test)]
@@ -321,6 +362,40 @@ mod tests {
         assert_eq!(present[2].cause, "a b ");
         register.note(TroubleKind::Malformed, Some("late"), "x", at(60));
         assert_eq!(shown(&register, at(60)), [": no frame", "late: x"], "lapsed ones give way");
+    }
+
+    #[test]
+    fn strangers_leave_room_for_what_members_are_told() {
+        let mut register = TroubleRegister::default();
+        let lines = (0..100).filter(|host| {
+            let about = format!("10.0.0.{host}");
+            register.note(TroubleKind::WrongKey, Some(&about), "heard with another key", at(0)).is_some()
+        });
+        assert_eq!(lines.count(), MAX_OF_STRANGERS + 1, "the last says that there are more");
+        assert!(register.note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0)).is_some());
+        assert_eq!(register.present(at(0)).len(), MAX_OF_STRANGERS + 1);
+    }
+
+    #[test]
+    fn another_cause_is_shown_at_once_and_logged_within_a_minute() {
+        let mut register = TroubleRegister::default();
+        register.note(TroubleKind::BrokerRefuses, Some("hub:1883"), "wrong password", at(0));
+        let mut note = |s| register.note(TroubleKind::BrokerRefuses, Some("hub:1883"), "certificate expired", at(s));
+        assert!(note(1).is_none());
+        assert_eq!(note(60).unwrap().cause, "certificate expired");
+        assert!(note(200).is_none(), "once");
+        assert_eq!(shown(&register, at(1)), ["hub:1883: certificate expired"]);
+    }
+
+    #[test]
+    fn a_trouble_about_any_name_can_be_settled() {
+        for about in ["", "a".repeat(200).as_str(), "a\u{202E}b"] {
+            let mut register = TroubleRegister::default();
+            register.note(TroubleKind::BrokerRefuses, Some(about), "refused", at(0));
+            assert!(register.present(at(0))[0].about.is_some(), "it is not the node's own");
+            register.settle(TroubleKind::BrokerRefuses, Some(about));
+            assert!(register.present(at(0)).is_empty());
+        }
     }
 
     #[test]

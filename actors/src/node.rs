@@ -227,7 +227,8 @@ impl NodeHandle {
 
     /// Present troubles of the cell: those of this node, and those that others tell in their statuses.
     pub fn troubles(&self) -> Vec<(Option<NodeName>, Trouble)> {
-        self.live_state.troubles(&self.name, self.counters.troubles().present())
+        let leader = self.leadership().borrow().leader().cloned();
+        self.live_state.troubles(&self.name, leader.as_ref(), self.counters.troubles().present())
     }
 
     /// Has the supervisor tell a service manager that the node runs, and how it is, until it ends.

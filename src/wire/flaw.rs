@@ -70,18 +70,20 @@ impl Flaw {
     /// The flaw of a value that is no valid one.
     fn of_value(payload: &Value, reason: RejectReason, field: String) -> Self {
         let pointer = format!("/{}", field.replace(['.', '['], "/").replace(']', ""));
-        let value = payload.pointer(&pointer).cloned().unwrap_or_default();
+        // A key with a dot of its own is not found again.
+        let value = payload.pointer(&pointer);
+        let shown = value.map_or_else(String::new, |value| format!(": {value}"));
         let fault = match reason {
-            RejectReason::UnknownSchema => format!("is {value}, not {SCHEMA_VERSION}"),
-            RejectReason::ConfidenceOutOfRange => format!("is not within 0 to 1: {value}"),
-            RejectReason::NotFinite if field.ends_with("covariance_m2") => format!("is no covariance: {value}"),
+            RejectReason::UnknownSchema => format!("is {}, not {SCHEMA_VERSION}", value.unwrap_or(&Value::Null)),
+            RejectReason::ConfidenceOutOfRange => format!("is not within 0 to 1{shown}"),
+            RejectReason::NotFinite if field.ends_with("covariance_m2") => format!("is no covariance{shown}"),
             // JSON has no such number; other encodings do.
-            RejectReason::NotFinite if value.is_null() => "is not a finite number".into(),
+            RejectReason::NotFinite if value.is_none_or(Value::is_null) => "is not a finite number".into(),
             RejectReason::TooManyObjects => "has too many entries".into(),
             RejectReason::InvalidLabel => {
                 format!("is empty, longer than {MAX_NAME_BYTES} bytes, or has control characters")
             }
-            _ => format!("is out of bounds: {value}"),
+            _ => format!("is out of bounds{shown}"),
         };
         Self::new(reason, field, fault)
     }
@@ -112,8 +114,9 @@ pub(crate) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Result<T, (String, 
     Ok(value)
 }
 
-/// The fault that a reader of JSON found. Its line is always the first.
+/// The fault that a reader of JSON found.
 fn fault(text: &[u8], error: &serde_json::Error) -> String {
+    let text = text.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
     // The column is at the first letter of a word or next to it.
     let around = text.get(error.column().saturating_sub(3)..).unwrap_or_default();
     let around = around.get(.."-Infinity".len() + 2).unwrap_or(around);

@@ -12,6 +12,7 @@ use std::time::Duration;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use ecod::description::{DescriptionEffect, DescriptionExchange, DescriptionHistory, PUBLISH_INTERVAL, Statement};
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Leadership;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -25,10 +26,13 @@ use crate::messages::gateway::GatewayMessage;
 use crate::platform::clock;
 use crate::platform::content_hash::{content_hash, is_intact};
 use crate::platform::state_file::StateFile;
-use crate::platform::state_writer::StateWriter;
+use crate::platform::state_writer::{SaveOutcome, StateWriter};
 use crate::telemetry::counters::{Counters, OTHERS};
 use crate::transport::gossip::Member;
 use crate::transport::pki::{Credentials, LoadedCredentials};
+
+/// The state that is saved here, in words.
+const DESCRIPTION: &str = "description of the cell";
 
 /// Callback that has a node use a description. It must not block.
 pub type DescriptionSink = Arc<dyn Fn(Arc<CellDescription>) + Send + Sync>;
@@ -109,7 +113,7 @@ impl Actor for DescriptionKeeper {
         let is_of_held = |saved: &DescriptionHistory| saved.current.as_ref().map(|it| it.description.stamp()) == stamp;
         let saved = file.as_ref().and_then(|file| file.load(|_: &DescriptionHistory| true)).filter(is_of_held);
         let history = saved.unwrap_or_else(|| DescriptionHistory::of(held.clone()));
-        let mut writer = StateWriter::new(file, "description of the cell");
+        let mut writer = StateWriter::new(file, DESCRIPTION);
         if held.is_some() {
             // One that the node was started with is not on the disk yet.
             writer.note_change();
@@ -201,7 +205,7 @@ impl DescriptionKeeperState {
         let is_revoked = |certificate: &str| BASE64.decode(certificate).is_ok_and(|der| loaded.has_revoked(&der));
         let is_new = self.applied.as_ref().is_none_or(|applied| !Arc::ptr_eq(applied, &loaded));
         let current = self.exchange.history().current.as_ref().filter(|_| has_adopted);
-        if !is_new && !current.and_then(|current| current.stated_by.as_deref()).is_some_and(is_revoked) {
+        if !is_new && !current.is_some_and(|current| current.is_of_revoked(is_revoked)) {
             return;
         }
         let effects = self.exchange.revoke(is_revoked, content_hash(&self.name, ""), now);
@@ -233,7 +237,15 @@ impl DescriptionKeeperState {
 
     async fn save(&mut self) {
         if self.exchange.current().is_some() {
-            self.writer.save(|| self.exchange.history().clone()).await;
+            let troubles = self.counters.troubles();
+            match self.writer.save(|| self.exchange.history().clone()).await {
+                SaveOutcome::Unchanged => {}
+                SaveOutcome::Written => troubles.settle(TroubleKind::NotSaved, Some(DESCRIPTION)),
+                SaveOutcome::Failed => {
+                    let cause = "it cannot be saved, and is learnt anew from other nodes after a restart";
+                    troubles.note_about(DESCRIPTION, TroubleKind::NotSaved, cause);
+                }
+            }
         }
     }
 }

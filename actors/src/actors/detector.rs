@@ -175,6 +175,9 @@ async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: A
                 CaptureStatus::Failed { error, .. } => {
                     counters.troubles().note(TroubleKind::Camera, &format!("the camera gives no frames: {error}"));
                 }
+                CaptureStatus::Ended => {
+                    counters.troubles().note(TroubleKind::Camera, "the camera's frames have ended");
+                }
                 _ => counters.troubles().settle(TroubleKind::Camera, None),
             }
         };

@@ -237,8 +237,8 @@ impl FuserState {
             }
             RejectReason::NotFused => self
                 .counters
-                .reject_with(reason, node, || "its reports are for an algorithm that the cell does not run".into()),
-            _ => self.counters.reject(reason, node),
+                .reject_report(reason, node, || "its reports are for an algorithm that the cell does not run".into()),
+            _ => self.counters.reject_report(reason, node, || format!("reports are rejected as {reason}")),
         }
     }
 

@@ -123,6 +123,11 @@ impl OpticsConfig {
         for (key, size_px) in [("width_px", self.width_px), ("height_px", self.height_px)] {
             size_px.map_or(Ok(()), |size_px| check_range(key, f64::from(size_px), 16.0, 16_384.0))?;
         }
+        if self.width_px.is_some() != self.height_px.is_some() {
+            let size = |size: Option<u32>| size.map_or_else(|| "none".to_owned(), |px| px.to_string());
+            let given = format!("{}x{}", size(self.width_px), size(self.height_px));
+            return Err(ConfigError::new("width_px and height_px", given, "both or neither"));
+        }
         check_range("horizontal_fov_deg", self.horizontal_fov_deg, 1.0, 175.0)?;
         self.vertical_fov_deg.map_or(Ok(()), |angle_deg| check_range("vertical_fov_deg", angle_deg, 1.0, 175.0))
     }

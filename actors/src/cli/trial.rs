@@ -196,7 +196,8 @@ async fn start_and_watch(
         if let Some(path) = save {
             let path = numbered(path, index);
             let text = config.to_toml().context("the configuration cannot be written as TOML")?;
-            std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
+            let written = std::fs::File::create_new(&path).and_then(|mut file| file.write_all(text.as_bytes()));
+            written.with_context(|| format!("cannot write {}, which must not exist yet", path.display()))?;
         }
     }
     watch(nodes).await

@@ -154,17 +154,25 @@ impl Counters {
         self.events[event as usize].fetch_add(times, Ordering::Relaxed);
     }
 
-    /// Counts a rejected payload of a node, or of a broker where the sender is not known. It is a trouble, unless
-    /// elections and re-ordering explain it.
+    /// Counts a rejected payload, other than a report, of a node, or of a broker where the sender is not known. It is a
+    /// trouble, unless elections and re-ordering explain it.
     pub fn reject(&self, reason: RejectReason, source: &str) {
-        self.reject_with(reason, source, || format!("rejected as {reason}"));
+        self.reject_message(reason, source, || format!("a message is rejected as {reason}"));
     }
 
     /// Counts a rejected payload as [`Self::reject`] does, with the cause in words.
-    pub fn reject_with(&self, reason: RejectReason, source: &str, cause: impl FnOnce() -> String) {
+    pub fn reject_message(&self, reason: RejectReason, source: &str, cause: impl FnOnce() -> String) {
+        self.count_reject(reason, source);
+        if trouble_of(reason).is_some() {
+            self.troubles.note_about_with(source, TroubleKind::MessageRefused, cause);
+        }
+    }
+
+    /// Counts a rejected report, with the cause in words.
+    pub fn reject_report(&self, reason: RejectReason, source: &str, cause: impl FnOnce() -> String) {
         self.count_reject(reason, source);
         if let Some(kind) = trouble_of(reason) {
-            self.troubles.note_about(source, kind, &cause());
+            self.troubles.note_about_with(source, kind, cause);
         }
     }
 
@@ -225,7 +233,7 @@ impl Counters {
     }
 }
 
-/// The trouble that a reason is a sign of. Some occur without anybody's fault: around a change of leader, or on a network
+/// The trouble that a reason is a sign of where a report is rejected. Some occur without anybody's fault: around a change of leader, or on a network
 /// that re-orders.
 fn trouble_of(reason: RejectReason) -> Option<TroubleKind> {
     use RejectReason as Reason;

@@ -24,9 +24,15 @@ impl Troubles {
         log(news);
     }
 
+    /// The same with a cause that is put into words only if they are needed.
+    pub fn note_about_with(&self, about: &str, kind: TroubleKind, cause: impl FnOnce() -> String) {
+        let news = self.register().note_with(kind, Some(about), cause, kind.remedy(), clock::now());
+        log(news);
+    }
+
     /// Notes what another node says of this one.
     pub fn relay(&self, kind: TroubleKind, cause: &str, remedy: &str) {
-        let news = self.register().relay(kind, None, cause, remedy, clock::now());
+        let news = self.register().note_with(kind, None, || cause.to_owned(), remedy, clock::now());
         log(news);
     }
 

@@ -67,7 +67,7 @@ async fn what_the_leader_sees_is_on_every_page() {
         until_told(page, ["edge", "late", "clock_off"], "its clock is 5.0 s ahead").await;
     }
     let metrics = get(edge_page, "/metrics").await.body;
-    assert!(metrics.contains("ecod_troubles{trouble=\"malformed\",about=\"watson\"} 1"), "{metrics}");
+    assert!(metrics.contains("ecod_troubles{trouble=\"malformed\",of=\"other\"} 1"), "{metrics}");
     drop((watson, late));
     until("both are forgotten", || async { told(edge_page).await.is_empty() && told(page).await.is_empty() }).await;
     stop([cav, edge]).await;

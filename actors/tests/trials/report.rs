@@ -144,11 +144,7 @@ impl Doors {
                 "clocks differ: {early_maps} of {maps} maps at doors before their nodes had them, at most a quarter"
             )
         });
-        counts
-            .into_iter()
-            .chain([early])
-            .chain([longer, later].map(|miss| miss.filter(|_| !self.is_crowded)))
-            .flatten()
+        counts.into_iter().chain([early]).chain([longer, later].map(|miss| miss.filter(|_| !self.is_crowded))).flatten()
     }
 }
 

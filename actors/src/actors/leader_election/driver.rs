@@ -11,7 +11,7 @@ use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{Encoding, NodeState, NodeStatus, RejectReason, Role, Trouble};
+use ecod::wire::{Encoding, NodeStatus, RejectReason, Role, Trouble};
 use ractor::ActorRef;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
@@ -132,7 +132,7 @@ impl ElectionDriver {
 
     /// Notes what a node says of itself, and what a leader says of this node.
     pub(super) async fn take_status(&mut self, status: &NodeStatus) {
-        if status.state == NodeState::Aggregating && status.node != self.name {
+        if self.leadership.borrow().leader() == Some(&status.node) && status.node != self.name {
             let of_this = |trouble: &&Trouble| {
                 let about = trouble.about.as_ref().and_then(|about| NodeName::new(about).ok());
                 let refuses = TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::refuses_reports);

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use ecod::admission::report_window::MAX_PARTS;
+use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind, Trouble};
@@ -129,21 +130,32 @@ impl LiveState {
         self.latest().statuses.clone()
     }
 
-    /// The present troubles of the cell, each once: those of this node `name`, and those that living nodes tell of
-    /// themselves and of others.
-    pub(crate) fn troubles(&self, name: &NodeName, own: Vec<Trouble>) -> Vec<(Option<NodeName>, Trouble)> {
+    /// The present troubles of the cell, each once: what this node `name` knows, what living nodes tell of themselves, what
+    /// the leader tells of others, and what other nodes tell of hosts and brokers that they do not reach.
+    pub(crate) fn troubles(
+        &self,
+        name: &NodeName,
+        leader: Option<&NodeName>,
+        own: Vec<Trouble>,
+    ) -> Vec<(Option<NodeName>, Trouble)> {
         let subject = |trouble: &Trouble, by: &NodeName| trouble.about.clone().unwrap_or_else(|| by.to_string());
         let mut known: BTreeSet<_> = own.iter().map(|trouble| (subject(trouble, name), trouble.kind.clone())).collect();
         let mut all: Vec<_> = own.into_iter().map(|trouble| (None, trouble)).collect();
-        for ReportedStatus { status, .. } in self.latest().statuses.values() {
-            if status.state == NodeState::Offline {
-                continue;
-            }
-            for trouble in &status.troubles {
-                let is_new = known.insert((subject(trouble, &status.node), trouble.kind.clone()));
-                if is_new && all.len() < MAX_TOLD_TROUBLES {
-                    all.push((Some(status.node.clone()), trouble.clone()));
-                }
+        let latest = self.latest();
+        let living = || {
+            let statuses = latest.statuses.values().map(|reported| &reported.status);
+            let told = statuses.filter(|status| status.state != NodeState::Offline);
+            told.flat_map(|status| status.troubles.iter().map(|trouble| (&status.node, trouble)))
+        };
+        let of_itself = living().filter(|(_, trouble)| trouble.about.is_none());
+        let may_tell = |(by, trouble): &(&NodeName, &Trouble)| {
+            let is_separating = || TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
+            trouble.about.is_some() && (leader == Some(*by) || is_separating())
+        };
+        for (by, trouble) in of_itself.chain(living().filter(may_tell)) {
+            let is_new = known.insert((subject(trouble, by), trouble.kind.clone()));
+            if is_new && all.len() < MAX_TOLD_TROUBLES {
+                all.push((Some(by.clone()), trouble.clone()));
             }
         }
         all
@@ -290,15 +302,31 @@ mod tests {
             let status = Arc::new(NodeStatus { state, troubles, ..starting });
             live_state.update(&Incoming::Status { status, via: broker("10.0.0.2:1883") }, Timestamp(1));
         };
-        say("edge", NodeState::Aggregating, vec![trouble("clock_off", Some("late"), "by the edge")]);
+        say(
+            "edge",
+            NodeState::Aggregating,
+            vec![trouble("clock_off", Some("late"), "by the edge"), trouble("untimely", Some("late"), "by the edge")],
+        );
         say("late", NodeState::Following, vec![trouble("clock_off", None, "by itself"), trouble("camera", None, "x")]);
         say("gone", NodeState::Offline, vec![trouble("camera", None, "y")]);
         let own = vec![trouble("malformed", Some("watson"), "z"), trouble("overload", None, "own")];
-        say("gauss", NodeState::Following, vec![trouble("overload", Some("self"), "by gauss")]);
-        let told = live_state.troubles(&NodeName::from_static("self"), own);
+        let lies = [("overload", Some("self")), ("malformed", Some("late")), ("wrong_key", Some("10.0.0.7"))];
+        say("aaa", NodeState::Following, lies.map(|(kind, about)| trouble(kind, about, "by aaa")).into());
+        let (name, edge) = (NodeName::from_static("self"), NodeName::from_static("edge"));
+        let told = live_state.troubles(&name, Some(&edge), own);
         let told: Vec<_> =
             told.iter().map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause)).collect();
-        assert_eq!(told, [(None, "z"), (None, "own"), (Some("edge"), "by the edge"), (Some("late"), "x")]);
+        assert_eq!(
+            told,
+            [
+                (None, "z"),
+                (None, "own"),
+                (Some("late"), "by itself"),
+                (Some("late"), "x"),
+                (Some("aaa"), "by aaa"),
+                (Some("edge"), "by the edge"),
+            ]
+        );
     }
 
     /// A stolen certificate may speak in the names of any number of parts.

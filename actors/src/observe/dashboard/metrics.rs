@@ -3,6 +3,7 @@
 //! All values are read on request; only counters that the node has anyway are kept. The number of label values is
 //! bounded: reasons and states are fixed sets, vehicles are the first [`MAX_VEHICLES`] by name.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::atomic::AtomicU64;
 
@@ -76,10 +77,13 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
 
 fn troubles(registry: &mut Registry, monitor: &NodeMonitor) {
     let present = monitor.sources.counters.troubles().present().into_iter();
-    let labels = present.map(|Trouble { kind, about, .. }| {
-        (vec![("trouble", kind), ("about", about.unwrap_or_else(|| monitor.sources.node.name.to_string()))], 1)
-    });
-    gauges(registry, "troubles", "Present troubles of the node and of vehicles as it sees them; 1 for each", labels);
+    // Not by name: names come from outside, and there is no end of them.
+    let mut by_kind: BTreeMap<(String, &str), i64> = BTreeMap::new();
+    for Trouble { kind, about, .. } in present {
+        *by_kind.entry((kind, if about.is_none() { "node" } else { "other" })).or_default() += 1;
+    }
+    let labels = by_kind.into_iter().map(|((kind, of), times)| (vec![("trouble", kind), ("of", of.to_owned())], times));
+    gauges(registry, "troubles", "Present troubles of the node itself and of others as it sees them, by kind", labels);
     let reading = monitor.sources.vitals.clock.reading();
     if reading.error_us.is_some() {
         let ahead_us = clock::wall_offset_us().saturating_sub(reading.offset_us);

@@ -142,8 +142,9 @@ impl NodeMonitor {
     }
 
     fn troubles(&self) -> Vec<TroubleEntry> {
-        let NodeSources { node, counters, live_state, .. } = &self.sources;
-        let all = live_state.troubles(&node.name, counters.troubles().present()).into_iter();
+        let NodeSources { node, counters, live_state, vitals, .. } = &self.sources;
+        let leader = vitals.leadership.borrow().leader().cloned();
+        let all = live_state.troubles(&node.name, leader.as_ref(), counters.troubles().present()).into_iter();
         all.map(|(by, trouble)| TroubleEntry { told_by: by.unwrap_or_else(|| node.name.clone()), trouble }).collect()
     }
 

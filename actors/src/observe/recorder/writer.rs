@@ -4,6 +4,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use ecod::aggregator::{Command, FusionConfig};
+use ecod::model::time::Timestamp;
 use ecod::replay::JournalEvent;
 use mcap::{McapError, McapResult};
 
@@ -80,6 +81,9 @@ impl LogWriter {
                 self.flush();
                 self.flush_due = Instant::now() + FLUSH_PERIOD;
             }
+        }
+        if let Some(change) = self.recording.take_change(Timestamp(u64::MAX)) {
+            self.write(&change);
         }
         self.flush();
         if let Some(Err(error)) = self.file.take().map(LogFile::finish) {
@@ -212,7 +216,6 @@ mod tests {
     use std::sync::mpsc::sync_channel;
 
     use ecod::model::names::NodeName;
-    use ecod::model::time::Timestamp;
     use ecod::perception::landmark::LandmarkConfig;
     use ecod::replay::JournalEntry;
     use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, memfd_create};

@@ -175,7 +175,15 @@ impl Inbox {
     pub(crate) fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome {
         self.counters.count(Event::Received);
         self.read(via, topic, payload, received_at).unwrap_or_else(|reason| {
-            self.counters.reject_with(reason, &self.source(via, topic), || self.fault(topic, payload, reason));
+            let source = self.source(via, topic);
+            match std::str::from_utf8(topic).ok().and_then(|path| self.topics.parse(path)) {
+                Some(Topic::Detections(_) | Topic::VoteDetections(_)) => {
+                    self.counters.reject_report(reason, &source, || self.fault(topic, payload, reason));
+                }
+                _ => self.counters.reject_message(reason, &source, || {
+                    format!("a message on {} is rejected as {reason}", String::from_utf8_lossy(topic))
+                }),
+            }
             tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
             PacketOutcome::Done
         })
@@ -345,14 +353,12 @@ impl Inbox {
         }
     }
 
-    /// The fault of a rejected payload, with the field if it is a report.
+    /// The fault of a rejected report, with the field.
     fn fault(&self, topic: &[u8], payload: &[u8], reason: RejectReason) -> String {
-        let shown = String::from_utf8_lossy(topic);
-        match self.topics.parse(&shown) {
-            Some(Topic::Detections(_) | Topic::VoteDetections(_)) if reason != RejectReason::BadSignature => {
-                format!("report rejected: {}", Flaw::of_report(payload, reason, &self.limits))
-            }
-            _ => format!("message on {shown} rejected as {reason}"),
+        let signed = self.security.signing.as_ref().map(|key| key.verify(topic, payload));
+        match signed.unwrap_or(Some(payload)) {
+            Some(report) => format!("report rejected: {}", Flaw::of_report(report, reason, &self.limits)),
+            None => format!("report rejected: {reason}"),
         }
     }
 

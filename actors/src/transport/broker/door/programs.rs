@@ -121,7 +121,7 @@ impl Door {
         let client = named.map_or(client_id, |(name, _)| name);
         match refusal.reason {
             RefusalReason::Throttled => setup.counters.shed(ShedReason::ReportThrottled, client),
-            RefusalReason::Rejected(reason) => setup.counters.reject_with(reason, client, || refusal.text.clone()),
+            RefusalReason::Rejected(reason) => setup.counters.reject_report(reason, client, || refusal.text.clone()),
         }
         if refusal.reason == RefusalReason::Rejected(RejectReason::NotPermitted) {
             setup.counters.count(Event::ClientDenied);

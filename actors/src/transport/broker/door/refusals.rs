@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use ecod::model::names::NodeName;
+use ecod::model::names::{NodeName, plain_text};
 use ecod::model::time::Timestamp;
 use ecod::wire::{ClientRefusal, ClientRefusals, RejectReason, SCHEMA_VERSION};
 use rmqtt::codec::v5::PublishAckReason;
@@ -26,12 +26,12 @@ pub(super) enum RefusalReason {
     Throttled,
 }
 
-/// Maximum length of a refusal's text in characters: it may quote what the program sent, and is shown to all.
+/// Maximum length of a refusal's text in bytes: it may quote what the program sent, and is shown to all.
 const MAX_TEXT: usize = 500;
 
 impl Refusal {
     pub(super) fn new(reason: RefusalReason, text: impl AsRef<str>) -> Self {
-        Self { reason, text: text.as_ref().chars().take(MAX_TEXT).collect() }
+        Self { reason, text: plain_text(text.as_ref(), MAX_TEXT) }
     }
 
     pub(in crate::transport::broker) fn not_permitted(text: impl AsRef<str>) -> Self {
@@ -135,7 +135,8 @@ mod tests {
     #[test]
     fn what_a_program_sent_is_not_quoted_at_length() {
         let refusal = Refusal::not_permitted("é".repeat(100_000));
-        assert_eq!(refusal.text.chars().count(), MAX_TEXT);
+        assert_eq!(refusal.text.len(), MAX_TEXT);
+        assert_eq!(Refusal::not_permitted("named\0\n").text, "named  ", "MQTT forbids the first");
         let mut refusals = Refusals::default();
         let clients = shown(&mut refusals, &"x".repeat(60_000), 0).unwrap();
         assert_eq!(clients[0].len(), MAX_CLIENT);
