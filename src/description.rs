@@ -92,7 +92,7 @@ enum Leader {
 
 /// Word of a node about its description.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Statement {
+pub struct DescriptionStatement {
     /// Version and hash.
     pub stamp: DescriptionStamp,
     /// True if the node may lead.
@@ -108,7 +108,7 @@ pub struct DescriptionExchange {
     may_lead: bool,
     history: DescriptionHistory,
     /// Last word of each node.
-    statements: BTreeMap<NodeName, Statement>,
+    statements: BTreeMap<NodeName, DescriptionStatement>,
     /// Bodies that no candidate has stated yet, oldest first.
     unproven: VecDeque<Arc<CellDescription>>,
     /// Times of the latest adoptions from others.
@@ -154,8 +154,8 @@ impl DescriptionExchange {
     }
 
     /// Takes the authenticated word of a node about its description.
-    pub fn hear(&mut self, from: &NodeName, statement: Statement, now: Timestamp) -> Vec<DescriptionEffect> {
-        let Statement { stamp, may_lead, .. } = statement;
+    pub fn hear(&mut self, from: &NodeName, statement: DescriptionStatement, now: Timestamp) -> Vec<DescriptionEffect> {
+        let DescriptionStatement { stamp, may_lead, .. } = statement;
         let is_leader = self.leader == Leader::Other(from.clone());
         if stamp.version > self.highest_plausible() && !is_leader {
             return vec![DescriptionEffect::CountImplausible { from: from.clone() }];
@@ -335,7 +335,7 @@ impl DescriptionExchange {
     }
 
     fn is_lacking(&self, stamp: DescriptionStamp) -> bool {
-        let is_behind = |statement: &Statement| statement.stamp < stamp;
+        let is_behind = |statement: &DescriptionStatement| statement.stamp < stamp;
         match &self.leader {
             Leader::Unknown => false,
             Leader::Myself => self.is_due || self.statements.values().any(is_behind),

@@ -26,7 +26,7 @@ use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind, SCHEMA_VERSION};
-use ecod_lab::eval::tracks::{AP_DISTANCES_M, Calibration, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
+use ecod_lab::eval::tracks::{AP_DISTANCES_M, ReliabilityBins, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
 use ecod_lab::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -288,7 +288,7 @@ fn main() -> anyhow::Result<()> {
     let mut table = header();
     print!("{table}");
     let mut courses: Vec<(usize, [Figures; METHODS.len()])> = Vec::new();
-    let mut stated: Vec<(String, Vec<Calibration>)> = Vec::new();
+    let mut stated: Vec<(String, Vec<ReliabilityBins>)> = Vec::new();
     for Scene { name, config } in Scene::all(&options) {
         config.validate()?;
         let seeds: Vec<u64> = options.seeds.clone().take(options.count).collect();

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use ecod_lab::eval::tracks::{Calibration, ReliabilityBin};
+use ecod_lab::eval::tracks::{ReliabilityBin, ReliabilityBins};
 use plotters::prelude::*;
 
 /// The scenes that are drawn, by name.
@@ -21,7 +21,7 @@ const BINS: usize = 10;
 const MIN_OBJECTS: u64 = 50;
 
 /// Draws a panel for `confidence` and one for `existence`; `stated` has the calibrations of all seeds by scene.
-pub(crate) fn draw(path: &Path, stated: &[(String, Vec<Calibration>)]) -> anyhow::Result<()> {
+pub(crate) fn draw(path: &Path, stated: &[(String, Vec<ReliabilityBins>)]) -> anyhow::Result<()> {
     let area = SVGBackend::new(path, (800, 430)).into_drawing_area();
     area.fill(&WHITE)?;
     let (legend, panels) = area.split_vertically(30);
@@ -30,8 +30,8 @@ pub(crate) fn draw(path: &Path, stated: &[(String, Vec<Calibration>)]) -> anyhow
         legend.draw(&PathElement::new([(x, 16), (x + 26, 16)], color.stroke_width(3)))?;
         legend.draw(&Text::new(name, (x + 34, 8), ("sans-serif", 16)))?;
     }
-    let confidence = |calibration: &Calibration| calibration.confidence.bins.clone();
-    let existence = |calibration: &Calibration| {
+    let confidence = |calibration: &ReliabilityBins| calibration.confidence.bins.clone();
+    let existence = |calibration: &ReliabilityBins| {
         calibration.existence.as_ref().map(|existence| existence.bins.clone()).unwrap_or_default()
     };
     let kinds: [(&str, BinsOf); 2] = [("confidence", &confidence), ("existence", &existence)];
@@ -64,7 +64,7 @@ pub(crate) fn draw(path: &Path, stated: &[(String, Vec<Calibration>)]) -> anyhow
 }
 
 /// The bins of one kind of stated probability.
-type BinsOf<'a> = &'a dyn Fn(&Calibration) -> Vec<ReliabilityBin>;
+type BinsOf<'a> = &'a dyn Fn(&ReliabilityBins) -> Vec<ReliabilityBin>;
 
 /// Stated and right percentages of the bins of several recordings together.
 fn pooled(bins: impl Iterator<Item = ReliabilityBin>) -> Vec<(f64, f64)> {

@@ -18,7 +18,7 @@ use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::{
     BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, MqttVersion, Security, SubscriptionRole,
 };
-use ecod_lab::bench::two_hop::{self, Load};
+use ecod_lab::bench::two_hop::{self, TwoHopLoad};
 use hdrhistogram::Histogram;
 use ractor::{Actor, ActorRef};
 use tokio::sync::mpsc;
@@ -30,7 +30,7 @@ use figures::Figures;
 async fn main() -> anyhow::Result<()> {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     let address = BrokerAddress::from(broker.start(([127, 0, 0, 1], 0).into())?);
-    let load = Load { messages: 1000, interval: Duration::from_millis(10), payload_bytes: 1100 };
+    let load = TwoHopLoad { messages: 1000, interval: Duration::from_millis(10), payload_bytes: 1100 };
     let mut figures = Figures::new("mqtt");
     println!("{:<28} {:>8} {:>8} {:>6}", "path", "p50 µs", "p99 µs", "n");
     take(&mut figures, "two_hops", &two_hop::raw(&address, load).await?);
@@ -49,7 +49,11 @@ fn take(figures: &mut Figures, path: &str, histogram: &Histogram<u64>) {
 }
 
 /// Times from a report's publication to the arrival of the map that answers it, in nanoseconds.
-async fn through_gateways(broker: &BrokerAddress, version: MqttVersion, load: Load) -> anyhow::Result<Histogram<u64>> {
+async fn through_gateways(
+    broker: &BrokerAddress,
+    version: MqttVersion,
+    load: TwoHopLoad,
+) -> anyhow::Result<Histogram<u64>> {
     let (edge, mut reports) = join("edge", SubscriptionRole::Candidate, version, broker).await?;
     let (euclid, mut maps) = join("euclid", SubscriptionRole::Follower, version, broker).await?;
     let aggregator = edge.clone();

@@ -25,7 +25,7 @@ use serde::Serialize;
 pub use truth::{Truth, TruthError};
 pub use votes::VehicleScores;
 
-use truth::Span;
+use truth::LabelSpan;
 use votes::Votes;
 
 /// A location and the position of a span among its truths.
@@ -259,7 +259,7 @@ impl Tally {
 }
 
 impl Last {
-    fn said(&self, truth: &Truth, span: &Span) -> Option<&Label> {
+    fn said(&self, truth: &Truth, span: &LabelSpan) -> Option<&Label> {
         if truth.accepts(span, None) { self.entry.as_ref() } else { self.labelled.as_ref() }
     }
 }

@@ -35,7 +35,7 @@ pub use config::{SaidConfig, SensorConfig, TrafficConfig};
 use dice::Dice;
 use drive::MovingVehicle;
 use roads::{Building, Roads};
-use sight::Body;
+use sight::TrafficBody;
 use simulated_sensor::{SimulatedSensor, Surroundings};
 use walk::Walker;
 
@@ -131,7 +131,7 @@ struct Town {
     buildings: Vec<Building>,
     vehicles: Vec<MovingVehicle>,
     walkers: Vec<Walker>,
-    parked: Vec<Body>,
+    parked: Vec<TrafficBody>,
     lures: Vec<Point2<f64>>,
 }
 
@@ -139,12 +139,12 @@ impl Town {
     fn new(config: &TrafficConfig, dice: &mut Dice<'_>) -> Self {
         let roads = Roads { count: config.roads, block_m: config.block_m };
         let lanes = roads.lanes();
-        let mut parked: Vec<Body> = Vec::new();
+        let mut parked: Vec<TrafficBody> = Vec::new();
         while parked.len() < config.parked {
             let lane = lanes[dice.below(lanes.len())];
             let (center, heading_rad) = roads.parking(lane, dice.between(0.0, roads.length_m(lane)));
             if parked.iter().all(|other| (other.center - center).norm() > 6.0) || dice.chance(0.001) {
-                parked.push(Body { length_m: dice.between(3.8, 4.9), ..body("car", center, heading_rad) });
+                parked.push(TrafficBody { length_m: dice.between(3.8, 4.9), ..body("car", center, heading_rad) });
             }
         }
         let mut walkers = walk::walkers(&roads, config.people, false, dice);
@@ -168,24 +168,24 @@ impl Town {
     }
 
     /// Everything that can be seen, vehicles first; a body keeps its place in the list.
-    fn bodies(&self) -> Vec<Body> {
+    fn bodies(&self) -> Vec<TrafficBody> {
         let vehicles = self.vehicles.iter().map(|vehicle| {
             let (center, heading_rad) = self.roads.place(vehicle.path, vehicle.along_m);
             let MovingVehicle { speed_mps, length_m, width_m, .. } = *vehicle;
-            Body { speed_mps, length_m, width_m, ..body("car", center, heading_rad) }
+            TrafficBody { speed_mps, length_m, width_m, ..body("car", center, heading_rad) }
         });
         let walkers = self.walkers.iter().map(|walker| {
             let (center, heading_rad) = walker.place();
             let (label, length_m) = if walker.is_bicycle { ("bicycle", 1.8) } else { ("person", 0.5) };
             let speed_mps = walker.speed_mps();
-            Body { speed_mps, length_m, width_m: 0.6, is_opaque: false, ..body(label, center, heading_rad) }
+            TrafficBody { speed_mps, length_m, width_m: 0.6, is_opaque: false, ..body(label, center, heading_rad) }
         });
         vehicles.chain(self.parked.iter().cloned()).chain(walkers).collect()
     }
 }
 
-fn body(label: &'static str, center: Point2<f64>, heading_rad: f64) -> Body {
-    Body { label, center, heading_rad, speed_mps: 0.0, length_m: 4.5, width_m: 1.8, is_opaque: true }
+fn body(label: &'static str, center: Point2<f64>, heading_rad: f64) -> TrafficBody {
+    TrafficBody { label, center, heading_rad, speed_mps: 0.0, length_m: 4.5, width_m: 1.8, is_opaque: true }
 }
 
 /// All observers and what has come of them.
@@ -246,7 +246,7 @@ impl<'a> Watch<'a> {
         }
     }
 
-    fn capture(&mut self, number: usize, step: u64, town: &Town, bodies: &[Body], dice: &mut Dice<'_>) {
+    fn capture(&mut self, number: usize, step: u64, town: &Town, bodies: &[TrafficBody], dice: &mut Dice<'_>) {
         let config = self.config;
         let (position, heading_rad) = match bodies.get(number) {
             Some(vehicle) if !config.fixed => (vehicle.center, vehicle.heading_rad),
@@ -284,7 +284,7 @@ impl<'a> Watch<'a> {
     }
 
     /// Objects that belong to the truth.
-    fn known(&self, step: u64, bodies: &[Body]) -> Vec<TruthObject> {
+    fn known(&self, step: u64, bodies: &[TrafficBody]) -> Vec<TruthObject> {
         let memory = (self.config.memory_s * STEPS_PER_S) as u64;
         let observers = if self.config.said.poses && !self.config.fixed { self.observers.len() } else { 0 };
         let is_known = |id: usize| id < observers || self.seen_at[id].is_some_and(|seen| step - seen <= memory);

@@ -20,8 +20,8 @@ fn node(own: &str) -> DescriptionExchange {
     DescriptionExchange::new(name(own), true, DescriptionHistory::default())
 }
 
-fn word(may_lead: bool, stamp: DescriptionStamp) -> Statement {
-    Statement { stamp, may_lead, certificate: None }
+fn word(may_lead: bool, stamp: DescriptionStamp) -> DescriptionStatement {
+    DescriptionStatement { stamp, may_lead, certificate: None }
 }
 
 fn adopts(effects: &[DescriptionEffect]) -> bool {
@@ -184,8 +184,8 @@ fn bodies_that_nobody_states_take_bounded_room() {
 }
 
 /// Word of a node with this certificate.
-fn certified(certificate: &str, stamp: DescriptionStamp) -> Statement {
-    Statement { certificate: Some(certificate.into()), ..word(true, stamp) }
+fn certified(certificate: &str, stamp: DescriptionStamp) -> DescriptionStatement {
+    DescriptionStatement { certificate: Some(certificate.into()), ..word(true, stamp) }
 }
 
 const EMPTY: ContentHash = ContentHash([0xee; 32]);

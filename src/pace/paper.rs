@@ -24,13 +24,13 @@ pub struct PaperPace {
     gate_m: f64,
     max_age: Duration,
     landmarks: Arc<LandmarkIndex>,
-    vehicles: BTreeMap<NodeName, LatestReport>,
+    vehicles: BTreeMap<NodeName, LatestDetections>,
     grouping: Grouping,
 }
 
 /// A vehicle's latest report: its objects near known locations, once for each location.
 #[derive(Debug, Clone, Default)]
-struct LatestReport {
+struct LatestDetections {
     captured_at: Timestamp,
     places: Vec<Place>,
     objects: Vec<NearbyObject>,

@@ -23,7 +23,7 @@ pub(super) struct Record {
 
 /// The evidence of all epochs. Serialised, it is the snapshot that is persisted and replicated.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "Snapshot", into = "Snapshot")]
+#[serde(from = "LedgerSnapshot", into = "LedgerSnapshot")]
 pub struct ReputationLedger {
     /// By the epoch whose aggregator writes the lane, and by vehicle.
     pub(super) lanes: BTreeMap<Epoch, BTreeMap<NodeName, Record>>,
@@ -43,15 +43,15 @@ type SnapshotLane = BTreeMap<NodeName, BTreeMap<Label, Counts>>;
 /// A ledger in its serialised form; snapshots of early versions have no marks.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Snapshot {
+struct LedgerSnapshot {
     /// By term, and by the aggregator that wrote the lane.
     lanes: BTreeMap<u64, BTreeMap<NodeName, SnapshotLane>>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     marks: Vec<LedgerMark>,
 }
 
-impl From<Snapshot> for ReputationLedger {
-    fn from(Snapshot { lanes, marks }: Snapshot) -> Self {
+impl From<LedgerSnapshot> for ReputationLedger {
+    fn from(LedgerSnapshot { lanes, marks }: LedgerSnapshot) -> Self {
         let mut ledger = Self::default();
         for (term, aggregators) in lanes {
             for (aggregator, vehicles) in aggregators {
@@ -68,7 +68,7 @@ impl From<Snapshot> for ReputationLedger {
     }
 }
 
-impl From<ReputationLedger> for Snapshot {
+impl From<ReputationLedger> for LedgerSnapshot {
     fn from(ledger: ReputationLedger) -> Self {
         let marks = ledger.marks().collect();
         let mut lanes: BTreeMap<u64, BTreeMap<_, _>> = BTreeMap::new();

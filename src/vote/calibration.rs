@@ -56,7 +56,7 @@ struct ConfidenceHistogram {
 ///   uninformative has no effect.
 /// - Until there is evidence, the weight is the stated confidence divided by the mean of all.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Calibration {
+pub(super) struct ConfidenceCalibration {
     live: BandCounts,
     settled: BandCounts,
     histograms: Vec<ConfidenceHistogram>,
@@ -65,7 +65,7 @@ pub(super) struct Calibration {
     prior_votes: f64,
 }
 
-impl Calibration {
+impl ConfidenceCalibration {
     /// No evidence yet; `prior_votes` is the weight of a stated confidence against evidence, in votes.
     pub(super) fn new(prior_votes: f64) -> Self {
         Self { prior_votes, ..Self::default() }
@@ -211,8 +211,8 @@ impl Weights {
 mod tests {
     use super::*;
 
-    fn learned(votes: impl Iterator<Item = (usize, f64, bool)> + Clone) -> Calibration {
-        let mut calibration = Calibration::new(10.0);
+    fn learned(votes: impl Iterator<Item = (usize, f64, bool)> + Clone) -> ConfidenceCalibration {
+        let mut calibration = ConfidenceCalibration::new(10.0);
         votes.clone().for_each(|(vehicle, confidence, _)| calibration.record_confidence(vehicle, confidence));
         for (vehicle, confidence, agreed) in votes {
             calibration.settle(calibration.band(vehicle, confidence), f64::from(agreed));
@@ -220,7 +220,7 @@ mod tests {
         calibration
     }
 
-    fn weight(calibration: &Calibration, vehicle: usize, confidence: f64) -> f64 {
+    fn weight(calibration: &ConfidenceCalibration, vehicle: usize, confidence: f64) -> f64 {
         calibration.weights().of(calibration.band(vehicle, confidence), confidence)
     }
 
@@ -262,7 +262,7 @@ mod tests {
 
     #[test]
     fn counts_that_rounding_leaves_behind_give_weights() {
-        let mut calibration = Calibration::new(10.0);
+        let mut calibration = ConfidenceCalibration::new(10.0);
         calibration.count(3, 0.3, 1.0);
         calibration.count(3, 0.1 + 0.2, -1.0);
         calibration.count(5, 1.0 + 1e-12, 1.0);

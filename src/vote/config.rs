@@ -41,7 +41,7 @@ pub struct VoteConfig {
     /// it the least useful labels are forgotten, first those of the vehicle that introduced most. In `paper` mode, whose
     /// sums never end, votes for new labels are ignored.
     pub max_labels: usize,
-    /// LabelTable that count as another one everywhere, such as `vase = "sports ball"`; a landmark's own synonyms go first.
+    /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's own synonyms go first.
     /// Default: none.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub synonyms: BTreeMap<Label, Label>,

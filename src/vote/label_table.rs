@@ -13,17 +13,17 @@ const EVICTION_DIVISOR: usize = 8;
 const SUPPORTED_VOTES: f64 = 1.0;
 
 #[derive(Debug, Clone)]
-struct Entry {
+struct LabelEntry {
     name: Label,
     /// The vehicle that stated it first, while that is known.
     introduced_by: Option<usize>,
     stated_at: Option<Timestamp>,
 }
 
-/// LabelTable, numbered in order of first appearance; a label that leaves makes its index free for another.
+/// Labels, numbered in order of first appearance; a label that leaves makes its index free for another.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LabelTable {
-    entries: Vec<Entry>,
+    entries: Vec<LabelEntry>,
     indices: BTreeMap<Label, LabelIndex>,
     free: Vec<LabelIndex>,
 }
@@ -55,7 +55,7 @@ impl LabelTable {
             entry.stated_at = stated_at.or(entry.stated_at);
             return index;
         }
-        let entry = Entry { name: label.clone(), introduced_by, stated_at };
+        let entry = LabelEntry { name: label.clone(), introduced_by, stated_at };
         let index = if let Some(index) = self.free.pop() {
             self.entries[usize::from(index)] = entry;
             index

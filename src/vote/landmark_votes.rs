@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use super::calibration::{Calibration, Weights};
+use super::calibration::{ConfidenceCalibration, Weights};
 use super::confusion::LabelIndex;
 use super::dawid_skene::WeightedVote;
 use super::dependence::Dependence;
@@ -115,7 +115,7 @@ impl LandmarkVotes {
     pub(super) fn compare(
         &mut self,
         dependence: &mut Dependence,
-        calibration: &mut Calibration,
+        calibration: &mut ConfidenceCalibration,
         order: impl Fn(usize) -> usize,
     ) {
         if self.votes.iter().any(|c| !c.compared) {
@@ -130,7 +130,7 @@ impl LandmarkVotes {
     }
 
     /// Sets the weight of every vote.
-    pub(super) fn weigh(&mut self, dependence: &Dependence, calibration: &Calibration, weights: &Weights) {
+    pub(super) fn weigh(&mut self, dependence: &Dependence, calibration: &ConfidenceCalibration, weights: &Weights) {
         for place in 0..self.votes.len() {
             let StoredVote { vehicle, label, confidence, visibility, recent, .. } = self.votes[place];
             let agrees = |other: usize| {
@@ -145,7 +145,7 @@ impl LandmarkVotes {
     }
 
     /// Takes a judgement, and adds to the evidence on confidences how probable the others make the label of each vote.
-    pub(super) fn take(&mut self, judged: LandmarkPosterior, calibration: &mut Calibration) {
+    pub(super) fn take(&mut self, judged: LandmarkPosterior, calibration: &mut ConfidenceCalibration) {
         if self.has_several_voters() {
             for (vote, agreement) in self.votes.iter_mut().zip(judged.agreements) {
                 calibration.count(vote.band, agreement, 1.0);

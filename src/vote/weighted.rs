@@ -11,7 +11,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Bound;
 use std::time::Duration;
 
-use super::calibration::{Calibration, Weights};
+use super::calibration::{ConfidenceCalibration, Weights};
 use super::config::{VoteConfig, WeightedConfig};
 use super::confusion::LabelIndex;
 use super::dawid_skene::{DawidSkene, VehicleEvidence};
@@ -38,7 +38,7 @@ const START_SWEEPS: u32 = 3;
 pub(super) struct WeightedVoting {
     config: WeightedConfig,
     model: DawidSkene,
-    calibration: Calibration,
+    calibration: ConfidenceCalibration,
     dependence: Dependence,
     /// Index of each vehicle.
     vehicles: BTreeMap<NodeName, usize>,
@@ -69,7 +69,7 @@ impl WeightedVoting {
     pub(super) fn new(config: WeightedConfig) -> Self {
         Self {
             model: DawidSkene::new(config.clone()),
-            calibration: Calibration::new(config.calibration_votes),
+            calibration: ConfidenceCalibration::new(config.calibration_votes),
             dependence: Dependence::new(config.pair_memory_votes),
             config,
             ..Self::default()

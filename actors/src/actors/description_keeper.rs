@@ -11,7 +11,9 @@ use std::time::Duration;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use ecod::description::{DescriptionEffect, DescriptionExchange, DescriptionHistory, PUBLISH_INTERVAL, Statement};
+use ecod::description::{
+    DescriptionEffect, DescriptionExchange, DescriptionHistory, DescriptionStatement, PUBLISH_INTERVAL,
+};
 use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Leadership;
 use ecod::model::names::NodeName;
@@ -195,7 +197,7 @@ impl DescriptionKeeperState {
         if self.credentials.is_some() && certificate.is_none() {
             return Vec::new();
         }
-        self.exchange.hear(from, Statement { stamp, may_lead, certificate }, now)
+        self.exchange.hear(from, DescriptionStatement { stamp, may_lead, certificate }, now)
     }
 
     /// Goes back to the description before those of revoked nodes, when the list has changed. The last word of a node may

@@ -17,8 +17,8 @@ use rumqttc::Transport;
 use rumqttc::v5::MqttOptions;
 use uuid::Uuid;
 
-use crate::connection::Shared;
-use crate::streams::{Stream, Streams};
+use crate::connection::ConnectionState;
+use crate::streams::{MessageStream, Streams};
 use crate::{Error, Tls};
 
 /// Where a cell is, and who the program is.
@@ -93,7 +93,7 @@ impl Frame {
 pub struct Cell {
     name: NodeName,
     topics: Topics,
-    shared: Arc<Shared>,
+    shared: Arc<ConnectionState>,
     /// Reports of each kind so far.
     sent: Mutex<[u64; ReportKind::COUNT]>,
     timeout: Duration,
@@ -103,9 +103,9 @@ pub struct Cell {
 ///
 /// A slow reader gets the newest message next, and never a backlog. The loop ends when the cell is closed.
 pub struct Messages<M> {
-    shared: Arc<Shared>,
+    shared: Arc<ConnectionState>,
     filter: String,
-    stream: fn(&Streams) -> &Stream<M>,
+    stream: fn(&Streams) -> &MessageStream<M>,
     number: u64,
     timeout: Option<Duration>,
 }
@@ -159,7 +159,7 @@ impl Cell {
             options.set_transport(Transport::tls_with_config(tls.client()?.into()));
         }
         let topics = Topics::new(&cell);
-        let shared = Shared::connect(address.to_string(), topics.clone(), options, settings.timeout)?;
+        let shared = ConnectionState::connect(address.to_string(), topics.clone(), options, settings.timeout)?;
         Ok(Self { name, topics, shared, sent: Default::default(), timeout: settings.timeout })
     }
 
@@ -246,7 +246,7 @@ impl Cell {
         self.shared.close();
     }
 
-    fn read<M>(&self, level: &str, stream: fn(&Streams) -> &Stream<M>, is_retained: bool) -> Messages<M> {
+    fn read<M>(&self, level: &str, stream: fn(&Streams) -> &MessageStream<M>, is_retained: bool) -> Messages<M> {
         let filter = self.topics.filter(level);
         let mut state = self.shared.state();
         state.subscribe(&filter);

@@ -16,7 +16,7 @@ use crate::Error;
 use crate::streams::Streams;
 
 /// What the connection's thread and the program share.
-pub(crate) struct Shared {
+pub(crate) struct ConnectionState {
     /// Address of the broker as given, for messages.
     pub(crate) at: String,
     topics: Topics,
@@ -57,7 +57,7 @@ const RETRY_MAX: Duration = Duration::from_secs(5);
 /// Time to send what waits when the connection is closed.
 const FLUSH_TIMEOUT: Duration = Duration::from_secs(1);
 
-impl Shared {
+impl ConnectionState {
     /// Connects, and waits until the broker lets the program in.
     pub(crate) fn connect(
         at: String,

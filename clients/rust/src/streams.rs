@@ -15,16 +15,16 @@ use ecod::wire::{
 /// All payloads of one connection.
 #[derive(Debug, Default)]
 pub(crate) struct Streams {
-    pub(crate) maps: Stream<GlobalMap>,
-    pub(crate) verdicts: Stream<Verdicts>,
-    pub(crate) reputations: Stream<Reputations>,
-    pub(crate) statuses: Stream<NodeStatus>,
-    pub(crate) descriptions: Stream<CellDescription>,
+    pub(crate) maps: MessageStream<GlobalMap>,
+    pub(crate) verdicts: MessageStream<Verdicts>,
+    pub(crate) reputations: MessageStream<Reputations>,
+    pub(crate) statuses: MessageStream<NodeStatus>,
+    pub(crate) descriptions: MessageStream<CellDescription>,
 }
 
 /// One kind of payload: the newest, of statuses the newest of each node.
 #[derive(Debug)]
-pub(crate) struct Stream<M> {
+pub(crate) struct MessageStream<M> {
     newest: BTreeMap<Option<NodeName>, (u64, Arc<M>)>,
     number: u64,
     gate: EpochGate,
@@ -75,13 +75,13 @@ impl Streams {
     }
 }
 
-impl<M> Default for Stream<M> {
+impl<M> Default for MessageStream<M> {
     fn default() -> Self {
         Self { newest: BTreeMap::new(), number: 0, gate: EpochGate::default(), admitted_at: None }
     }
 }
 
-impl<M> Stream<M> {
+impl<M> MessageStream<M> {
     /// Takes a round, unless it is earlier than the last by epoch, aggregator and number.
     fn take(
         &mut self,

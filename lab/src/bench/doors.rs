@@ -106,7 +106,7 @@ pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorF
     let mut vehicle = NodeProcess::start(program, &vehicle, &directory)?;
     let door = serves(&mut vehicle).await?;
 
-    let [at_door, at_leader] = [Watcher::connect(door).await?, Watcher::connect(leader).await?];
+    let [at_door, at_leader] = [DoorWatcher::connect(door).await?, DoorWatcher::connect(leader).await?];
     at_door.first_map().await?;
     let [mut report_at_door, mut report_at_leader] = [Latencies::default(), Latencies::default()];
     for _ in 0..TURNS {
@@ -115,7 +115,7 @@ pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorF
         report_at_door.add(&report(door, &format!("{VEHICLE}--bench"), turn, &at_leader).await?);
     }
     let behind_node = behind_node(&map_log, &at_door)?;
-    let load = two_hop::Load { messages: 500, ..two_hop::Load::default() };
+    let load = two_hop::TwoHopLoad { messages: 500, ..two_hop::TwoHopLoad::default() };
     let hop_us = two_hop::raw(&door.into(), load).await?.value_at_quantile(0.5) as f64 / 2000.0;
     vehicle.stop().await;
     edge.stop().await;
@@ -177,27 +177,27 @@ async fn idle_memory(program: &Path, vehicle: &NodeConfig, directory: &Path) -> 
 }
 
 /// A plain client that reads maps.
-struct Watcher {
+struct DoorWatcher {
     /// The connection ends with it.
     _client: AsyncClient,
-    maps: Arc<Mutex<Vec<Arrival>>>,
+    maps: Arc<Mutex<Vec<DoorArrival>>>,
     task: AbortHandle,
 }
 
 #[derive(Debug, Clone)]
-struct Arrival {
+struct DoorArrival {
     epoch: u64,
     round: u64,
     oldest_capture: Option<Timestamp>,
     at: Timestamp,
 }
 
-impl Watcher {
+impl DoorWatcher {
     async fn connect(broker: SocketAddr) -> anyhow::Result<Self> {
         let topic = topics().path(&Topic::GlobalDetections);
         let id = format!("ecod-bench-watcher-{}", broker.port());
         let (client, events) = BrokerAccess::open(broker.into()).subscribed(&id, &[&topic]).await?;
-        let maps = Arc::<Mutex<Vec<Arrival>>>::default();
+        let maps = Arc::<Mutex<Vec<DoorArrival>>>::default();
         let task = tokio::spawn(watch(events, Arc::clone(&maps))).abort_handle();
         Ok(Self { _client: client, maps, task })
     }
@@ -211,24 +211,24 @@ impl Watcher {
         Ok(())
     }
 
-    fn maps(&self) -> Vec<Arrival> {
+    fn maps(&self) -> Vec<DoorArrival> {
         self.maps.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }
 
-impl Drop for Watcher {
+impl Drop for DoorWatcher {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
-async fn watch(mut events: EventLoop, maps: Arc<Mutex<Vec<Arrival>>>) {
+async fn watch(mut events: EventLoop, maps: Arc<Mutex<Vec<DoorArrival>>>) {
     while let Ok(event) = events.poll().await {
         let at = clock::now();
         let Event::Incoming(Packet::Publish(publish)) = event else { continue };
         if let Ok(map) = decode::<GlobalMap>(&publish.payload, &Limits::default()) {
             let GlobalMap { epoch, round, oldest_capture_us: oldest_capture, .. } = map;
-            let arrival = Arrival { epoch, round, oldest_capture, at };
+            let arrival = DoorArrival { epoch, round, oldest_capture, at };
             maps.lock().unwrap_or_else(PoisonError::into_inner).push(arrival);
         }
     }
@@ -239,7 +239,12 @@ fn topics() -> Topics {
 }
 
 /// Reports at a broker in a name for so long; the times until the watcher has the maps that rest on the reports.
-async fn report(broker: SocketAddr, name: &str, duration: Duration, watcher: &Watcher) -> anyhow::Result<Latencies> {
+async fn report(
+    broker: SocketAddr,
+    name: &str,
+    duration: Duration,
+    watcher: &DoorWatcher,
+) -> anyhow::Result<Latencies> {
     let name = NodeName::new(name)?;
     let topic = topics().path(&ReportKind::Detections.topic(name.clone()));
     let id = format!("ecod-bench-{name}");
@@ -268,7 +273,7 @@ async fn report(broker: SocketAddr, name: &str, duration: Duration, watcher: &Wa
     let (maps, mut latencies) = (watcher.maps(), Latencies::default());
     for captured_at in sent {
         // The leader's estimate of a clock is not exact to the microsecond.
-        let rests_on = |map: &&Arrival| map.oldest_capture.is_some_and(|oldest| oldest + PERIOD / 2 > captured_at);
+        let rests_on = |map: &&DoorArrival| map.oldest_capture.is_some_and(|oldest| oldest + PERIOD / 2 > captured_at);
         let answer = maps.iter().filter(|map| map.at >= captured_at).find(rests_on);
         latencies.take_time(answer.map(|map| map.at.since(captured_at)), LAST_MAP);
     }
@@ -276,13 +281,13 @@ async fn report(broker: SocketAddr, name: &str, duration: Duration, watcher: &Wa
 }
 
 /// Times by which the program at the door has each map later than its node.
-fn behind_node(map_log: &Path, at_door: &Watcher) -> anyhow::Result<Latencies> {
+fn behind_node(map_log: &Path, at_door: &DoorWatcher) -> anyhow::Result<Latencies> {
     // Before the log: the node writes a map there before its door passes it on.
     let at_door = at_door.maps();
     let text = fs::read_to_string(map_log).with_context(|| format!("cannot read {}", map_log.display()))?;
     let received = text.lines().filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
     let received: HashMap<_, _> = received.map(|map| ((map.map.epoch, map.map.round), map.received_at)).collect();
-    let delay = |Arrival { epoch, round, at, .. }: &Arrival| {
+    let delay = |DoorArrival { epoch, round, at, .. }: &DoorArrival| {
         let received_at =
             received.get(&(*epoch, *round)).context("a program has a map that its node did not accept")?;
         Ok(at.micros_from(*received_at))

@@ -38,7 +38,7 @@ pub struct Target {
 
 /// Result of a load.
 #[derive(Debug, Clone)]
-pub struct Measurement {
+pub struct BenchFigure {
     /// From when a round's last report was due to the map that rests on the reports of all, and to the verdicts of that
     /// round, at every vehicle.
     pub cell: Answers,
@@ -71,7 +71,7 @@ const LEAD_IN: Duration = Duration::from_millis(300);
 ///
 /// # Errors
 /// When the broker cannot be reached or no map comes.
-pub async fn measure(target: &Target, load: Load) -> anyhow::Result<Measurement> {
+pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure> {
     let load = Load { votes: load.votes && target.votes, ..load };
     let answer_bytes = Arc::new(AnswerBytes::default());
     let common = Arc::new(Common {
@@ -115,7 +115,7 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<Measurement>
     let [aggregator, own] = meters.map(|meter| meter.map(UsageMeter::stop));
     let (cell, bare) = gather(&vehicles, schedule, load).await;
     let [map_bytes, verdict_bytes] = answer_bytes.all();
-    Ok(Measurement {
+    Ok(BenchFigure {
         cell,
         bare,
         report_bytes: sent.report_bytes,

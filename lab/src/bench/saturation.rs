@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::latency::Quantiles;
 use super::load::Load;
-use super::measurement::{Measurement, Target, measure};
+use super::measurement::{BenchFigure, Target, measure};
 
 /// A load is carried while 99 of 100 answers take less, and none is missing.
 pub const LIMIT: Duration = Duration::from_millis(100);
@@ -100,7 +100,7 @@ pub async fn search(
 }
 
 impl Step {
-    fn new(vehicles: usize, target: &Target, measured: &Measurement) -> Self {
+    fn new(vehicles: usize, target: &Target, measured: &BenchFigure) -> Self {
         let map = measured.cell.map.quantiles();
         let verdict = target.votes.then(|| measured.cell.verdict.quantiles());
         let is_carried = |latency: &Quantiles| latency.missing == 0 && latency.p99_us < LIMIT.as_micros() as f64;
@@ -133,7 +133,7 @@ impl Step {
 
 impl Shares {
     /// Costs of a load.
-    pub fn of(measured: &Measurement) -> Self {
+    pub fn of(measured: &BenchFigure) -> Self {
         let aggregator = measured.aggregator.as_ref().map(|aggregator| {
             let broker = aggregator.percent_of(BROKER_THREAD);
             AggregatorShares { broker, fusion: aggregator.percent() - broker }

@@ -13,7 +13,7 @@ use super::access::BrokerAccess;
 
 /// Messages that are sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Load {
+pub struct TwoHopLoad {
     /// Number of messages; those of the first tenth warm up and are not counted.
     pub messages: u32,
     /// Time from one message to the next, whatever became of the last: a slow broker does not slow the load down.
@@ -22,7 +22,7 @@ pub struct Load {
     pub payload_bytes: usize,
 }
 
-impl Default for Load {
+impl Default for TwoHopLoad {
     /// 10 s of a report of ten objects every 10 ms.
     fn default() -> Self {
         Self { messages: 1000, interval: Duration::from_millis(10), payload_bytes: 1500 }
@@ -61,7 +61,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 ///
 /// # Errors
 /// [`TwoHopError`] when the broker cannot be reached or loses messages.
-pub async fn raw(broker: &BrokerAddress, load: Load) -> Result<Histogram<u64>, TwoHopError> {
+pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u64>, TwoHopError> {
     let error = |source| TwoHopError::Connection { broker: broker.clone(), source: Box::new(source) };
     let access = BrokerAccess::open(broker.clone());
     let (echoer, echo_events) = access.subscribed("ecod-bench-echo", &[OUT]).await.map_err(error)?;

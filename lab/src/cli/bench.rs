@@ -22,7 +22,7 @@ use crate::bench::aggregator::OwnAggregator;
 use crate::bench::doors::DoorFigures;
 use crate::bench::latency::{Answers, Latencies, Quantiles};
 use crate::bench::load::Load;
-use crate::bench::measurement::{Measurement, Target, measure};
+use crate::bench::measurement::{BenchFigure, Target, measure};
 use crate::bench::page;
 use crate::bench::saturation::{self, AggregatorShares, Saturation, Step};
 use crate::node_process::node_program;
@@ -231,7 +231,7 @@ async fn compare(target: &Target, arguments: &BenchArguments, figures: &mut Figu
             figures.goal(format!("vehicles_{vehicles}_{answer}_p50_ratio"), ways.p50_ratio, MAX_RATIO);
             figures.goal(format!("vehicles_{vehicles}_{answer}_p99_ratio"), ways.p99_ratio, MAX_RATIO);
         }
-        let Measurement { report_bytes, map_bytes, verdict_bytes, refused, latest, .. } = last;
+        let BenchFigure { report_bytes, map_bytes, verdict_bytes, refused, latest, .. } = last;
         let sent_late_us = latest.as_micros();
         let comparison = Comparison { map, verdict, report_bytes, map_bytes, verdict_bytes, refused, sent_late_us };
         figures.vehicles.insert(vehicles, comparison);

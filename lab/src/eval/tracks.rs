@@ -27,7 +27,7 @@ use nalgebra::Point2;
 use serde::Serialize;
 use uuid::Uuid;
 
-pub use calibration::{Calibration, Reliability, ReliabilityBin};
+pub use calibration::{Reliability, ReliabilityBin, ReliabilityBins};
 pub use truth::{TrackTruth, TrackTruthError};
 
 use super::formats::{Sequence, time_of};
@@ -107,7 +107,7 @@ pub struct TrackScores {
     /// At [`DEFAULT_THRESHOLD`].
     pub at_default: ThresholdScores,
     /// Calibration of the stated probabilities, whatever the threshold.
-    pub calibration: Calibration,
+    pub calibration: ReliabilityBins,
 }
 
 /// Figures of the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes

@@ -25,19 +25,19 @@ const VACANT: &str = "EMPTY";
 /// `item,truth`, of which an empty truth is null.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Truth {
-    landmarks: BTreeMap<LandmarkId, Vec<Span>>,
+    landmarks: BTreeMap<LandmarkId, Vec<LabelSpan>>,
     empty: BTreeSet<Label>,
 }
 
 /// Truth from a time on.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Span {
+pub(super) struct LabelSpan {
     from: Timestamp,
     /// Any of these is right; the first names it. `None` is nothing.
     accepted: Vec<Option<Label>>,
 }
 
-impl Span {
+impl LabelSpan {
     /// The first accepted label, `None` where nothing stands.
     pub(super) fn name(&self) -> Option<&Label> {
         self.accepted.first().and_then(Option::as_ref)
@@ -96,7 +96,7 @@ impl Truth {
             let found: String = text.lines().next().unwrap_or_default().chars().take(MAX_NAME_BYTES).collect();
             return Err(TruthError::NeitherForm(format!("the first line is {found:?}")));
         }
-        let mut landmarks: BTreeMap<LandmarkId, Vec<Span>> = BTreeMap::new();
+        let mut landmarks: BTreeMap<LandmarkId, Vec<LabelSpan>> = BTreeMap::new();
         for row in table.records() {
             let row = row.map_err(broken)?;
             let item = row.get(0).unwrap_or_default();
@@ -108,7 +108,7 @@ impl Truth {
             if let Some(truth) = truth.as_ref().filter(|truth| !is_label(truth)) {
                 return Err(location(item, format!("is {truth:?}, no label: is a quotation mark missing?")));
             }
-            let span = vec![Span { from: Timestamp(0), accepted: vec![truth] }];
+            let span = vec![LabelSpan { from: Timestamp(0), accepted: vec![truth] }];
             if landmarks.insert(name(item)?, span.clone()).is_some_and(|earlier| earlier != span) {
                 return Err(location(item, "is given twice and differs"));
             }
@@ -117,18 +117,18 @@ impl Truth {
     }
 
     /// Truth at a location, with the position of its span among the location's; `None` where none is known.
-    pub(super) fn at(&self, landmark: &LandmarkId, time: Timestamp) -> Option<(usize, &Span)> {
+    pub(super) fn at(&self, landmark: &LandmarkId, time: Timestamp) -> Option<(usize, &LabelSpan)> {
         let spans = self.landmarks.get(landmark)?;
         spans.iter().enumerate().rev().find(|(_, span)| span.from <= time)
     }
 
     /// Every span of every location.
-    pub(super) fn spans(&self) -> impl Iterator<Item = (&LandmarkId, usize, &Span)> {
+    pub(super) fn spans(&self) -> impl Iterator<Item = (&LandmarkId, usize, &LabelSpan)> {
         self.landmarks.iter().flat_map(|(id, spans)| spans.iter().enumerate().map(move |(n, span)| (id, n, span)))
     }
 
     /// True if the label, or none, is right.
-    pub(super) fn accepts(&self, span: &Span, label: Option<&Label>) -> bool {
+    pub(super) fn accepts(&self, span: &LabelSpan, label: Option<&Label>) -> bool {
         let said_empty = label.is_some_and(|label| self.empty.contains(label));
         span.accepted.iter().any(|right| right.as_ref() == label || (right.is_none() && said_empty))
     }
@@ -141,16 +141,16 @@ struct SpanFields {
     label: Value,
 }
 
-fn spans(landmark: &str, value: &Value) -> Result<Vec<Span>, TruthError> {
+fn spans(landmark: &str, value: &Value) -> Result<Vec<LabelSpan>, TruthError> {
     let timed = value.as_array().filter(|items| items.iter().any(Value::is_object));
     let Some(timed) = timed else {
-        return Ok(vec![Span { from: Timestamp(0), accepted: accepted(landmark, value)? }]);
+        return Ok(vec![LabelSpan { from: Timestamp(0), accepted: accepted(landmark, value)? }]);
     };
     let mut spans = Vec::with_capacity(timed.len());
     for item in timed {
         let SpanFields { from_us, label } =
             SpanFields::deserialize(item).map_err(|error| location(landmark, format!("cannot be read: {error}")))?;
-        spans.push(Span { from: from_us, accepted: accepted(landmark, &label)? });
+        spans.push(LabelSpan { from: from_us, accepted: accepted(landmark, &label)? });
     }
     if spans.is_sorted_by(|a, b| a.from < b.from) { Ok(spans) } else { Err(location(landmark, "goes back in time")) }
 }

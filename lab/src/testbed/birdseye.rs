@@ -76,13 +76,13 @@ fn check(scene: &Scene, detections: &[(NodeName, Point2<f64>)], map: Option<&Glo
 
 /// Comparison of a spot's label in the map with the truth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Judgement {
+enum MarkKind {
     Right,
     Wrong,
     Unknown,
 }
 
-impl Judgement {
+impl MarkKind {
     fn of(is_right: Option<bool>) -> Self {
         match is_right {
             None => Self::Unknown,
@@ -114,7 +114,7 @@ impl Judgement {
     }
 }
 
-/// Fill of each vehicle in turn: the colours of Okabe and Ito that are not kin to those of a [`Judgement`].
+/// Fill of each vehicle in turn: the colours of Okabe and Ito that are not kin to those of a [`MarkKind`].
 const VEHICLE_COLORS: [&str; 5] = ["#0072b2", "#e69f00", "#cc79a7", "#56b4e9", "#000000"];
 const INK: &str = "#222222";
 const FAINT: &str = "#8a8a8a";
@@ -163,7 +163,7 @@ impl Picture<'_> {
     }
 
     fn title(&self) -> Group {
-        let right = self.scene.spots.iter().filter(|spot| self.judge(spot) == Judgement::Right).count();
+        let right = self.scene.spots.iter().filter(|spot| self.judge(spot) == MarkKind::Right).count();
         let all = self.scene.spots.len();
         let share = match self.map {
             Some(_) if all > 0 => {
@@ -330,7 +330,7 @@ impl Picture<'_> {
         entry(stroke(5.0), "plate of a parked vehicle");
         entry(stroke(1.5), "EMPTY placard");
         for (judgement, words) in
-            [(Judgement::Right, "agreed, right"), (Judgement::Wrong, "agreed, wrong"), (Judgement::Unknown, "unknown")]
+            [(MarkKind::Right, "agreed, right"), (MarkKind::Wrong, "agreed, wrong"), (MarkKind::Unknown, "unknown")]
         {
             entry(judgement.mark(0.0, 0.0), words);
         }
@@ -352,8 +352,8 @@ impl Picture<'_> {
         spot.truth.as_ref().unwrap_or(&self.testbed.placard.empty_text)
     }
 
-    fn judge(&self, spot: &Spot) -> Judgement {
-        Judgement::of(self.state(spot).and_then(|state| is_right(self.testbed, spot, state)))
+    fn judge(&self, spot: &Spot) -> MarkKind {
+        MarkKind::of(self.state(spot).and_then(|state| is_right(self.testbed, spot, state)))
     }
 }
 

@@ -96,7 +96,7 @@ struct RecordingFields {
     #[serde(default)]
     units: UnitFields,
     camera: CameraFields,
-    objects: Vec<ObjectFields>,
+    objects: Vec<RecordedFields>,
     cavs: Vec<CavFields>,
     #[serde(default)]
     bounding_box_order: Option<String>,
@@ -104,7 +104,7 @@ struct RecordingFields {
 }
 
 #[derive(Deserialize)]
-struct ObjectFields {
+struct RecordedFields {
     id: String,
     position: [f64; 2],
     accepted_labels: Vec<String>,
@@ -157,7 +157,7 @@ impl RecordingFields {
     }
 }
 
-impl ObjectFields {
+impl RecordedFields {
     fn check(self, index: usize, place: &KeyPath) -> Result<KnownObject, TestbedError> {
         let key = |name: &str| format!("objects[{index}].{name}");
         if self.accepted_labels.is_empty() {

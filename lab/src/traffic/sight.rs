@@ -7,7 +7,7 @@ use super::roads::Building;
 
 /// Something that stands or moves on the ground.
 #[derive(Debug, Clone)]
-pub(super) struct Body {
+pub(super) struct TrafficBody {
     pub(super) label: &'static str,
     pub(super) center: Point2<f64>,
     pub(super) heading_rad: f64,
@@ -33,7 +33,7 @@ pub(super) struct Sight {
 }
 
 /// Bodies within `range_m` of a place, and how much of each is seen from there; the one at the place itself is not.
-pub(super) fn sights(from: Point2<f64>, bodies: &[Body], buildings: &[Building], range_m: f64) -> Vec<Sight> {
+pub(super) fn sights(from: Point2<f64>, bodies: &[TrafficBody], buildings: &[Building], range_m: f64) -> Vec<Sight> {
     let mut sights: Vec<Sight> =
         (0..bodies.len()).filter_map(|body| Sight::towards(from, body, &bodies[body], range_m)).collect();
     sights.sort_by(|a, b| a.range_m.total_cmp(&b.range_m));
@@ -47,7 +47,7 @@ pub(super) fn sights(from: Point2<f64>, bodies: &[Body], buildings: &[Building],
 }
 
 impl Sight {
-    fn towards(from: Point2<f64>, body: usize, of: &Body, limit_m: f64) -> Option<Self> {
+    fn towards(from: Point2<f64>, body: usize, of: &TrafficBody, limit_m: f64) -> Option<Self> {
         let offset = of.center - from;
         let range_m = offset.norm();
         if range_m > limit_m || range_m == 0.0 {
@@ -93,12 +93,20 @@ mod tests {
     use super::super::roads::Roads;
     use super::*;
 
-    fn car(x: f64, y: f64) -> Body {
+    fn car(x: f64, y: f64) -> TrafficBody {
         let center = Point2::new(x, y);
-        Body { label: "car", center, heading_rad: 0.0, speed_mps: 0.0, length_m: 4.0, width_m: 2.0, is_opaque: true }
+        TrafficBody {
+            label: "car",
+            center,
+            heading_rad: 0.0,
+            speed_mps: 0.0,
+            length_m: 4.0,
+            width_m: 2.0,
+            is_opaque: true,
+        }
     }
 
-    fn share(bodies: &[Body], body: usize) -> f64 {
+    fn share(bodies: &[TrafficBody], body: usize) -> f64 {
         let buildings = Roads { count: 2, block_m: 80.0 }.buildings();
         sights(bodies[0].center, bodies, &buildings, 100.0).into_iter().find(|sight| sight.body == body).unwrap().share
     }

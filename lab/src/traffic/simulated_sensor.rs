@@ -11,7 +11,7 @@ use nalgebra::{Point2, Vector2};
 
 use super::config::{SaidConfig, TrafficConfig};
 use super::dice::{Dice, Drift};
-use super::sight::{Body, Sight};
+use super::sight::{Sight, TrafficBody};
 
 /// Correlation times in seconds of what an observer makes of an object, and of its pose error.
 const GLANCE_S: f64 = 0.8;
@@ -68,7 +68,7 @@ struct Found {
 /// Surroundings of an observer.
 pub(super) struct Surroundings<'a> {
     pub(super) pose: Pose,
-    pub(super) bodies: &'a [Body],
+    pub(super) bodies: &'a [TrafficBody],
     pub(super) sights: &'a [Sight],
     /// Places that look like an object, in view.
     pub(super) lures: &'a [Point2<f64>],
@@ -216,7 +216,7 @@ impl SimulatedSensor {
 fn describe(
     said: &SaidConfig,
     object: &mut PerceivedObject,
-    body: Option<&Body>,
+    body: Option<&TrafficBody>,
     turned_rad: f64,
     dice: &mut Dice<'_>,
 ) {

@@ -7,7 +7,7 @@ use crate::model::time::Timestamp;
 
 /// The latest exchanges with one node. The one with the least error counts.
 #[derive(Debug, Clone, Default)]
-pub struct OffsetFilter(VecDeque<Sample>);
+pub struct OffsetFilter(VecDeque<OffsetSample>);
 
 /// The four stamps of an exchange: this node sends, the other receives, the other sends, this node receives.
 #[derive(Debug, Clone, Copy)]
@@ -27,7 +27,7 @@ pub(super) struct Offset {
 }
 
 #[derive(Debug, Clone)]
-struct Sample {
+struct OffsetSample {
     offset_us: i64,
     /// Time on the way, there and back.
     delay_us: u64,
@@ -43,12 +43,13 @@ impl OffsetFilter {
         if self.0.len() >= SAMPLES {
             self.0.pop_front();
         }
-        self.0.push_back(Sample { offset_us, delay_us, at: t4 });
+        self.0.push_back(OffsetSample { offset_us, delay_us, at: t4 });
     }
 
     /// The offset by the best exchange, counting drift since then.
     pub(super) fn best(&self, now: Timestamp) -> Option<Offset> {
-        let error = |sample: &Sample| sample.delay_us / 2 + now.since(sample.at).as_micros() as u64 * DRIFT / 1_000_000;
+        let error =
+            |sample: &OffsetSample| sample.delay_us / 2 + now.since(sample.at).as_micros() as u64 * DRIFT / 1_000_000;
         let best = self.0.iter().min_by_key(|sample| error(sample))?;
         let error_us = u32::try_from(error(best)).unwrap_or(u32::MAX);
         (Duration::from_micros(error_us.into()) <= MAX_ERROR).then_some(Offset { offset_us: best.offset_us, error_us })

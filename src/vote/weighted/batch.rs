@@ -1,7 +1,7 @@
 //! Batch estimation: all stored votes are judged together, whatever their order of arrival.
 
 use super::{START_SWEEPS, WeightedVoting};
-use crate::vote::calibration::Calibration;
+use crate::vote::calibration::ConfidenceCalibration;
 use crate::vote::dependence::Dependence;
 
 /// Log loss per vote, in nats, by which passes may predict votes worse than their start.
@@ -14,7 +14,7 @@ impl WeightedVoting {
     /// Judging in turn is the better start: each landmark is judged without its own votes in the evidence.
     pub(super) fn judge_all(&mut self, passes: u32) {
         let mut dependence = Dependence::of_stored();
-        let mut calibration = Calibration::new(self.config.calibration_votes);
+        let mut calibration = ConfidenceCalibration::new(self.config.calibration_votes);
         let mut by_name = vec![0; self.names.len()];
         self.vehicles.values().enumerate().for_each(|(rank, &vehicle)| by_name[vehicle] = rank);
         for landmark_votes in self.landmarks.values_mut() {

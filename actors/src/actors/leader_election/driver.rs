@@ -295,8 +295,8 @@ impl ElectionDriver {
 }
 
 /// A member as the node's leadership wants to know it.
-fn as_seen(member: &Member) -> node::Member {
-    node::Member {
+fn as_seen(member: &Member) -> node::KnownMember {
+    node::KnownMember {
         name: member.name.clone(),
         run: member.run,
         broker: member.broker.map(BrokerAddress::from),

@@ -17,7 +17,7 @@ const CONFIDENCE_DISTANCE_M: f64 = 1.5;
 
 /// Calibration of the probabilities of a map.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Calibration {
+pub struct ReliabilityBins {
     /// Of `confidence`: right if a true object is within 1.5 m.
     pub confidence: Reliability,
     /// Of `existence`, which says nothing of the place: right if a true object is within 4 m. Absent if none is stated.
@@ -45,9 +45,9 @@ pub struct ReliabilityBin {
     pub objects: u64,
 }
 
-pub(super) fn judge(frames: &[Frame]) -> Calibration {
+pub(super) fn judge(frames: &[Frame]) -> ReliabilityBins {
     let states_existence = frames.iter().flat_map(|frame| &frame.said).any(|said| said.existence.is_some());
-    Calibration {
+    ReliabilityBins {
         confidence: reliability(frames, CONFIDENCE_DISTANCE_M, |said| Some(said.score)),
         existence: states_existence.then(|| reliability(frames, ZERO_DISTANCE_M, |said| said.existence)),
     }

@@ -8,7 +8,7 @@
 
 use hashbrown::HashMap;
 
-use super::matching::{Pair, best, near_pairs};
+use super::matching::{MatchedPair, best, near_pairs};
 use super::{Frame, MATCH_DISTANCE_M, ZERO_DISTANCE_M};
 
 /// Counts of a whole sequence.
@@ -30,7 +30,7 @@ pub(super) fn judge(frames: &[Frame]) -> Clear {
     // By true identity the identity it matched in the frame before, and at last.
     let (mut before, mut last): (HashMap<u32, u32>, HashMap<u32, u32>) = Default::default();
     for frame in frames {
-        let ids = |pair: &Pair| (frame.truth[pair.truth].id, frame.said[pair.said].id);
+        let ids = |pair: &MatchedPair| (frame.truth[pair.truth].id, frame.said[pair.said].id);
         let mut pairs = near_pairs(frame, MATCH_DISTANCE_M);
         for pair in &mut pairs {
             let (truth, said) = ids(pair);

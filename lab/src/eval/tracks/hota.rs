@@ -6,7 +6,7 @@
 
 use hashbrown::HashMap;
 
-use super::matching::{Pair, best, near_pairs};
+use super::matching::{MatchedPair, best, near_pairs};
 use super::{Frame, ZERO_DISTANCE_M};
 
 /// Means over all thresholds, 0 to 1.
@@ -37,13 +37,13 @@ struct AtThreshold {
 }
 
 pub(super) fn judge(frames: &[Frame]) -> Hota {
-    let similar: Vec<Vec<Pair>> = frames.iter().map(similarities).collect();
+    let similar: Vec<Vec<MatchedPair>> = frames.iter().map(similarities).collect();
     let lives = Lives::of(frames, &similar);
     let mut at: Vec<AtThreshold> = TWENTIETHS.map(|_| AtThreshold::default()).collect();
     for (frame, pairs) in frames.iter().zip(&similar) {
-        let ids = |pair: &Pair| (frame.truth[pair.truth].id, frame.said[pair.said].id);
-        let worth: Vec<Pair> =
-            pairs.iter().map(|pair| Pair { value: pair.value * lives.overlap(ids(pair)), ..*pair }).collect();
+        let ids = |pair: &MatchedPair| (frame.truth[pair.truth].id, frame.said[pair.said].id);
+        let worth: Vec<MatchedPair> =
+            pairs.iter().map(|pair| MatchedPair { value: pair.value * lives.overlap(ids(pair)), ..*pair }).collect();
         for chosen in best(&worth) {
             let distance = (frame.truth[chosen.truth].position - frame.said[chosen.said].position).norm();
             let similarity = 1.0 - distance / ZERO_DISTANCE_M;
@@ -61,14 +61,14 @@ pub(super) fn judge(frames: &[Frame]) -> Hota {
     Hota { hota: mean(|s| s.hota), deta: mean(|s| s.deta), assa: mean(|s| s.assa), loca: mean(|s| s.loca) }
 }
 
-fn similarities(frame: &Frame) -> Vec<Pair> {
+fn similarities(frame: &Frame) -> Vec<MatchedPair> {
     let mut pairs = near_pairs(frame, ZERO_DISTANCE_M);
     pairs.iter_mut().for_each(|pair| pair.value = 1.0 - pair.value / ZERO_DISTANCE_M);
     pairs
 }
 
 impl Lives {
-    fn of(frames: &[Frame], similar: &[Vec<Pair>]) -> Self {
+    fn of(frames: &[Frame], similar: &[Vec<MatchedPair>]) -> Self {
         let mut lives = Self::default();
         for (frame, pairs) in frames.iter().zip(similar) {
             let (mut of_truth, mut of_said) = (vec![0.0; frame.truth.len()], vec![0.0; frame.said.len()]);

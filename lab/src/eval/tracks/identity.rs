@@ -5,37 +5,37 @@
 
 use hashbrown::HashMap;
 
-use super::matching::{Pair, best, near_pairs};
+use super::matching::{MatchedPair, best, near_pairs};
 use super::{Frame, MATCH_DISTANCE_M};
 
 /// Counts of a whole sequence.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Identity {
+pub(super) struct IdentityScore {
     /// Objects said that bear the identity matched to the true one.
     true_positives: u64,
     /// True objects and objects said, together.
     all: u64,
 }
 
-impl Identity {
+impl IdentityScore {
     /// Twice the right ones by all; zero if there is nothing.
     pub(super) fn f1(&self) -> f64 {
         2.0 * self.true_positives as f64 / self.all.max(1) as f64
     }
 }
 
-pub(super) fn judge(frames: &[Frame]) -> Identity {
+pub(super) fn judge(frames: &[Frame]) -> IdentityScore {
     let mut together: HashMap<(u32, u32), u64> = HashMap::new();
     for frame in frames {
         for pair in near_pairs(frame, MATCH_DISTANCE_M) {
             *together.entry((frame.truth[pair.truth].id, frame.said[pair.said].id)).or_default() += 1;
         }
     }
-    let mut pairs: Vec<Pair> = together
+    let mut pairs: Vec<MatchedPair> = together
         .into_iter()
-        .map(|((truth, said), count)| Pair { truth: truth as usize, said: said as usize, value: count as f64 })
+        .map(|((truth, said), count)| MatchedPair { truth: truth as usize, said: said as usize, value: count as f64 })
         .collect();
     pairs.sort_unstable_by_key(|pair| (pair.truth, pair.said));
     let all = frames.iter().map(|frame| (frame.truth.len() + frame.said.len()) as u64).sum();
-    Identity { true_positives: best(&pairs).iter().map(|pair| pair.value as u64).sum(), all }
+    IdentityScore { true_positives: best(&pairs).iter().map(|pair| pair.value as u64).sum(), all }
 }

@@ -6,7 +6,7 @@ use super::{Frame, SaidObject, TrueObject};
 
 /// A true object and one that was said, by their places in a frame or in a table of identities.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Pair {
+pub(super) struct MatchedPair {
     pub(super) truth: usize,
     pub(super) said: usize,
     /// Similarity of the pair, or its distance.
@@ -20,11 +20,11 @@ pub(super) fn distance_m(truth: &TrueObject, said: &SaidObject, limit_m: f64) ->
 }
 
 /// All pairs of a frame within `limit_m`, with their distance.
-pub(super) fn near_pairs(frame: &Frame, limit_m: f64) -> Vec<Pair> {
+pub(super) fn near_pairs(frame: &Frame, limit_m: f64) -> Vec<MatchedPair> {
     let mut pairs = Vec::new();
     for (said, object) in frame.said.iter().enumerate() {
         let of_said = frame.truth.iter().enumerate().filter_map(|(truth, candidate)| {
-            distance_m(candidate, object, limit_m).map(|value| Pair { truth, said, value })
+            distance_m(candidate, object, limit_m).map(|value| MatchedPair { truth, said, value })
         });
         pairs.extend(of_said);
     }
@@ -32,11 +32,11 @@ pub(super) fn near_pairs(frame: &Frame, limit_m: f64) -> Vec<Pair> {
 }
 
 /// The one-to-one choice of pairs whose values have the greatest sum; pairs worth nothing are never chosen.
-pub(super) fn best(pairs: &[Pair]) -> Vec<Pair> {
+pub(super) fn best(pairs: &[MatchedPair]) -> Vec<MatchedPair> {
     assign(pairs.iter().copied().filter(|pair| pair.benefit() > 0).collect(), |_, _| None)
 }
 
-impl Candidate for Pair {
+impl Candidate for MatchedPair {
     fn row(&self) -> u32 {
         self.truth as u32
     }

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 
 use ecod::model::names::Label;
 
-use super::matching::{Pair, near_pairs};
+use super::matching::{MatchedPair, near_pairs};
 use super::{AP_DISTANCES_M, Frame, MATCH_DISTANCE_M};
 
 /// The threshold at which F1 is greatest.
@@ -34,7 +34,8 @@ pub(super) fn by_class(frames: &[Frame]) -> BTreeMap<Label, [Option<f64>; AP_DIS
     for (place, limit_m) in AP_DISTANCES_M.into_iter().enumerate() {
         let verdicts = verdicts(frames, limit_m);
         for (label, ap_pct) in &mut classes {
-            let of_class: Vec<Verdict> = verdicts.iter().filter(|verdict| verdict.label == label).copied().collect();
+            let of_class: Vec<RankedObject> =
+                verdicts.iter().filter(|verdict| verdict.label == label).copied().collect();
             ap_pct[place] = Some(100.0 * average_precision(&curve(of_class, objects[label])));
         }
     }
@@ -57,7 +58,7 @@ pub(super) fn best_f1(frames: &[Frame]) -> Option<BestF1> {
 
 /// True if a reported object took a true one.
 #[derive(Debug, Clone, Copy)]
-struct Verdict<'a> {
+struct RankedObject<'a> {
     label: &'a Label,
     score: f64,
     is_right: bool,
@@ -71,10 +72,10 @@ struct Point {
     recall: f64,
 }
 
-fn verdicts(frames: &[Frame], limit_m: f64) -> Vec<Verdict<'_>> {
+fn verdicts(frames: &[Frame], limit_m: f64) -> Vec<RankedObject<'_>> {
     let mut verdicts = Vec::new();
     for frame in frames {
-        let mut by_said: Vec<Vec<Pair>> = vec![Vec::new(); frame.said.len()];
+        let mut by_said: Vec<Vec<MatchedPair>> = vec![Vec::new(); frame.said.len()];
         for pair in near_pairs(frame, limit_m) {
             by_said[pair.said].push(pair);
         }
@@ -88,13 +89,13 @@ fn verdicts(frames: &[Frame], limit_m: f64) -> Vec<Verdict<'_>> {
                 taken[pair.truth] = true;
             }
             let object = &frame.said[said];
-            verdicts.push(Verdict { label: &object.label, score: object.score, is_right: nearest.is_some() });
+            verdicts.push(RankedObject { label: &object.label, score: object.score, is_right: nearest.is_some() });
         }
     }
     verdicts
 }
 
-fn curve(mut verdicts: Vec<Verdict<'_>>, objects: u64) -> Vec<Point> {
+fn curve(mut verdicts: Vec<RankedObject<'_>>, objects: u64) -> Vec<Point> {
     verdicts.sort_by(|a, b| b.score.total_cmp(&a.score));
     let (mut right, mut all) = (0u64, 0u64);
     let mut points = Vec::new();

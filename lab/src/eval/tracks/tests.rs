@@ -2,7 +2,7 @@ use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::wire::{FusedObject, SCHEMA_VERSION};
 
-use super::matching::Pair;
+use super::matching::MatchedPair;
 use super::*;
 
 fn truth(id: u32, x: f64) -> TrueObject {
@@ -132,7 +132,7 @@ fn calibration_is_that_worked_out_by_hand() {
             said(4, 21.0, 0.05),
         ],
     };
-    let Calibration { confidence, existence } = score(&[frame]).calibration;
+    let ReliabilityBins { confidence, existence } = score(&[frame]).calibration;
     assert_eq!(existence, None);
     near(confidence.ece_pct, 100.0 * (3.0 * (0.95 - 2.0 / 3.0) + 0.55 + 0.95) / 5.0);
     let bins: Vec<_> =
@@ -142,7 +142,7 @@ fn calibration_is_that_worked_out_by_hand() {
     let mut exists = said(0, 3.0, 0.5);
     exists.existence = Some(1.0);
     let frame = Frame { truth: vec![truth(0, 0.0)], said: vec![exists, said(1, 50.0, 0.1)] };
-    let Calibration { confidence, existence } = score(&[frame]).calibration;
+    let ReliabilityBins { confidence, existence } = score(&[frame]).calibration;
     near(confidence.ece_pct, 30.0);
     near(existence.unwrap().ece_pct, 0.0);
     assert_eq!(score(&[]).calibration.confidence.ece_pct, None);
@@ -162,7 +162,7 @@ fn a_match_is_kept_while_it_is_near_enough() {
 
 #[test]
 fn the_matching_has_the_greatest_sum_however_many_contest() {
-    let pair = |truth, said, value| Pair { truth, said, value };
+    let pair = |truth, said, value| MatchedPair { truth, said, value };
     let pairs = [
         pair(0, 0, 0.9),
         pair(0, 1, 0.8),
