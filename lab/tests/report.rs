@@ -169,3 +169,61 @@ fn a_report_of_the_open_world_is_about_objects() {
     assert!(html.contains("in 20 frames.") && html.contains("AP@0.5 %") && html.contains("HOTA %"), "{html}");
     assert_row(&html, &["all", "20", "40"]);
 }
+
+/// The data of map and timeline in a page.
+fn timeline(html: &str) -> Value {
+    let data = html.split_once("id=\"log-data\">").unwrap().1.split_once("</script>").unwrap().0;
+    serde_json::from_str(data).unwrap()
+}
+
+/// A map of a leader.
+fn map(leader: &str, epoch: u64, round: u64, fused_at_us: u64) -> Value {
+    json!({ "schema": 1, "aggregator": leader, "epoch": epoch, "round": round, "fused_at_us": fused_at_us,
+        "landmarks": [], "objects": [] })
+}
+
+/// A node that was started again with its clock an hour back, a log that was silent for a while under the same leader,
+/// and a leader that came back: all are in order, by the cell's time.
+#[test]
+fn a_timeline_is_in_order_whatever_happened_to_clocks_leaders_and_log() {
+    let folder = tempfile::tempdir().unwrap();
+    let [before, after] = ["1.mcap", "2.mcap"].map(|name| folder.path().join(name));
+    let status = |node: &str, state: &str, troubles: Value| {
+        json!({ "schema": 1, "node": node, "id": uuid::Uuid::from_u128(7), "role": "auto", "state": state, "epoch": 1,
+            "version": "0.1.0", "troubles": troubles })
+    };
+    let mut log = Log::begin(&before, 1);
+    let second = |n: u64| BEGIN_US + n * 1_000_000;
+    for n in (0..5).chain(40..45) {
+        log.put("ecod.GlobalMap", "global_detections", second(n), &map("edge", 1, n, second(n) - 5000));
+    }
+    let trouble = json!([{ "kind": "clock_off", "about": "late", "cause": "</script>5 s ahead", "remedy": "chrony" }]);
+    log.put("ecod.NodeStatus", "nodes/edge", second(44), &status("edge", "aggregating", trouble));
+    log.finish();
+    let mut log = Log::begin(&after, 2);
+    let hour_us = 3_600_000_000;
+    log.put("ecod.NodeStatus", "nodes/edge", second(50) - hour_us, &status("edge", "offline", json!([])));
+    for n in 50..55 {
+        let leader = if n < 53 { "gauss" } else { "edge" };
+        log.put("ecod.GlobalMap", "global_detections", second(n) - hour_us, &map(leader, n / 53 + 2, n, second(n)));
+    }
+    log.finish();
+    // The later file first, as its name may have it.
+    let html = page(&[&after, &before], r#"{"landmarks": {"a": "car"}}"#);
+    let told = timeline(&html);
+    let terms: Vec<_> = told["reigns"].as_array().unwrap().iter().collect();
+    let leaders: Vec<_> = terms.iter().map(|term| term["leader"].as_str().unwrap()).collect();
+    assert_eq!(leaders, ["edge", "edge", "gauss", "edge"], "no band where the log has nothing");
+    assert_eq!((&terms[1]["from_us"], &terms[1]["until_us"]), (&second(40).into(), &second(44).into()));
+    assert_eq!(terms[3]["gap_ms"], 1000);
+    let texts: Vec<_> =
+        told["events"].as_array().unwrap().iter().map(|event| event["text"].as_str().unwrap()).collect();
+    let expected =
+        ["the log has nothing of the 36 s before", "edge joined", "late: </script>5 s ahead. Remedy: chrony"];
+    assert_eq!(texts, expected, "{told}");
+    let times: Vec<_> = told["frames"].as_array().unwrap().iter().map(|time| time.as_u64().unwrap()).collect();
+    assert!(times.len() == 15 && times.is_sorted(), "{times:?}");
+    let scenes = told["scenes"].as_array().unwrap();
+    let rounds: Vec<_> = scenes.iter().map(|scene| scene["map"]["message"]["round"].as_u64().unwrap()).collect();
+    assert!(rounds.is_sorted() && rounds.len() == 15, "{rounds:?}");
+}

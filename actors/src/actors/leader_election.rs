@@ -36,6 +36,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::observe::readiness::SharedFacts;
+use crate::observe::recorder::LogSender;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
@@ -59,6 +60,8 @@ pub struct Parts {
     pub broker: ActorSlot<BrokerMessage>,
     /// Shows the node's status to programs.
     pub door: Door,
+    /// Gets the node's status for the log.
+    pub recording: LogSender,
     /// Settings of the cell, and whether the node uses them.
     pub shared: watch::Receiver<SharedFacts>,
 }

@@ -15,6 +15,7 @@ pub(crate) mod response_cache;
 pub(crate) mod routes;
 pub(crate) mod server;
 pub(crate) mod snapshot;
+pub(crate) mod timeline;
 
 pub use assets::paths as page_paths;
 pub use config::{DEFAULT_ADDRESS, DashboardConfig};

@@ -1,4 +1,4 @@
-//! Report about a log as one HTML page: leadership, latency and gaps of rounds, reputations, coverage, losses.
+//! Report about a log as one HTML page, in the cell's time: map and timeline, leadership, latency and gaps of rounds, reputations, coverage, losses.
 //!
 //! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`]. A [`Section`] adds to the page.
 
@@ -6,6 +6,7 @@ mod losses;
 mod page;
 mod plot;
 mod series;
+mod timeline;
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -25,6 +26,7 @@ use crate::observe::recorder::{
 };
 use losses::Losses;
 use series::Samples;
+use timeline::{GAP, LogTimeline, Picture, cell_offset_us};
 
 /// Additional section of the page, made from the messages of the log in their order.
 pub trait Section: Debug {
@@ -57,6 +59,9 @@ pub struct Report {
     entries: u64,
     reputations: BTreeMap<NodeName, Samples>,
     losses: Losses,
+    timeline: LogTimeline,
+    /// From the clock of the recording node to the cell's time in the present file.
+    offset_us: i64,
     sections: Vec<Box<dyn Section>>,
 }
 
@@ -73,7 +78,7 @@ struct RoundTimes {
     fused_to_received: Vec<f64>,
 }
 
-/// Consecutive rounds of one leader in one term.
+/// Consecutive rounds of one leader in one term, each less than [`GAP`] after the one before.
 #[derive(Debug, Clone, PartialEq)]
 struct LeaderRounds {
     epoch: Epoch,
@@ -105,6 +110,7 @@ impl Report {
     /// # Errors
     /// [`LogError::Unreadable`].
     pub fn file(&mut self, path: &Path) -> Result<(), LogError> {
+        self.offset_us = cell_offset_us(path)?;
         let mut log = LogReader::open(path)?;
         for event in log.by_ref() {
             match event {
@@ -146,20 +152,29 @@ impl Report {
         {
             self.problems.push(format!("logs of {} and {} are mixed", known.node, identity.node));
         }
+        self.timeline.identity(identity);
         self.sections.iter_mut().for_each(|section| section.identity(identity));
     }
 
     fn message(&mut self, message: &LogMessage) {
         self.messages += 1;
-        self.first = Some(self.first.map_or(message.at, |first| first.min(message.at)));
-        self.last = self.last.max(message.at);
+        let at = message.at.shifted(self.offset_us);
+        self.first = Some(self.first.map_or(at, |first| first.min(at)));
+        self.last = self.last.max(at);
+        self.timeline.advance(at);
         let is_valid = match message.schema {
-            SchemaName::ObjectReport => self.with(message, |report, it| report.report(&message.topic, message.at, &it)),
-            SchemaName::GlobalMap => self.with(message, |report, it| report.map(message.at, it)),
-            SchemaName::Verdicts => self.with(message, |report, it| report.verdicts(message.at, it)),
-            SchemaName::Reputations => self.with(message, |report, it| report.reputations(message.at, &it)),
-            SchemaName::Leadership => self.with(message, |report, it| report.changes.push(it)),
-            SchemaName::Counters => self.with(message, Self::counters),
+            SchemaName::ObjectReport => self.with(message, |report, it| report.report(&message.topic, at, &it)),
+            SchemaName::GlobalMap => self.with(message, |report, it| report.map(at, it)),
+            SchemaName::Verdicts => self.with(message, |report, it| report.verdicts(at, it)),
+            SchemaName::Reputations => self.with(message, |report, it| report.reputations(at, &it)),
+            SchemaName::Leadership => {
+                self.with(message, |report, it| report.changes.push(LeadershipChange { at_us: at, ..it }))
+            }
+            SchemaName::Counters => {
+                self.with(message, |report, it| report.counters(CounterReading { at_us: at, ..it }))
+            }
+            SchemaName::NodeStatus => self.with(message, |report, it| report.timeline.status(it, at)),
+            SchemaName::CompressedImage => self.with(message, |report, it: Picture| report.timeline.picture(it, at)),
             _ => true,
         };
         if !is_valid && self.problems.len() < MAX_PROBLEMS {
@@ -174,6 +189,7 @@ impl Report {
 
     fn report(&mut self, topic: &str, at: Timestamp, report: &ObjectReport) {
         let kind = if topic.starts_with("vote_") { ReportKind::VoteDetections } else { ReportKind::Detections };
+        self.timeline.report(kind, report, at);
         self.sections.iter_mut().for_each(|section| section.report(kind, report));
         let vehicle = self.vehicles.entry(report.node.clone()).or_default();
         vehicle.reports += 1;
@@ -183,7 +199,8 @@ impl Report {
     }
 
     fn map(&mut self, at: Timestamp, map: GlobalMap) {
-        self.maps.add(at, map.oldest_capture_us, map.fused_at_us);
+        self.maps.add(at, map.oldest_capture_us, map.fused_at_us, self.offset_us);
+        self.timeline.map(&map, at);
         self.leader(at, Epoch::new(map.epoch, map.aggregator.clone()));
         let labelled = map.landmarks.iter().filter(|entry| entry.label.is_some()).map(|entry| &entry.contributors);
         for contributors in labelled.chain(map.objects.iter().map(|object| &object.contributors)) {
@@ -196,7 +213,8 @@ impl Report {
     }
 
     fn verdicts(&mut self, at: Timestamp, verdicts: Verdicts) {
-        self.verdicts.add(at, None, verdicts.fused_at_us);
+        self.verdicts.add(at, None, verdicts.fused_at_us, self.offset_us);
+        self.timeline.verdicts(&verdicts, self.maps.count > 0, at);
         if self.maps.count == 0 {
             self.leader(at, Epoch::new(verdicts.epoch, verdicts.aggregator.clone()));
         }
@@ -208,6 +226,7 @@ impl Report {
     }
 
     fn reputations(&mut self, at: Timestamp, reputations: &Reputations) {
+        self.timeline.reputations(reputations, at);
         for (node, reputation) in &reputations.reputations {
             self.reputations.entry(node.clone()).or_default().push(at, reputation.score);
         }
@@ -219,7 +238,9 @@ impl Report {
 
     fn leader(&mut self, at: Timestamp, epoch: Epoch) {
         match self.leaders.last_mut() {
-            Some(leader) if leader.epoch == epoch => (leader.last_at, leader.rounds) = (at, leader.rounds + 1),
+            Some(leader) if leader.epoch == epoch && at.since(leader.last_at) < GAP => {
+                (leader.last_at, leader.rounds) = (at, leader.rounds + 1);
+            }
             _ => self.leaders.push(LeaderRounds { epoch, first_at: at, last_at: at, rounds: 1 }),
         }
     }
@@ -229,12 +250,13 @@ impl Report {
 const MAX_PROBLEMS: usize = 20;
 
 impl RoundTimes {
-    fn add(&mut self, at: Timestamp, oldest_capture: Option<Timestamp>, fused_at: Timestamp) {
+    /// Adds a round; `offset_us` is from the recording node's clock to the cell's time, in which `at` is.
+    fn add(&mut self, at: Timestamp, oldest_capture: Option<Timestamp>, fused_at: Timestamp, offset_us: i64) {
         self.count += 1;
         if let Some(last) = self.last_at.replace(at) {
             self.gaps.push(at, at.since(last).as_secs_f64());
         }
         self.capture_to_fused.extend(oldest_capture.map(|capture| fused_at.since(capture).as_secs_f64()));
-        self.fused_to_received.push(at.since(fused_at).as_secs_f64());
+        self.fused_to_received.push(at.shifted(offset_us.saturating_neg()).since(fused_at).as_secs_f64());
     }
 }

@@ -11,5 +11,6 @@ mod load;
 mod metrics;
 mod pictures;
 mod processes;
+mod timeline;
 mod troubles;
 mod webdriver;

@@ -109,6 +109,13 @@ async fn history_tells_who_led_and_how_it_went() {
     let (edge, _) = start(config("edge", Role::Edge, 2)).await;
     let (auto, page) = join(config("euclid", Role::Auto, 2), &edge).await;
     until("the edge is followed", || async { get(page, "/readyz").await.json()["reason"] == "following edge" }).await;
+    let held = async |at: u64| match get(page, &format!("/api/frame?at={at}")).await {
+        frame if frame.status == 200 => frame.json(),
+        _ => Value::Null,
+    };
+    until("a map of the edge is held", || async { held(u64::MAX).await["map"]["message"]["aggregator"] == "edge" })
+        .await;
+    let of_edge = held(u64::MAX).await["now_us"].as_u64().unwrap();
     edge.stop().await;
     until("the vehicle leads", || async { get(page, "/readyz").await.json()["reason"] == "leading" }).await;
     until("a sample with rounds", || async {
@@ -122,6 +129,22 @@ async fn history_tells_who_led_and_how_it_went() {
     assert_eq!((&last["leader"], &last["until_us"]), (&Value::from("euclid"), &Value::Null));
     assert!(reigns.iter().any(|reign| reign["leader"] == "edge" && reign["until_us"].is_u64()), "{history}");
     assert!(history["failovers"].as_u64() >= Some(1), "{history}");
+    until("the edge's end is told", || async {
+        let history = get(page, "/api/history").await.json();
+        history["events"].as_array().unwrap().iter().any(|event| event["text"] == "edge is gone")
+    })
+    .await;
+    until("a map of the vehicle is held", || async {
+        held(u64::MAX).await["map"]["message"]["aggregator"] == "euclid"
+    })
+    .await;
+    let earlier = held(of_edge).await;
+    assert_eq!((&earlier["now_us"], &earlier["map"]["message"]["aggregator"]), (&of_edge.into(), &"edge".into()));
+    let history = get(page, "/api/history").await.json();
+    assert!(history["frames"].as_array().unwrap().contains(&of_edge.into()), "{history}");
+    for query in ["", "?at=", "?at=-1", "?at=x"] {
+        assert_eq!(get(page, &format!("/api/frame{query}")).await.status, 404, "{query}");
+    }
     let latest = history["samples"].as_array().unwrap().last().unwrap()["at_us"].as_u64().unwrap();
     let news = get(page, &format!("/api/history?since={latest}")).await.json();
     assert!(news["samples"].as_array().unwrap().len() <= 1, "{news}");

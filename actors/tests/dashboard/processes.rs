@@ -25,7 +25,7 @@ impl Drop for Process {
 pub(crate) struct Place {
     pub(crate) page: SocketAddr,
     pub(crate) broker: SocketAddr,
-    gossip: SocketAddr,
+    pub(crate) gossip: SocketAddr,
 }
 
 /// Addresses on which nothing listens now.

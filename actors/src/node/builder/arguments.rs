@@ -297,6 +297,7 @@ impl NodeBuilder {
                 description,
                 broker,
                 door,
+                recording: self.recording.clone(),
                 shared: self.shared.subscribe(),
             },
             leadership: self.leadership.clone(),

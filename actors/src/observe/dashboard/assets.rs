@@ -13,12 +13,15 @@ const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const SVG: &str = "image/svg+xml";
 
-const ASSETS: [Asset; 9] = [
+const ASSETS: [Asset; 12] = [
     asset("/", HTML, include_str!("page/index.html")),
+    asset("/view.css", CSS, VIEW_STYLE),
     asset("/style.css", CSS, include_str!("page/style.css")),
     asset("/icon.svg", SVG, include_str!("page/icon.svg")),
     asset("/main.js", SCRIPT, include_str!("page/main.js")),
     asset("/live.js", SCRIPT, include_str!("page/live.js")),
+    asset("/scene.js", SCRIPT, include_str!("page/scene.js")),
+    asset("/timeline.js", SCRIPT, include_str!("page/timeline.js")),
     asset("/map.js", SCRIPT, include_str!("page/map.js")),
     asset("/tables.js", SCRIPT, include_str!("page/tables.js")),
     asset("/charts.js", SCRIPT, include_str!("page/charts.js")),
@@ -32,6 +35,22 @@ const fn asset(path: &'static str, content_type: &'static str, content: &'static
 /// Paths of all files of the page, the page itself first.
 pub fn paths() -> impl Iterator<Item = &'static str> {
     ASSETS.iter().map(|asset| asset.path)
+}
+
+/// Style sheet of map and timeline, with the colours of all pages.
+pub(crate) const VIEW_STYLE: &str = include_str!("page/view.css");
+
+/// Map and timeline of the page in HTML, with the identities that the scripts know.
+pub(crate) fn view() -> &'static str {
+    let page = include_str!("page/index.html").split("<!-- map and timeline, also of reports -->").nth(1);
+    page.and_then(|rest| rest.split("<!-- end -->").next()).unwrap_or_default()
+}
+
+/// The scripts that draw map and timeline, as one script without imports. No two of them have a name of their own alike.
+pub(crate) fn view_script() -> String {
+    let scripts = ["/dom.js", "/scene.js", "/tables.js", "/map.js", "/timeline.js"].into_iter().filter_map(Asset::find);
+    let lines = scripts.flat_map(|script| script.content.lines()).filter(|line| !line.starts_with("import "));
+    lines.map(|line| line.strip_prefix("export ").unwrap_or(line).to_owned() + "\n").collect()
 }
 
 impl Asset {
@@ -55,6 +74,23 @@ mod tests {
             for import in imports {
                 assert!(Asset::find(&format!("/{import}")).is_some(), "{} imports {import}", asset.path);
             }
+        }
+    }
+
+    #[test]
+    fn a_report_gets_map_and_timeline_as_one_script() {
+        let (view, script) = (view(), view_script());
+        for id in ["map", "map-table", "timeline-bands", "timeline-cursor", "timeline-events"] {
+            assert!(view.contains(&format!("id=\"{id}\"")), "{id}");
+        }
+        assert!(!script.contains("import ") && !script.contains("\nexport "));
+        let declared = |line: &'static str| {
+            let rest = ["const ", "let ", "function ", "class "].iter().find_map(|word| line.strip_prefix(word))?;
+            rest.split(|letter: char| !letter.is_alphanumeric() && letter != '_').next()
+        };
+        let mut names = std::collections::BTreeSet::new();
+        for line in String::leak(script).lines() {
+            assert!(declared(line).is_none_or(|name| name.is_empty() || names.insert(name)), "{line}");
         }
     }
 

@@ -11,6 +11,7 @@ use ecod::wire::Reputations;
 use serde::Serialize;
 
 use super::snapshot::json;
+use super::timeline::Timeline;
 
 /// One leader's time in the lead, as this node saw it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -42,11 +43,13 @@ struct Sample<'a> {
     reputations: BTreeMap<&'a NodeName, f64>,
 }
 
-/// Leader terms and samples, oldest first.
-#[derive(Debug, Default)]
+/// Leader terms, events, maps and samples, oldest first.
+#[derive(Debug)]
 pub(crate) struct History {
     /// The latest terms.
     pub terms: VecDeque<LeaderTerm>,
+    /// Events and maps of the latest [`SPAN`].
+    pub timeline: Timeline,
     /// End of each period and its sample as JSON, which is encoded once for all browsers.
     samples: VecDeque<(Timestamp, Vec<u8>)>,
     /// Changes of the leader since the node started.
@@ -61,8 +64,14 @@ pub(crate) struct History {
 /// Time between two samples.
 pub(crate) const SAMPLE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Maximum number of samples: ten minutes.
-pub(crate) const MAX_SAMPLES: usize = 300;
+/// Time over which events, maps and samples are held.
+pub(crate) const SPAN: Duration = Duration::from_secs(600);
+
+/// Minimum time between two maps that are held.
+const MAP_PERIOD: Duration = Duration::from_millis(500);
+
+/// Maximum number of samples.
+pub(crate) const MAX_SAMPLES: usize = (SPAN.as_secs() / SAMPLE_PERIOD.as_secs()) as usize;
 
 /// Maximum number of terms.
 pub(crate) const MAX_TERMS: usize = 32;
@@ -73,14 +82,28 @@ pub(crate) const MAX_VEHICLES: usize = 64;
 /// Maximum number of latencies per sample.
 const MAX_LATENCIES: usize = 256;
 
+impl Default for History {
+    fn default() -> Self {
+        Self {
+            terms: VecDeque::new(),
+            timeline: Timeline::new(SPAN, MAP_PERIOD),
+            samples: VecDeque::new(),
+            failovers: 0,
+            last_round: None,
+            last_gap: None,
+            latencies_ms: Vec::new(),
+            rounds: 0,
+        }
+    }
+}
+
 impl History {
-    /// The whole history as JSON, with the samples after `time` only.
+    /// The whole history as JSON, with the samples, events and times of maps after `time` only.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
         let samples: Vec<_> = self.samples.iter().filter(|(at, _)| *at > time).map(|(_, sample)| &**sample).collect();
         let (terms, samples, failovers) = (json(&self.terms), samples.join(&b','), json(&self.failovers));
-        let parts: [&[u8]; 7] =
-            [b"{\"reigns\":", &terms, b",\"samples\":[", &samples, b"],\"failovers\":", &failovers, b"}"];
-        parts.concat()
+        let (head, timeline) = (&b"{\"reigns\":"[..], self.timeline.json_since(time));
+        [head, &terms, b",\"samples\":[", &samples, b"],\"failovers\":", &failovers, b",", &timeline, b"}"].concat()
     }
 
     /// Takes the present leadership.

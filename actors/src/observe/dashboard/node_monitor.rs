@@ -17,6 +17,7 @@ use super::map_latency::MapLatency;
 use super::node_sources::NodeSources;
 use super::response_cache::{CachedResponse, ResponseCache};
 use super::snapshot::{API_VERSION, LeadershipFacts, Snapshot, TroubleEntry, json, nodes};
+use super::timeline::Frame;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::newest::Received;
 use crate::observe::readiness::Probe;
@@ -52,12 +53,15 @@ const PROBE_PERIOD: Duration = Duration::from_millis(500);
 /// Maximum time between two snapshots: browsers take a longer silence for a lost connection.
 const HEARTBEAT: Duration = Duration::from_secs(1);
 
+/// Time between two looks at what the timeline shows.
+const LOOK_PERIOD: Duration = Duration::from_secs(1);
+
 /// Frame of a server-sent event around the JSON of a snapshot.
 const EVENT_HEAD: &[u8] = b"event: picture\ndata: ";
 const EVENT_END: &[u8] = b"\n\n";
 
 /// Age of a vehicle's last report beyond which the vehicle is no longer shown.
-const MAX_REPORT_AGE: Duration = Duration::from_secs(30);
+pub(crate) const MAX_REPORT_AGE: Duration = Duration::from_secs(30);
 
 impl NodeMonitor {
     pub(crate) fn new(sources: NodeSources, max_rate_hz: f64) -> Self {
@@ -153,7 +157,7 @@ impl NodeMonitor {
         let mut maps = self.sources.vitals.newest.map.subscribe();
         let mut verdicts = self.sources.vitals.newest.verdicts.subscribe();
         let mut members = self.sources.members.clone();
-        let mut samples = ticks(SAMPLE_PERIOD);
+        let (mut samples, mut looks) = (ticks(SAMPLE_PERIOD), ticks(LOOK_PERIOD));
         let (mut next_snapshot, mut changed, mut sent_at) = (Instant::now(), true, Instant::now());
         self.take_leadership();
         self.take_members();
@@ -178,6 +182,7 @@ impl NodeMonitor {
                     changed = true;
                 }
                 _ = samples.tick() => self.sample(),
+                _ = looks.tick() => self.extend_timeline(),
                 () = tokio::time::sleep_until(due), if self.viewers() > 0 => {
                     let event = self.cached_event();
                     self.snapshots.send_replace(event.value);
@@ -233,6 +238,29 @@ impl NodeMonitor {
     fn sample(&self) {
         let reputations = self.sources.vitals.newest.reputations.borrow().clone();
         self.observed().history.sample(reputations.as_ref().map(|newest| &*newest.message), clock::now());
+    }
+
+    /// Adds to the timeline what is news, and the newest map.
+    fn extend_timeline(&self) {
+        let (sources, now, troubles) = (&self.sources, clock::now(), self.troubles());
+        let newest = &sources.vitals.newest;
+        let map = newest.map.borrow().clone();
+        let map = map.map(|newest| Received { received_at: newest.received_at, message: newest.map });
+        let verdicts = newest.verdicts.borrow().clone();
+        let received = [map.as_ref().map(|map| map.received_at), verdicts.as_ref().map(|it| it.received_at)];
+        let mut observed = self.observed();
+        let Observed { history, probe, met } = &mut *observed;
+        let nodes = nodes(sources, met, probe.links.as_ref()).into_iter().filter(|node| node.alive);
+        history.timeline.nodes(nodes.map(|node| node.name).collect(), now);
+        history.timeline.troubles(troubles.iter().map(|entry| (&entry.told_by, &entry.trouble)), now);
+        if let Some(reputations) = &*newest.reputations.borrow() {
+            history.timeline.reputations(&reputations.message, now);
+        }
+        if let Some(now_us) = received.into_iter().flatten().max() {
+            let vehicles = || sources.live_state.reports_since(now - MAX_REPORT_AGE);
+            let frame = || json(&Frame { now_us, map, verdicts, vehicles: vehicles() });
+            history.timeline.frames.push(now_us, frame);
+        }
     }
 
     /// Has a node that only follows receive the vehicles' reports while a browser shows them.

@@ -57,14 +57,7 @@ impl NodeSources {
     /// Known locations of the cell.
     pub(crate) fn landmarks(&self) -> Vec<LandmarkFacts> {
         let landmarks = Arc::clone(&self.vitals.shared.borrow().landmarks);
-        let facts = |landmark: &LandmarkConfig| LandmarkFacts {
-            id: landmark.id.clone(),
-            x_m: landmark.x_m,
-            y_m: landmark.y_m,
-            facing_rad: landmark.facing_deg.map(f64::to_radians),
-            vacancy: landmark.vacancy.as_ref().map(|sign| sign.label.clone()),
-        };
-        landmarks.iter().map(facts).collect()
+        landmarks.iter().map(LandmarkFacts::from).collect()
     }
 }
 
@@ -81,4 +74,16 @@ pub struct LandmarkFacts {
     pub facing_rad: Option<f64>,
     /// Label of its vacancy sign.
     pub vacancy: Option<Label>,
+}
+
+impl From<&LandmarkConfig> for LandmarkFacts {
+    fn from(landmark: &LandmarkConfig) -> Self {
+        Self {
+            id: landmark.id.clone(),
+            x_m: landmark.x_m,
+            y_m: landmark.y_m,
+            facing_rad: landmark.facing_deg.map(f64::to_radians),
+            vacancy: landmark.vacancy.as_ref().map(|sign| sign.label.clone()),
+        }
+    }
 }

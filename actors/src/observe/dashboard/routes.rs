@@ -68,6 +68,7 @@ impl HttpApi {
             .route("/metrics", get(show_metrics))
             .route("/api/picture", get(show_snapshot))
             .route("/api/history", get(show_history))
+            .route("/api/frame", get(show_frame))
             .route("/api/landmarks", get(show_landmarks))
             .route("/api/events", get(show_events))
             .fallback(show_asset)
@@ -147,10 +148,20 @@ async fn show_snapshot(State(api): Api) -> Response {
     typed(JSON, api.monitor.json())
 }
 
-/// The history, with the samples after `?since=` only.
+/// The history, with the samples, events and times of maps after `?since=` only.
 async fn show_history(State(api): Api, uri: Uri) -> Response {
-    let since = uri.query().and_then(|query| query.strip_prefix("since=")).and_then(|time| time.parse().ok());
-    typed(JSON, api.monitor.observed().history.json_since(Timestamp(since.unwrap_or(0))))
+    typed(JSON, api.monitor.observed().history.json_since(time_in(&uri, "since=").unwrap_or_default()))
+}
+
+/// The map that was the newest at `?at=`.
+async fn show_frame(State(api): Api, uri: Uri) -> Response {
+    let frame =
+        time_in(&uri, "at=").and_then(|at| api.monitor.observed().history.timeline.frames.at(at).map(Vec::from));
+    frame.map_or_else(|| StatusCode::NOT_FOUND.into_response(), |frame| typed(JSON, frame))
+}
+
+fn time_in(uri: &Uri, key: &str) -> Option<Timestamp> {
+    uri.query()?.strip_prefix(key)?.parse().ok().map(Timestamp)
 }
 
 async fn show_landmarks(State(api): Api) -> Response {

@@ -38,7 +38,7 @@ pub enum LogItem {
     Reputations(Arc<Reputations>),
     /// Another candidate's evidence.
     Share(Arc<LedgerShare>),
-    /// Another node's status.
+    /// The status of a node, also of this one.
     Status(Arc<NodeStatus>),
     /// A change of the leadership.
     Leadership(Leadership),

@@ -9,6 +9,7 @@ use ecod::model::time::Timestamp;
 use super::plot::{Axis, Curve, Plot, bars, class};
 use super::series::{Samples, distribution, quantile};
 use super::{Report, RoundTimes};
+use crate::observe::dashboard::assets::VIEW_STYLE;
 
 /// Number of time slices in a plot.
 const SLICES: usize = 700;
@@ -20,6 +21,7 @@ const MAX_CURVES: usize = 12;
 pub(super) fn write(report: &Report) -> String {
     let added: String = report.sections.iter().map(|section| section.html()).collect();
     let sections = [
+        report.timeline.html(&report.leaders),
         added,
         leadership(report),
         latency(report),
@@ -34,7 +36,8 @@ pub(super) fn write(report: &Report) -> String {
     format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <meta name=\"color-scheme\" content=\"light dark\">\n<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n\
+         <meta name=\"color-scheme\" content=\"light dark\">\n<meta http-equiv=\"Content-Security-Policy\" \
+         content=\"default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:\">\n<title>{title}</title>\n<style>{VIEW_STYLE}{STYLE}</style>\n</head>\n\
          <body>\n<main>\n{head}{}</main>\n</body>\n</html>\n",
         sections.concat()
     )

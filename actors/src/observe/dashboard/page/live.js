@@ -4,10 +4,12 @@
 const SILENCE_MS = 3000;
 /// Polling period of the history, and of snapshots where the node sends none.
 const HISTORY_MS = 2000;
+/// Time that the node holds, in microseconds.
+export const SPAN_US = 600e6;
 
 export class Live {
   picture = null;
-  history = { reigns: [], samples: [], failovers: 0 };
+  history = { reigns: [], samples: [], events: [], frames: [], failovers: 0 };
   landmarks = [];
   refused = false;
   /// Whether the node has no room for another live page, so that this one polls.
@@ -96,14 +98,23 @@ export class Live {
       this.#follow();
     }
     // The old history stays until the new one arrives: the node may end before that.
-    const known = this.#afresh ? [] : this.history.samples;
-    const since = known.at(-1)?.at_us ?? 0;
+    const known = this.#afresh ? { samples: [], events: [], frames: [] } : this.history;
+    const since = known.samples.at(-1)?.at_us ?? 0;
     const news = await this.#get(`/api/history?since=${since}`);
     if (!news) return;
     this.#afresh = false;
-    const samples = [...known, ...news.samples.filter((sample) => sample.at_us > since)].slice(-300);
-    this.history = { ...news, samples };
+    const extended = (name, time) => {
+      const last = known[name].length > 0 ? time(known[name].at(-1)) : 0;
+      return [...known[name], ...news[name].filter((item) => time(item) > last)].filter((item) => time(item) > this.now - SPAN_US);
+    };
+    const [samples, events] = ["samples", "events"].map((name) => extended(name, (item) => item.at_us));
+    this.history = { ...news, samples, events, frames: extended("frames", (time) => time) };
     this.onHistory();
+  }
+
+  /// The map that was the newest at a time, as part of a snapshot; null if the node does not answer.
+  frame(at) {
+    return this.#get(`/api/frame?at=${at}`);
   }
 
   async #get(path) {

@@ -1,10 +1,12 @@
 // Draws snapshots. The map follows every snapshot; text changes four times a second, so that it can be read.
 
 import { chart } from "./charts.js";
-import { byId, span, text } from "./dom.js";
-import { Live } from "./live.js";
-import { BirdsEye, colours } from "./map.js";
+import { ago, byId, clock, span, text } from "./dom.js";
+import { Live, SPAN_US } from "./live.js";
+import { BirdsEye } from "./map.js";
+import { arrange, colours } from "./scene.js";
 import * as tables from "./tables.js";
+import { Timeline } from "./timeline.js";
 
 const TEXT_MS = 250;
 let [queued, textAt, told] = [false, 0, {}];
@@ -13,15 +15,21 @@ const faults = {};
 
 const live = new Live(draw, () => attempt("history", drawHistory));
 const map = new BirdsEye(draw);
+const timeline = new Timeline(scrub, { live: true, time: clock, moment: (at) => `${clock(at)}, ${ago((live.now - at) / 1e6)}` });
+/// The map that the timeline chose, and whether one is on its way.
+let [past, loading] = [null, false];
 
-byId("as-table").onclick = ({ target }) => {
-  const asTable = byId("map-table").hidden;
-  byId("map-table").hidden = !asTable;
-  byId("map-frame").hidden = asTable;
-  target.setAttribute("aria-pressed", String(asTable));
-  textAt = 0;
+async function scrub() {
   draw();
-};
+  if (loading) return;
+  loading = true;
+  while (timeline.frame !== (past?.at ?? null)) {
+    const at = timeline.frame;
+    past = at && { at, picture: (await live.frame(at)) ?? past?.picture };
+  }
+  loading = false;
+  draw();
+}
 
 function draw() {
   if (queued) return;
@@ -45,44 +53,25 @@ function attempt(part, drawing) {
 }
 
 function drawPicture() {
-  const scene = arrange(live.picture, live.landmarks, live.now);
-  if (!byId("map-frame").hidden) map.draw(scene);
+  const { picture, landmarks, now } = live;
+  const known = (of) => (of ? of.vehicles.map((vehicle) => vehicle.report.node) : []);
+  const rated = Object.keys(picture.reputations?.message.reputations ?? {});
+  const colour = colours([...known(picture), ...known(past?.picture), ...rated, ...live.history.reigns.map((term) => term.leader)]);
+  const scene = arrange(picture, landmarks, now, colour);
+  const shown = past?.picture ? arrange(past.picture, landmarks, past.picture.now_us, colour) : scene;
+  if (!map.asTable) map.draw(shown);
   if (performance.now() - textAt < TEXT_MS) return;
-  drawText(live.picture, scene);
+  if (map.asTable) tables.places(shown);
+  drawText(picture, scene);
+  drawTimeline(scene);
   textAt = performance.now();
 }
 
-/// Scene of the map: the snapshot joined with known locations and vehicle colours.
-function arrange(picture, landmarks, now) {
-  const colour = colours(picture.vehicles.map((vehicle) => vehicle.report.node).concat(Object.keys(picture.reputations?.message.reputations ?? {})));
-  const known = new Map(landmarks.map((landmark) => [landmark.id, landmark]));
-  const verdicts = new Map((picture.verdicts?.message.verdicts ?? []).map((verdict) => [verdict.landmark, verdict]));
-  const fused = picture.map?.message.landmarks ?? [];
-  const source = fused.length > 0 ? fused : landmarks.map((l) => ({ ...l, label: verdicts.get(l.id)?.label ?? null, confidence: 0, contributors: verdicts.get(l.id)?.contributors ?? [] }));
-  const places = source.map((place) => {
-    const empty = (place.observers ?? []).length > 0;
-    const state = place.label !== null ? "full" : empty ? "" : "unknown";
-    return { ...place, facing_rad: known.get(place.id)?.facing_rad, vacancy: known.get(place.id)?.vacancy, state, words: empty ? "seen empty" : "not seen" };
-  });
-  const byNode = new Map();
-  for (const sighting of picture.vehicles) {
-    const { node } = sighting.report;
-    byNode.set(node, [...(byNode.get(node) ?? []), sighting]);
-  }
-  const vehicles = [...byNode].map(([node, sightings]) => vehicle(node, sightings, known, colour.get(node)));
-  return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now };
-}
-
-/// A vehicle may report for the map, for votes, or for both.
-function vehicle(node, sightings, known, colour) {
-  const [detections, votes] = ["detections", "vote_detections"].map((kind) => sightings.find((sighting) => sighting.kind === kind));
-  const { report } = detections ?? votes;
-  return {
-    node, colour, view: report.view, pose: report.pose, objects: report.objects, votes: votes?.report.objects.length,
-    detected: detections?.report.objects.length, inView: report.seen?.length,
-    seen: (report.seen ?? []).map((id) => known.get(id)).filter(Boolean),
-    received_at_us: Math.max(...sightings.map((sighting) => sighting.received_at_us)),
-  };
+function drawTimeline({ colour, now }) {
+  const { reigns, events, frames } = live.history;
+  const first = Math.min(now - 60e6, reigns[0]?.from_us ?? now, events[0]?.at_us ?? now, frames[0] ?? now);
+  timeline.colour = colour;
+  timeline.draw({ reigns, events, frames, from: Math.max(first, now - SPAN_US), until: now });
 }
 
 function drawText(picture, scene) {
@@ -93,7 +82,6 @@ function drawText(picture, scene) {
   const sample = live.history.samples.at(-1);
   tables.troubles(picture);
   tables.tiles(picture, now, sample ? sample.rounds / 2 : null);
-  if (!byId("map-table").hidden) tables.places(scene);
   tables.verdicts(picture.verdicts, now);
   tables.vehicles(scene.vehicles, now, picture.troubles);
   tables.reputations(picture.reputations, scene.colour);
@@ -150,10 +138,9 @@ function drawHistory() {
   chart(byId("rounds-chart"), { now, label: "Rounds accepted a second over ten minutes", lines: [line("rounds", 2, (s) => s.rounds / 2)] });
   const names = Object.keys(samples.at(-1).reputations);
   if (names.length > 0 && live.picture) {
-    const { colour } = arrange(live.picture, [], now);
     chart(byId("reputation-chart"), {
       now, label: "Reputation of each vehicle over ten minutes", ceiling: 1, names: true,
-      lines: names.map((name) => line(name, colour.get(name) ?? 7, (s) => s.reputations[name])),
+      lines: names.map((name) => line(name, timeline.colour?.get(name) ?? 7, (s) => s.reputations[name])),
     });
   }
 }

@@ -1,6 +1,6 @@
 // Bird's-eye view: world metres to screen pixels, symbols of constant size, labels that do not overlap.
 
-import { reasons } from "./tables.js";
+import { reasons } from "./scene.js";
 import { ago, byId, keyed, set, span, svg, text } from "./dom.js";
 
 /// Standard deviations of the 95 % error ellipse in two dimensions: the square root of the χ² quantile.
@@ -15,9 +15,6 @@ const MAX_SCALE = 4000;
 /// Time for which half of the map must have been enough before it is fitted again.
 const ROOMY_MS = 5000;
 
-/// Colours by name, in alphabetical order.
-export const colours = (names) => new Map([...new Set(names)].sort().map((name, index) => [name, index % 8]));
-
 export class BirdsEye {
   #picture = byId("map");
   #layers = {};
@@ -25,6 +22,8 @@ export class BirdsEye {
   #fullAt = 0;
   #zoom = 1;
   #shift = [0, 0];
+  /// Whether a table is shown in the place of the map.
+  asTable = false;
 
   constructor(redraw) {
     this.redraw = redraw;
@@ -34,6 +33,13 @@ export class BirdsEye {
     byId("zoom-in").onclick = () => this.#zoomBy(1.4);
     byId("zoom-out").onclick = () => this.#zoomBy(1 / 1.4);
     byId("fit").onclick = () => this.#fit();
+    byId("as-table").onclick = ({ target }) => {
+      this.asTable = !this.asTable;
+      byId("map-table").hidden = !this.asTable;
+      byId("map-frame").hidden = this.asTable;
+      target.setAttribute("aria-pressed", String(this.asTable));
+      redraw();
+    };
     this.#picture.addEventListener("keydown", (event) => this.#key(event));
     this.#picture.addEventListener("wheel", (event) => {
       if (!event.ctrlKey) return;

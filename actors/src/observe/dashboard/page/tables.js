@@ -1,9 +1,9 @@
 // Tables and tiles of the page.
 
 import { ago, byId, clock, milliseconds, n, rows, span, text } from "./dom.js";
+import { list, reasons } from "./scene.js";
 
 const percent = (value) => `${Math.round(value * 100)} %`;
-const list = (names) => (names.length > 3 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(", ") || "–");
 
 const inOrder = new Intl.Collator(undefined, { numeric: true }).compare;
 
@@ -54,16 +54,6 @@ export function places(scene) {
     entry.name, entry.label ?? { text: entry.words ?? "–", class: "dim" }, n(entry.label ? percent(entry.confidence) : "–"),
     n(entry.x_m.toFixed(2)), n(entry.y_m.toFixed(2)), n(entry.age_s === undefined ? "–" : ago(entry.age_s)), { text: reasons(entry) ?? list(entry.contributors ?? []), class: "dim" },
   ]);
-}
-
-/// Why a place has its label, in words: who read what.
-export function reasons({ label, readings, vacancy }) {
-  if (!readings?.length) return null;
-  const all = new Set(readings.flatMap(({ nodes }) => nodes)).size;
-  const agreeing = readings.find((reading) => reading.label === label)?.nodes.length ?? 0;
-  const others = readings.filter((reading) => reading.label !== label);
-  const words = others.map((reading) => `${list(reading.nodes)} read ${reading.label === vacancy ? "the sign behind it" : reading.label}`);
-  return [`${agreeing} of ${all} saw ${label ?? "nothing"}`, ...words].join("; ");
 }
 
 export function verdicts(received, now) {

@@ -1,0 +1,48 @@
+// Scene of the map, from what a node knew at one moment.
+
+/// Colours by name, in alphabetical order.
+export const colours = (names) => new Map([...new Set(names)].sort().map((name, index) => [name, index % 8]));
+
+export const list = (names) => (names.length > 3 ? `${names.slice(0, 2).join(", ")} and ${names.length - 2} more` : names.join(", ") || "–");
+
+/// Scene of the map: a snapshot, or the map at an earlier time, joined with known locations and colours by name.
+export function arrange(picture, landmarks, now, colour) {
+  const known = new Map(landmarks.map((landmark) => [landmark.id, landmark]));
+  const verdicts = new Map((picture.verdicts?.message.verdicts ?? []).map((verdict) => [verdict.landmark, verdict]));
+  const fused = picture.map?.message.landmarks ?? [];
+  const source = fused.length > 0 ? fused : landmarks.map((l) => ({ ...l, label: verdicts.get(l.id)?.label ?? null, confidence: 0, contributors: verdicts.get(l.id)?.contributors ?? [] }));
+  const places = source.map((place) => {
+    const empty = (place.observers ?? []).length > 0;
+    const state = place.label !== null ? "full" : empty ? "" : "unknown";
+    return { ...place, facing_rad: known.get(place.id)?.facing_rad, vacancy: known.get(place.id)?.vacancy, state, words: empty ? "seen empty" : "not seen" };
+  });
+  const byNode = new Map();
+  for (const sighting of picture.vehicles) {
+    const { node } = sighting.report;
+    byNode.set(node, [...(byNode.get(node) ?? []), sighting]);
+  }
+  const vehicles = [...byNode].map(([node, sightings]) => vehicle(node, sightings, known, colour.get(node)));
+  return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now };
+}
+
+/// A vehicle may report for the map, for votes, or for both.
+function vehicle(node, sightings, known, colour) {
+  const [detections, votes] = ["detections", "vote_detections"].map((kind) => sightings.find((sighting) => sighting.kind === kind));
+  const { report } = detections ?? votes;
+  return {
+    node, colour, view: report.view, pose: report.pose, objects: report.objects, votes: votes?.report.objects.length,
+    detected: detections?.report.objects.length, inView: report.seen?.length,
+    seen: (report.seen ?? []).map((id) => known.get(id)).filter(Boolean),
+    received_at_us: Math.max(...sightings.map((sighting) => sighting.received_at_us)),
+  };
+}
+
+/// Why a place has its label, in words: who read what.
+export function reasons({ label, readings, vacancy }) {
+  if (!readings?.length) return null;
+  const all = new Set(readings.flatMap(({ nodes }) => nodes)).size;
+  const agreeing = readings.find((reading) => reading.label === label)?.nodes.length ?? 0;
+  const others = readings.filter((reading) => reading.label !== label);
+  const words = others.map((reading) => `${list(reading.nodes)} read ${reading.label === vacancy ? "the sign behind it" : reading.label}`);
+  return [`${agreeing} of ${all} saw ${label ?? "nothing"}`, ...words].join("; ");
+}
