@@ -352,7 +352,7 @@ impl Inbox {
             Some(Topic::Detections(_) | Topic::VoteDetections(_)) if reason != RejectReason::BadSignature => {
                 format!("report rejected: {}", Flaw::of_report(payload, reason, &self.limits))
             }
-            _ => format!("message on {shown} rejected as {reason}"),
+            _ => format!("message on {shown} rejected: {}", reason.as_str().replace('_', " ")),
         }
     }
 
