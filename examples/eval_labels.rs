@@ -9,6 +9,9 @@
 //! by `ecod-node replay` in one pass, with passes, and in `paper` mode, and judged by `ecod-lab eval`, which lies beside
 //! `ecod-node`. All files stay in the work folder.
 //!
+//! A second table compares PACE, VOTE and the answer that both agree on, by default settings but for the bounds of memory:
+//! [`PLACES`] known locations hold one item after the other, and each annotator reports it for both.
+//!
 //! The recording is as from a drive: items one after the other in random order, all annotators of an item in random
 //! order within the round in which the item is in view. `--keep` drops labels at random, to see what an accuracy rests
 //! on.
@@ -43,6 +46,12 @@ const HEADER: &str =
     "| set | majority | best known | `paper` | online, one pass | with passes |\n|---|---|---|---|---|---|\n";
 const START_US: u64 = 1_700_000_000_000_000;
 const ROUND_US: u64 = 100_000;
+
+/// Known locations of the comparison; an item is forgotten before the next one comes to its place.
+const PLACES: u64 = 50;
+const PLACE_DISTANCE_M: f64 = 10.0;
+
+const ANSWER_HEADER: &str = "| set | PACE alone | VOTE alone | one answer |\n|---|---|---|---|\n";
 
 struct Options {
     program: PathBuf,
@@ -143,11 +152,24 @@ fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
             items.entry(names.of(&row[0])).or_default().push((worker, labels.of(&row[2]), confidence));
         }
     }
+    let path = set.join("truth.csv");
+    let truth = rows(&path, &["item", "truth"], 2).with_context(|| path.display().to_string())?;
+    let truth: BTreeMap<String, String> =
+        truth.into_iter().map(|row| (names.of(&row[0]), labels.of(&row[1]))).collect();
     let mut order: Vec<_> = items.into_iter().collect();
     order.shuffle(&mut rng);
     let mut sequence: HashMap<String, u64> = HashMap::new();
     let mut recording = BufWriter::new(File::create(work.join("reports.jsonl"))?);
+    let mut placed = BufWriter::new(File::create(work.join("placed.jsonl"))?);
+    let mut spans: BTreeMap<String, Vec<Value>> = BTreeMap::new();
     for (round, (item, mut votes)) in (0..).zip(order) {
+        let place = round % PLACES;
+        // An item without a known truth would be judged by that of the item before it.
+        let judged = truth.get(&item);
+        if let Some(label) = judged {
+            let span = json!({"from_us": START_US + round * ROUND_US, "label": label});
+            spans.entry(format!("place-{place}")).or_default().push(span);
+        }
         votes.shuffle(&mut rng);
         for (worker, label, confidence) in votes {
             let seq = sequence.entry(worker.clone()).or_default();
@@ -157,13 +179,18 @@ fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
             let report = json!({"schema": 1, "node": worker, "seq": seq, "captured_at_us": at, "objects": [object],
                 "topic": "vote_detections"});
             writeln!(recording, "{report}")?;
+            let mut placed_report = report;
+            placed_report["objects"][0]["landmark"] = format!("place-{place}").into();
+            placed_report["objects"][0]["x_m"] = (place as f64 * PLACE_DISTANCE_M).into();
+            for topic in ["vote_detections", "detections"].into_iter().filter(|_| judged.is_some()) {
+                placed_report["topic"] = topic.into();
+                writeln!(placed, "{placed_report}")?;
+            }
         }
     }
     recording.flush()?;
-    let path = set.join("truth.csv");
-    let truth = rows(&path, &["item", "truth"], 2).with_context(|| path.display().to_string())?;
-    let truth: BTreeMap<String, String> =
-        truth.into_iter().map(|row| (names.of(&row[0]), labels.of(&row[1]))).collect();
+    placed.flush()?;
+    fs::write(work.join("placed-truth.json"), json!({ "landmarks": spans }).to_string())?;
     fs::write(work.join("truth.json"), json!({ "landmarks": truth }).to_string())?;
     Ok(())
 }
@@ -175,13 +202,58 @@ fn run(command: &mut Command) -> anyhow::Result<()> {
     if !output.status.success() {
         bail!("{command:?}: {said}");
     }
-    said.lines().filter(|line| line.starts_with("rejected")).for_each(|line| eprintln!("{line}"));
+    let is_news = |line: &&str| line.starts_with("rejected") && !line.starts_with("rejected not_fused");
+    said.lines().filter(is_news).for_each(|line| eprintln!("{line}"));
     Ok(())
 }
 
 /// Accuracy in percent of one run and of the majority.
 fn measure(options: &Options, work: &Path, name: &str, config: &Path, passes: u32) -> anyhow::Result<(f64, f64)> {
-    let (reports, output) = (work.join("reports.jsonl"), work.join(format!("{name}.jsonl")));
+    let result = judge(options, work, name, config, passes, ["reports.jsonl", "truth.json"])?;
+    let figure = |key: &str| result["vote"][key].as_f64().with_context(|| format!("{name}: eval gave no {key}"));
+    Ok((figure("accuracy_pct")?, figure("majority_accuracy_pct")?))
+}
+
+/// Accuracy in percent of PACE, of VOTE, and of the map where both run.
+fn compare(options: &Options, work: &Path) -> anyhow::Result<[f64; 3]> {
+    let files = ["placed.jsonl", "placed-truth.json"];
+    let accuracy = |algorithms: &str, judged: &str| -> anyhow::Result<f64> {
+        let config = placed_config(options, algorithms)?;
+        let result = judge(options, work, &format!("placed-{algorithms}"), &config, 0, files)?;
+        result[judged]["accuracy_pct"].as_f64().with_context(|| format!("{algorithms}: eval gave no accuracy"))
+    };
+    Ok([accuracy("pace", "pace")?, accuracy("vote", "vote")?, accuracy("both", "pace")?])
+}
+
+/// The configuration of the comparison.
+fn placed_config(options: &Options, algorithms: &str) -> anyhow::Result<PathBuf> {
+    let places = (0..PLACES)
+        .map(|place| json!({"id": format!("place-{place}"), "x_m": place as f64 * PLACE_DISTANCE_M, "y_m": 0}));
+    let config = json!({
+        "fusion": {
+            "algorithms": algorithms,
+            "round": { "close": "periodic", "period_s": ROUND_US as f64 / 1e6 },
+            "window": { "max_vehicles": 10_000 },
+            "vote": { "max_vehicles": 10_000, "max_labels": 65_535 },
+            "tracks": { "mode": "off" },
+        },
+        "landmarks": places.collect::<Vec<_>>(),
+    });
+    let path = options.work.join(format!("placed-{algorithms}.toml"));
+    fs::write(&path, toml::to_string(&config)?)?;
+    Ok(path)
+}
+
+/// What `ecod-lab eval` says of a replay of the reports, by the truth.
+fn judge(
+    options: &Options,
+    work: &Path,
+    name: &str,
+    config: &Path,
+    passes: u32,
+    [reports, truth]: [&str; 2],
+) -> anyhow::Result<Value> {
+    let (reports, output) = (work.join(reports), work.join(format!("{name}.jsonl")));
     let mut replay = Command::new(&options.program);
     replay.arg("replay").arg("--config").arg(config).arg("--input").arg(&reports).arg("--output").arg(&output);
     if passes > 0 {
@@ -190,11 +262,9 @@ fn measure(options: &Options, work: &Path, name: &str, config: &Path, passes: u3
     run(&mut replay)?;
     let result = work.join(format!("{name}.json"));
     let mut eval = Command::new(options.program.with_file_name("ecod-lab"));
-    eval.arg("eval").arg("--truth").arg(work.join("truth.json")).arg("--input").arg(&output);
+    eval.arg("eval").arg("--truth").arg(work.join(truth)).arg("--input").arg(&output);
     run(eval.arg("--reports").arg(&reports).arg("--out").arg(&result))?;
-    let result: Value = serde_json::from_slice(&fs::read(&result)?)?;
-    let figure = |key: &str| result["vote"][key].as_f64().with_context(|| format!("{name}: eval gave no {key}"));
-    Ok((figure("accuracy_pct")?, figure("majority_accuracy_pct")?))
+    Ok(serde_json::from_slice(&fs::read(&result)?)?)
 }
 
 /// The configuration with the paper's formulas and a verdict after every item.
@@ -234,20 +304,19 @@ fn sets(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     if sets.is_empty() { bail!("there is no set in {}", folder.display()) } else { Ok(sets) }
 }
 
-fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
-    const BEGIN: &str = "<!-- label table begin -->\n";
-    const END: &str = "<!-- label table end -->";
+fn write_table(path: &Path, kind: &str, table: &str) -> anyhow::Result<()> {
+    let (begin, end) = (format!("<!-- {kind} table begin -->\n"), format!("<!-- {kind} table end -->"));
     let text = fs::read_to_string(path)?;
-    let (before, rest) = text.split_once(BEGIN).context("no begin marker")?;
-    let (_, after) = rest.split_once(END).context("no end marker")?;
-    Ok(fs::write(path, format!("{before}{BEGIN}{table}{END}{after}"))?)
+    let (before, rest) = text.split_once(&begin).context("no begin marker")?;
+    let (_, after) = rest.split_once(&end).context("no end marker")?;
+    Ok(fs::write(path, format!("{before}{begin}{table}{end}{after}"))?)
 }
 
 fn main() -> anyhow::Result<()> {
     let options = options()?;
     fs::create_dir_all(&options.work)?;
     let paper_config = paper_config(&options)?;
-    let mut table = HEADER.to_owned();
+    let (mut table, mut answers) = (HEADER.to_owned(), ANSWER_HEADER.to_owned());
     print!("{table}");
     for set in sets(&options.sets)? {
         let name = fs::canonicalize(&set)?.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -262,9 +331,13 @@ fn main() -> anyhow::Result<()> {
         writeln!(row, "| {name} | {majority:.2} | {best} | {paper:.2} | {online:.2} | {refined:.2} |")?;
         print!("{row}");
         table.push_str(&row);
+        let [pace, vote, both] = compare(&options, &work)?;
+        writeln!(answers, "| {name} | {pace:.2} | {vote:.2} | {both:.2} |")?;
     }
+    print!("\n{answers}");
     if let Some(path) = &options.table {
-        write_table(path, &table)?;
+        write_table(path, "label", &table)?;
+        write_table(path, "answer", &answers)?;
     }
     Ok(())
 }

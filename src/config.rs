@@ -20,10 +20,10 @@ impl ConfigError {
         Self { key: key.into(), value: value.to_string(), allowed: allowed.into() }
     }
 
-    /// The same error with the key below `section`.
+    /// The same error with the key below `section`; an error without a key gets that of the section.
     #[must_use]
     pub fn within(mut self, section: &str) -> Self {
-        self.key = format!("{section}.{}", self.key);
+        self.key = if self.key.is_empty() { section.into() } else { format!("{section}.{}", self.key) };
         self
     }
 }
@@ -77,4 +77,9 @@ pub fn check_range(key: &str, value: f64, low: f64, high: f64) -> Result<(), Con
     } else {
         Err(ConfigError::new(key, value, format!("a number from {low} to {high}")))
     }
+}
+
+/// A check that a value, if there is one, is a number from `low` to `high`.
+pub(crate) fn check_optional(low: f64, high: f64) -> impl Fn(&Option<f64>) -> Result<(), ConfigError> {
+    move |value| value.map_or(Ok(()), |value| check_range("", value, low, high))
 }

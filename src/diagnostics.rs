@@ -69,6 +69,8 @@ trouble_kinds! {
     NoSize = "no_size", SHORT, "set the label's size in `camera.projection.sizes.labels`, or `camera.projection.sizes.default`";
     /// A size in another unit than metres.
     ImplausibleSize = "implausible_size", UNTIL_SETTLED, "sizes are in metres: correct `camera.projection.sizes`";
+    /// Another value that looks as if it were in another unit.
+    ImplausibleUnit = "implausible_unit", UNTIL_SETTLED, "correct it in this node's configuration or the cell's description; if it is meant so, leave it";
     /// Vehicles name known locations, and the aggregator has none.
     NoLocations = "no_locations", SHORT, "give this node the cell's `landmarks`, or the cell a description: `ecod-node cell set`";
     /// A vehicle names a location that the aggregator does not know.
@@ -401,8 +403,10 @@ mod tests {
     #[test]
     fn every_kind_has_a_name_of_its_own_a_remedy_that_fits_and_a_line_in_the_manual() {
         let manual = include_str!("../docs/troubleshooting.md");
+        let (_, tests) = manual.split_once("| kind | test |").unwrap();
         for kind in TroubleKind::ALL {
             assert!(manual.contains(&format!("\n| `{}` |", kind.as_str())), "{kind:?}");
+            assert!(tests.lines().any(|row| row.contains(&format!("`{}`", kind.as_str()))), "no test makes {kind:?}");
             assert_eq!(TroubleKind::named(kind.as_str()), Some(*kind));
             assert!((10..MAX_TROUBLE_TEXT).contains(&kind.remedy().len()), "{kind:?}");
         }

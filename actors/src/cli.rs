@@ -74,7 +74,7 @@ enum Command {
     Top(top::TopArguments),
     /// Join a cell as an observer and record all its messages (MCAP)
     Record(record::RecordArguments),
-    /// Fuse recorded reports again in virtual time: equal input gives equal output
+    /// Make maps and verdicts of a recording again; equal input gives equal output
     Replay(replay::ReplayArguments),
     /// Write an HTML report about a log: leadership, latency, gaps, reputations, coverage, losses
     Report(report::ReportArguments),
@@ -95,7 +95,7 @@ enum Command {
     Cell(cell::CellCommand),
     /// Forget the evidence behind the reputations, the highest term, or the cell's description, of a node that is stopped
     Reset(reset::ResetArguments),
-    /// Print the JSON Schemas of every payload
+    /// Print the JSON Schemas of every message
     Schema,
     /// Print a completion script for a shell
     Completions(shell::CompletionsArguments),

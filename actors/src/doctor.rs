@@ -13,6 +13,7 @@ mod storage;
 
 use std::path::Path;
 
+use ecod::diagnostics::TroubleKind;
 use serde::Serialize;
 
 use crate::node::config::NodeConfig;
@@ -62,6 +63,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     let mut findings = Vec::new();
     #[cfg(feature = "camera")]
     findings.extend(camera::examine(config).await);
+    findings.extend(units(config));
     findings.extend(network::broker(config).await);
     findings.push(network::gossip(config));
     findings.extend(network::seeds(config).await);
@@ -78,6 +80,14 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     findings.extend(storage::directories(config));
     findings.extend(storage::service(config, file));
     findings
+}
+
+/// Checks that values look as if they had the units of their keys.
+fn units(config: &NodeConfig) -> impl Iterator<Item = Finding> {
+    config.doubtful_units().into_iter().filter_map(|(kind, cause)| {
+        let check = if kind == TroubleKind::ImplausibleSize { "sizes" } else { "units" };
+        Some(Finding::doubtful(check, cause?, kind.remedy()))
+    })
 }
 
 #[cfg(test)]

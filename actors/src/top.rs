@@ -165,7 +165,7 @@ fn locations(view: &mut CellView, height: u16) -> Table<'static> {
         _ => " what is where ".to_owned(),
     };
     let widths = [16, 16, 6, 16, 7].map(Constraint::Length).into_iter().chain([Constraint::Fill(1)]);
-    let head = Row::new(["location", "map", "conf.", "verdict", "margin", "by"]).style(Style::new().bold());
+    let head = Row::new(["place", "what", "sure", "voted", "lead", "seen by"]).style(Style::new().bold());
     Table::new(rows.into_iter().skip(first).take(room), widths).header(head).block(Block::bordered().title(title))
 }
 
@@ -222,14 +222,17 @@ fn vehicles(view: &CellView) -> Table<'_> {
     let rows: Vec<_> = members.chain(others).collect();
     let title = format!(" {} node{} ", rows.len(), if rows.len() == 1 { "" } else { "s" });
     let widths = [Constraint::Fill(1), Constraint::Length(5), Constraint::Length(6), Constraint::Length(20)];
-    let head = Row::new(["node", "role", "", "reputation"]).style(Style::new().bold());
+    let head = Row::new(["node", "role", "", "trust, right+ wrong-"]).style(Style::new().bold());
     Table::new(rows, widths).header(head).block(Block::bordered().title(title))
 }
 
 fn counted(view: &CellView) -> Table<'_> {
+    // Copies that come a second way are no loss.
+    const COPIES: &str = "out_of_order";
     const SHOWN: [&str; 5] = ["inbox_full", "publish_refused", "disconnected", "connect_failed", "record_dropped"];
     let events = view.counters.events.iter().filter(|(name, _)| SHOWN.contains(name));
-    let counts = events.chain(&view.counters.rejects).chain(&view.counters.shed).filter(|(_, times)| **times > 0);
+    let rejects = view.counters.rejects.iter().filter(|(name, _)| **name != COPIES);
+    let counts = events.chain(rejects).chain(&view.counters.shed).filter(|(_, times)| **times > 0);
     let rows: Vec<_> = counts.map(|(name, times)| Row::new([name.replace('_', " "), times.to_string()])).collect();
     let title = if rows.is_empty() { " nothing lost here " } else { " lost here " };
     Table::new(rows, [Constraint::Fill(1), Constraint::Length(10)]).block(Block::bordered().title(title))

@@ -82,6 +82,41 @@ fn the_page_is_there_unless_it_is_switched_off() {
 }
 
 #[test]
+fn only_what_is_not_a_default_is_printed_on_request() {
+    let changed = |environment: &[(&str, &str)]| {
+        let mut command = ecod_node();
+        command.args(["--role", "edge", "--print-config", "--changed"]).envs(environment.iter().copied());
+        String::from_utf8(command.output().unwrap().stdout).unwrap()
+    };
+    assert_eq!(changed(&[]), "name = \"edge\"\nrole = \"edge\"\n");
+    let gate = ("ECOD_FUSION__PACE__GATE_M", "1.5");
+    let expected = "name = \"edge\"\nrole = \"edge\"\n\n[fusion.pace]\ngate_m = 1.5\n";
+    assert_eq!(changed(&[gate, ("ECOD_FUSION__PACE__POSITION_FLOOR_M", "0.05")]), expected);
+    assert!(changed(&[("ECOD_DASHBOARD__TOKEN", "correct-horse")]).starts_with("# `dashboard.token` is set"));
+    let alone = ecod_node().args(["--role", "edge", "--changed"]).output().unwrap();
+    assert!(alone.status.code() == Some(2) && stderr(&alone).contains("--print-config"), "{}", stderr(&alone));
+}
+
+/// A period in milliseconds is warned of by the node that starts and by `doctor`, with key, value and remedy.
+#[test]
+fn values_in_another_unit_are_named_at_the_start_and_by_doctor() {
+    let mut file = tempfile::NamedTempFile::new().unwrap();
+    let offline = "listen = \"127.0.0.1:0\"\n[membership]\nbind = \"127.0.0.1:0\"\nmulticast = { enabled = false }\n\
+        [dashboard]\nenabled = false\n";
+    write!(file, "role = \"edge\"\n{offline}[fusion.round]\nperiod_s = 50").unwrap();
+    let expected =
+        ["`fusion.round.period_s` is 50, and should be in seconds", "correct it in this node's configuration"];
+    let mut started = ecod_node();
+    started.args(["--log-format", "text", "--stop-at-eof", "--config"]).arg(file.path());
+    let log = stderr(&started.output().unwrap());
+    assert!(expected.iter().all(|part| log.contains(part)) && log.contains("WARN"), "{log}");
+    let checked = ecod_node().arg("doctor").arg("--config").arg(file.path()).output().unwrap();
+    let said = String::from_utf8(checked.stdout).unwrap();
+    let line = said.lines().find(|line| line.starts_with("warn  units")).unwrap_or_else(|| panic!("{said}"));
+    assert!(expected.iter().all(|part| line.contains(part)), "{line}");
+}
+
+#[test]
 fn a_listening_address_without_ip_is_told_what_is_missing() {
     for listen in ["1883", "localhost:1883", "127.0.0.1:80000"] {
         let output = ecod_node().args(["--role", "edge", "--listen", listen]).output().unwrap();

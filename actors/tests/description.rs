@@ -315,6 +315,8 @@ async fn a_node_whose_own_file_contradicts_says_so_with_both_values_and_goes_on(
         }
     };
     tells_of_both(&shows(&edge, &["# edge: version 1, hash", "# gauss: version 1, hash", "not used"]).await);
+    let troubles = gauss.troubles();
+    assert!(troubles.iter().any(|(_, it)| it.kind == "description" && it.cause.contains("slot-0")), "{troubles:?}");
     map_where(&gauss, "of the cell", |map| places(map) == ["slot-0", "slot-1"]).await;
     gauss.stop().await;
     // A description of others stops no node: it has it saved, and goes on without it.

@@ -57,6 +57,33 @@ fn the_example_vehicles_fit_the_example_edge() {
     }
 }
 
+/// Keys of a configuration that are no tables.
+fn leaves(table: &toml::Table, path: &str) -> Vec<String> {
+    let below = |(key, value): (&String, &toml::Value)| match value {
+        toml::Value::Table(inner) => leaves(inner, &format!("{path}{key}.")),
+        _ => vec![format!("{path}{key}")],
+    };
+    table.iter().flat_map(below).collect()
+}
+
+#[cfg(feature = "camera")]
+#[test]
+fn the_keys_that_most_need_are_explained_first_and_are_all_that_the_example_sets() {
+    let manual = page("docs/configuration.md");
+    let first = manual.split("\n## ").nth(1).unwrap();
+    let cells = first.lines().filter_map(|line| line.strip_prefix("| `")?.split_once(" | "));
+    let mut explained: Vec<&str> = cells.flat_map(|(keys, _)| keys.trim_end_matches('`').split("`, `")).collect();
+    explained.sort_unstable();
+    let text = std::fs::read_to_string(example("auto.toml")).unwrap();
+    let mut set = leaves(&text.parse().unwrap(), "");
+    set.sort_unstable();
+    assert_eq!((explained.len(), explained), (15, set.iter().map(String::as_str).collect()));
+    let mut changed = leaves(&load("auto.toml").to_toml_changed().unwrap().parse().unwrap(), "");
+    changed.sort_unstable();
+    set.retain(|key| key != "role");
+    assert_eq!(changed, set, "the role is the default one");
+}
+
 #[cfg(feature = "camera")]
 #[test]
 fn configurations_in_the_documentation_can_be_used() {

@@ -92,6 +92,24 @@ fn lines_that_cannot_be_used_are_counted_by_reason() {
     }
 }
 
+/// A vote that names its location needs no position. Detections do: the field is named, and nothing used is a failure.
+#[test]
+fn votes_by_name_are_used_without_positions_and_detections_are_told_what_they_lack() {
+    let line = |topic: &str| {
+        let object = r#"{"label":"cup","confidence":0.9,"landmark":"table"}"#;
+        let report =
+            format!(r#""schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,"objects":[{object}]"#);
+        format!("{{{report},\"topic\":\"{topic}\"}}\n")
+    };
+    let run = |topic: &str| ecod_with_input(&["replay", "--input", "-", "--output", "-"], line(topic).as_bytes());
+    let votes = run("vote_detections");
+    assert!(votes.status.success() && said(&votes).contains("1 lines, 1 used"), "{}", said(&votes));
+    assert!(String::from_utf8_lossy(&votes.stdout).contains(r#""landmark":"table","label":"cup""#));
+    let detections = run("detections");
+    assert_eq!(detections.status.code(), Some(3));
+    assert!(said(&detections).contains("line 1: objects[0]: missing field `x_m`"), "{}", said(&detections));
+}
+
 #[test]
 fn input_that_is_no_recording_fails() {
     let folder = TempDir::new().unwrap();

@@ -216,6 +216,8 @@ async fn a_broken_state_does_not_stop_a_node() {
         unmasked(&euclid, &euclid).await;
         let event = if saved { Event::ReputationsSaved } else { Event::ReputationsNotSaved };
         assert!(edge.counters().events(event) > 0);
+        let troubles = edge.troubles();
+        assert_eq!(troubles.iter().any(|(_, trouble)| trouble.kind == "not_saved"), !saved, "{troubles:?}");
         assert_eq!(directory.path().join("crossing.edge.reputations.set-aside").exists(), saved);
         euclid.stop().await;
         edge.stop().await;

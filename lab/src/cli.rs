@@ -22,8 +22,17 @@ use serde::Serialize;
 struct Cli {
     #[command(subcommand)]
     command: Command,
-    /// Form of the log; RUST_LOG sets what is in it
-    #[arg(long, global = true, value_enum, value_name = "FORM", default_value_t)]
+    /// Format of log lines: auto, text, json or journal; RUST_LOG sets their level
+    #[arg(
+        long,
+        global = true,
+        value_enum,
+        value_name = "FORM",
+        default_value_t,
+        help_heading = "Logging",
+        hide_short_help = true,
+        hide_possible_values = true
+    )]
     log_format: LogFormat,
 }
 

@@ -1,16 +1,11 @@
 //! One answer for each place where PACE and VOTE both run.
 //!
 //! PACE says whether an object is there: it alone counts misses. VOTE says what it is: it alone knows whom to trust. Its
-//! label stands unless the vote is undecided, or PACE knows that the place is empty. Both rest on the same frames, so that
+//! label stands, however narrow the vote, unless PACE knows that the place is empty. Both rest on the same frames, so that
 //! neither adds certainty to the other: the answer is as sure as the less sure of them.
-
-use std::collections::BTreeMap;
 
 use crate::model::names::Label;
 use crate::wire::{LabelReading, LandmarkState, Verdict};
-
-/// Share of all votes by which the best label must lead to decide against PACE.
-const MIN_LEAD: f64 = 0.1;
 
 /// Combines the state of a place by PACE with its verdict and with what each vehicle read there. `sign` is the label of
 /// the place's vacancy sign.
@@ -24,12 +19,9 @@ pub(super) fn agree(
         Some(label) => Some(label) == sign,
         None => !state.observers.is_empty(),
     };
-    if let Some(Decision { label, share, lead, mass, votes }) = verdict.and_then(decision).filter(|_| !is_known_empty) {
+    if let Some(Decision { label, share, mass }) = verdict.and_then(decision).filter(|_| !is_known_empty) {
         match &state.label {
             Some(known) if known == label => state.confidence = state.confidence.min(share),
-            Some(known) if lead < MIN_LEAD && votes.contains_key(known) => {
-                state.confidence = state.confidence.min(votes[known] / mass);
-            }
             known => {
                 // Without PACE, few voters make nothing sure: Laplace's rule of succession for votes that all agree.
                 let sure = if known.is_some() { state.confidence } else { mass / (mass + 1.0) };
@@ -40,7 +32,9 @@ pub(super) fn agree(
             }
         }
     }
-    state.readings = readings;
+    // Where all read the place's label, the contributors say as much.
+    let is_unanimous = matches!(&readings[..], [reading] if Some(&reading.label) == state.label.as_ref());
+    state.readings = if is_unanimous { Vec::new() } else { readings };
     state
 }
 
@@ -49,19 +43,15 @@ struct Decision<'a> {
     label: &'a Label,
     /// The label's share of all votes.
     share: f64,
-    /// Its lead over the next as a share of all votes.
-    lead: f64,
     /// Weight of all votes.
     mass: f64,
-    /// Weight by label.
-    votes: &'a BTreeMap<Label, f64>,
 }
 
 fn decision(verdict: &Verdict) -> Option<Decision<'_>> {
     let mass: f64 = verdict.votes.values().sum();
     let label = verdict.label.as_ref().filter(|_| mass > 0.0)?;
     let share = (verdict.score / mass).clamp(0.0, 1.0);
-    Some(Decision { label, share, lead: verdict.margin / mass, mass, votes: &verdict.votes })
+    Some(Decision { label, share, mass })
 }
 
 #[cfg(test)]
@@ -110,7 +100,7 @@ mod tests {
         let seen: &[&str] = &["euclid"];
         assert_eq!(answer(state(Some("car"), 0.9, seen), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.9));
         assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.9), ("van", 0.1)]).0, Some("car".into()));
-        assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.05), ("van", 0.95)]).0, Some("van".into()));
+        assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.05), ("van", 0.95)]), (Some("car".into()), 0.53));
         assert_eq!(answer(state(None, 0.0, &[]), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.67));
         assert_eq!(answer(state(None, 0.0, seen), &[("car", 2.0)]), (None, 0.0), "seen empty");
         assert_eq!(answer(state(Some("EMPTY"), 0.8, seen), &[("car", 2.0)]), (Some("EMPTY".into()), 0.8));

@@ -6,7 +6,7 @@
 
 use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
 
-use crate::config::config_section;
+use crate::config::{check_optional, config_section};
 use crate::model::geometry::{Pose, wrap_angle};
 use crate::model::names::LandmarkId;
 use crate::perception::camera::{Intrinsics, Mount};
@@ -17,8 +17,9 @@ use crate::wire::PerceivedObject;
 config_section! {
     /// Conditions for a location to be in view.
     pub struct ViewConfig {
-        /// Width of the target or object to be recognised at a location, in metres; default 0.05.
-        pub target_width_m: f64 = 0.05, in 1e-4 to 1e3;
+        /// Width of the target or object to be recognised at a location, in metres; default that of the smallest listed
+        /// size or, without any, 0.05.
+        pub target_width_m: Option<f64> = None, checked by check_optional(1e-4, 1e3);
         /// Minimum width in pixels of the target as it is turned; default 36: a placard code of 21 modules at 1.7 pixels
         /// each. Less claims more locations, some of which the detector cannot read.
         pub min_target_px: f64 = 36.0, in 0.0 to 1e5;
@@ -29,11 +30,32 @@ config_section! {
         /// Maximum angle in radians between the facing of the location and the direction to the camera; default 0.87
         /// (50°).
         pub max_yaw_rad: f64 = 0.87, in 0.0 to std::f64::consts::PI;
-        /// Width in metres of an occluding object whose label has no listed size; default 0.07.
-        pub occluder_width_m: f64 = 0.07, in 0.0 to 1e3;
+        /// Width in metres of an occluding object whose label has no listed size; default the target's, at least 0.07.
+        pub occluder_width_m: Option<f64> = None, checked by check_optional(0.0, 1e3);
         /// Distance in metres by which an object must be nearer than a location to hide it; default 0.05. It must exceed
         /// the error of a position, or an object hides its own location.
         pub clearance_m: f64 = 0.05, in 0.0 to 1e3;
+    }
+}
+
+/// Widths of target and occluder of placards, where nothing is known.
+const PLACARD_TARGET_M: f64 = 0.05;
+const PLACARD_OCCLUDER_M: f64 = 0.07;
+
+/// Settings with the defaults that rest on sizes.
+struct Widths<'a> {
+    config: &'a ViewConfig,
+    sizes: &'a ObjectSizes,
+    target_m: f64,
+    unlisted_m: f64,
+}
+
+impl<'a> Widths<'a> {
+    fn new(config: &'a ViewConfig, sizes: &'a ObjectSizes) -> Self {
+        let listed = sizes.labels.values().chain(&sizes.default).map(|size| size.width_m);
+        let target_m = config.target_width_m.or(listed.reduce(f64::min)).unwrap_or(PLACARD_TARGET_M);
+        let unlisted_m = config.occluder_width_m.unwrap_or(target_m.max(PLACARD_OCCLUDER_M));
+        Self { config, sizes, target_m, unlisted_m }
     }
 }
 
@@ -70,21 +92,22 @@ pub fn landmarks_in_view(
     sizes: &ObjectSizes,
     config: &ViewConfig,
 ) -> Vec<LandmarkId> {
+    let widths = Widths::new(config, sizes);
     let occluder = |object: &PerceivedObject| {
         let landmark = object.landmark.as_ref().and_then(|id| landmarks.iter().find(|landmark| landmark.id == *id));
-        Occluder::new(object, landmark.and_then(|landmark| landmark.facing_rad), &camera.pose, sizes, config)
+        Occluder::new(object, landmark.and_then(|landmark| landmark.facing_rad), &camera.pose, &widths)
     };
     let occluders: Vec<Occluder> = objects.iter().map(occluder).collect();
     let in_view = |landmark: &&Landmark| {
         let (range_m, bearing_rad) = camera.pose.range_bearing(&landmark.position);
         range_m <= config.max_range_m
-            && is_readable(landmark, camera, config)
+            && is_readable(landmark, camera, &widths)
             && !occluders.iter().any(|occluder| {
                 occluder.hides(
                     range_m,
                     bearing_rad,
                     visible_width_share(landmark.facing_rad, &camera.pose, &landmark.position),
-                    config,
+                    &widths,
                 )
             })
     };
@@ -92,7 +115,8 @@ pub fn landmarks_in_view(
 }
 
 /// True if a target that faces as the landmark does is inside the image and large enough.
-fn is_readable(landmark: &Landmark, camera: &PosedCamera, config: &ViewConfig) -> bool {
+fn is_readable(landmark: &Landmark, camera: &PosedCamera, widths: &Widths) -> bool {
+    let config = widths.config;
     let to_camera = camera.pose.position - landmark.position;
     let towards_camera_rad = to_camera.y.atan2(to_camera.x);
     let facing_rad = landmark.facing_rad.unwrap_or(towards_camera_rad);
@@ -100,7 +124,7 @@ fn is_readable(landmark: &Landmark, camera: &PosedCamera, config: &ViewConfig) -
         return false;
     }
     // The left end as seen from the side that the target faces.
-    let half_width = Vector2::new(facing_rad.sin(), -facing_rad.cos()) * (config.target_width_m / 2.0);
+    let half_width = Vector2::new(facing_rad.sin(), -facing_rad.cos()) * (widths.target_m / 2.0);
     let ends = [landmark.position + half_width, landmark.position - half_width].map(|end| camera.pixel(&end));
     let [Some(left), Some(right)] = ends else { return false };
     let (width, height) = (f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
@@ -120,26 +144,20 @@ struct Occluder {
 
 impl Occluder {
     /// An object that faces `facing_rad`, or has the same width from all sides.
-    fn new(
-        object: &PerceivedObject,
-        facing_rad: Option<f64>,
-        camera: &Pose,
-        sizes: &ObjectSizes,
-        config: &ViewConfig,
-    ) -> Self {
+    fn new(object: &PerceivedObject, facing_rad: Option<f64>, camera: &Pose, widths: &Widths) -> Self {
         let position = Point2::new(object.x_m, object.y_m);
         let (range_m, bearing_rad) = camera.range_bearing(&position);
-        let width_m = sizes.labels.get(&object.label).map_or(config.occluder_width_m, |size| size.width_m);
+        let width_m = widths.sizes.labels.get(&object.label).map_or(widths.unlisted_m, |size| size.width_m);
         let half_angle_rad = half_angle(width_m * visible_width_share(facing_rad, camera, &position), range_m);
         Self { range_m, bearing_rad, half_angle_rad }
     }
 
     /// True if any part of a target at the given range and bearing is behind this object; `width_share` is the visible
     /// share of its width.
-    fn hides(&self, range_m: f64, bearing_rad: f64, width_share: f64, config: &ViewConfig) -> bool {
-        self.range_m + config.clearance_m < range_m
+    fn hides(&self, range_m: f64, bearing_rad: f64, width_share: f64, widths: &Widths) -> bool {
+        self.range_m + widths.config.clearance_m < range_m
             && wrap_angle(self.bearing_rad - bearing_rad).abs()
-                < self.half_angle_rad + half_angle(config.target_width_m * width_share, range_m)
+                < self.half_angle_rad + half_angle(widths.target_m * width_share, range_m)
     }
 }
 
@@ -158,6 +176,7 @@ mod tests {
     use std::f64::consts::{FRAC_PI_2, PI};
 
     use super::*;
+    use crate::perception::projection::ObjectSize;
 
     fn landmark(id: &str, x_m: f64, y_m: f64, facing_rad: Option<f64>) -> Landmark {
         Landmark { id: id.into(), position: Point2::new(x_m, y_m), facing_rad, vacancy: None, synonyms: vec![] }
@@ -204,6 +223,16 @@ mod tests {
                 .contains(&"behind".into())
         );
         assert!(!seen(&[behind, all_around], &[hiding], &ObjectSizes::default()).contains(&"behind".into()));
+    }
+
+    #[test]
+    fn places_are_judged_by_the_sizes_that_are_listed() {
+        let (slot, car) = (landmark("slot", 8.0, 0.0, None), ObjectSize::square(1.8));
+        let sizes = ObjectSizes { labels: [("car".into(), car)].into(), ..ObjectSizes::default() };
+        let slot = std::slice::from_ref(&slot);
+        assert!(seen(slot, &[], &ObjectSizes::default()).is_empty(), "too far for a placard");
+        assert_eq!(seen(slot, &[], &sizes), ["slot"]);
+        assert!(seen(slot, &[object("dragon", 4.0, 0.8)], &sizes).is_empty(), "what is not listed hides as a car does");
     }
 
     #[test]
@@ -254,8 +283,11 @@ mod tests {
 
     #[test]
     fn a_listed_width_decides_how_much_an_object_hides() {
-        let sizes: ObjectSizes =
-            serde_json::from_str(r#"{"labels": {"truck": {"width_m": 0.3, "height_m": 0.3}}}"#).unwrap();
+        let sizes: ObjectSizes = serde_json::from_str(
+            r#"{"labels": {"truck": {"width_m": 0.3, "height_m": 0.3},
+            "QR": {"width_m": 0.05, "height_m": 0.05}}}"#,
+        )
+        .unwrap();
         let landmarks = [landmark("a", 0.6, 0.0, Some(PI)), landmark("b", 0.6, -0.2, Some(PI))];
         assert_eq!(seen(&landmarks, &[object("truck", 0.3, 0.1)], &sizes), ["b"]);
         assert_eq!(seen(&landmarks, &[object("van", 0.3, 0.1)], &sizes), ["a", "b"]);

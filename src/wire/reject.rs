@@ -74,6 +74,13 @@ reject_reasons! {
     NotPermitted = "not_permitted",
 }
 
+impl RejectReason {
+    /// The name in words.
+    pub fn in_words(self) -> String {
+        self.as_str().replace('_', " ")
+    }
+}
+
 impl fmt::Display for RejectReason {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.as_str())

@@ -238,7 +238,7 @@ impl FuserState {
             RejectReason::NotFused => self
                 .counters
                 .reject_report(reason, node, || "its reports are for an algorithm that the cell does not run".into()),
-            _ => self.counters.reject_report(reason, node, || format!("reports are rejected as {reason}")),
+            _ => self.counters.reject_report(reason, node, || format!("reports rejected: {}", reason.in_words())),
         }
     }
 

@@ -326,10 +326,14 @@ fn draw_secrets() -> Result<(SessionNonce, [u8; 32], u64), ActorProcessingErr> {
 
 fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: SocketAddr) {
     match (config.has_key(), address.ip().is_loopback()) {
-        (true, _) if proves => tracing::info!(%address, "gossiping with whoever has the cell's key and a certificate"),
-        (true, _) => tracing::info!(%address, "gossiping with whoever has the cell's key: certificates are not proven"),
-        (false, false) if proves => tracing::warn!(%address, "gossiping with certificates, no cell key is set"),
-        (false, true) => tracing::info!(%address, "gossiping on this machine only: no cell key is set"),
-        (false, false) => tracing::warn!(%address, "gossiping with anyone: no cell key is set"),
+        (true, _) if proves => tracing::info!(%address, "looking for nodes that have the cell's key and a certificate"),
+        (true, _) => {
+            tracing::info!(%address, "looking for nodes that have the cell's key; certificates are not asked for")
+        }
+        (false, false) if proves => {
+            tracing::warn!(%address, "looking for nodes that have a certificate; no cell key is set")
+        }
+        (false, true) => tracing::info!(%address, "looking for nodes on this machine only: no cell key is set"),
+        (false, false) => tracing::warn!(%address, "looking for nodes of anyone: no cell key is set"),
     }
 }

@@ -178,7 +178,7 @@ impl ProjectorState {
 }
 
 /// The report as VOTE needs it: objects at known locations only.
-fn votes(report: &ObjectReport) -> ObjectReport {
+pub fn votes(report: &ObjectReport) -> ObjectReport {
     let objects = report.objects.iter().filter(|object| object.landmark.is_some()).cloned().collect();
     let ObjectReport { node, seq, captured_at_us, pose, clock_error_us, .. } = report;
     let empty = ObjectReport::new(node.clone(), *seq, *captured_at_us);

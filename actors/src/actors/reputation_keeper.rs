@@ -148,7 +148,7 @@ impl Actor for ReputationKeeper {
             ReputationKeeperMessage::StepDown => state.resync.step_down(),
             ReputationKeeperMessage::Merge { delivery } => state.merge(&delivery),
             ReputationKeeperMessage::SendSnapshot { to } => {
-                tracing::info!(%to, "sharing all evidence");
+                tracing::info!(%to, "sending all evidence behind the reputations to another candidate");
                 state.send_snapshot();
             }
             ReputationKeeperMessage::Tick => state.tick().await,

@@ -36,7 +36,7 @@ pub(super) struct ReplayArguments {
     /// File for maps and verdicts, one JSON object per line; `-` for standard output
     #[arg(long, value_name = "FILE")]
     output: PathBuf,
-    /// Repeat VOTE over all evidence N times, and write the verdicts of the last pass only
+    /// Weigh all recorded votes together N times, and write the last verdicts only
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     passes: Option<u32>,
     /// Share of rejected reports beyond which the program ends with code 3, as it does if none was usable

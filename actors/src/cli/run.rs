@@ -28,7 +28,7 @@ pub(super) struct RunArguments {
     role: Option<String>,
     #[command(flatten)]
     join: JoinArguments,
-    /// Address of the embedded broker
+    /// Address where this node's own MQTT broker listens
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     listen: Option<SocketAddr>,
     /// Directory for state that survives a restart
@@ -53,6 +53,9 @@ pub(super) struct RunArguments {
     /// Print the configuration that results from file, environment and flags, and exit
     #[arg(long)]
     print_config: bool,
+    /// With --print-config: print only what differs from the defaults
+    #[arg(long, requires = "print_config")]
+    changed: bool,
     /// Stop when standard input ends, as when the parent process is gone
     #[arg(long, hide = true)]
     stop_at_eof: bool,
@@ -70,7 +73,7 @@ struct JoinArguments {
     /// Name of the cell
     #[arg(long)]
     cell: Option<NodeName>,
-    /// External broker for all data; without one, nodes use their own
+    /// MQTT broker for all data; without one, nodes use their own
     #[arg(long, value_name = "HOST:PORT")]
     broker: Option<BrokerAddress>,
     /// Address of a node of the cell; may be given several times
@@ -85,7 +88,8 @@ pub(super) fn ip_and_port(text: &str) -> Result<SocketAddr, &'static str> {
 pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
     let config = arguments.load()?;
     if arguments.print_config {
-        return Ok(print(&config.to_toml().context("the configuration cannot be written as TOML")?)?);
+        let text = if arguments.changed { config.to_toml_changed() } else { config.to_toml() };
+        return Ok(print(&text.context("the configuration cannot be written as TOML")?)?);
     }
     run_node(config, arguments.stop_at_eof)
 }

@@ -2,8 +2,6 @@
 
 use std::time::Duration;
 
-use ecod::diagnostics::TroubleKind;
-
 use super::Finding;
 use crate::camera::config::CameraConfig;
 use crate::camera::frame_source::SourceConfig;
@@ -16,15 +14,7 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 /// All checks of a camera, if there is one.
 pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     let Some(camera) = &config.camera else { return Vec::new() };
-    let mut findings = vec![frame(camera).await, calibration(camera), detector(camera).await];
-    findings.extend(sizes(camera));
-    findings
-}
-
-/// Checks that sizes of labels are in metres.
-fn sizes(camera: &CameraConfig) -> Option<Finding> {
-    let seen = camera.projection.sizes.implausible()?;
-    Some(Finding::doubtful("sizes", seen, TroubleKind::ImplausibleSize.remedy()))
+    vec![frame(camera).await, calibration(camera), detector(camera).await]
 }
 
 async fn frame(camera: &CameraConfig) -> Finding {

@@ -151,7 +151,7 @@ impl NodeBuilder {
             dashboard_address: watch::Sender::new(None),
             failed,
         };
-        builder.note_sizes();
+        builder.note_units();
         builder.door = builder.new_door();
         builder.door.publish_description(&builder.present_description());
         builder

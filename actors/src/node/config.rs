@@ -4,7 +4,9 @@
 
 mod extraction;
 mod observer;
+mod printed;
 mod shared;
+mod units;
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -152,7 +154,7 @@ impl NodeConfig {
             stated = stated.merge(Toml::file_exact(path));
         }
         let stated = stated.merge(environment()).merge(Serialized::defaults(flags));
-        let mut config = extract(Figment::from(Serialized::defaults(Self::default())).merge(&stated))?;
+        let mut config = Self::of_keys(&stated)?;
         config.stated = stated.extract().map(|stated| StatedKeys::of(&stated)).unwrap_or_default();
         if config.name.is_none() {
             let edge = (config.role == Role::Edge).then_some(NodeName::from_static("edge"));
@@ -178,10 +180,19 @@ impl NodeConfig {
             shared.put_into(&mut config);
             return Ok(config);
         }
-        let config = extract(Figment::from(Serialized::defaults(Self::default())).merge(Toml::file_exact(file)))?;
+        let config = Self::of_keys(&Figment::from(Toml::file_exact(file)))?;
         config.fusion.validate().map_err(|error| error.within("fusion"))?;
         LandmarkConfig::validate_all(&config.landmarks)?;
         Ok(config)
+    }
+
+    /// The stated keys over the defaults, unchecked. Boxes of a neural detector have a default deviation of their own.
+    fn of_keys(stated: &Figment) -> Result<Self, LoadError> {
+        let mut defaults = Figment::from(Serialized::defaults(Self::default()));
+        if stated.extract_inner("camera.detector.kind").is_ok_and(|kind: String| kind == "coco") {
+            defaults = defaults.merge(Serialized::default("camera.projection.pixel_sigma_px", COCO_PIXEL_SIGMA_PX));
+        }
+        extract(defaults.merge(stated))
     }
 
     /// Checks every value and that they fit together.
@@ -252,29 +263,6 @@ impl NodeConfig {
         Ok(())
     }
 
-    /// The configuration as TOML that can be read back; secrets are left out, and a comment says so.
-    ///
-    /// # Errors
-    /// When a value has no form in TOML.
-    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
-        let mut shown = self.clone();
-        let mut comment = String::new();
-        if shown.mqtt.password.take().is_some() {
-            comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
-        }
-        if shown.dashboard.token.take().is_some() {
-            comment.push_str("# `dashboard.token` is set but not shown: add it, or set ECOD_DASHBOARD__TOKEN\n");
-        }
-        if shown.membership.key.take().is_some() {
-            comment.push_str("# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n");
-        }
-        #[cfg(feature = "camera")]
-        if shown.camera.as_mut().is_some_and(|camera| camera.source.forget_credentials()) {
-            comment.push_str("# user and password of `camera.source.url` are set but not shown: add them\n");
-        }
-        Ok(comment + &toml::to_string(&shown)?)
-    }
-
     /// The embedded broker's limits; its packets hold the cell's maps.
     pub fn broker(&self) -> BrokerConfig {
         let needed = u32::try_from(self.mqtt.max_packet_bytes()).ok();
@@ -331,6 +319,9 @@ impl NodeConfig {
         self.landmarks.iter().map(Landmark::from).collect()
     }
 }
+
+/// Default standard deviation in pixels of the edges of boxes that the detector of COCO gives.
+const COCO_PIXEL_SIGMA_PX: f64 = 3.0;
 
 /// The machine's name without its domain, as far as names of nodes may have its characters.
 fn host_name() -> Option<NodeName> {

@@ -157,7 +157,7 @@ impl Counters {
     /// Counts a rejected payload, other than a report, of a node, or of a broker where the sender is not known. It is a
     /// trouble, unless elections and re-ordering explain it.
     pub fn reject(&self, reason: RejectReason, source: &str) {
-        self.reject_message(reason, source, || format!("a message is rejected as {reason}"));
+        self.reject_message(reason, source, || format!("message rejected: {}", reason.in_words()));
     }
 
     /// Counts a rejected payload as [`Self::reject`] does, with the cause in words.
@@ -199,7 +199,7 @@ impl Counters {
             ShedReason::ReaderSlow => "reads too slowly and misses the oldest messages",
             // A busy fuser takes the later report: the vehicle need not know.
             ShedReason::ReportReplaced => return,
-            _ => "sends more than is taken, the rest is left out",
+            _ => "sends more than is taken, the rest is not used",
         };
         self.troubles.note_about(source, TroubleKind::Overload, &format!("{cause} ({})", reason.as_str()));
     }

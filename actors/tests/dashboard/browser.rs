@@ -5,6 +5,8 @@ use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
 use ecod_actors::platform::secret::Secret;
+#[cfg(feature = "camera")]
+use opencv::prelude::MatTraitConst;
 
 use crate::cell::{self, Stray, Vehicles, config};
 use crate::http::Events;
@@ -156,6 +158,40 @@ async fn an_older_browser_shows_the_map_and_a_page_that_cannot_be_drawn_says_so(
     assert_eq!(browser.evaluate(&format!("{is_said} && !{is_live}")).await, true, "and goes on to");
     browser.evaluate("document.querySelector('#gone').id = 'places'").await;
     browser.until(&format!("{is_live} && document.querySelector('#notice').hidden")).await;
+    browser.quit().await;
+    node.stop().await;
+}
+
+/// A table that is cut off shows a shadow where it goes on, and none where it ends.
+#[cfg(feature = "camera")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn a_table_that_goes_on_shows_it_by_a_shadow() {
+    let (node, page) = cell::start(config("euclid", Role::Auto, 24)).await;
+    let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 24);
+    let directory = tempfile::tempdir().unwrap();
+    let browser = Browser::start().await;
+    browser.look(1440, 900, "light").await;
+    browser.open(&format!("http://{page}/")).await;
+    browser.until("document.querySelectorAll('#verdicts tr').length >= 24").await;
+    let scroll = "document.querySelector('#verdicts').closest('.scroll')";
+    let cut_off = format!("{scroll}.scrollHeight > {scroll}.clientHeight + 100");
+    assert_eq!(browser.evaluate(&cut_off).await, true, "the table is too short for this test");
+    let lightest_at_the_end = async |name: &str| {
+        let place = "(({ left, right, bottom }) => [left + scrollX, right + scrollX, bottom + scrollY])";
+        let place = browser.evaluate(&format!("{place}({scroll}.getBoundingClientRect())")).await;
+        let [left, right, bottom] = [0, 1, 2].map(|index| place[index].as_f64().unwrap() as i32);
+        let file = directory.path().join(name);
+        browser.screenshot(&file).await;
+        let picture = opencv::imgcodecs::imread(file.to_str().unwrap(), opencv::imgcodecs::IMREAD_GRAYSCALE).unwrap();
+        let pixels = (left + 4..right - 20).map(|x| *picture.at_2d::<u8>(bottom - 2, x).unwrap());
+        pixels.max().unwrap()
+    };
+    let goes_on = lightest_at_the_end("begin.png").await;
+    browser.evaluate(&format!("{scroll}.scrollTo(0, {scroll}.scrollHeight)")).await;
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    let ends = lightest_at_the_end("end.png").await;
+    assert!(goes_on + 15 < ends, "{goes_on} where rows follow, {ends} after the last");
     browser.quit().await;
     node.stop().await;
 }

@@ -1,13 +1,20 @@
 //! Troubles, as nodes name them.
 
 use std::net::SocketAddr;
+#[cfg(feature = "camera")]
+use std::path::Path;
 use std::time::Duration;
 
+use ecod::aggregator::Algorithms;
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use ecod_actors::node::NodeHandle;
+#[cfg(feature = "camera")]
+use ecod_actors::node::config::NodeConfig;
 use ecod_actors::platform::clock;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 use uuid::Uuid;
 
@@ -16,7 +23,16 @@ use crate::http::get;
 
 /// A client that sends one report after the other, made by its number; ends when dropped. Its id is that of a node's run.
 fn send(broker: SocketAddr, node: &'static str, report: impl Fn(u64) -> String + Send + 'static) -> JoinSet<()> {
-    let id = format!("{node}-{}", Uuid::from_u128(7).simple());
+    send_as(format!("{node}-{}", Uuid::from_u128(7).simple()), broker, node, report)
+}
+
+/// The same under a client id.
+fn send_as(
+    id: String,
+    broker: SocketAddr,
+    node: &'static str,
+    report: impl Fn(u64) -> String + Send + 'static,
+) -> JoinSet<()> {
     let options = MqttOptions::new(id, broker.ip().to_string(), broker.port());
     let (client, mut events) = AsyncClient::new(options, 16);
     let mut tasks = JoinSet::new();
@@ -115,6 +131,74 @@ async fn who_is_alone_says_why() {
     until_told(last_page, ["hertz", "no-such-host.invalid:1883", "broker_unreachable"], "broker not reached").await;
     assert_eq!(get(page, "/readyz").await.status, 503);
     stop([last, other, cav, edge]).await;
+}
+
+/// What a leader does not take is named with its sender: reports for the other algorithm, too many, in another's name.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn reports_that_are_not_taken_are_named_with_their_sender() {
+    let mut voting = config("edge", Role::Edge, 1);
+    voting.fusion.algorithms = Algorithms::Vote;
+    voting.mqtt.max_report_hz = 4;
+    let (edge, page) = start(voting).await;
+    let broker = edge.broker_address().unwrap();
+    let watson = send(broker, "watson", |seq| report("watson", seq, 0, "1"));
+    until_told(page, ["edge", "watson", "not_fused"], "for an algorithm that the cell does not run").await;
+    until_told(page, ["edge", "watson", "overload"], "sends more than is taken").await;
+    drop(watson);
+    // A program at the door of a node speaks for that node alone.
+    let program = send_as("program".into(), broker, "hertz", |seq| report("hertz", seq, 0, "1"));
+    until_told(page, ["edge", "hertz", "not_permitted"], "rejected: not permitted").await;
+    drop(program);
+    edge.stop().await;
+}
+
+/// A broker that is there and refuses the login.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_broker_that_refuses_is_named_with_its_answer() {
+    let broker = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = broker.local_addr().unwrap().to_string();
+    let mut refused = config("euclid", Role::Cav, 1);
+    refused.mqtt.broker = Some(address.parse().unwrap());
+    let mut refusing = JoinSet::new();
+    refusing.spawn(async move {
+        loop {
+            let (mut client, _) = broker.accept().await.unwrap();
+            // CONNACK of MQTT 3.1.1 with return code 5, not authorised; the client reads it before the end.
+            client.read_u8().await.ok();
+            client.write_all(&[0x20, 2, 0, 5]).await.ok();
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    });
+    let (node, page) = start(refused).await;
+    until_told(page, ["euclid", &address, "broker_refuses"], "broker refuses this node").await;
+    node.stop().await;
+}
+
+/// A camera that is not there, one whose pose nobody sends, and one that sees what has no size.
+#[cfg(feature = "camera")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_camera_lacks_is_named() {
+    let directory = tempfile::tempdir().unwrap();
+    let (frames, detections) = (directory.path().join("frames"), directory.path().join("detections.jsonl"));
+    std::fs::create_dir(&frames).unwrap();
+    std::fs::write(frames.join("0.ppm"), [b"P6 64 48 255\n".as_slice(), &[128; 64 * 48 * 3]].concat()).unwrap();
+    let seen = r#"[{"label":"dragon","confidence":0.9,"bounding_box":{"x_min":30,"y_min":20,"x_max":34,"y_max":24}}]"#;
+    std::fs::write(&detections, seen).unwrap();
+    let with_camera = |name: &str, frames: &Path| {
+        let detector = format!("{{ kind = \"recorded\", path = {detections:?}, looping = true }}");
+        let camera =
+            format!("source = {{ kind = \"images\", path = {frames:?}, looping = true }}\ndetector = {detector}");
+        NodeConfig { camera: Some(toml::from_str(&camera).unwrap()), ..config(name, Role::Cav, 1) }
+    };
+    let (seeing, page) = start(with_camera("euclid", &frames)).await;
+    until_told(page, ["euclid", "", "no_size"], "dragon").await;
+    let mut moving = with_camera("gauss", &frames);
+    moving.pose.listen = Some("127.0.0.1:0".parse().unwrap());
+    let (lost, page) = start(moving).await;
+    until_told(page, ["gauss", "", "no_pose"], "no pose is known").await;
+    let (blind, page) = start(with_camera("hertz", &directory.path().join("none"))).await;
+    until_told(page, ["hertz", "", "camera"], "the camera gives no frames").await;
+    stop([blind, lost, seeing]).await;
 }
 
 /// An observer that stops properly is not listed as a node that was lost.

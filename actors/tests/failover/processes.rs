@@ -40,21 +40,20 @@ impl Drop for Logs<'_> {
 }
 
 fn start(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Process {
+    let log = File::options().create(true).append(true).open(directory.join(format!("{name}.log"))).unwrap();
+    Process(command(name, role, seed, directory).stdout(Stdio::null()).stderr(log).spawn().unwrap())
+}
+
+/// The program as a node of this name, whose files are in the directory.
+fn command(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Command {
     let bind = (role == Role::Edge).then_some(seed);
     let file = directory.join(format!("{name}.toml"));
     let mut config = config(name, role, bind, seed, directory);
     config.tls = certificates(name, role, directory);
     std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
-    let log = File::options().create(true).append(true).open(directory.join(format!("{name}.log"))).unwrap();
-    let child = Command::new(env!("CARGO_BIN_EXE_ecod-node"))
-        .arg("--config")
-        .arg(&file)
-        .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(log)
-        .spawn()
-        .unwrap();
-    Process(child)
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
+    command.arg("--config").arg(file).stdin(Stdio::null());
+    command
 }
 
 /// A node's certificates, if the cell has a CA in its directory.
@@ -81,6 +80,47 @@ fn vehicles_with_certificates_go_on_when_the_process_of_the_edge_is_killed() {
     let directory = tempfile::tempdir().unwrap();
     Authority::init(&directory.path().join(CA), &NodeName::from_static("cell"), clock::now()).unwrap();
     edge_is_killed(&directory);
+}
+
+/// A second run under the name of a running vehicle takes no part: it says why, and ends by itself with a code of its
+/// own. Neither its coming nor its going touches the lead or costs a map.
+#[test]
+fn a_second_process_of_a_name_ends_and_the_leader_stays() {
+    let directory = tempfile::tempdir().unwrap();
+    let _logs = Logs(directory.path());
+    let seed = free_address();
+    let record = || Record::read(&directory.path().join("euclid.maps"));
+    let until = |what: &str, holds: &dyn Fn() -> bool| {
+        let deadline = Instant::now() + PATIENCE;
+        while !holds() {
+            assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    };
+    let _edge = start("edge", Role::Edge, seed, directory.path());
+    let _euclid = start("euclid", Role::Auto, seed, directory.path());
+    until("the edge serves", &|| record().source() == Some("edge"));
+    let before = record().last_round();
+
+    for role in [Role::Cav, Role::Auto] {
+        let elsewhere = tempfile::tempdir().unwrap();
+        let mut second = command("euclid", role, seed, elsewhere.path());
+        // It ends by itself, or the test does not.
+        let ended = second.output().unwrap();
+        let said = String::from_utf8_lossy(&ended.stderr);
+        assert_eq!(ended.status.code(), Some(4), "{said}");
+        let reason = "another running node of the cell cell is called euclid: give one of them another name";
+        assert!(said.contains(reason), "{said}");
+        // By itself it may lead itself, until it has heard long enough that its name is taken.
+        assert_ne!(Record::read(&elsewhere.path().join("euclid.maps")).source(), Some("edge"), "it took part");
+    }
+    let seen = record().last_round();
+    until("maps go on", &|| record().last_round() > seen + 5);
+    let record = record();
+    record.misses_and_repeats_none_after(before, "edge");
+    assert_eq!(record.leaderships(), 1);
+    eprintln!("longest gap beside a namesake {:?}", record.longest_gap());
+    assert!(record.longest_gap() < Duration::from_secs(1), "{:?}", record.longest_gap());
 }
 
 fn edge_is_killed(directory: &TempDir) {

@@ -1,5 +1,6 @@
 //! What a node took, as its map log tells.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::time::Duration;
 
@@ -30,6 +31,12 @@ impl Record {
 
     pub(crate) fn last_round(&self) -> u64 {
         self.maps.last().map_or(0, |received| received.map.round)
+    }
+
+    /// Number of epochs from which maps were taken.
+    pub(crate) fn leaderships(&self) -> usize {
+        let epoch = |received: &ReceivedMap| (received.map.epoch, received.map.aggregator.clone());
+        self.maps.iter().map(epoch).collect::<BTreeSet<_>>().len()
     }
 
     pub(crate) fn longest_gap(&self) -> Duration {

@@ -99,7 +99,7 @@ pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorF
     let mut edge = NodeProcess::start(program, &edge, &directory)?;
     let leader = serves(&mut edge).await?;
     let mut vehicle = configuration(VEHICLE, Role::Cav);
-    vehicle.membership.seeds = vec![timeout(PATIENCE, edge.address("gossiping")).await??.to_string()];
+    vehicle.membership.seeds = vec![timeout(PATIENCE, edge.address("looking for nodes")).await??.to_string()];
     let (resident_mb, door_mb) = idle_memory(program, &vehicle, &directory).await?;
     let map_log = directory.join("maps.jsonl");
     vehicle.map_log = Some(map_log.clone());

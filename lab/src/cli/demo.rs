@@ -77,7 +77,7 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         })));
         let outcome = outcome.with_context(|| format!("scene {}", scene.name))?;
         print(&format!(
-            "        {} maps, {} missed by a vehicle, {:.1} ms from the oldest capture in a map to its receipt (median)\n",
+            "        {} maps, of which vehicles missed {} in all, {:.1} ms from the cameras to a vehicle's map (median)\n",
             outcome.maps,
             outcome.missed,
             outcome.median_age.as_secs_f64() * 1e3,
@@ -99,9 +99,15 @@ fn leaders(outcome: &DemoResult) -> String {
         let since = |time: Timestamp| time.since(outcome.from).as_secs_f64();
         let (leader, from, until) = (&term.epoch.leader, since(term.from), since(term.until));
         let gap = term.gap.map_or_else(String::new, |gap| {
-            format!(", {} ms after the last map of the one before (worst vehicle)", gap.as_millis())
+            format!(
+                ", first map {} ms after the last one before (for the vehicle that waited longest)",
+                gap.as_millis()
+            )
         });
-        format!("        {leader} led from {from:.1} to {until:.1} s, {:.1} % right{gap}\n", term.score.accuracy_pct())
+        format!(
+            "        {leader} led from {from:.1} to {until:.1} s, {:.1} % of the spots right{gap}\n",
+            term.score.accuracy_pct()
+        )
     };
     outcome.terms.iter().map(line).collect()
 }

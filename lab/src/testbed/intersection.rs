@@ -15,6 +15,7 @@ use ecod::aggregator::{Algorithms, FusionConfig};
 use ecod::model::geometry::{Pose, wrap_angle};
 use ecod::model::names::{Label, LandmarkId, NodeName};
 use ecod::model::time::Timestamp;
+use ecod::pace::PaceConfig;
 use ecod::perception::camera::Mount;
 use ecod::perception::landmark::{Landmark, LandmarkGate, LandmarkIndex};
 use ecod::perception::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
@@ -28,7 +29,7 @@ use nalgebra::Point2;
 use serde::Serialize;
 use serde_json::json;
 
-use crate::eval::{Evaluation, Scores, Truth};
+use crate::eval::{EvalResult, Evaluation, Scores, Truth};
 use crate::testbed::{Cav, IntersectionRecording};
 
 /// When virtual time begins.
@@ -76,6 +77,10 @@ pub struct IntersectionResult {
     pub vote_accuracy_pct: f64,
     /// Right verdicts in percent, `paper` mode with a verdict after every frame.
     pub vote_paper_accuracy_pct: f64,
+    /// Right labels of the map in percent, by PACE alone.
+    pub pace_accuracy_pct: f64,
+    /// Right labels of the map in percent, as both algorithms agree on them.
+    pub answer_accuracy_pct: f64,
     /// Expected share in percent of objects and frames at which most votes are right.
     pub majority_accuracy_pct: f64,
     /// Share in percent of objects and frames at which a vehicle's own votes are right.
@@ -104,8 +109,10 @@ pub struct FrameLabel {
 /// When a report cannot be written or read back.
 pub fn run(name: &str, recording: &IntersectionRecording) -> anyhow::Result<IntersectionResult> {
     let reports = reports(recording);
-    let (fused, scores) = vote(recording, &reports, VoteMode::Weighted)?;
-    let (_, paper) = vote(recording, &reports, VoteMode::Paper)?;
+    let (fused, scores) = fuse(recording, &reports, Algorithms::Vote, VoteMode::Weighted)?;
+    let (_, paper) = fuse(recording, &reports, Algorithms::Vote, VoteMode::Paper)?;
+    let (_, pace) = fuse(recording, &reports, Algorithms::Pace, VoteMode::Weighted)?;
+    let (_, answer) = fuse(recording, &reports, Algorithms::Both, VoteMode::Weighted)?;
     let alone =
         |cav: &Cav| (cav.name.clone(), scores.vehicles.get(&cav.name).and_then(|v| v.accuracy_pct).unwrap_or(0.0));
     Ok(IntersectionResult {
@@ -114,6 +121,8 @@ pub fn run(name: &str, recording: &IntersectionRecording) -> anyhow::Result<Inte
         verdicts: scores.items,
         vote_accuracy_pct: scores.accuracy_pct.unwrap_or(0.0),
         vote_paper_accuracy_pct: paper.accuracy_pct.unwrap_or(0.0),
+        pace_accuracy_pct: pace.accuracy_pct.unwrap_or(0.0),
+        answer_accuracy_pct: answer.accuracy_pct.unwrap_or(0.0),
         majority_accuracy_pct: scores.majority_accuracy_pct.unwrap_or(0.0),
         single_cav_accuracy_pct: recording.cavs.iter().map(alone).collect(),
         labels: labels(recording, &fused),
@@ -132,6 +141,8 @@ impl IntersectionResult {
             verdicts: scenes.iter().map(|scene| scene.verdicts).sum(),
             vote_accuracy_pct: mean(&|scene| scene.vote_accuracy_pct),
             vote_paper_accuracy_pct: mean(&|scene| scene.vote_paper_accuracy_pct),
+            pace_accuracy_pct: mean(&|scene| scene.pace_accuracy_pct),
+            answer_accuracy_pct: mean(&|scene| scene.answer_accuracy_pct),
             majority_accuracy_pct: mean(&|scene| scene.majority_accuracy_pct),
             single_cav_accuracy_pct: first
                 .single_cav_accuracy_pct
@@ -181,24 +192,34 @@ fn name_by_bearing(report: &mut ObjectReport, landmarks: &[Landmark]) {
 ///
 /// # Errors
 /// When it cannot be written as JSON.
-pub fn line(report: &ObjectReport) -> serde_json::Result<String> {
+pub fn line(report: &ObjectReport, kind: ReportKind) -> serde_json::Result<String> {
     let mut line = serde_json::to_value(report)?;
-    line["topic"] = json!("vote_detections");
+    line["topic"] = json!(match kind {
+        ReportKind::Detections => "detections",
+        ReportKind::VoteDetections => "vote_detections",
+    });
     serde_json::to_string(&line)
 }
 
-/// The verdicts of a mode and how right they are, each frame by itself.
-fn vote(
+/// The maps or verdicts of these algorithms and how right they are, each frame by itself; of both, the maps are judged.
+fn fuse(
     recording: &IntersectionRecording,
     reports: &[ObjectReport],
+    algorithms: Algorithms,
     mode: VoteMode,
 ) -> anyhow::Result<(Vec<FusedLine>, Scores)> {
     let landmarks = recording.landmarks();
-    let config = ReplayConfig { fusion: fusion(mode), landmarks: landmarks.clone(), ..ReplayConfig::default() };
-    let mut replay = Replay::new(config);
+    let fusion = fusion(algorithms, mode);
+    let mut replay = Replay::new(ReplayConfig { fusion, landmarks: landmarks.clone(), ..ReplayConfig::default() });
     let mut fused = Vec::new();
     for report in reports {
-        fused.append(&mut replay.line(line(report)?.as_bytes()));
+        // As vehicles send them: votes first.
+        if algorithms.vote() {
+            fused.append(&mut replay.line(line(report, ReportKind::VoteDetections)?.as_bytes()));
+        }
+        if algorithms.pace() {
+            fused.append(&mut replay.line(line(report, ReportKind::Detections)?.as_bytes()));
+        }
     }
     let (mut rest, summary) = replay.finish();
     fused.append(&mut rest);
@@ -209,7 +230,9 @@ fn vote(
     let mut evaluation = Evaluation::new(truth(recording)?).with_landmarks(index, GATE);
     fused.iter().for_each(|line| evaluation.fused(line));
     reports.iter().for_each(|report| evaluation.report(ReportKind::VoteDetections, report));
-    let scores = evaluation.result().vote.ok_or_else(|| anyhow::anyhow!("no report and no verdict"))?;
+    let EvalResult { pace, vote } = evaluation.result();
+    let scores = if algorithms.pace() { pace } else { vote };
+    let scores = scores.ok_or_else(|| anyhow::anyhow!("no report, and nothing fused"))?;
     Ok((fused, scores))
 }
 
@@ -246,12 +269,14 @@ fn captured_at(frame: usize) -> Timestamp {
 }
 
 /// A round closes with the last vehicle's report of a frame, at the latest within the time of the next.
-fn fusion(mode: VoteMode) -> FusionConfig {
+fn fusion(algorithms: Algorithms, mode: VoteMode) -> FusionConfig {
     let mut vote = VoteConfig { mode, ..VoteConfig::default() };
     vote.paper.frames_per_verdict = 1;
     vote.weighted.max_range_m = vote.paper.max_range_m;
+    let LandmarkGate { radius_m: gate_m, sigmas: gate_sigmas, floor_m: position_floor_m } = GATE;
     FusionConfig {
-        algorithms: Algorithms::Vote,
+        algorithms,
+        pace: PaceConfig { gate_m, gate_sigmas, position_floor_m, ..PaceConfig::default() },
         round: RoundConfig { period_s: FRAME_INTERVAL.as_secs_f64(), ..RoundConfig::default() },
         vote,
         ..FusionConfig::default()

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use ecod::model::names::{LandmarkId, NodeName};
-use ecod::wire::{GlobalMap, LandmarkState};
+use ecod::wire::{GlobalMap, LandmarkState, Verdicts};
 use serde::{Serialize, Serializer};
 
 use crate::testbed::{Scene, Spot, Testbed};
@@ -23,6 +23,15 @@ impl SpotScore {
         for spot in &scene.spots {
             let state = map.landmarks.iter().find(|state| state.id == spot.id);
             self.count(spot, state.and_then(|state| is_right(testbed, spot, state)) == Some(true));
+        }
+    }
+
+    /// Judges every spot by its verdict; without a label that is wrong, as nobody voted for the placard of a free spot.
+    pub fn judge_verdicts(&mut self, testbed: &Testbed, scene: &Scene, verdicts: &Verdicts) {
+        for spot in &scene.spots {
+            let verdict = verdicts.verdicts.iter().find(|verdict| verdict.landmark == spot.id);
+            let right = spot.truth.as_ref().unwrap_or(&testbed.placard.empty_text);
+            self.count(spot, verdict.is_some_and(|verdict| verdict.label.as_ref() == Some(right)));
         }
     }
 
@@ -68,6 +77,10 @@ pub struct SceneResult {
     pub verdicts: u64,
     /// Right spots in percent, fused.
     pub pace_accuracy_pct: f64,
+    /// Right spots in percent by VOTE alone; null where VOTE does not run.
+    pub vote_accuracy_pct: Option<f64>,
+    /// Right spots in percent as PACE and VOTE agree on them; likewise.
+    pub answer_accuracy_pct: Option<f64>,
     /// Right spots among the occupied ones in percent, fused; written as 100 when none is occupied, as none is wrong.
     #[serde(serialize_with = "hundred_if_none")]
     pub occupied_accuracy_pct: Option<f64>,
@@ -102,6 +115,8 @@ impl SceneResult {
             name: scene.name.clone(),
             verdicts,
             pace_accuracy_pct: fused.accuracy_pct(),
+            vote_accuracy_pct: None,
+            answer_accuracy_pct: None,
             occupied_accuracy_pct: fused.occupied_accuracy_pct(),
             single_cav_accuracy_pct: single.iter().map(|(name, s)| (name.clone(), s.accuracy_pct())).collect(),
             always_empty_pct: percent(empty, scene.spots.len() as u64),

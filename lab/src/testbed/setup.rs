@@ -12,6 +12,7 @@ use ecod::perception::camera::Mount;
 use ecod::perception::landmark::{LandmarkConfig, LandmarkIndex};
 use ecod::perception::projection::{ObjectSize, ObjectSizes, ProjectionConfig};
 use ecod::perception::view::ViewConfig;
+use ecod::vote::VoteConfig;
 use ecod::wire::Role;
 use ecod_actors::camera::config::{CameraConfig, MountConfig, OpticsConfig};
 use ecod_actors::camera::detect::DetectorConfig;
@@ -102,10 +103,13 @@ pub fn fusion(testbed: &Testbed) -> FusionConfig {
     (pace.gate_m, pace.position_floor_m) = (GATE_M, 0.01);
     pace.max_age_s = pace.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MAX_AGE_S);
     window.max_age_s = window.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MAX_AGE_S);
+    let mut vote = VoteConfig::default();
+    vote.weighted.freshness_s = vote.weighted.freshness_s.max(FRAMES_REMEMBERED * period_s);
     FusionConfig {
         algorithms: Algorithms::Pace,
         round: RoundConfig { period_s, ..RoundConfig::default() },
         pace,
+        vote,
         window,
         ..FusionConfig::default()
     }
@@ -126,10 +130,10 @@ fn projection(placard: &Placard) -> ProjectionConfig {
 /// A spot counts as looked at where a plate would be read in most frames.
 fn view(placard: &Placard) -> ViewConfig {
     ViewConfig {
-        target_width_m: placard.qr_width_m,
+        target_width_m: Some(placard.qr_width_m),
         min_target_px: 30.0,
         max_yaw_rad: 66f64.to_radians(),
-        occluder_width_m: placard.card_width_m,
+        occluder_width_m: Some(placard.card_width_m),
         ..ViewConfig::default()
     }
 }

@@ -4,21 +4,30 @@ use std::fmt::Write;
 
 use super::score::SceneResult;
 
-/// One line a scene: fused accuracy, on occupied spots, each vehicle alone, the guess, and the physical testbed.
+/// One line a scene: maps, shares of spots that are right, and spots that nobody sees.
 pub fn table(results: &[SceneResult]) -> String {
     let mut text = String::new();
-    let header = ["scene", "verdicts", "fused %", "occupied %", "best alone %", "guess %", "testbed %", "not in view"];
-    let rows: Vec<[String; 8]> = results.iter().map(row).collect();
+    let header = [
+        "scene",
+        "maps",
+        "right %",
+        "occupied spots %",
+        "best vehicle alone %",
+        "all said empty %",
+        "recorded %",
+        "spots out of view",
+    ];
+    let rows: Vec<[String; COLUMNS]> = results.iter().map(row).collect();
     let mut widths = header.map(str::len);
     for row in &rows {
         for (width, cell) in widths.iter_mut().zip(row) {
             *width = (*width).max(cell.chars().count());
         }
     }
-    let mut line = |cells: [&str; 8]| {
+    let mut line = |cells: [&str; COLUMNS]| {
         for (index, (cell, width)) in cells.iter().zip(widths).enumerate() {
             let padding = width - cell.chars().count();
-            let (before, after) = if matches!(index, 0 | 7) { (0, padding) } else { (padding, 0) };
+            let (before, after) = if index == 0 || index == COLUMNS - 1 { (0, padding) } else { (padding, 0) };
             let _ = write!(text, "{:before$}{cell}{:after$}  ", "", "");
         }
         text.truncate(text.trim_end().len());
@@ -32,14 +41,19 @@ pub fn table(results: &[SceneResult]) -> String {
     for result in results {
         let alone = result.single_cav_accuracy_pct.iter().map(|(name, pct)| {
             let recorded = result.recorded_single_cav_accuracy_pct.get(name);
-            format!("{name} {pct:.1}{}", recorded.map_or_else(String::new, |pct| format!(" (testbed {pct:.1})")))
+            format!("{name} {pct:.1}{}", recorded.map_or_else(String::new, |pct| format!(" (recorded {pct:.1})")))
         });
-        let _ = writeln!(text, "{} alone %: {}", result.name, alone.collect::<Vec<_>>().join(", "));
+        let kinds = [("VOTE alone", result.vote_accuracy_pct), ("PACE and VOTE together", result.answer_accuracy_pct)];
+        let kinds = kinds.into_iter().filter_map(|(kind, pct)| Some(format!("{kind} {:.2}", pct?)));
+        let all: Vec<_> = alone.chain(kinds).collect();
+        let _ = writeln!(text, "{}, right % by each alone: {}", result.name, all.join(", "));
     }
     text
 }
 
-fn row(result: &SceneResult) -> [String; 8] {
+const COLUMNS: usize = 8;
+
+fn row(result: &SceneResult) -> [String; COLUMNS] {
     let percent = |pct: Option<f64>| pct.map_or_else(|| "-".into(), |pct| format!("{pct:.2}"));
     let best_alone = result.single_cav_accuracy_pct.values().copied().max_by(f64::total_cmp);
     let unseen: Vec<&str> = result.unseen_spots.iter().map(|id| id.as_str()).collect();

@@ -7,10 +7,11 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 
 use anyhow::Context;
-use ecod::aggregator::Aggregator;
+use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, ObjectReport, ReportKind};
+use ecod::wire::{ObjectReport, RejectReason, ReportKind};
+use ecod_actors::actors::projector::votes;
 use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
 use ecod_actors::camera::frame::Frame;
@@ -43,27 +44,41 @@ impl Trial<'_> {
     /// When a part of the pipeline cannot be built or a frame cannot be rendered.
     pub fn run(&self, progress: impl Fn() + Sync) -> anyhow::Result<SceneResult> {
         let reports = self.reports(&progress)?;
-        let mut fused = self.aggregator();
+        let mut fused = self.aggregator(Algorithms::Pace);
+        let (mut voting, mut agreeing) = (self.aggregator(Algorithms::Vote), self.aggregator(Algorithms::Both));
+        let alone = || (self.aggregator(Algorithms::Pace), SpotScore::default());
         let mut alone: BTreeMap<NodeName, (Aggregator, SpotScore)> =
-            self.scene.cavs.iter().map(|cav| (cav.name.clone(), (self.aggregator(), SpotScore::default()))).collect();
-        let mut score = SpotScore::default();
+            self.scene.cavs.iter().map(|cav| (cav.name.clone(), alone())).collect();
+        let [mut score, mut votes, mut answers] = [SpotScore::default(); 3];
         for verdict in 0..self.verdicts {
             let steps = verdict * self.frames_per_verdict()..(verdict + 1) * self.frames_per_verdict();
             let of_verdict = |cav: &[ObjectReport]| cav[steps.start as usize..steps.end as usize].to_vec();
             let all: Vec<_> = reports.values().flat_map(|cav| of_verdict(cav)).collect();
-            if let Some(map) = fuse(&mut fused, all) {
-                score.judge(self.testbed, self.scene, &map);
+            for (aggregator, score) in
+                [(&mut fused, &mut score), (&mut voting, &mut votes), (&mut agreeing, &mut answers)]
+            {
+                self.judge(aggregator, all.clone(), score);
             }
             for (name, cav) in &reports {
-                if let Some((aggregator, score)) = alone.get_mut(name)
-                    && let Some(map) = fuse(aggregator, of_verdict(cav))
-                {
-                    score.judge(self.testbed, self.scene, &map);
+                if let Some((aggregator, score)) = alone.get_mut(name) {
+                    self.judge(aggregator, of_verdict(cav), score);
                 }
             }
         }
         let alone = alone.into_iter().map(|(name, (_, score))| (name, score)).collect();
-        Ok(SceneResult::new(self.testbed, self.scene, self.verdicts, &score, &alone))
+        let result = SceneResult::new(self.testbed, self.scene, self.verdicts, &score, &alone);
+        let [vote_accuracy_pct, answer_accuracy_pct] = [votes, answers].map(|score| Some(score.accuracy_pct()));
+        Ok(SceneResult { vote_accuracy_pct, answer_accuracy_pct, ..result })
+    }
+
+    /// Fuses one verdict's reports and judges what comes of them.
+    fn judge(&self, aggregator: &mut Aggregator, reports: Vec<ObjectReport>, score: &mut SpotScore) {
+        let Some(Fused { map, verdicts, .. }) = fuse(aggregator, reports) else { return };
+        match (map, verdicts) {
+            (Some(map), _) => score.judge(self.testbed, self.scene, &map),
+            (None, Some(verdicts)) => score.judge_verdicts(self.testbed, self.scene, &verdicts),
+            (None, None) => {}
+        }
     }
 
     /// Frames that every vehicle captures for one verdict.
@@ -109,23 +124,28 @@ impl Trial<'_> {
             .collect()
     }
 
-    fn aggregator(&self) -> Aggregator {
+    fn aggregator(&self, algorithms: Algorithms) -> Aggregator {
         let landmarks = self.scene.landmarks(&self.testbed.placard);
-        Aggregator::new(NodeName::from_static("edge"), 1, setup::fusion(self.testbed), landmarks, START)
+        let fusion = FusionConfig { algorithms, ..setup::fusion(self.testbed) };
+        Aggregator::new(NodeName::from_static("edge"), 1, fusion, landmarks, START)
     }
 }
 
-/// Fuses one verdict's reports in the order of capture and returns the last map.
-fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<GlobalMap> {
+/// Fuses one verdict's reports in the order of capture, each for the algorithms that run, and returns the last round.
+fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<Fused> {
     reports.sort_by(|a, b| a.captured_at_us.cmp(&b.captured_at_us).then_with(|| a.node.cmp(&b.node)));
     let last = reports.last()?.captured_at_us;
-    let mut map = None;
-    for report in reports.into_iter().map(Arc::new) {
-        match aggregator.report(ReportKind::Detections, &report, report.captured_at_us) {
-            Ok(closed) => map = closed.and_then(|fused| fused.map).or(map),
-            Err(reason) => tracing::warn!(node = %report.node, %reason, "report not used"),
+    let mut round = None;
+    for report in &reports {
+        let (node, captured_at) = (&report.node, report.captured_at_us);
+        for (kind, report) in [(ReportKind::VoteDetections, votes(report)), (ReportKind::Detections, report.clone())] {
+            match aggregator.report(kind, &Arc::new(report), captured_at) {
+                Ok(closed) => round = closed.or(round),
+                Err(RejectReason::NotFused) => {}
+                Err(reason) => tracing::warn!(%node, %reason, "report not used"),
+            }
         }
     }
     let deadline = aggregator.deadline();
-    aggregator.tick(deadline.max(last)).and_then(|fused| fused.map).or(map)
+    aggregator.tick(deadline.max(last)).or(round)
 }

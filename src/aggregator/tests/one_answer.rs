@@ -61,6 +61,18 @@ fn a_sign_behind_a_plate_is_no_vote_against_it() {
     assert!(lot.wrong("galileo") <= 1, "{:?}", lot.cell.reputations());
 }
 
+/// Maps are sent ten times a second: they say only once what all agree on.
+#[test]
+fn readings_are_told_where_they_differ_and_not_where_all_agree() {
+    let names = ["euclid", "gauss", "galileo", "noether"];
+    let agreeing = Lot::new().read(5, &names.map(|name| (name, "MNOP101")));
+    assert_eq!((shown(&agreeing), readings(&agreeing)), ((Some("MNOP101"), Some("MNOP101")), Vec::new()));
+    assert_eq!(agreeing.map.unwrap().landmarks[0].contributors.len(), 4);
+    let [first, second, third, fourth] = names;
+    let voters = [(first, "MNOP101"), (second, "MNOP101"), (third, "MNOP101"), (fourth, "XYZ")];
+    assert_eq!(readings(&Lot::new().read(5, &voters)).len(), 2);
+}
+
 #[test]
 fn one_who_invents_a_plate_does_not_outvote_those_who_read_the_sign() {
     let mut lot = Lot::new();

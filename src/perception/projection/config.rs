@@ -89,15 +89,6 @@ impl ObjectSizes {
         self.labels.get(label).or(self.default.as_ref()).or_else(|| coco_sizes::of(label))
     }
 
-    /// The first size that cannot be in metres, in words: no object of a road is as large.
-    pub fn implausible(&self) -> Option<String> {
-        let named = self.labels.iter().map(|(label, size)| (&**label, size));
-        let mut all = named.chain(self.default.as_ref().map(|size| ("default", size)));
-        let (label, size) = all.find(|(_, size)| size.width_m.max(size.height_m) > MAX_PLAUSIBLE_M)?;
-        let ObjectSize { width_m, height_m, .. } = size;
-        Some(format!("the size of `{label}` is {width_m} m by {height_m} m"))
-    }
-
     /// Checks every size.
     ///
     /// # Errors
@@ -138,26 +129,6 @@ config_section! {
     }
 }
 
-/// Longest side in metres of what a camera of a cell detects; road trains have 25 m.
-const MAX_PLAUSIBLE_M: f64 = 30.0;
-
 fn default_relative_sigma() -> f64 {
     0.02
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn centimetres_and_millimetres_are_noticed() {
-        let sizes = |width_m| ObjectSizes {
-            labels: BTreeMap::from([("car".into(), ObjectSize { width_m, ..ObjectSize::square(1.5) })]),
-            default: None,
-        };
-        assert_eq!(sizes(1.8).implausible(), None);
-        assert_eq!(sizes(180.0).implausible().as_deref(), Some("the size of `car` is 180 m by 1.5 m"));
-        let default = ObjectSizes { default: Some(ObjectSize::square(50.0)), ..ObjectSizes::default() };
-        assert_eq!(default.implausible().as_deref(), Some("the size of `default` is 50 m by 50 m"));
-    }
 }

@@ -278,7 +278,7 @@ impl ElectionDriver {
         });
         if has_moved {
             let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
-            tracing::info!(?position, epoch, standby, "leadership");
+            tracing::info!(?position, epoch, standby, "who leads has changed, or who stands by");
         }
     }
 
@@ -328,15 +328,15 @@ fn log(notice: Notice) {
     match notice {
         Notice::Fit => tracing::info!("fit to lead"),
         Notice::Unfit { health: Health { broker, fuser, gateway, reports, .. } } => {
-            tracing::warn!(broker, fuser, gateway, reports, "not fit to lead");
+            tracing::warn!(broker, fuser, gateway, reports, "not fit to lead: a part does not work");
         }
         Notice::OutOfReach { members } => tracing::warn!(
             ?members,
             "other machines do not reach this node's broker: it does not lead; give the nodes certificates in [tls], \
              or set broker.allow_plaintext, or an external mqtt.broker that is there"
         ),
-        Notice::ProcessGone { peer, broker } => tracing::info!(%peer, %broker, "process is gone"),
-        Notice::LeaderDisconnected { peer } => tracing::info!(%peer, "connection of the leader broke"),
+        Notice::ProcessGone { peer, broker } => tracing::info!(%peer, %broker, "the process of another node is gone"),
+        Notice::LeaderDisconnected { peer } => tracing::info!(%peer, "the leader's connection to this node broke"),
         Notice::Preparing { leader } => tracing::info!(%leader, "preparing to take over"),
         Notice::NotServed { challenger } => {
             tracing::debug!(%challenger, "the lead is not handed over yet: no login at the challenger's broker");

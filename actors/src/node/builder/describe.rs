@@ -2,11 +2,7 @@
 
 use std::sync::Arc;
 
-#[cfg(feature = "camera")]
-use ecod::diagnostics::TroubleKind;
 use ecod::leadership::node::Input;
-#[cfg(feature = "camera")]
-use ecod::perception::projection::ObjectSizes;
 use ecod::wire::CellDescription;
 
 use super::NodeBuilder;
@@ -27,7 +23,7 @@ impl NodeBuilder {
         if let Some(config) = self.held.lay_over(&self.own_config) {
             let before = std::mem::replace(&mut self.config, config);
             self.configure_parts(&before);
-            self.note_sizes();
+            self.note_units();
             tracing::info!(stamp = %description.stamp(), "the description of the cell is used");
         }
         self.door.publish_description(description);
@@ -40,13 +36,11 @@ impl NodeBuilder {
         self.slots().election.send(LeaderElectionMessage::Note { input });
     }
 
-    /// Notes a size of a label that cannot be in metres.
-    pub(super) fn note_sizes(&self) {
-        #[cfg(feature = "camera")]
-        {
-            let sizes = self.config.camera.as_ref().map(|camera| &camera.projection.sizes);
-            let (troubles, kind) = (self.counters.troubles(), TroubleKind::ImplausibleSize);
-            match sizes.and_then(ObjectSizes::implausible) {
+    /// Notes values that look as if they were in another unit.
+    pub(super) fn note_units(&self) {
+        let troubles = self.counters.troubles();
+        for (kind, cause) in self.config.doubtful_units() {
+            match cause {
                 Some(cause) => troubles.note(kind, &cause),
                 None => troubles.settle(kind, None),
             }

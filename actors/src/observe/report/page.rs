@@ -86,20 +86,24 @@ fn leadership(report: &Report) -> String {
             vec![clock(change.at_us), change.position.replace('_', " "), leader, standby]
         })
         .collect();
-    let mut text = table(&["leader", "term", "first round, UTC", "duration s", "rounds accepted"], &rows);
+    let mut text = table(&["leader", "term", "from, UTC", "duration s", "maps or verdicts"], &rows);
     if !changes.is_empty() {
         let all = table(&["UTC", "this node is", "leader@term", "standby"], &changes);
         text += &format!("<details><summary>Changes as this node saw them</summary>\n{all}</details>\n");
     }
-    section("Leadership", "Leaders whose rounds this node accepted.", &text)
+    section(
+        "Leadership",
+        "Nodes that led, one after the other, as far as this node got their maps. Each time of office is a term.",
+        &text,
+    )
 }
 
 fn latency(report: &Report) -> String {
     let RoundTimes { capture_to_fused, fused_to_received, .. } = &report.maps;
     let kinds = [
-        ("maps: oldest capture to end of round", capture_to_fused),
-        ("maps: end of round to this node", fused_to_received),
-        ("verdicts: end of round to this node", &report.verdicts.fused_to_received),
+        ("maps: from the oldest frame in a map to the map", capture_to_fused),
+        ("maps: from the leader to this node", fused_to_received),
+        ("verdicts: from the leader to this node", &report.verdicts.fused_to_received),
     ];
     let kinds: Vec<_> = kinds.into_iter().filter(|(_, values)| !values.is_empty()).collect();
     let rows: Vec<_> = kinds.iter().map(|(name, values)| quantiles(name, values)).collect();
@@ -110,13 +114,13 @@ fn latency(report: &Report) -> String {
     let plot = Plot {
         title: "latency distribution",
         x_label: "ms",
-        y_label: "% of rounds within",
+        y_label: "% within that time",
         curves: kinds.iter().map(curves).collect(),
         marks: Vec::new(),
         x: Axis::Logarithmic,
     };
     let text = shown(&plot) + &table(&QUANTILES, &rows);
-    section("Latency", "Measured by the clocks of aggregator and recording node, whose offset is included.", &text)
+    section("Latency", "By the clocks of leader and recording node: their difference is included.", &text)
 }
 
 fn gaps(report: &Report) -> String {
@@ -130,9 +134,13 @@ fn gaps(report: &Report) -> String {
         let points = points.flat_map(|(x, gap)| [(x - gap, gap * 1000.0), (x, gap * 1000.0)]);
         Curve { name: name.to_owned(), points: points.collect() }
     };
-    let plot = over_time(report, "time between rounds", "ms since the round before", kinds.iter().map(curve).collect());
+    let plot = over_time(report, "time between rounds", "ms since the one before", kinds.iter().map(curve).collect());
     let text = shown(&plot) + &table(&QUANTILES, &rows);
-    section("Gaps", "Time between rounds that this node accepted; dotted lines mark changes of leader.", &text)
+    section(
+        "Gaps",
+        "Time from one map, or set of verdicts, to the next at this node; dotted lines mark changes of leader.",
+        &text,
+    )
 }
 
 fn reputations(report: &Report) -> String {
@@ -150,7 +158,11 @@ fn reputations(report: &Report) -> String {
     let rows: Vec<_> = report.reputations.iter().filter_map(newest).collect();
     let text =
         shown(&over_time(report, "reputations", "weight of votes", curves)) + &table(&["vehicle", "last"], &rows);
-    section("Reputations", "Weight of each vehicle's votes.", &text)
+    section(
+        "Reputations",
+        "How much each vehicle's word counts, from 0 to 1: it follows from how often the others agreed with it.",
+        &text,
+    )
 }
 
 fn coverage(report: &Report) -> String {
@@ -169,7 +181,7 @@ fn coverage(report: &Report) -> String {
             [node.to_string()].into_iter().chain(counts).collect()
         })
         .collect();
-    let head = ["vehicle", "reports", "per second", "objects each", "entries contributed to"];
+    let head = ["vehicle", "reports", "per second", "objects each", "places and objects on maps"];
     let text = if report.entries == 0 { String::new() } else { drawing(&bars("coverage per vehicle", &shares)) };
     let about = "Share of the objects and labelled locations of all maps that a vehicle contributed to, and its reports \
                  of all kinds.";
@@ -184,13 +196,13 @@ fn drops(report: &Report) -> String {
     let row = |(name, times): (&String, &u64)| vec![name.replace('_', " "), times.to_string()];
     let rows: Vec<_> = losses.by_reason().iter().map(row).collect();
     if rows.is_empty() {
-        return section("Drops", "Nothing was lost or rejected while this log was recorded.", "");
+        return section("Lost or rejected", "Nothing was lost or rejected while this log was recorded.", "");
     }
     let points = losses.over_time().points(report.start(), seconds(report), SLICES);
     let curve = Curve { name: "lost or rejected so far".into(), points };
     let text =
         shown(&over_time(report, "drops", "lost or rejected", vec![curve])) + &table(&["reason", "times"], &rows);
-    section("Drops", "Messages lost or rejected by this node while this log was recorded, by reason.", &text)
+    section("Lost or rejected", "Messages lost or rejected by this node while this log was recorded, by reason.", &text)
 }
 
 fn over_time<'a>(report: &Report, title: &'a str, y_label: &'a str, curves: Vec<Curve>) -> Plot<'a> {

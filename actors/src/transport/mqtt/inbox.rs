@@ -181,7 +181,7 @@ impl Inbox {
                     self.counters.reject_report(reason, &source, || self.fault(topic, payload, reason));
                 }
                 _ => self.counters.reject_message(reason, &source, || {
-                    format!("a message on {} is rejected as {reason}", String::from_utf8_lossy(topic))
+                    format!("message on {} rejected: {}", String::from_utf8_lossy(topic), reason.in_words())
                 }),
             }
             tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
@@ -358,7 +358,7 @@ impl Inbox {
         let signed = self.security.signing.as_ref().map(|key| key.verify(topic, payload));
         match signed.unwrap_or(Some(payload)) {
             Some(report) => format!("report rejected: {}", Flaw::of_report(report, reason, &self.limits)),
-            None => format!("report rejected: {reason}"),
+            None => format!("report rejected: {}", reason.in_words()),
         }
     }
 

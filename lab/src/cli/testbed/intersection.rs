@@ -4,6 +4,7 @@ use std::fs;
 
 use anyhow::Context;
 use ecod::model::names::Label;
+use ecod::wire::ReportKind;
 use ecod_actors::cli::{Failure, print};
 use tracing::subscriber::NoSubscriber;
 
@@ -44,7 +45,9 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
     }
     print(&table(&results))?;
     if let Some(file) = &arguments.reports {
-        let lines = intersection::reports(&recording).iter().map(intersection::line).collect::<Result<Vec<_>, _>>();
+        let lines = intersection::reports(&recording);
+        let of_votes = |report| intersection::line(report, ReportKind::VoteDetections);
+        let lines = lines.iter().map(of_votes).collect::<Result<Vec<_>, _>>();
         let text = lines.context("reports are plain json")?.join("\n") + "\n";
         fs::write(file, text).with_context(|| format!("cannot write {}", file.display()))?;
     }
@@ -75,14 +78,16 @@ fn generated(
 }
 
 fn table(results: &[IntersectionResult]) -> String {
-    let header = ["", "scenes", "verdicts", "VOTE %", "paper %", "majority %", "best alone %"];
+    let header =
+        ["", "scenes", "verdicts", "VOTE %", "PACE %", "one answer %", "paper %", "majority %", "best alone %"];
     let mut rows = vec![header.map(str::to_owned).to_vec()];
     for result in results {
         let best = result.single_cav_accuracy_pct.values().copied().max_by(f64::total_cmp);
-        let (vote, paper) = (result.vote_accuracy_pct, result.vote_paper_accuracy_pct);
-        let shares = [Some(vote), Some(paper), Some(result.majority_accuracy_pct), best].map(percent);
+        let alone = [result.vote_accuracy_pct, result.pace_accuracy_pct, result.answer_accuracy_pct];
+        let others = [result.vote_paper_accuracy_pct, result.majority_accuracy_pct];
+        let shares = alone.into_iter().chain(others).map(Some).chain([best]).map(percent);
         let counts = [result.name.clone(), result.scenes.to_string(), result.verdicts.to_string()];
-        rows.push([counts.to_vec(), shares.to_vec()].concat());
+        rows.push(counts.into_iter().chain(shares).collect());
     }
     let mut text = columns(&rows);
     for result in results {

@@ -135,7 +135,7 @@ function drawHistory() {
     now, label: "Latency of maps over ten minutes, median and largest, in milliseconds", unit: "",
     lines: [line("largest", 7, (s) => s.latency_max_ms, "line soft"), line("median", 0, (s) => s.latency_p50_ms)],
   });
-  chart(byId("rounds-chart"), { now, label: "Rounds accepted a second over ten minutes", lines: [line("rounds", 2, (s) => s.rounds / 2)] });
+  chart(byId("rounds-chart"), { now, label: "Maps received a second over ten minutes", lines: [line("rounds", 2, (s) => s.rounds / 2)] });
   const names = Object.keys(samples.at(-1).reputations);
   if (names.length > 0 && live.picture) {
     chart(byId("reputation-chart"), {

@@ -62,7 +62,7 @@ export function verdicts(received, now) {
     const votes = Object.entries(verdict.votes).sort((a, b) => b[1] - a[1]);
     const close = verdict.label !== null && votes.length > 1 && verdict.margin < 0.25 * verdict.score;
     return [
-      verdict.landmark, verdict.label ?? { text: "nothing", class: "dim" },
+      verdict.landmark, verdict.label ?? { text: "undecided", class: "dim" },
       { text: votes.map(([label, score]) => `${label} ${score.toFixed(2)}`).join(", ") || "–", class: "dim" },
       { text: verdict.margin.toFixed(2) + (close ? " close" : ""), class: close ? "n warn" : "n" },
     ];
@@ -132,10 +132,19 @@ const DROPS = {
   detection_unplaced: "detection without a position", pose_rejected: "pose rejected", frame_without_pose: "frame without a pose", browser_refused: "browser refused", browser_throttled: "browser refused: too many requests", dashboard_not_bound: "page address already in use",
 };
 
+/// Reasons to reject a message, in plain words.
+const REJECTS = {
+  too_large: "too large", malformed: "cannot be read", unknown_schema: "unknown version", node_mismatch: "in another node's name", too_many_objects: "too many objects",
+  not_finite: "a number that cannot be", out_of_range: "a number out of its range", confidence_out_of_range: "confidence not from 0 to 1", invalid_label: "label empty or too long",
+  from_the_future: "dated in the future", stale: "too old", too_many_vehicles: "too many vehicles", unknown_topic: "unknown topic", superseded: "of an earlier leader", not_elected: "not of the leader",
+  not_fused: "for an algorithm that does not run here", bad_signature: "no valid signature", not_candidate: "evidence of a node that may not lead", unknown_term: "evidence of an unknown term",
+  unattested: "evidence without proof", implausible: "more votes than there can be", not_permitted: "beyond the sender's rights",
+};
+
 const earlier = new Map();
 
 export function drops({ counters, now_us }) {
-  const rejected = Object.entries(counters.rejects).filter(([reason]) => reason !== COPIES).map(([reason, count]) => [`rejected: ${reason.replaceAll("_", " ")}`, count]);
+  const rejected = Object.entries(counters.rejects).filter(([reason]) => reason !== COPIES).map(([reason, count]) => [`rejected: ${REJECTS[reason] ?? reason.replaceAll("_", " ")}`, count]);
   const shed = Object.entries(counters.shed).map(([reason, count]) => [`overload: ${reason.replaceAll("_", " ")}`, count]);
   const events = Object.entries(DROPS).map(([event, words]) => [words, counters.events[event] ?? 0]);
   const all = [...rejected, ...shed, ...events].filter(([, count]) => count > 0);

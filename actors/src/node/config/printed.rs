@@ -1,0 +1,76 @@
+//! The configuration as text that can be read back.
+
+use figment::Figment;
+use figment::providers::Serialized;
+use toml::{Table, Value};
+
+use super::NodeConfig;
+
+impl NodeConfig {
+    /// The configuration as TOML that can be read back; secrets are left out, and a comment says so.
+    ///
+    /// # Errors
+    /// When a value has no form in TOML.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        let (shown, comment) = self.without_secrets();
+        Ok(comment + &toml::to_string(&shown)?)
+    }
+
+    /// The same, with those keys alone whose values differ from the defaults.
+    ///
+    /// # Errors
+    /// When a value has no form in TOML.
+    pub fn to_toml_changed(&self) -> Result<String, toml::ser::Error> {
+        let (shown, comment) = self.without_secrets();
+        let mut keys = Table::try_from(&shown)?;
+        remove_defaults(&mut keys, &mut Vec::new(), &shown);
+        Ok(comment + &toml::to_string(&keys)?)
+    }
+
+    /// The configuration without secrets, and a comment on each that is missing.
+    fn without_secrets(&self) -> (Self, String) {
+        let mut shown = self.clone();
+        let mut comment = String::new();
+        if shown.mqtt.password.take().is_some() {
+            comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
+        }
+        if shown.dashboard.token.take().is_some() {
+            comment.push_str("# `dashboard.token` is set but not shown: add it, or set ECOD_DASHBOARD__TOKEN\n");
+        }
+        if shown.membership.key.take().is_some() {
+            comment.push_str("# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n");
+        }
+        #[cfg(feature = "camera")]
+        if shown.camera.as_mut().is_some_and(|camera| camera.source.forget_credentials()) {
+            comment.push_str("# user and password of `camera.source.url` are set but not shown: add them\n");
+        }
+        (shown, comment)
+    }
+}
+
+/// Removes each key and table below `path` without which the configuration is still `config`.
+fn remove_defaults(keys: &mut Table, path: &mut Vec<String>, config: &NodeConfig) {
+    let names: Vec<String> = at(keys, path).keys().cloned().collect();
+    for name in names {
+        let Some(value) = at(keys, path).remove(&name) else { continue };
+        let rest = Figment::from(Serialized::defaults(&*keys));
+        if NodeConfig::of_keys(&rest).is_ok_and(|rest| rest == *config) {
+            continue;
+        }
+        let is_table = value.is_table();
+        at(keys, path).insert(name.clone(), value);
+        if is_table {
+            path.push(name);
+            remove_defaults(keys, path, config);
+            path.pop();
+        }
+    }
+}
+
+/// The table at a path of tables.
+fn at<'a>(keys: &'a mut Table, path: &[String]) -> &'a mut Table {
+    path.iter().fold(keys, |table, name| match table.entry(name.clone()).or_insert_with(|| Table::new().into()) {
+        Value::Table(inner) => inner,
+        _ => unreachable!("the path is one of tables"),
+    })
+}
