@@ -2,6 +2,7 @@
 //!
 //! - The first rounds of a leadership without handover follow each other more quickly.
 //! - A round waits for both reports of a vehicle that sends both kinds.
+//! - A vehicle that reports less often than rounds close is waited for in the rounds in which its next report is expected.
 //! - Vehicles often report once a period, all at about the same time, and just as a round ends. If it ended amid their
 //!   reports, the later ones would wait for another period, in every round. So the end is delayed a little while reports
 //!   come in. If a round ends amid them nevertheless, the rest get a round as soon as the last of them has reported;
@@ -72,10 +73,36 @@ pub struct RoundTrigger {
 #[derive(Debug, Clone)]
 struct Reporter {
     last_report: Timestamp,
-    /// True if it has reported in the present round.
+    /// Times between its last three reports; [`Duration::ZERO`] where it has sent fewer.
+    gaps: [Duration; 2],
+    /// True if the present round does not wait for it: it has reported, or its next report is not expected yet.
     reported: bool,
     /// True if its report was due when the last round closed.
     due: bool,
+}
+
+impl Reporter {
+    fn new(now: Timestamp) -> Self {
+        Self { last_report: now, gaps: [Duration::ZERO; 2], reported: true, due: false }
+    }
+
+    fn note(&mut self, now: Timestamp) {
+        self.gaps = [self.gaps[1], now.since(self.last_report)];
+        self.last_report = now;
+    }
+
+    /// Time between its reports, at least a round's. A single lost report does not change it.
+    fn interval(&self, period: Duration) -> Duration {
+        self.gaps[0].min(self.gaps[1]).max(period)
+    }
+
+    /// Begins a round at `now`; true if the round waits for it.
+    fn begin_round(&mut self, now: Timestamp, period: Duration) -> bool {
+        let (silent, interval) = (now.since(self.last_report), self.interval(period));
+        let expected_within = interval.saturating_sub(silent);
+        self.reported = silent >= interval * LIVE_INTERVALS || expected_within > period + period / DELAY_DIVISOR;
+        !self.reported
+    }
 }
 
 /// The due time of the first round of a leadership. After [`Self::Overdue`] and [`Self::AfterConnects`] a few more follow
@@ -103,8 +130,11 @@ const EARLY: [Duration; 2] = [CONNECT_TIME, Duration::from_millis(50)];
 /// Number of shortened rounds after the first of an unplanned leadership.
 pub const EARLY_ROUNDS: usize = EARLY.len();
 
-/// Number of periods after which a silent vehicle is no longer live.
-const LIVE_PERIODS: u32 = 3;
+/// Number of its intervals after which a silent vehicle is no longer live.
+const LIVE_INTERVALS: u32 = 3;
+
+/// Time for which a silent vehicle is remembered. Reports that come less often do not hold up rounds.
+const REMEMBERED: Duration = Duration::from_secs(3);
 
 /// Maximum number of rounds in a period. Excepted are the first rounds of a leadership and those that follow at once with
 /// the reports of vehicles that were due; they are few, as a vehicle is not due again for half a period.
@@ -113,7 +143,7 @@ const MAX_RATE: u32 = 5;
 /// Inverse share of a period by which the end of a round is delayed after its first report.
 const DELAY_DIVISOR: u32 = 10;
 
-/// Inverse share of a period after which the next report of a vehicle is due.
+/// Inverse share of its interval after which the next report of a vehicle is due.
 const DUE_DIVISOR: u32 = 2;
 
 impl RoundTrigger {
@@ -145,7 +175,7 @@ impl RoundTrigger {
         let live = &mut self.live[kind as usize];
         let mut was_last_due = false;
         if let Some(vehicle) = live.get_mut(node) {
-            vehicle.last_report = now;
+            vehicle.note(now);
             if !std::mem::replace(&mut vehicle.reported, true) {
                 self.missing -= 1;
             }
@@ -154,7 +184,7 @@ impl RoundTrigger {
                 was_last_due = self.due == 0;
             }
         } else {
-            live.insert(node.clone(), Reporter { last_report: now, reported: true, due: false });
+            live.insert(node.clone(), Reporter::new(now));
         }
         if was_last_due && !self.held && now.since(self.last_close) < self.config.period() / MAX_RATE {
             self.close(now);
@@ -179,11 +209,10 @@ impl RoundTrigger {
         let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;
         (self.missing, self.due) = (0, 0);
         for live in &mut self.live {
-            live.retain(|_, vehicle| now.since(vehicle.last_report) < period * LIVE_PERIODS);
+            live.retain(|_, vehicle| now.since(vehicle.last_report) < REMEMBERED.max(period * LIVE_INTERVALS));
             for vehicle in live.values_mut() {
-                vehicle.reported = false;
-                vehicle.due = by_reports && now.since(vehicle.last_report) > period / DUE_DIVISOR;
-                self.missing += 1;
+                self.missing += usize::from(vehicle.begin_round(now, period));
+                vehicle.due = by_reports && now.since(vehicle.last_report) > vehicle.interval(period) / DUE_DIVISOR;
                 self.due += usize::from(vehicle.due);
             }
         }
@@ -319,6 +348,39 @@ mod tests {
             rounds.tick(at(round * 100 + 99));
         }
         assert!(rounds.report(Detections, &node("a"), at(600)), "closes without the vehicle that left");
+    }
+
+    /// Two reports a second of each of seven cameras, which capture together.
+    #[test]
+    fn cameras_that_report_less_often_than_rounds_close_share_a_round() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        for frame in 1..8 {
+            let capture = at(frame * 500);
+            while rounds.deadline() < capture {
+                assert!(rounds.tick(rounds.deadline()));
+            }
+            let names = ["a", "b", "c", "d", "e", "f", "g"];
+            let closed: Vec<_> = names.iter().filter(|name| rounds.report(Detections, &node(name), capture)).collect();
+            assert!(frame < 4 || closed == [&"g"], "frame {frame}: a round after {closed:?}");
+        }
+    }
+
+    #[test]
+    fn one_slow_vehicle_does_not_hold_up_rounds_in_which_it_has_nothing_to_report() {
+        let mut rounds = trigger(RoundClose::WhenComplete);
+        let mut slow = 0;
+        for ms in (1..5000).step_by(100) {
+            while rounds.deadline() < at(ms) {
+                assert!(rounds.tick(rounds.deadline()));
+            }
+            if ms % 1000 == 1 {
+                rounds.report(Detections, &node("slow"), at(ms));
+                slow = ms;
+            }
+            rounds.report(Detections, &node("a"), at(ms));
+            let closed = rounds.report(Detections, &node("b"), at(ms + 1));
+            assert!(ms < 2000 || closed || ms - slow >= 900, "open at {ms}, {} after the slow one", ms - slow);
+        }
     }
 
     #[test]

@@ -37,7 +37,7 @@ const MAX_DELAY: f64 = 3.0;
 const STANDS_S: f64 = 1.0;
 
 /// Maximum weight of a vehicle that stands, as a multiple of that of one that moves.
-const MAX_WEIGHT: f64 = 10.0;
+const MAX_WEIGHT: f64 = 100.0;
 
 /// Minimum number of correspondences of a published correction.
 const MIN_PAIRS: f64 = 3.0;
@@ -223,9 +223,15 @@ impl Registration {
         Rotation2::new(self.error.z)
     }
 
-    /// Delay of the vehicle's stamps, seconds.
-    pub(super) fn delay_s(&self) -> f64 {
-        self.error.w
+    /// Delay of the vehicle's stamps, seconds: the estimate if its marginal likelihood is greater than that of no delay.
+    ///
+    /// The ratio of the two is that of the densities of no delay before and after the observations (Dickey, "The weighted
+    /// likelihood ratio, linear hypotheses on normal location parameters", 1971). An estimate of little more than noise
+    /// would move reports that were captured together apart.
+    pub(super) fn delay_s(&self, prior: &BiasPrior) -> f64 {
+        let (before, after) = (prior.delay_s * prior.delay_s, self.covariance.m44);
+        let is_delayed = self.error.w * self.error.w > after * (before / after).ln();
+        if is_delayed { self.error.w } else { 0.0 }
     }
 
     /// Mean variance of a corrected position in each direction, m², of an object with a velocity in m/s.
@@ -366,5 +372,33 @@ mod tests {
         let off = registration.corrector()(&Vector2::zeros()) - error;
         assert!(off.norm() < 0.15, "off by {off:?}");
         assert!(registration.correction().is_some_and(|correction| correction.dheading_rad.abs() < 0.004));
+    }
+
+    /// Stamps late by `late_s`, and objects of 8 m/s each way, for `seconds` of ten rounds.
+    fn delay_after(seconds: u64, late_s: f64) -> f64 {
+        let prior = BiasPrior { offset_m: 0.5, heading_rad: 0.01, delay_s: 0.02, memory_s: 10.0 };
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let start = Timestamp(1_732_154_400_000_000);
+        let mut registration = Registration::new(start, &prior);
+        for round in 0..10 * seconds {
+            let delay_s = registration.delay_s(&prior);
+            let pair = |n: u32| {
+                let velocity = Vector2::new(if n % 2 == 0 { 8.0 } else { -8.0 }, 0.0);
+                let reported = Vector2::new(f64::from(n) * 10.0 - 30.0, 5.0);
+                let noise = Vector2::new(rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
+                let reference = reported + noise + velocity * (late_s - delay_s);
+                Correspondence { reported, reference, velocity, variance: 0.08, common: 0.02 }
+            };
+            let pairs: Vec<_> = (0..6).map(pair).collect();
+            registration.observe(Timestamp(start.0 + round * 100_000), delay_s, &pairs, &prior);
+        }
+        registration.delay_s(&prior)
+    }
+
+    #[test]
+    fn stamps_are_moved_only_by_a_delay_that_is_likelier_than_none() {
+        assert!((1..5).all(|seconds| delay_after(seconds, 0.0) == 0.0));
+        let found = delay_after(10, 0.05);
+        assert!((found - 0.05).abs() < 0.01, "{found} s");
     }
 }

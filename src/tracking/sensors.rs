@@ -1,9 +1,10 @@
 //! Owner of the sensor models: what is learnt of each vehicle, and the only module that creates a [`SensorId`].
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use hashbrown::HashMap;
-use nalgebra::Matrix2;
+use nalgebra::{Matrix2, Vector2};
 
 use super::calibration::Calibration;
 use super::config::TracksConfig;
@@ -16,6 +17,12 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::wire::{ObjectReport, PerceivedObject, WirePose};
+
+/// Distance of the median of a vehicle's detections from where it was, as a share of its range, up to which it stays.
+const STAYS: f64 = 0.25;
+
+/// Time after which a vehicle that states no pose and stays is known to stand.
+const STAYS_FOR: Duration = Duration::from_secs(120);
 
 /// Number of a vehicle that is heard. [`Sensors::forget_silent`] frees it for another vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -146,6 +153,8 @@ pub(super) struct SensorModel {
     pub(super) node: NodeName,
     last_report: Timestamp,
     pose: Option<WirePose>,
+    /// Place about which the median of its detections stays, metres, and since when.
+    place: (Vector2<f64>, Timestamp),
     pub(super) registration: Registration,
     pub(super) noise: NoiseModel,
     pub(super) calibration: Calibration,
@@ -161,6 +170,7 @@ impl SensorModel {
             node,
             last_report: at,
             pose: None,
+            place: (Vector2::zeros(), at),
             registration: Registration::new(at, &config.bias_prior()),
             noise: NoiseModel::default(),
             calibration: Calibration::new(config.even_confidence),
@@ -183,14 +193,28 @@ impl SensorModel {
         if has_jumped {
             self.registration = Registration::new(at, &config.bias_prior());
         }
-        // Estimates of a vehicle that drives, and even waits, differ from report to report.
-        let stands = report.pose.is_some() && self.pose == report.pose;
+        let stands = self.stands(report, at);
         self.registration.stand(stands.then_some(passed_s));
         self.pose = report.pose;
-        if let Some(centre) = self.coverage.centre() {
+        if let Some(centre) = self.coverage.centre().filter(|_| !stands) {
             self.registration.set_pivot(centre);
         }
         has_jumped
+    }
+
+    /// Whether the vehicle is known to be where it was at the report before. Estimates of the pose of one that drives, and
+    /// even waits, differ from report to report. Without a pose, the detections of one that stands stay about a place for
+    /// longer than any signal is red.
+    fn stands(&mut self, report: &ObjectReport, at: Timestamp) -> bool {
+        let (place, since) = self.place;
+        let centre = self.coverage.centre().unwrap_or(place);
+        if (centre - place).norm() > STAYS * self.coverage.range_m() {
+            self.place = (centre, at);
+        }
+        match (report.pose, self.pose) {
+            (None, None) => at.since(since) > STAYS_FOR && self.place.1 == since,
+            (pose, before) => pose == before,
+        }
     }
 }
 

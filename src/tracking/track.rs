@@ -138,7 +138,9 @@ impl Track {
     /// probability of detection.
     pub(super) fn record_miss(&mut self, at: Timestamp, dt_s: f64, rate: f64) {
         if at > self.last_seen {
-            self.disappeared = ((self.disappeared + DISAPPEARANCE_RATE * dt_s) / (1.0 - rate)).min(1e6);
+            // It was there when another vehicle saw it meanwhile.
+            let unseen_s = dt_s.min(at.since(self.last_seen).as_secs_f64());
+            self.disappeared = ((self.disappeared + DISAPPEARANCE_RATE * unseen_s) / (1.0 - rate)).min(1e6);
         }
     }
 
@@ -276,5 +278,24 @@ impl Track {
         let velocity: Vector2<f64> = self.state.velocity;
         let sigma = (self.state.velocity_covariance().trace() / 2.0).sqrt();
         (velocity.norm() > (3.0 * sigma).max(1.0)).then(|| velocity.y.atan2(velocity.x))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_object_that_one_camera_has_just_detected_is_still_there_for_others_that_miss_it() {
+        let config = TracksConfig::default();
+        let (before, at) = (Timestamp(1_000_000), Timestamp(1_500_000));
+        let independent = nalgebra::Matrix2::identity() * 0.01;
+        let measurement = Measurement { position: Vector2::zeros(), independent, common_m: 0.0 };
+        let mut track = Track::new(Uuid::nil(), before, &measurement, &config);
+        track.record_hit(at);
+        (1..=3).for_each(|ms| track.record_miss(at + Duration::from_millis(ms), 0.5, 0.9));
+        assert!(track.survival(at) > 0.8, "survival {}", track.survival(at));
+        (1..=3).for_each(|ms| track.record_miss(at + Duration::from_millis(500 + ms), 0.5, 0.9));
+        assert!(track.survival(at) < 0.1, "survival {}", track.survival(at));
     }
 }

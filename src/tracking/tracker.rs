@@ -130,11 +130,12 @@ impl Tracker {
 
     /// The reports of a round in the order of capture, whatever the order of arrival.
     fn in_order(&self, pending: Vec<(Timestamp, Arc<ObjectReport>)>) -> Vec<Captured> {
+        let prior = self.config.bias_prior();
         let mut reports: Vec<Captured> = pending
             .into_iter()
             .map(|(stamp, report)| {
                 let sensor = self.sensors.by_name(&report.node);
-                let delay_s = sensor.map_or(0.0, |sensor| sensor.registration.delay_s());
+                let delay_s = sensor.map_or(0.0, |sensor| sensor.registration.delay_s(&prior));
                 let at = stamp.shifted((-delay_s * 1e6) as i64);
                 Captured { at, delay_s, report: self.frame.steady(report, at) }
             })

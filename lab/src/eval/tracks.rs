@@ -102,6 +102,8 @@ pub struct TrackScores {
     pub class_ap_pct: BTreeMap<Label, [Option<f64>; AP_DISTANCES_M.len()]>,
     /// Greatest F1 at [`MATCH_DISTANCE_M`] over all thresholds, all classes together.
     pub best_f1_pct: Option<f64>,
+    /// Greatest MODA at [`AP_DISTANCES_M`] over all thresholds, all classes together. Matches are those of average precision.
+    pub best_moda_pct: [Option<f64>; AP_DISTANCES_M.len()],
     /// At the threshold of the greatest F1.
     pub at_best_f1: ThresholdScores,
     /// At [`DEFAULT_THRESHOLD`].
@@ -163,6 +165,7 @@ pub fn score(frames: &[Frame]) -> TrackScores {
         ap_pct: std::array::from_fn(mean),
         class_ap_pct,
         best_f1_pct: best.map(|best| 100.0 * best.f1),
+        best_moda_pct: precision::best_moda_pct(frames),
         at_best_f1: at_threshold(frames, best.map_or(DEFAULT_THRESHOLD, |best| best.threshold)),
         at_default: at_threshold(frames, DEFAULT_THRESHOLD),
         calibration: calibration::judge(frames),

@@ -56,6 +56,16 @@ pub(super) fn best_f1(frames: &[Frame]) -> Option<BestF1> {
     points.iter().map(f1).reduce(|best, next| if next.f1 > best.f1 { next } else { best })
 }
 
+/// The greatest MODA in percent over all thresholds, at every distance; `None` if nothing is true.
+pub(super) fn best_moda_pct(frames: &[Frame]) -> [Option<f64>; AP_DISTANCES_M.len()] {
+    let objects: usize = frames.iter().map(|frame| frame.truth.len()).sum();
+    let moda = |point: &Point| point.recall * (2.0 - 1.0 / point.precision.max(f64::MIN_POSITIVE));
+    AP_DISTANCES_M.map(|limit_m| {
+        let points = (objects > 0).then(|| curve(verdicts(frames, limit_m), objects as u64))?;
+        Some(100.0 * points.iter().map(moda).fold(0.0, f64::max))
+    })
+}
+
 /// True if a reported object took a true one.
 #[derive(Debug, Clone, Copy)]
 struct RankedObject<'a> {
