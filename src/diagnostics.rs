@@ -165,13 +165,13 @@ type Key = (Option<String>, TroubleKind);
 #[derive(Debug, Clone, Default)]
 pub struct TroubleRegister {
     /// A lapsed entry stays until its room is needed, so that a trouble that comes and goes is not logged each time.
-    entries: BTreeMap<Key, Entry>,
+    entries: BTreeMap<Key, KnownTrouble>,
     /// When the log was last told that there is no room.
     crowded_at: Option<Timestamp>,
 }
 
 #[derive(Debug, Clone)]
-struct Entry {
+struct KnownTrouble {
     shown: Trouble,
     shown_at: Timestamp,
     /// The cause that is shown, and the one that was logged, without their figures.
@@ -184,7 +184,7 @@ struct Entry {
     is_settled: bool,
 }
 
-impl Entry {
+impl KnownTrouble {
     fn is_present(&self, kind: TroubleKind, now: Timestamp) -> bool {
         !self.is_settled && now.since(self.seen_at) < kind.lasts()
     }
@@ -241,7 +241,7 @@ impl TroubleRegister {
             });
         }
         let cause = cause();
-        let entry = Entry {
+        let entry = KnownTrouble {
             shown: shown(&cause, ""),
             shown_at: now,
             gist: gist(&cause),

@@ -11,7 +11,7 @@ use std::time::Duration;
 use ecod::leadership::election::{Election, ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::links::{DataPlane, LinkState};
-use ecod::leadership::node::{Effect, Input, KnownMember, LeadershipNode, NodeSettings};
+use ecod::leadership::node::{Effect, Input, LeadershipNode, NodeSettings, SeenMember};
 use ecod::leadership::round_filter::{Origin, RoundFilter};
 use ecod::leadership::timers::EPOCH_MEMORY;
 use ecod::leadership::{Leadership, Rights};
@@ -115,8 +115,8 @@ fn broker(index: usize) -> SocketAddr {
     SocketAddr::from(([10, 0, 0, 1], 1883 + index as u16))
 }
 
-fn member(index: usize) -> KnownMember {
-    KnownMember { name: name(index), run: 1, broker: Some(broker(index).into()), is_on_this_machine: false }
+fn member(index: usize) -> SeenMember {
+    SeenMember { name: name(index), run: 1, broker: Some(broker(index).into()), is_on_this_machine: false }
 }
 
 impl Cell {

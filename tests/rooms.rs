@@ -36,6 +36,33 @@ fn imports_run_downward_without_a_circle() {
     assert!(circles.is_empty(), "rooms that import each other:\n{}", circles.concat());
 }
 
+/// Names that every actor or program has one of.
+const IDIOMS: [&str; 6] = ["Arguments", "Cli", "Command", "Error", "Msg", "State"];
+
+#[test]
+fn one_type_name_means_one_thing() {
+    let house = House::read(Path::new(env!("CARGO_MANIFEST_DIR")));
+    let mut named = BTreeMap::<String, BTreeSet<&Module>>::new();
+    for (module, path) in &house.modules {
+        let file = syn::parse_file(&fs::read_to_string(path).unwrap()).unwrap();
+        for item in file.items {
+            let (name, attributes) = match item {
+                syn::Item::Struct(item) => (item.ident, item.attrs),
+                syn::Item::Enum(item) => (item.ident, item.attrs),
+                syn::Item::Trait(item) => (item.ident, item.attrs),
+                syn::Item::Type(item) => (item.ident, item.attrs),
+                _ => continue,
+            };
+            // One of two that stand for each other.
+            if !attributes.iter().any(|attribute| attribute.path().is_ident("cfg")) {
+                named.entry(name.to_string()).or_default().insert(module);
+            }
+        }
+    }
+    named.retain(|name, modules| modules.len() > 1 && !IDIOMS.contains(&name.as_str()));
+    assert!(named.is_empty(), "type names that mean several things: {named:#?}");
+}
+
 #[test]
 fn a_circle_is_found_and_named() {
     let graph = |edges: &[(&str, &str)]| {

@@ -81,10 +81,10 @@ pub enum NodeMessage {
 
 /// Starts the parts of a node and starts them again.
 #[derive(Debug, Default)]
-struct Node;
+struct Supervisor;
 
 /// The running parts.
-struct NodeState {
+struct SupervisorState {
     builder: NodeBuilder,
     running: HashMap<ActorId, ActorKind>,
     restarts: Restarts,
@@ -148,7 +148,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
     let (slots, counters) = (builder.slots().clone(), builder.counters());
     let (live_state, name) = (builder.live_state(), builder.name().clone());
-    let started = Actor::spawn(None, Node, builder).await;
+    let started = Actor::spawn(None, Supervisor, builder).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
     Ok(NodeHandle {
@@ -255,9 +255,9 @@ impl NodeHandle {
     }
 }
 
-impl Actor for Node {
+impl Actor for Supervisor {
     type Msg = NodeMessage;
-    type State = NodeState;
+    type State = SupervisorState;
     type Arguments = NodeBuilder;
 
     async fn pre_start(
@@ -265,7 +265,8 @@ impl Actor for Node {
         myself: ActorRef<Self::Msg>,
         builder: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let mut state = NodeState { builder, running: HashMap::new(), restarts: Restarts::default(), manager: None };
+        let mut state =
+            SupervisorState { builder, running: HashMap::new(), restarts: Restarts::default(), manager: None };
         for part in state.builder.parts() {
             state.start(part, &myself.get_cell()).await?;
         }
@@ -339,7 +340,7 @@ impl Actor for Node {
     }
 }
 
-impl NodeState {
+impl SupervisorState {
     fn log_health(&self) {
         let snapshot = self.builder.counters().snapshot();
         let frames = self.builder.frames().snapshot();

@@ -11,7 +11,7 @@ use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::health::HealthSample;
 use ecod::leadership::ledger_resync::LedgerResync;
 use ecod::leadership::links::{DataPlane, LinkState};
-use ecod::leadership::node::{Effect, Input, KnownMember, LeadershipNode, NodeSettings};
+use ecod::leadership::node::{Effect, Input, LeadershipNode, NodeSettings, SeenMember};
 use ecod::leadership::round_filter::{Origin, RoundFilter};
 use ecod::leadership::{Leadership, Rights};
 use ecod::model::epoch::Epoch;
@@ -45,7 +45,7 @@ pub(crate) struct Vehicle {
     aggregator: Aggregator,
     pub(crate) ledger: ReputationLedger,
     /// The other vehicles.
-    pub(crate) members: BTreeMap<NodeName, KnownMember>,
+    pub(crate) members: BTreeMap<NodeName, SeenMember>,
     rounds_due: u64,
     /// Time of the fuser's next timer; it may be early.
     alarm: Timestamp,
@@ -101,13 +101,13 @@ impl Vehicle {
         vehicle
     }
 
-    pub(crate) fn as_member(&self) -> KnownMember {
+    pub(crate) fn as_member(&self) -> SeenMember {
         let broker = Some(broker(self.index).into());
-        KnownMember { name: self.name.clone(), run: 1, broker, is_on_this_machine: false }
+        SeenMember { name: self.name.clone(), run: 1, broker, is_on_this_machine: false }
     }
 
     /// Takes the membership's news of another vehicle.
-    pub(crate) fn notice(&mut self, member: KnownMember, is_there: bool, now: Timestamp) {
+    pub(crate) fn notice(&mut self, member: SeenMember, is_there: bool, now: Timestamp) {
         if is_there {
             self.members.insert(member.name.clone(), member.clone());
             self.handle(Input::MemberAlive { member }, now);

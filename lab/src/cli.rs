@@ -45,7 +45,7 @@ enum Command {
     /// Measure a live cell under simulated vehicles: latency beside the bare broker, capacity, costs
     Bench(bench::BenchArguments),
     /// Write one page about a log, as `ecod-node report`, judged by what is true
-    Report(report::ReportArguments),
+    Report(report::LogReportArguments),
     /// Judge the output of a replay by what is true
     Eval(eval::EvalArguments),
 }

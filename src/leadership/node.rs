@@ -24,7 +24,7 @@ use std::time::Duration;
 
 use uuid::Uuid;
 
-pub use interface::{Effect, Input, KnownMember, NodeSettings, Notice};
+pub use interface::{Effect, Input, NodeSettings, Notice, SeenMember};
 
 use crate::leadership::address::BrokerAddress;
 use crate::leadership::election::{Body, Election, ElectionEffect, ElectionInput, ElectionMessage, Health};
@@ -281,7 +281,7 @@ impl LeadershipNode {
         }
     }
 
-    fn meet(&mut self, member: KnownMember, now: Timestamp) {
+    fn meet(&mut self, member: SeenMember, now: Timestamp) {
         let peer = member.name.clone();
         self.members.place(member);
         self.forget_login(&peer, now);
@@ -339,7 +339,7 @@ impl LeadershipNode {
 
     /// Notes a look. The list of members makes up for events from before the start, and for members that a restarted
     /// membership lost without a word.
-    fn take_look(&mut self, rounds_due: u64, load_percent: u8, members: Vec<KnownMember>, now: Timestamp) {
+    fn take_look(&mut self, rounds_due: u64, load_percent: u8, members: Vec<SeenMember>, now: Timestamp) {
         if !self.is_vehicle_only {
             self.monitor.note_look(rounds_due, load_percent, now);
             self.update_health(now);

@@ -37,7 +37,7 @@ const MIN_NATS: f64 = -9.6;
 
 /// Learnt relation between confidence and probability of one vehicle.
 #[derive(Debug, Clone)]
-pub(super) struct Calibration {
+pub(super) struct DetectionCalibration {
     /// Numbers of detections that recurred, and of all, by log-odds of their confidence.
     bins: [(f64, f64); BINS],
     /// Log-odds of the even confidence: assumed and learnt.
@@ -57,7 +57,7 @@ fn bounded(confidence: f64) -> f64 {
     confidence.clamp(1e-4, 1.0 - 1e-4)
 }
 
-impl Calibration {
+impl DetectionCalibration {
     /// A calibration that assumes the even confidence.
     pub(super) fn new(even_confidence: f64) -> Self {
         let assumed = log_odds(even_confidence);

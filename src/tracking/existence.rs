@@ -64,7 +64,7 @@ pub(super) struct SensorHistory {
     /// Log-odds of the last confidence.
     pub(super) confidence_log_odds: f64,
     /// Hits and looks since the last judgement.
-    unjudged: Statement,
+    unjudged: ExistenceStatement,
     judged_at: Timestamp,
     /// Evidence of the sequence of hits and misses, nats.
     sequence: f64,
@@ -77,7 +77,7 @@ pub(super) struct SensorHistory {
 
 /// Hits and looks of one vehicle at one object over some time.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Statement {
+pub(super) struct ExistenceStatement {
     pub(super) hits: u32,
     pub(super) looks: u32,
 }
@@ -174,7 +174,7 @@ impl SensorHistory {
             position: Vector2::zeros(),
             looks: 0,
             confidence_log_odds: 0.0,
-            unjudged: Statement::default(),
+            unjudged: ExistenceStatement::default(),
             judged_at: at,
             sequence: 0.0,
             is_view_stated: false,
@@ -226,7 +226,7 @@ impl SensorHistory {
     }
 
     /// The statement since the last judgement, if a judgement is due.
-    pub(super) fn take_due(&mut self, at: Timestamp) -> Option<Statement> {
+    pub(super) fn take_due(&mut self, at: Timestamp) -> Option<ExistenceStatement> {
         (at.since(self.judged_at) >= JUDGED_AFTER && self.unjudged.looks >= MIN_JUDGED_LOOKS).then(|| {
             self.judged_at = at;
             std::mem::take(&mut self.unjudged)

@@ -4,12 +4,12 @@ use std::time::Duration;
 
 use super::store::TrackIndex;
 use super::track::{MIN_LABEL_SIMILARITY, Track};
-use super::update::{Detection, ESTABLISHED_HITS, ReportUpdate};
+use super::update::{ESTABLISHED_HITS, ReportUpdate, TimedDetection};
 use crate::association::{Candidate, ClusterSize, assign};
 
 /// A detection and a track within the gate.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Pairing {
+pub(super) struct GatedPair {
     /// Index into the detections of the report.
     pub(super) detection: usize,
     pub(super) track: TrackIndex,
@@ -35,7 +35,7 @@ const MAX_FAST: usize = 64;
 
 impl ReportUpdate<'_> {
     /// Pairings of detections with tracks within the gate, by detection.
-    pub(super) fn associate(&self, detections: &[Detection<'_>]) -> Vec<Pairing> {
+    pub(super) fn associate(&self, detections: &[TimedDetection<'_>]) -> Vec<GatedPair> {
         let (gate, gate_m) = (self.config.gate(), self.config.gate_m);
         let reach_m = gate_m + self.tracks.slack_m(self.at);
         let mut pairings = Vec::with_capacity(2 * detections.len());
@@ -57,7 +57,7 @@ impl ReportUpdate<'_> {
                 let benefit = gate - innovation.distance_squared + (maturity * similarity.powi(2) / spread).ln();
                 if benefit > 0.0 || similarity > MIN_LABEL_SIMILARITY {
                     let benefit = benefit.max(MIN_BENEFIT);
-                    pairings.push(Pairing { detection: number, track: indexed.track, benefit });
+                    pairings.push(GatedPair { detection: number, track: indexed.track, benefit });
                 }
             });
         }
@@ -65,7 +65,7 @@ impl ReportUpdate<'_> {
     }
 
     /// Adds pairings of the remaining likely detections with tracks that are so new that they may have any velocity.
-    pub(super) fn associate_fast(&mut self, detections: &[Detection<'_>], pairings: &mut Vec<Pairing>) {
+    pub(super) fn associate_fast(&mut self, detections: &[TimedDetection<'_>], pairings: &mut Vec<GatedPair>) {
         if pairings.len() == detections.len() {
             return;
         }
@@ -83,7 +83,7 @@ impl ReportUpdate<'_> {
                 if continued.binary_search(&indexed.track).is_err()
                     && let Some(benefit) = self.benefit_if_fast(&self.tracks[indexed.track], detection)
                 {
-                    fast.push(Pairing { detection: number, track: indexed.track, benefit });
+                    fast.push(GatedPair { detection: number, track: indexed.track, benefit });
                 }
             });
         }
@@ -95,7 +95,7 @@ impl ReportUpdate<'_> {
     }
 
     /// Benefit of pairing a detection with a new track of any velocity; `None` if they cannot be the same object.
-    fn benefit_if_fast(&self, track: &Track, detection: &Detection<'_>) -> Option<f64> {
+    fn benefit_if_fast(&self, track: &Track, detection: &TimedDetection<'_>) -> Option<f64> {
         let passed = self.at.since(track.last_seen);
         let is_new = track.hits < ESTABLISHED_HITS && track.vehicle.is_none();
         let offset = detection.measurement.position - track.state.position_at(self.at);
@@ -114,7 +114,7 @@ impl ReportUpdate<'_> {
 }
 
 /// The best pairings, by detection.
-fn best(mut pairings: Vec<Pairing>) -> Vec<Pairing> {
+fn best(mut pairings: Vec<GatedPair>) -> Vec<GatedPair> {
     pairings.sort_by_key(|pairing| (pairing.detection, pairing.track));
     let mut assigned = assign(pairings, greedy_if_large);
     assigned.sort_by_key(|pairing| pairing.detection);
@@ -122,11 +122,11 @@ fn best(mut pairings: Vec<Pairing>) -> Vec<Pairing> {
 }
 
 /// Of a cluster that is too large, the pairings taken one after the other, the best first.
-fn greedy_if_large(size: ClusterSize, cluster: &[Pairing]) -> Option<Vec<Pairing>> {
+fn greedy_if_large(size: ClusterSize, cluster: &[GatedPair]) -> Option<Vec<GatedPair>> {
     (size.rows > MAX_CLUSTER).then(|| {
         let mut by_benefit = cluster.to_vec();
         by_benefit.sort_by(|a, b| b.benefit.total_cmp(&a.benefit));
-        let mut chosen: Vec<Pairing> = Vec::new();
+        let mut chosen: Vec<GatedPair> = Vec::new();
         for pairing in by_benefit {
             if chosen.iter().all(|other| other.detection != pairing.detection && other.track != pairing.track) {
                 chosen.push(pairing);
@@ -136,7 +136,7 @@ fn greedy_if_large(size: ClusterSize, cluster: &[Pairing]) -> Option<Vec<Pairing
     })
 }
 
-impl Candidate for Pairing {
+impl Candidate for GatedPair {
     const SPARE_COLUMNS: bool = true;
 
     fn row(&self) -> u32 {

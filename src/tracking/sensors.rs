@@ -6,7 +6,7 @@ use std::time::Duration;
 use hashbrown::HashMap;
 use nalgebra::{Matrix2, Vector2};
 
-use super::calibration::Calibration;
+use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
 use super::existence::{ClutterRates, DetectionRates, LookRates};
@@ -157,7 +157,7 @@ pub(super) struct SensorModel {
     place: (Vector2<f64>, Timestamp),
     pub(super) registration: Registration,
     pub(super) noise: NoiseModel,
-    pub(super) calibration: Calibration,
+    pub(super) calibration: DetectionCalibration,
     pub(super) coverage: Coverage,
     pub(super) clutter: ClutterRates,
     pub(super) counts: TrustCounts,
@@ -173,7 +173,7 @@ impl SensorModel {
             place: (Vector2::zeros(), at),
             registration: Registration::new(at, &config.bias_prior()),
             noise: NoiseModel::default(),
-            calibration: Calibration::new(config.even_confidence),
+            calibration: DetectionCalibration::new(config.even_confidence),
             coverage: Coverage::default(),
             clutter: ClutterRates::default(),
             counts,

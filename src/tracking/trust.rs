@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use super::detection_history::DetectionHistory;
-use super::existence::Statement;
+use super::existence::ExistenceStatement;
 use super::sensors::SensorId;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
@@ -74,7 +74,7 @@ impl PeerEvidence {
         peers
     }
 
-    fn judge(&self, statement: Statement) -> Option<Judgement> {
+    fn judge(&self, statement: ExistenceStatement) -> Option<Judgement> {
         let share = f64::from(statement.hits) / f64::from(statement.looks.max(1));
         let exists = self.nats >= EXISTS_NATS;
         if self.detecting >= 1 && exists && share >= MIN_STATED {
@@ -216,7 +216,7 @@ impl Fleet {
     pub(super) fn judge(
         &mut self,
         sensor: SensorId,
-        statement: Statement,
+        statement: ExistenceStatement,
         history: &DetectionHistory,
         distance_m: f64,
         at: Timestamp,

@@ -7,7 +7,7 @@ use nalgebra::{Matrix2, Vector2};
 
 use super::calibration::log_odds;
 use super::config::TracksConfig;
-use super::existence::{DetectionRates, LookRates, Statement};
+use super::existence::{DetectionRates, ExistenceStatement, LookRates};
 use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::track_id;
 use super::occlusion::OcclusionMap;
@@ -36,7 +36,7 @@ pub(super) const ESTABLISHED_HITS: u32 = 5;
 const OWN_NATS: f64 = 4.0;
 
 /// A detection of a report, corrected by the vehicle's registration.
-pub(super) struct Detection<'a> {
+pub(super) struct TimedDetection<'a> {
     /// Index into the objects of the report.
     pub(super) index: usize,
     pub(super) object: &'a PerceivedObject,
@@ -159,7 +159,7 @@ impl<'a> ReportUpdate<'a> {
     }
 
     /// The report's detections, but for those of the vehicle itself.
-    fn detections(&self) -> Vec<Detection<'a>> {
+    fn detections(&self) -> Vec<TimedDetection<'a>> {
         let own = self.report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
         let trust = self.trust.max(MIN_TRUST);
         let correct = self.sensor.registration.corrector();
@@ -172,7 +172,7 @@ impl<'a> ReportUpdate<'a> {
                 common_m: self.config.common_m,
             };
             let log_odds = log_odds(object.confidence);
-            (!is_itself).then_some(Detection { index, object, log_odds, reported, measurement })
+            (!is_itself).then_some(TimedDetection { index, object, log_odds, reported, measurement })
         };
         let mut detections = Vec::with_capacity(self.report.objects.len());
         detections.extend(self.report.objects.iter().enumerate().filter_map(detection));
@@ -180,9 +180,9 @@ impl<'a> ReportUpdate<'a> {
     }
 
     /// Updates a track with its detection, and the sensor model with what the track tells of it.
-    fn update_track(&mut self, index: TrackIndex, detection: &Detection<'_>) {
+    fn update_track(&mut self, index: TrackIndex, detection: &TimedDetection<'_>) {
         let (id, at, density) = (self.sensor.id, self.at, self.config.density());
-        let Detection { object, reported, measurement, .. } = detection;
+        let TimedDetection { object, reported, measurement, .. } = detection;
         let track = &mut self.tracks[index];
         let is_vehicle = track.vehicle.is_some();
         if track.hits >= MATURE_HITS && !is_vehicle {
@@ -281,7 +281,7 @@ impl<'a> ReportUpdate<'a> {
     }
 
     /// Judges the vehicle's statement about a track by the evidence of the others.
-    fn judge(&mut self, index: TrackIndex, reported: &Vector2<f64>, statement: Statement) {
+    fn judge(&mut self, index: TrackIndex, reported: &Vector2<f64>, statement: ExistenceStatement) {
         let track = &self.tracks[index];
         let distance_m = self.sensor.coverage.centre().map_or(0.0, |centre| (reported - centre).norm());
         let judgement = self.fleet.judge(self.sensor.id, statement, &track.history, distance_m, self.at);
@@ -293,7 +293,7 @@ impl<'a> ReportUpdate<'a> {
     }
 
     /// Spawns a track from a detection that no track explains.
-    fn spawn(&mut self, detection: &Detection<'_>) {
+    fn spawn(&mut self, detection: &TimedDetection<'_>) {
         let (id, at) = (track_id(self.report, detection.index), self.at);
         let mut track = Track::new(id, at, &detection.measurement, self.config);
         detection.describe(&mut track, self.sensor, at, self.config);
@@ -306,7 +306,7 @@ impl<'a> ReportUpdate<'a> {
     }
 }
 
-impl Detection<'_> {
+impl TimedDetection<'_> {
     /// Updates velocity, attributes and time of a track.
     fn describe(&self, track: &mut Track, sensor: &SensorModel, at: Timestamp, config: &TracksConfig) {
         if let Some([x, y]) = self.object.velocity_mps {

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use super::config::WeightedConfig;
 use super::confusion::{Confusion, LabelIndex};
-use super::likelihood::{LandmarkPosterior, Likelihood, Posterior, normalise, probability};
+use super::likelihood::{LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability};
 
 /// Evidence about one vehicle.
 #[derive(Debug, Clone, Default)]
@@ -51,19 +51,6 @@ impl VehicleEvidence {
     pub(super) fn votes(&self) -> f64 {
         self.live.total() + self.settled.total() + self.inherited.total()
     }
-}
-
-/// A vote as the model takes it.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct WeightedVote {
-    /// Index of the vehicle.
-    pub(super) vehicle: usize,
-    /// The stated label.
-    pub(super) label: LabelIndex,
-    /// Calibrated confidence × visibility, 1 for a plain vote.
-    pub(super) weight: f64,
-    /// Part of the vote that does not depend on other vehicles, 0 to 1.
-    pub(super) independence: f64,
 }
 
 /// What the fleet's mean vehicle states where one label is true.

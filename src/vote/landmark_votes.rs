@@ -4,9 +4,8 @@ use std::collections::BTreeSet;
 
 use super::calibration::{ConfidenceCalibration, Weights};
 use super::confusion::LabelIndex;
-use super::dawid_skene::WeightedVote;
 use super::dependence::Dependence;
-use super::likelihood::{LandmarkPosterior, Posterior, probability};
+use super::likelihood::{LandmarkPosterior, Posterior, WeightedVote, probability};
 use crate::model::time::Timestamp;
 
 /// Independent part of a vehicle's statements: one frame is much like the next.

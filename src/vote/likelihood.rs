@@ -1,7 +1,19 @@
 //! Likelihood of votes and the posterior that follows from it.
 
 use super::confusion::LabelIndex;
-use super::dawid_skene::WeightedVote;
+
+/// A vote as the model takes it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct WeightedVote {
+    /// Index of the vehicle.
+    pub(super) vehicle: usize,
+    /// The stated label.
+    pub(super) label: LabelIndex,
+    /// Calibrated confidence × visibility, 1 for a plain vote.
+    pub(super) weight: f64,
+    /// Part of the vote that does not depend on other vehicles, 0 to 1.
+    pub(super) independence: f64,
+}
 
 /// Probabilities of labels.
 pub(super) type Posterior = Vec<(LabelIndex, f64)>;

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
 use ecod::leadership::election::{ElectionConfig, ElectionMessage};
 use ecod::leadership::links::LinkState;
-use ecod::leadership::node::{Effect, Input, KnownMember};
+use ecod::leadership::node::{Effect, Input, SeenMember};
 use ecod::leadership::{Position, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
@@ -315,9 +315,9 @@ impl World {
         Timestamp(self.now).shifted(self.nodes[index].clock)
     }
 
-    fn member(&self, about: usize, run: u64) -> KnownMember {
+    fn member(&self, about: usize, run: u64) -> SeenMember {
         let name = self.nodes[about].name.clone();
-        KnownMember { name, run, broker: Some(address_of(about)), is_on_this_machine: false }
+        SeenMember { name, run, broker: Some(address_of(about)), is_on_this_machine: false }
     }
 
     /// Hands in what happened and carries out what comes of it, as the actors do.

@@ -12,7 +12,7 @@ use crate::observe::recorder::{LogError, LogReader};
 
 /// Choice among logs of several nodes.
 #[derive(Debug, Args)]
-pub(super) struct NodeArguments {
+pub(super) struct LogsNodeArguments {
     /// Node whose log to use, among logs of several nodes
     #[arg(long, value_name = "NAME")]
     pub(super) node: Option<NodeName>,
@@ -27,7 +27,7 @@ pub(super) struct Logs {
 
 impl Logs {
     /// Finds the log files of one node among files and directories. Files without a node's name belong to the only node.
-    pub(super) fn find(inputs: &[PathBuf], NodeArguments { node }: &NodeArguments) -> Result<Self, Failure> {
+    pub(super) fn find(inputs: &[PathBuf], LogsNodeArguments { node }: &LogsNodeArguments) -> Result<Self, Failure> {
         let paths = log_files(inputs).map_err(Failure::usage)?;
         let (mut logs, mut nodes) = (Vec::new(), BTreeSet::new());
         for path in paths {

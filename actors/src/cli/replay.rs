@@ -14,7 +14,7 @@ use ecod::wire::Limits;
 pub use log::rounds_of_log;
 
 use super::Failure;
-use super::logs::{Logs, NodeArguments};
+use super::logs::{Logs, LogsNodeArguments};
 use crate::cli::lines::{self, LineRead, read_line};
 use crate::node::config::NodeConfig;
 use crate::observe::recorder::LogReader;
@@ -32,7 +32,7 @@ pub(super) struct ReplayArguments {
     #[arg(long, value_name = "FILE", required = true)]
     input: Vec<PathBuf>,
     #[command(flatten)]
-    node: NodeArguments,
+    node: LogsNodeArguments,
     /// File for maps and verdicts, one JSON object per line; `-` for standard output
     #[arg(long, value_name = "FILE")]
     output: PathBuf,
@@ -63,7 +63,7 @@ pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
 }
 
 /// The input, if it is a file of lines or standard input; none for logs.
-fn input_of_lines<'a>(inputs: &'a [PathBuf], node: &NodeArguments) -> Result<Option<&'a Path>, Failure> {
+fn input_of_lines<'a>(inputs: &'a [PathBuf], node: &LogsNodeArguments) -> Result<Option<&'a Path>, Failure> {
     let [input] = inputs else { return Ok(None) };
     if input != Path::new("-") && (input.is_dir() || LogReader::recognises(input).map_err(Failure::usage)?) {
         return Ok(None);

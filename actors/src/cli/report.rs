@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, anyhow};
 use clap::Args;
 
-use super::logs::{Logs, NodeArguments};
+use super::logs::{Logs, LogsNodeArguments};
 use super::{Failure, in_lab};
 use crate::cli::lines;
 use crate::observe::report::Report;
@@ -18,7 +18,7 @@ pub struct PageArguments {
     #[arg(value_name = "LOG", required = true)]
     logs: Vec<PathBuf>,
     #[command(flatten)]
-    node: NodeArguments,
+    node: LogsNodeArguments,
     /// Report to write (HTML)
     #[arg(short, long, value_name = "FILE", default_value = "report.html")]
     output: PathBuf,

@@ -27,7 +27,7 @@ pub(super) struct RunArguments {
     #[arg(long, value_parser = ["auto", "cav", "edge"])]
     role: Option<String>,
     #[command(flatten)]
-    join: JoinArguments,
+    join: SeedArguments,
     /// Address where this node's own MQTT broker listens
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     listen: Option<SocketAddr>,
@@ -63,7 +63,7 @@ pub(super) struct RunArguments {
 
 /// Flags by which a program finds and joins a cell.
 #[derive(Debug, Clone, Default, Args)]
-struct JoinArguments {
+struct SeedArguments {
     /// Configuration file (TOML)
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -178,7 +178,7 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
 #[derive(Debug, Args)]
 pub(super) struct ObserverArguments {
     #[command(flatten)]
-    join: JoinArguments,
+    join: SeedArguments,
 }
 
 impl ObserverArguments {
@@ -192,12 +192,12 @@ impl ObserverArguments {
     pub(super) fn load(&self, purpose: &str) -> Result<NodeConfig, Failure> {
         let default_name = format!("{purpose}-{}", std::process::id());
         let name = self.join.name.clone().or_else(|| NodeName::new(&default_name).ok());
-        let join = JoinArguments { name, ..self.join.clone() };
+        let join = SeedArguments { name, ..self.join.clone() };
         let mut config = RunArguments { role: Some("cav".into()), join, ..RunArguments::default() }.load()?;
         // With a node's certificate, the observer needs a name below that node's.
         if config.tls.is_some() && self.join.name.is_none() {
-            let JoinArguments { config: file, cell, .. } = self.join.clone();
-            let join = JoinArguments { config: file, cell, ..JoinArguments::default() };
+            let SeedArguments { config: file, cell, .. } = self.join.clone();
+            let join = SeedArguments { config: file, cell, ..SeedArguments::default() };
             if let Some(holder) = (RunArguments { join, ..RunArguments::default() }).load()?.name {
                 let name = NodeName::new(format!("{holder}{OBSERVER_MARK}{default_name}"));
                 config.name = Some(name.map_err(Failure::usage)?);
@@ -232,7 +232,7 @@ mod tests {
         let text =
             "name = \"euclid\"\n[dashboard]\nlisten = \"127.0.0.1:8080\"\n[membership]\nbind = \"127.0.0.1:17884\"\n";
         std::fs::write(&path, text).unwrap();
-        let join = JoinArguments { config: Some(path), ..JoinArguments::default() };
+        let join = SeedArguments { config: Some(path), ..SeedArguments::default() };
         let arguments = ObserverArguments { join };
         let Ok(config) = arguments.load("recorder") else { panic!("the configuration is valid") };
         assert!(!config.dashboard.enabled && !config.has_broker());

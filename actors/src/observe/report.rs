@@ -26,7 +26,7 @@ use crate::observe::recorder::{
 };
 use losses::Losses;
 use series::Samples;
-use timeline::{GAP, LogTimeline, Picture, cell_offset_us};
+use timeline::{GAP, LogTimeline, RecordedPicture, cell_offset_us};
 
 /// Additional section of the page, made from the messages of the log in their order.
 pub trait Section: Debug {
@@ -174,7 +174,9 @@ impl Report {
                 self.with(message, |report, it| report.counters(CounterReading { at_us: at, ..it }))
             }
             SchemaName::NodeStatus => self.with(message, |report, it| report.timeline.status(it, at)),
-            SchemaName::CompressedImage => self.with(message, |report, it: Picture| report.timeline.picture(it, at)),
+            SchemaName::CompressedImage => {
+                self.with(message, |report, it: RecordedPicture| report.timeline.picture(it, at))
+            }
             _ => true,
         };
         if !is_valid && self.problems.len() < MAX_PROBLEMS {

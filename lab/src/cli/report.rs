@@ -14,7 +14,7 @@ use crate::report::{judged_by, judged_by_tracks};
 
 /// Flags of `report`.
 #[derive(Debug, Args)]
-pub(super) struct ReportArguments {
+pub(super) struct LogReportArguments {
     #[command(flatten)]
     page: PageArguments,
     /// Truth: the object at each location (JSON, or CSV with the columns item,truth), or the places of all objects (JSON)
@@ -22,7 +22,7 @@ pub(super) struct ReportArguments {
     truth: Option<PathBuf>,
 }
 
-pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
+pub(super) fn run(arguments: &LogReportArguments) -> Result<(), Failure> {
     let truth = arguments.truth.as_deref();
     let report = truth.map_or_else(|| Ok(Report::default()), judged).map_err(Failure::usage)?;
     page(&arguments.page, report, truth, "ecod-lab")

@@ -52,7 +52,7 @@ const REACH: f64 = 0.75;
 
 /// One moment: what stood where, and what was said.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Frame {
+pub struct ScoredFrame {
     /// True objects, each id once.
     pub truth: Vec<TrueObject>,
     /// Objects of the map, each id once.
@@ -149,8 +149,8 @@ pub struct ThresholdScores {
 }
 
 /// Judges frames that follow each other in time.
-pub fn score(frames: &[Frame]) -> TrackScores {
-    let count = |of: fn(&Frame) -> usize| frames.iter().map(|frame| of(frame) as u64).sum();
+pub fn score(frames: &[ScoredFrame]) -> TrackScores {
+    let count = |of: fn(&ScoredFrame) -> usize| frames.iter().map(|frame| of(frame) as u64).sum();
     let class_ap_pct = precision::by_class(frames);
     let mean = |place: usize| {
         let all: Vec<f64> = class_ap_pct.values().filter_map(|ap| ap[place]).collect();
@@ -172,12 +172,12 @@ pub fn score(frames: &[Frame]) -> TrackScores {
     }
 }
 
-fn at_threshold(frames: &[Frame], threshold: f64) -> ThresholdScores {
-    let kept = |frame: &Frame| {
+fn at_threshold(frames: &[ScoredFrame], threshold: f64) -> ThresholdScores {
+    let kept = |frame: &ScoredFrame| {
         let said = frame.said.iter().filter(|said| said.score >= threshold).cloned().collect();
-        Frame { truth: frame.truth.clone(), said }
+        ScoredFrame { truth: frame.truth.clone(), said }
     };
-    let frames: Vec<Frame> = frames.iter().map(kept).collect();
+    let frames: Vec<ScoredFrame> = frames.iter().map(kept).collect();
     let clear = clear::judge(&frames);
     let identity = identity::judge(&frames);
     let hota = hota::judge(&frames);
@@ -259,13 +259,13 @@ impl TrackEvaluation {
     /// The figures.
     pub fn result(self) -> TrackScores {
         let with_map = self.maps.iter().flatten().count() as u64;
-        let frames: Vec<Frame> = self
+        let frames: Vec<ScoredFrame> = self
             .maps
             .into_iter()
             .enumerate()
             .map(|(number, map)| match map {
-                Some((at, said)) => Frame { truth: self.truth.at(number, at), said },
-                None => Frame { truth: self.truth.frames()[number].objects.clone(), said: Vec::new() },
+                Some((at, said)) => ScoredFrame { truth: self.truth.at(number, at), said },
+                None => ScoredFrame { truth: self.truth.frames()[number].objects.clone(), said: Vec::new() },
             })
             .collect();
         let mut scores = TrackScores { frames_with_map: with_map, ..score(&frames) };

@@ -29,7 +29,7 @@ pub fn birdseye(
     map: Option<&GlobalMap>,
 ) -> Result<String, BirdseyeError> {
     check(scene, detections, map)?;
-    let picture = Picture { testbed, scene, map, sheet: Sheet::around(scene) };
+    let picture = BirdseyePicture { testbed, scene, map, sheet: Sheet::around(scene) };
     Ok(picture.draw(detections).to_string() + "\n")
 }
 
@@ -124,14 +124,14 @@ const LINE_PX: f64 = 18.0;
 /// Longest text in characters; the rest is cut.
 const LONGEST_TEXT: usize = 12;
 
-struct Picture<'a> {
+struct BirdseyePicture<'a> {
     testbed: &'a Testbed,
     scene: &'a Scene,
     map: Option<&'a GlobalMap>,
     sheet: Sheet,
 }
 
-impl Picture<'_> {
+impl BirdseyePicture<'_> {
     fn draw(&self, detections: &[(NodeName, Point2<f64>)]) -> Document {
         let sheet = &self.sheet;
         let (width, height) = sheet.size();

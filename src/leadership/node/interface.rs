@@ -31,7 +31,7 @@ pub struct NodeSettings {
 
 /// Another node of the cell.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub struct KnownMember {
+pub struct SeenMember {
     /// Its name.
     pub name: NodeName,
     /// Start of its present run, in Unix microseconds by its own clock.
@@ -59,12 +59,12 @@ pub enum Input {
     /// The membership found a node, or a new run of it.
     MemberAlive {
         /// The node.
-        member: KnownMember,
+        member: SeenMember,
     },
     /// A living node's addresses changed.
     MemberChanged {
         /// The node as it is now.
-        member: KnownMember,
+        member: SeenMember,
     },
     /// The membership doubts a node.
     MemberSuspected {
@@ -119,7 +119,7 @@ pub enum Input {
         /// Processor load of the machine, 0 to 100 %.
         load_percent: u8,
         /// All nodes that the membership knows.
-        members: Vec<KnownMember>,
+        members: Vec<SeenMember>,
     },
     /// The answer to [`Effect::AskParts`], later.
     PartsAnswered {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::leadership::address::BrokerAddress;
-use crate::leadership::node::KnownMember;
+use crate::leadership::node::SeenMember;
 use crate::leadership::timers::{DEPARTED_TIME, REDISCOVERY_TIME};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
@@ -11,7 +11,7 @@ use crate::model::time::Timestamp;
 /// The living members, and those that were given up a moment ago.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub(super) struct Members {
-    living: BTreeMap<NodeName, KnownMember>,
+    living: BTreeMap<NodeName, SeenMember>,
     /// Brokers of nodes that were given up, and until when their end proves these nodes gone.
     departed: BTreeMap<NodeName, (BrokerAddress, Timestamp)>,
     /// Time since when a restarted membership has not found a member again.
@@ -20,7 +20,7 @@ pub(super) struct Members {
 
 impl Members {
     /// Notes a living member.
-    pub(super) fn place(&mut self, member: KnownMember) {
+    pub(super) fn place(&mut self, member: SeenMember) {
         self.living.insert(member.name.clone(), member);
     }
 
@@ -33,12 +33,12 @@ impl Members {
     }
 
     /// True if this run of a member is known.
-    pub(super) fn knows(&self, member: &KnownMember) -> bool {
+    pub(super) fn knows(&self, member: &SeenMember) -> bool {
         self.living.get(&member.name).is_some_and(|known| known.run == member.run)
     }
 
     /// Members that a restarted membership has not found again in [`REDISCOVERY_TIME`].
-    pub(super) fn long_missing(&mut self, found: &[KnownMember], now: Timestamp) -> Vec<NodeName> {
+    pub(super) fn long_missing(&mut self, found: &[SeenMember], now: Timestamp) -> Vec<NodeName> {
         let is_found = |name: &&NodeName| found.iter().any(|member| member.name == **name);
         let missing: Vec<_> = self.living.keys().filter(|name| !is_found(name)).cloned().collect();
         if missing.is_empty() {
@@ -82,9 +82,9 @@ mod tests {
         Timestamp(ms * 1000)
     }
 
-    fn member(name: &'static str, port: u16) -> KnownMember {
+    fn member(name: &'static str, port: u16) -> SeenMember {
         let broker = Some(format!("10.0.0.1:{port}").parse().unwrap());
-        KnownMember { name: NodeName::from_static(name), run: 1, broker, is_on_this_machine: false }
+        SeenMember { name: NodeName::from_static(name), run: 1, broker, is_on_this_machine: false }
     }
 
     #[test]

@@ -27,7 +27,7 @@ struct Scene {
     machine: LeadershipNode,
     now: Timestamp,
     rounds_due: u64,
-    members: Vec<KnownMember>,
+    members: Vec<SeenMember>,
     effects: Vec<Effect>,
     seq: u64,
 }
@@ -147,8 +147,8 @@ impl Scene {
     }
 }
 
-fn member(node: &str, host: u8) -> KnownMember {
-    KnownMember { name: name(node), run: 1, broker: Some(broker(host).into()), is_on_this_machine: false }
+fn member(node: &str, host: u8) -> SeenMember {
+    SeenMember { name: name(node), run: 1, broker: Some(broker(host).into()), is_on_this_machine: false }
 }
 
 #[test]
@@ -197,7 +197,7 @@ fn a_false_last_will_ends_a_leader_once_in_each_of_its_runs() {
     let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
     scene.take(Input::LinkChanged { broker: "10.0.0.9:1883".parse().unwrap(), state: LinkState::Up });
     for (attempt, run, is_ended) in [(0, 1, true), (1, 1, false), (2, 1, false), (3, 2, true)] {
-        let edge = KnownMember { run, ..member("edge", 2) };
+        let edge = SeenMember { run, ..member("edge", 2) };
         scene.members = vec![edge.clone()];
         scene.take(Input::MemberAlive { member: edge });
         scene.run_for(1000);

@@ -297,8 +297,8 @@ impl ElectionDriver {
 }
 
 /// A member as the node's leadership wants to know it.
-fn as_seen(member: &Member) -> node::KnownMember {
-    node::KnownMember {
+fn as_seen(member: &Member) -> node::SeenMember {
+    node::SeenMember {
         name: member.name.clone(),
         run: member.run,
         broker: member.broker.map(BrokerAddress::from),

@@ -12,15 +12,15 @@ use crate::platform::state_file::StateFile;
 #[derive(Debug)]
 pub(super) struct TermWriter {
     wanted: watch::Sender<u64>,
-    answer: watch::Receiver<Answer>,
+    answer: watch::Receiver<DiskAnswer>,
     has_disk: bool,
     /// The disk's last answer when it was found to hang.
-    hung_at: Option<Answer>,
+    hung_at: Option<DiskAnswer>,
 }
 
 /// The disk's answer to the last term that was handed to it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-struct Answer {
+struct DiskAnswer {
     term: u64,
     is_saved: bool,
 }
@@ -58,7 +58,7 @@ impl TermWriter {
     /// A writer that ends, with what it was handed last on disk, after it is dropped; without a file it does nothing.
     pub(super) fn new(file: Option<StateFile>) -> Self {
         let (wanted, terms) = watch::channel(0);
-        let (answers, answer) = watch::channel(Answer::default());
+        let (answers, answer) = watch::channel(DiskAnswer::default());
         let has_disk = file.is_some();
         if let Some(file) = file {
             tokio::spawn(write_all(file, terms, answers));
@@ -77,7 +77,7 @@ impl TermWriter {
         // A node may unlearn a term, and then hands in a lower one: earlier answers are not about it.
         let wanted = *self.wanted.borrow();
         let term = term.min(wanted);
-        let is_about = |answer: &Answer| (term..=wanted).contains(&answer.term);
+        let is_about = |answer: &DiskAnswer| (term..=wanted).contains(&answer.term);
         if !self.has_disk {
             return TermState::NoDisk;
         }
@@ -99,7 +99,7 @@ impl TermWriter {
     }
 }
 
-async fn write_all(file: StateFile, mut terms: watch::Receiver<u64>, answers: watch::Sender<Answer>) {
+async fn write_all(file: StateFile, mut terms: watch::Receiver<u64>, answers: watch::Sender<DiskAnswer>) {
     let mut is_failing = false;
     while terms.changed().await.is_ok() {
         let term = *terms.borrow_and_update();
@@ -114,7 +114,7 @@ async fn write_all(file: StateFile, mut terms: watch::Receiver<u64>, answers: wa
             Ok(()) | Err(_) => {}
         }
         is_failing = written.is_err();
-        answers.send_replace(Answer { term, is_saved: !is_failing });
+        answers.send_replace(DiskAnswer { term, is_saved: !is_failing });
     }
 }
 
@@ -168,7 +168,7 @@ mod tests {
     #[tokio::test]
     async fn a_disk_that_hangs_is_waited_for_once() {
         let (wanted, _terms) = watch::channel(3);
-        let (_answers, answer) = watch::channel(Answer::default());
+        let (_answers, answer) = watch::channel(DiskAnswer::default());
         let mut writer = TermWriter { wanted, answer, has_disk: true, hung_at: None };
         let begun = tokio::time::Instant::now();
         assert_eq!(writer.wait_for(3).await, TermState::Unanswered);

@@ -86,7 +86,7 @@ pub type Opener = Arc<dyn Fn() -> Result<Box<dyn FrameSource>, FrameError> + Sen
 pub struct Capture {
     slot: Arc<LatestSlot<Frame>>,
     status: watch::Receiver<CaptureStatus>,
-    events: SyncSender<Event>,
+    events: SyncSender<CaptureEvent>,
     unusable: Arc<AtomicU64>,
     failures: Arc<AtomicU64>,
 }
@@ -147,7 +147,7 @@ impl Capture {
 impl Drop for Capture {
     fn drop(&mut self) {
         // The capture thread is gone if the source has ended.
-        let _ = self.events.send(Event::Stop);
+        let _ = self.events.send(CaptureEvent::Stop);
     }
 }
 
@@ -181,7 +181,7 @@ pub fn wait_for_readers(timeout: Duration) {
 /// Maximum number of blocked readers.
 const MAX_ABANDONED: usize = 4;
 
-enum Event {
+enum CaptureEvent {
     /// A result of the reader with this number.
     Read(u64, Result<Frame, FrameError>),
     Stop,
@@ -198,8 +198,8 @@ struct CaptureLoop {
     config: CaptureConfig,
     slot: Arc<LatestSlot<Frame>>,
     status: watch::Sender<CaptureStatus>,
-    events: SyncSender<Event>,
-    inbox: Receiver<Event>,
+    events: SyncSender<CaptureEvent>,
+    inbox: Receiver<CaptureEvent>,
     /// Number of the present opening and its reader.
     opening: Arc<AtomicU64>,
     abandoned: Vec<JoinHandle<()>>,
@@ -259,15 +259,15 @@ impl CaptureLoop {
         let mut deadline = Instant::now() + stall_timeout;
         loop {
             match self.inbox.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
-                Ok(Event::Stop) | Err(RecvTimeoutError::Disconnected) => return Outcome::Stopped,
+                Ok(CaptureEvent::Stop) | Err(RecvTimeoutError::Disconnected) => return Outcome::Stopped,
                 Err(RecvTimeoutError::Timeout) => return Outcome::Failed(FrameError::Stalled(stall_timeout)),
-                Ok(Event::Read(from, _)) if from != opening => {}
-                Ok(Event::Read(_, Err(error @ FrameError::Unusable { .. }))) => {
+                Ok(CaptureEvent::Read(from, _)) if from != opening => {}
+                Ok(CaptureEvent::Read(_, Err(error @ FrameError::Unusable { .. }))) => {
                     tracing::warn!(%error, "frame skipped");
                     self.unusable.fetch_add(1, Ordering::Relaxed);
                 }
-                Ok(Event::Read(_, Err(error))) => return Outcome::Failed(error),
-                Ok(Event::Read(_, Ok(frame))) => {
+                Ok(CaptureEvent::Read(_, Err(error))) => return Outcome::Failed(error),
+                Ok(CaptureEvent::Read(_, Ok(frame))) => {
                     deadline = Instant::now() + stall_timeout;
                     if matches!(*self.status.borrow(), CaptureStatus::Failed { .. }) {
                         tracing::info!("frame source runs again");
@@ -286,9 +286,9 @@ impl CaptureLoop {
         let deadline = Instant::now() + time;
         loop {
             match self.inbox.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
-                Ok(Event::Read(..)) => {}
+                Ok(CaptureEvent::Read(..)) => {}
                 Err(RecvTimeoutError::Timeout) => return false,
-                Ok(Event::Stop) | Err(RecvTimeoutError::Disconnected) => return true,
+                Ok(CaptureEvent::Stop) | Err(RecvTimeoutError::Disconnected) => return true,
             }
         }
     }
@@ -298,7 +298,7 @@ impl CaptureLoop {
 struct Reader {
     opening: u64,
     current: Arc<AtomicU64>,
-    events: SyncSender<Event>,
+    events: SyncSender<CaptureEvent>,
 }
 
 impl Reader {
@@ -319,7 +319,7 @@ impl Reader {
 
     fn send(&self, read: Result<Frame, FrameError>) {
         // The receiver is gone once the capture has ended.
-        let _ = self.events.send(Event::Read(self.opening, read));
+        let _ = self.events.send(CaptureEvent::Read(self.opening, read));
     }
 }
 

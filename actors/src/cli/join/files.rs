@@ -34,12 +34,12 @@ struct Configuration<'a> {
     cell: &'a NodeName,
     role: ecod::wire::Role,
     state_dir: PathBuf,
-    membership: Membership<'a>,
+    membership: MembershipSection<'a>,
     tls: &'a TlsConfig,
 }
 
 #[derive(Serialize)]
-struct Membership<'a> {
+struct MembershipSection<'a> {
     key_file: PathBuf,
     #[serde(skip_serializing_if = "<[String]>::is_empty")]
     seeds: &'a [String],
@@ -105,7 +105,7 @@ impl NodeDirectory {
             cell: &welcome.cell,
             role: welcome.role,
             state_dir,
-            membership: Membership { key_file: file("cell.key"), seeds: &welcome.seeds },
+            membership: MembershipSection { key_file: file("cell.key"), seeds: &welcome.seeds },
             tls: &tls,
         })?;
         let configuration = format!("{HEAD}{configuration}");

@@ -12,13 +12,13 @@ use crate::platform::secret::Secret;
 
 /// Decides which requests are answered.
 #[derive(Debug)]
-pub(crate) struct AccessPolicy {
+pub(crate) struct PageAccess {
     loopback: bool,
-    token: Option<Token>,
+    token: Option<PageToken>,
 }
 
 #[derive(Debug)]
-struct Token {
+struct PageToken {
     /// Signatures are compared in constant time, so that timing reveals neither the token nor its length.
     key: hmac::Key,
     cookie_name: String,
@@ -55,12 +55,12 @@ pub(crate) const HEADERS: [(HeaderName, HeaderValue); 5] = [
     (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
 ];
 
-impl AccessPolicy {
+impl PageAccess {
     /// Access to the page of a node that listens on `address`.
     pub(crate) fn new(token: Option<&Secret>, address: SocketAddr, node: &NodeName) -> Self {
         // Cookies are shared between the ports of a host, but not between names.
         let token =
-            token.map(|token| Token { key: key(token.reveal().as_bytes()), cookie_name: format!("ecod-{node}") });
+            token.map(|token| PageToken { key: key(token.reveal().as_bytes()), cookie_name: format!("ecod-{node}") });
         Self { loopback: address.ip().is_loopback(), token }
     }
 
@@ -82,13 +82,13 @@ impl AccessPolicy {
 
     /// The cookie of a signed-in browser, which it also sends after following a link from another site.
     pub(crate) fn cookie(&self) -> Option<HeaderValue> {
-        let Token { key, cookie_name } = self.token.as_ref()?;
+        let PageToken { key, cookie_name } = self.token.as_ref()?;
         let cookie = BASE64_URL_SAFE_NO_PAD.encode(hmac::sign(key, COOKIE_MESSAGE));
         HeaderValue::from_str(&format!("{cookie_name}={cookie}; Path=/; HttpOnly; SameSite=Lax")).ok()
     }
 }
 
-impl Token {
+impl PageToken {
     fn is_in_headers(&self, headers: &HeaderMap) -> bool {
         let bearer = headers.get(AUTHORIZATION).and_then(|value| value.as_bytes().strip_prefix(b"Bearer "));
         if bearer.is_some_and(|given| self.is(given)) {
@@ -128,12 +128,12 @@ fn is_this_machine(host: &HeaderValue) -> bool {
 mod tests {
     use super::*;
 
-    fn access(listen: &str, token: Option<&str>) -> AccessPolicy {
+    fn access(listen: &str, token: Option<&str>) -> PageAccess {
         let token = token.map(Secret::new);
-        AccessPolicy::new(token.as_ref(), listen.parse().unwrap(), &NodeName::from_static("edge"))
+        PageAccess::new(token.as_ref(), listen.parse().unwrap(), &NodeName::from_static("edge"))
     }
 
-    fn decide(access: &AccessPolicy, uri: &str, headers: &[(HeaderName, &str)]) -> AccessDecision {
+    fn decide(access: &PageAccess, uri: &str, headers: &[(HeaderName, &str)]) -> AccessDecision {
         let headers = headers.iter().map(|(name, value)| (name.clone(), HeaderValue::from_str(value).unwrap()));
         access.decide(&uri.parse().unwrap(), &headers.collect())
     }

@@ -19,15 +19,15 @@ pub(crate) struct ConnectionLimit {
 #[derive(Debug, Default)]
 struct OpenConnections {
     /// By number, which is the order of arrival.
-    by_number: BTreeMap<u64, Connection>,
+    by_number: BTreeMap<u64, TrackedConnection>,
     next: u64,
 }
 
 #[derive(Debug)]
-struct Connection {
+struct TrackedConnection {
     source: IpAddr,
     kept: bool,
-    /// Closes [`Admitted::displaced`] when dropped.
+    /// Closes [`ConnectionSlot::displaced`] when dropped.
     _displace: oneshot::Sender<()>,
 }
 
@@ -40,7 +40,7 @@ pub(crate) struct ConnectionSlot {
 
 /// An admitted connection.
 #[derive(Debug)]
-pub(crate) struct Admitted {
+pub(crate) struct AdmittedConnection {
     pub(crate) slot: ConnectionSlot,
     /// Ends when the connection is displaced.
     pub(crate) displaced: oneshot::Receiver<()>,
@@ -54,7 +54,7 @@ impl ConnectionLimit {
     }
 
     /// A slot for a connection from an address; none while all connections are kept.
-    pub(crate) fn admit(&self, from: IpAddr) -> Option<Admitted> {
+    pub(crate) fn admit(&self, from: IpAddr) -> Option<AdmittedConnection> {
         let mut open = lock(&self.open);
         let displaces = open.by_number.len() >= self.max;
         if displaces {
@@ -64,8 +64,9 @@ impl ConnectionLimit {
         let number = open.next;
         open.next += 1;
         let (displace, displaced) = oneshot::channel();
-        open.by_number.insert(number, Connection { source: host_network(from), kept: false, _displace: displace });
-        Some(Admitted { slot: ConnectionSlot { open: Arc::clone(&self.open), number }, displaced, displaces })
+        open.by_number
+            .insert(number, TrackedConnection { source: host_network(from), kept: false, _displace: displace });
+        Some(AdmittedConnection { slot: ConnectionSlot { open: Arc::clone(&self.open), number }, displaced, displaces })
     }
 }
 
@@ -104,11 +105,11 @@ fn lock(open: &Mutex<OpenConnections>) -> MutexGuard<'_, OpenConnections> {
 mod tests {
     use super::*;
 
-    fn admit(connection_limit: &ConnectionLimit, from: &str) -> Option<Admitted> {
+    fn admit(connection_limit: &ConnectionLimit, from: &str) -> Option<AdmittedConnection> {
         connection_limit.admit(from.parse().unwrap())
     }
 
-    fn is_displaced(admitted: &mut Admitted) -> bool {
+    fn is_displaced(admitted: &mut AdmittedConnection) -> bool {
         admitted.displaced.try_recv() == Err(oneshot::error::TryRecvError::Closed)
     }
 

@@ -30,7 +30,7 @@ pub(crate) struct LeaderTerm {
 
 /// Statistics of one [`SAMPLE_PERIOD`].
 #[derive(Debug, Serialize)]
-struct Sample<'a> {
+struct VitalsSample<'a> {
     /// End of the period.
     at_us: Timestamp,
     /// Rounds accepted.
@@ -144,7 +144,7 @@ impl History {
         let mut latencies = std::mem::take(&mut self.latencies_ms);
         latencies.sort_by(f64::total_cmp);
         let reputations = reputations.into_iter().flat_map(|r| &r.reputations).take(MAX_VEHICLES);
-        let sample = Sample {
+        let sample = VitalsSample {
             at_us: now,
             rounds: std::mem::take(&mut self.rounds),
             latency_p50_ms: latencies.get(latencies.len() / 2).copied(),

@@ -15,7 +15,7 @@ use axum::{Json, Router};
 use ecod::model::time::Timestamp;
 use futures_util::stream;
 
-use super::access::{AccessDecision, AccessPolicy, HEADERS};
+use super::access::{AccessDecision, HEADERS, PageAccess};
 use super::assets::Asset;
 use super::connection_limit::ConnectionSlot;
 use super::metrics;
@@ -30,7 +30,7 @@ use crate::telemetry::counters::Event;
 #[derive(Debug)]
 pub(crate) struct HttpApi {
     monitor: Arc<NodeMonitor>,
-    access: AccessPolicy,
+    access: PageAccess,
     answers: Mutex<TokenBucket>,
     /// Separate, so that requests without access leave the rate of those with access alone.
     refusals: Mutex<TokenBucket>,
@@ -49,7 +49,7 @@ const METRICS_MIN_AGE: Duration = Duration::from_millis(100);
 
 impl HttpApi {
     /// At most half of the connections carry live snapshots.
-    pub(crate) fn new(monitor: Arc<NodeMonitor>, access: AccessPolicy, max_connections: usize) -> Self {
+    pub(crate) fn new(monitor: Arc<NodeMonitor>, access: PageAccess, max_connections: usize) -> Self {
         let throttle = || Mutex::new(TokenBucket::new(BURST, REQUEST_INTERVAL, clock::now()));
         Self {
             access,

@@ -17,9 +17,9 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{oneshot, watch};
 use tokio_io_timeout::TimeoutStream;
 
-use super::access::AccessPolicy;
+use super::access::PageAccess;
 use super::config::{DEFAULT_ADDRESS, DashboardConfig};
-use super::connection_limit::{Admitted, ConnectionLimit, ConnectionSlot};
+use super::connection_limit::{AdmittedConnection, ConnectionLimit, ConnectionSlot};
 use super::node_monitor::NodeMonitor;
 use super::routes::HttpApi;
 use crate::telemetry::counters::Event;
@@ -96,7 +96,7 @@ async fn serve(config: &DashboardConfig, monitor: &Arc<NodeMonitor>, bound: &wat
         None => listen_anywhere(monitor).await,
     };
     let Ok(address) = listener.local_addr() else { return };
-    let access = AccessPolicy::new(config.token.as_ref(), address, &monitor.sources.node.name);
+    let access = PageAccess::new(config.token.as_ref(), address, &monitor.sources.node.name);
     tracing::info!(url = %format_args!("http://{address}/"), token = config.token.is_some(), "dashboard serves");
     bound.send_replace(Some(address));
     let router = HttpApi::new(Arc::clone(monitor), access, config.max_connections).router();
@@ -114,7 +114,7 @@ async fn serve(config: &DashboardConfig, monitor: &Arc<NodeMonitor>, bound: &wat
         if admitted.as_ref().is_none_or(|admitted| admitted.displaces) {
             monitor.sources.counters.count(Event::BrowserRefused);
         }
-        let Some(Admitted { slot, displaced, .. }) = admitted else { continue };
+        let Some(AdmittedConnection { slot, displaced, .. }) = admitted else { continue };
         let router = router.clone();
         tokio::spawn(async move {
             tokio::select! {

@@ -17,7 +17,7 @@ use crate::transport::gossip::Member;
 use crate::transport::mqtt::{BrokerAddress, LinkState};
 
 /// State of the link to each broker.
-pub(crate) type Links = BTreeMap<BrokerAddress, LinkState>;
+pub(crate) type LinkStates = BTreeMap<BrokerAddress, LinkState>;
 
 /// Version of [`Snapshot`] and of the other answers of the API.
 pub(crate) const API_VERSION: u32 = 1;
@@ -107,7 +107,7 @@ pub(crate) fn json(value: &impl Serialize) -> Vec<u8> {
 }
 
 /// This node and the others by name. `met` holds the nodes that have ever answered; `links` is absent if unknown.
-pub(crate) fn nodes(sources: &NodeSources, met: &BTreeSet<NodeName>, links: Option<&Links>) -> Vec<NodeEntry> {
+pub(crate) fn nodes(sources: &NodeSources, met: &BTreeSet<NodeName>, links: Option<&LinkStates>) -> Vec<NodeEntry> {
     let own = &sources.node;
     let leading = sources.vitals.leadership.borrow().is_leading();
     let mut nodes = others(&sources.members.borrow(), sources.live_state.statuses(), met, links);
@@ -129,7 +129,7 @@ fn others(
     members: &[Member],
     mut statuses: BTreeMap<NodeName, ReportedStatus>,
     met: &BTreeSet<NodeName>,
-    links: Option<&Links>,
+    links: Option<&LinkStates>,
 ) -> Vec<NodeEntry> {
     let entry = |name: &NodeName, role, alive, status: Option<&NodeStatus>| NodeEntry {
         name: name.clone(),
@@ -190,7 +190,7 @@ mod tests {
         }
         say("both", &edge);
         say("both", &euclid);
-        let alive = |members: &[Member], links: &Links| {
+        let alive = |members: &[Member], links: &LinkStates| {
             let met = [name("edge"), name("euclid")].into();
             let nodes = others(members, live_state.statuses(), &met, Some(links));
             nodes.into_iter().filter(|node| node.alive).map(|node| node.name.to_string()).collect::<Vec<_>>()

@@ -44,7 +44,7 @@ pub(crate) struct Quaternion {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, JsonSchema)]
-pub(crate) struct Pose {
+pub(crate) struct FoxglovePose {
     position: Vector3,
     orientation: Quaternion,
 }
@@ -138,7 +138,7 @@ struct SceneEntity {
     cylinders: [(); 0],
     lines: [(); 0],
     triangles: [(); 0],
-    texts: Vec<Text>,
+    texts: Vec<FoxgloveText>,
     models: [(); 0],
 }
 
@@ -150,7 +150,7 @@ struct KeyValue {
 
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
 struct Arrow {
-    pose: Pose,
+    pose: FoxglovePose,
     shaft_length: f64,
     shaft_diameter: f64,
     head_length: f64,
@@ -160,14 +160,14 @@ struct Arrow {
 
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
 struct Sphere {
-    pose: Pose,
+    pose: FoxglovePose,
     size: Vector3,
     color: Color,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
-struct Text {
-    pose: Pose,
+struct FoxgloveText {
+    pose: FoxglovePose,
     billboard: bool,
     font_size: f64,
     scale_invariant: bool,
@@ -232,7 +232,8 @@ impl SceneUpdate {
 impl FrameTransform {
     /// A vehicle's pose.
     pub(crate) fn of(node: &NodeName, pose: WirePose, at: Timestamp) -> Self {
-        let Pose { position: translation, orientation: rotation } = plane_pose(pose.x_m, pose.y_m, pose.heading_rad);
+        let FoxglovePose { position: translation, orientation: rotation } =
+            plane_pose(pose.x_m, pose.y_m, pose.heading_rad);
         Self { timestamp: at.into(), parent_frame_id: MAP, child_frame_id: node.clone(), translation, rotation }
     }
 }
@@ -242,7 +243,7 @@ impl SceneEntity {
         Self { timestamp: at.into(), frame_id: MAP, id, lifetime: LIFETIME, ..Self::default() }
     }
 
-    fn arrow(mut self, pose: Pose, length_m: f64, color: Color) -> Self {
+    fn arrow(mut self, pose: FoxglovePose, length_m: f64, color: Color) -> Self {
         self.arrows.push(Arrow {
             pose,
             shaft_length: length_m * 0.7,
@@ -254,13 +255,14 @@ impl SceneEntity {
         self
     }
 
-    fn sphere(mut self, pose: Pose, diameter_m: f64, color: Color) -> Self {
+    fn sphere(mut self, pose: FoxglovePose, diameter_m: f64, color: Color) -> Self {
         self.spheres.push(Sphere { pose, size: Vector3 { x: diameter_m, y: diameter_m, z: diameter_m }, color });
         self
     }
 
-    fn text(mut self, pose: Pose, text: String) -> Self {
-        let text = Text { pose, billboard: true, font_size: TEXT_PX, scale_invariant: true, color: VEHICLE, text };
+    fn text(mut self, pose: FoxglovePose, text: String) -> Self {
+        let text =
+            FoxgloveText { pose, billboard: true, font_size: TEXT_PX, scale_invariant: true, color: VEHICLE, text };
         self.texts.push(text);
         self
     }
@@ -272,9 +274,9 @@ impl SceneEntity {
 }
 
 /// Pose in the plane: east and north in metres, heading in radians counter-clockwise from east.
-fn plane_pose(x: f64, y: f64, heading_rad: f64) -> Pose {
+fn plane_pose(x: f64, y: f64, heading_rad: f64) -> FoxglovePose {
     let (z, w) = (heading_rad / 2.0).sin_cos();
-    Pose { position: Vector3 { x, y, z: 0.0 }, orientation: Quaternion { x: 0.0, y: 0.0, z, w } }
+    FoxglovePose { position: Vector3 { x, y, z: 0.0 }, orientation: Quaternion { x: 0.0, y: 0.0, z, w } }
 }
 
 fn listed(nodes: &[NodeName]) -> String {

@@ -21,10 +21,10 @@ pub(crate) struct LogFile {
     /// True if the disk holds any message.
     has_messages: bool,
     opened: Instant,
-    channels: HashMap<(SchemaName, String), Channel>,
+    channels: HashMap<(SchemaName, String), WrittenChannel>,
 }
 
-struct Channel {
+struct WrittenChannel {
     id: u16,
     sequence: u32,
 }
@@ -93,7 +93,7 @@ impl MessageSink for LogFile {
             let text = schema.json_schema().to_value().to_string();
             let schema_id = self.writer.add_schema(schema.as_str(), "jsonschema", text.as_bytes())?;
             let id = self.writer.add_channel(schema_id, topic, "json", &BTreeMap::new())?;
-            self.channels.insert(key.clone(), Channel { id, sequence: 0 });
+            self.channels.insert(key.clone(), WrittenChannel { id, sequence: 0 });
         }
         let Some(channel) = self.channels.get_mut(&key) else { return Ok(()) };
         channel.sequence = channel.sequence.wrapping_add(1);

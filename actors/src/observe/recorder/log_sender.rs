@@ -69,10 +69,10 @@ impl LogItem {
 
 /// Sends items to the recorder. Clones share one queue; items are discarded until a recorder runs.
 #[derive(Debug, Clone, Default)]
-pub struct LogSender(Arc<Shared>);
+pub struct LogSender(Arc<SharedQueue>);
 
 #[derive(Debug, Default)]
-struct Shared {
+struct SharedQueue {
     queue: RwLock<Option<SyncSender<LogEntry>>>,
     /// Journal entries that were lost and are not yet noted in the log.
     missing: AtomicU64,
@@ -93,7 +93,7 @@ pub(crate) struct AggregatorState {
 impl LogSender {
     /// A sender that counts losses in `counters`.
     pub fn new(counters: Arc<Counters>) -> Self {
-        Self(Arc::new(Shared { counters, ..Shared::default() }))
+        Self(Arc::new(SharedQueue { counters, ..SharedQueue::default() }))
     }
 
     /// Queues an item. A full queue drops and counts it, but for the latest change of settings, which waits beside the queue.

@@ -91,7 +91,7 @@ pub struct LogReader {
     source: BufReader<File>,
     reader: LinearReader,
     schemas: HashMap<u16, String>,
-    channels: HashMap<u16, Channel>,
+    channels: HashMap<u16, ReadChannel>,
     node: Option<NodeName>,
     /// True if the data section was read to its end.
     complete: bool,
@@ -100,7 +100,7 @@ pub struct LogReader {
     unknown: BTreeMap<String, u64>,
 }
 
-struct Channel {
+struct ReadChannel {
     schema: Option<SchemaName>,
     schema_name: String,
     topic: String,
@@ -193,7 +193,7 @@ impl LogReader {
             Record::Channel(channel) => {
                 let schema_name = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
                 let schema = SchemaName::from_name(&schema_name).filter(|_| channel.message_encoding == "json");
-                self.channels.insert(channel.id, Channel { schema, schema_name, topic: channel.topic });
+                self.channels.insert(channel.id, ReadChannel { schema, schema_name, topic: channel.topic });
                 None
             }
             Record::Message { header, data } => {

@@ -34,7 +34,7 @@ pub(super) struct LogTimeline {
 
 /// A recorded camera image; `data` is a JPEG file in base64.
 #[derive(Debug, Serialize, Deserialize)]
-pub(super) struct Picture {
+pub(super) struct RecordedPicture {
     #[serde(default)]
     at_us: Timestamp,
     #[serde(alias = "frame_id")]
@@ -130,8 +130,8 @@ impl LogTimeline {
     }
 
     /// Takes an image.
-    pub(super) fn picture(&mut self, picture: Picture, at_us: Timestamp) {
-        self.pictures.push(at_us, || json(&Picture { at_us, ..picture }));
+    pub(super) fn picture(&mut self, picture: RecordedPicture, at_us: Timestamp) {
+        self.pictures.push(at_us, || json(&RecordedPicture { at_us, ..picture }));
     }
 
     fn frame(&mut self, map: Option<&GlobalMap>, now_us: Timestamp) {

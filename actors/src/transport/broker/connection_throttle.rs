@@ -39,7 +39,7 @@ struct AddressEntry {
 
 /// Source of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Origin {
+pub(super) enum ClientOrigin {
     /// A throttled address.
     Remote(IpAddr),
     /// This machine, where a whole cell may run and nothing tells its nodes apart. Only waiting connections are limited.
@@ -93,14 +93,14 @@ impl ConnectionThrottle {
     }
 
     /// A place to log in, unless the origin connects too often.
-    pub(super) fn admit(&self, from: Origin, now: Timestamp) -> Option<LoginSlot> {
+    pub(super) fn admit(&self, from: ClientOrigin, now: Timestamp) -> Option<LoginSlot> {
         let (source, limit) = match from {
-            Origin::Remote(address) => (host_network(address), MAX_PENDING_PER_ADDRESS),
-            Origin::Local => (IpAddr::V4(Ipv4Addr::LOCALHOST), MAX_PENDING_LOCAL),
+            ClientOrigin::Remote(address) => (host_network(address), MAX_PENDING_PER_ADDRESS),
+            ClientOrigin::Local => (IpAddr::V4(Ipv4Addr::LOCALHOST), MAX_PENDING_LOCAL),
         };
         let mut table = self.table();
         let is_allowed = match table.entry(source, now) {
-            Some(entry) => from == Origin::Local || entry.bucket.allow(now),
+            Some(entry) => from == ClientOrigin::Local || entry.bucket.allow(now),
             None => table.overflow.allow(now),
         };
         is_allowed.then(|| {
@@ -195,8 +195,8 @@ mod tests {
         Timestamp(ms * 1000)
     }
 
-    fn from(text: &str) -> Origin {
-        Origin::Remote(text.parse().unwrap())
+    fn from(text: &str) -> ClientOrigin {
+        ClientOrigin::Remote(text.parse().unwrap())
     }
 
     fn evicted(tickets: &mut [LoginSlot]) -> Vec<usize> {
@@ -231,7 +231,7 @@ mod tests {
     fn however_many_addresses_wait_the_oldest_gives_way() {
         let throttle = throttle(100, at(0));
         let mut held: Vec<_> = (0..MAX_PENDING as u32 + 10)
-            .filter_map(|n| throttle.admit(Origin::Remote(IpAddr::V4(n.into())), at(0)))
+            .filter_map(|n| throttle.admit(ClientOrigin::Remote(IpAddr::V4(n.into())), at(0)))
             .collect();
         assert_eq!(evicted(&mut held), (0..10).collect::<Vec<_>>());
     }
@@ -254,7 +254,7 @@ mod tests {
     #[test]
     fn this_machines_are_not_throttled_but_few_wait() {
         let throttle = throttle(100, at(0));
-        let mut held: Vec<_> = (0..MAX_PENDING).filter_map(|_| throttle.admit(Origin::Local, at(0))).collect();
+        let mut held: Vec<_> = (0..MAX_PENDING).filter_map(|_| throttle.admit(ClientOrigin::Local, at(0))).collect();
         assert_eq!(held.len(), MAX_PENDING);
         assert_eq!(evicted(&mut held).len(), MAX_PENDING - MAX_PENDING_LOCAL);
     }
@@ -263,10 +263,10 @@ mod tests {
     fn any_number_of_addresses_costs_bounded_memory() {
         let throttle = throttle(100, at(0));
         for n in 0..2 * MAX_ADDRESSES as u32 {
-            drop(throttle.admit(Origin::Remote(IpAddr::V4(n.into())), at(0)));
+            drop(throttle.admit(ClientOrigin::Remote(IpAddr::V4(n.into())), at(0)));
         }
         assert_eq!(throttle.table().by_address.len(), MAX_ADDRESSES);
-        let latest = Origin::Remote(IpAddr::V4(u32::MAX.into()));
+        let latest = ClientOrigin::Remote(IpAddr::V4(u32::MAX.into()));
         assert!(throttle.admit(latest, at(60_000)).is_some(), "the old are forgotten");
         let sources = throttle.table();
         assert_eq!((sources.by_address.len(), sources.pending.len()), (1, 0));

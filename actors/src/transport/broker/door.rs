@@ -36,8 +36,8 @@ use crate::platform::clock;
 use crate::platform::throttle::TokenBucket;
 use crate::telemetry::counters::{Counters, Event};
 
-pub(super) use self::programs::{DoorHooks, Place};
-pub(super) use self::refusals::Refusal;
+pub(super) use self::programs::{DoorHooks, TopicPlace};
+pub(super) use self::refusals::DoorRefusal;
 
 /// The node of a door, and its ways to the cell.
 pub struct DoorSetup {
@@ -201,7 +201,7 @@ impl Door {
         let before: Vec<_> = lock(&door.retained).clone().into_iter().collect();
         let from = From::from_system(Id::new(context.node.id(), 0, None, None, "door".into(), None));
         let publish = async |Publication { topic, payload, retain }| {
-            let topic = Place::Door.topic(&topic).into();
+            let topic = TopicPlace::Door.topic(&topic).into();
             let (qos, properties) = (QoS::AtMostOnce, None);
             let packet = CodecPublish { dup: false, retain, qos, topic, packet_id: None, payload, properties };
             if let Err(error) = SessionState::forwards(&context, from.clone(), packet.into(), false, None).await {

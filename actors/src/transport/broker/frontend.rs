@@ -25,7 +25,7 @@ use tokio_rustls::TlsAcceptor;
 use super::backlog::Backlog;
 use super::byte_throttle::ByteThrottle;
 use super::client_rejection::ClientRejection;
-use super::connection_throttle::{ConnectionThrottle, LoginSlot, Origin};
+use super::connection_throttle::{ClientOrigin, ConnectionThrottle, LoginSlot};
 use super::door::Door;
 use super::in_flight::InFlight;
 use super::permissions::AccessPolicy;
@@ -133,7 +133,7 @@ impl BrokerFrontend {
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
         // With certificates even local clients are told apart.
         let is_local = self.current.is_none() && from.ip().to_canonical().is_loopback();
-        let origin = if is_local { Origin::Local } else { Origin::Remote(from.ip()) };
+        let origin = if is_local { ClientOrigin::Local } else { ClientOrigin::Remote(from.ip()) };
         let Some(slot) = self.throttle.admit(origin, clock::now()) else {
             self.shared.counters.count(Event::ClientThrottled);
             return;
@@ -164,7 +164,7 @@ impl BrokerFrontend {
     }
 }
 
-type Stream = Pin<Box<dyn Duplex>>;
+type DuplexStream = Pin<Box<dyn Duplex>>;
 
 trait Duplex: AsyncRead + AsyncWrite + Send {}
 
@@ -192,7 +192,7 @@ impl FrontendState {
                     let server = Arc::clone(&current.borrow().server);
                     secure(stream, server).await?
                 }
-                None => (stream as Stream, Vec::new()),
+                None => (stream as DuplexStream, Vec::new()),
             };
             let mut first = stream.read_u8().await?;
             if first == websocket::FIRST_BYTE {
@@ -234,7 +234,7 @@ impl FrontendState {
 async fn secure(
     stream: Pin<Box<TimeoutStream<TcpStream>>>,
     server: Arc<rustls::ServerConfig>,
-) -> Result<(Stream, Vec<CertificateDer<'static>>), ClientRejection> {
+) -> Result<(DuplexStream, Vec<CertificateDer<'static>>), ClientRejection> {
     let accepted = TlsAcceptor::from(server).accept(stream).await;
     let stream = accepted.map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
     let certificates = stream.get_ref().1.peer_certificates().map(|chain| chain.to_vec());

@@ -25,7 +25,7 @@ use rmqtt::types::{
     AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, QoS, SubscribeAclResult, TopicFilter,
 };
 
-use super::door::{Door, Place, Refusal};
+use super::door::{Door, DoorRefusal, TopicPlace};
 use super::principal::{LeaderCheck, Principal, PrincipalRegistry, is_run};
 use crate::telemetry::counters::Counters;
 use crate::transport::mqtt::ENVELOPE_BYTES;
@@ -86,16 +86,16 @@ impl Permissions {
     }
 
     /// Takes a message, or says why not.
-    fn check_publish(&self, session: &Session, publish: &Publish) -> Result<(), Refusal> {
-        let (place, topic) = Place::of(&publish.topic);
-        let refused = || Refusal::not_permitted(format!("no permission to publish {topic} here"));
+    fn check_publish(&self, session: &Session, publish: &Publish) -> Result<(), DoorRefusal> {
+        let (place, topic) = TopicPlace::of(&publish.topic);
+        let refused = || DoorRefusal::not_permitted(format!("no permission to publish {topic} here"));
         let principal = self.principals.principal(session.id.remote_addr).ok_or_else(refused)?;
         let (retain, bytes) = (publish.retain, publish.payload.len());
         if self.door.is_program(&principal, &session.id.client_id) {
-            self.check_limits(topic, retain, bytes).map_err(Refusal::not_permitted)?;
+            self.check_limits(topic, retain, bytes).map_err(DoorRefusal::not_permitted)?;
             return self.door.take(&principal, (place, topic), publish);
         }
-        let is_allowed = place == Place::Cell && self.allows(&principal, topic, retain, bytes);
+        let is_allowed = place == TopicPlace::Cell && self.allows(&principal, topic, retain, bytes);
         is_allowed.then_some(()).ok_or_else(refused)
     }
 
@@ -133,8 +133,8 @@ impl Permissions {
         Ok(())
     }
 
-    fn note_refusal(&self, session: &Session, publish: &Publish, refusal: &Refusal) {
-        let (client, topic) = (&session.id.client_id, Place::of(&publish.topic).1);
+    fn note_refusal(&self, session: &Session, publish: &Publish, refusal: &DoorRefusal) {
+        let (client, topic) = (&session.id.client_id, TopicPlace::of(&publish.topic).1);
         let principal = self.principals.principal(session.id.remote_addr);
         if principal.is_some_and(|principal| self.door.is_program(&principal, client)) {
             self.door.note_refusal(client, topic, refusal);
@@ -151,7 +151,7 @@ impl Permissions {
     /// The filter as it is inside the broker.
     fn inner_filter(&self, session: &Session, filter: &TopicFilter) -> Option<TopicFilter> {
         let principal = self.principals.principal(session.id.remote_addr)?;
-        self.door.is_program(&principal, &session.id.client_id).then(|| Place::Door.topic(filter).into())
+        self.door.is_program(&principal, &session.id.client_id).then(|| TopicPlace::Door.topic(filter).into())
     }
 }
 

@@ -112,15 +112,15 @@ struct Registered {
 }
 
 /// Entry of one connection in the registry; removed when dropped.
-pub(super) struct Registration {
+pub(super) struct ClientRegistration {
     principals: PrincipalRegistry,
     address: SocketAddr,
 }
 
 impl PrincipalRegistry {
-    pub(super) fn register(&self, address: SocketAddr, principal: Principal) -> Registration {
+    pub(super) fn register(&self, address: SocketAddr, principal: Principal) -> ClientRegistration {
         self.connections_mut().insert(address, Registered { principal, subscriptions: HashSet::new() });
-        Registration { principals: self.clone(), address }
+        ClientRegistration { principals: self.clone(), address }
     }
 
     pub(super) fn principal(&self, address: Option<SocketAddr>) -> Option<Principal> {
@@ -179,7 +179,7 @@ impl PrincipalRegistry {
     }
 }
 
-impl Drop for Registration {
+impl Drop for ClientRegistration {
     fn drop(&mut self) {
         self.principals.connections_mut().remove(&self.address);
     }

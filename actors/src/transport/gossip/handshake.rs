@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 use super::counters::FrameEvent;
 use super::frame::HEADER_BYTES;
 use super::key::{CellKey, Cookie, SessionId, SessionNonce, session_of};
-use super::notices::{Notice, Notices};
+use super::notices::{GossipNotice, Notices};
 use super::replay_window::ReplayWindow;
 use super::session_keys::KeySet;
 use crate::platform::throttle::host_network;
@@ -224,7 +224,7 @@ impl Prover {
     }
 
     /// Nodes that were not admitted since the last call.
-    pub(crate) fn take_notices(&mut self) -> Vec<Notice> {
+    pub(crate) fn take_notices(&mut self) -> Vec<GossipNotice> {
         self.notices.take()
     }
 }

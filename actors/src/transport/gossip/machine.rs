@@ -24,7 +24,7 @@ use super::frame::{FrameKind, Introduction, NameClaim};
 use super::handshake::Identity;
 use super::key::{CellKey, SessionNonce};
 use super::node_id::{MAX_CLAIMED_LIFE, NodeId};
-use super::notices::Notice;
+use super::notices::GossipNotice;
 use super::sessions::{Arrival, FrameContent, Sessions};
 use super::swim::{Swim, SwimOutput};
 use super::{Member, MembershipEvent};
@@ -155,7 +155,7 @@ impl GossipMachine {
             self.counters.count(reason);
             tracing::debug!(%from, reason = reason.as_str(), "gossip frame refused");
         }
-        for Notice { about, kind, cause } in self.sessions.take_notices() {
+        for GossipNotice { about, kind, cause } in self.sessions.take_notices() {
             if self.notices.allow(at) {
                 let event = MembershipEvent::Troubled { about, kind, cause };
                 self.outputs.push_back(GossipOutput::Tell(event));

@@ -28,7 +28,7 @@ use super::handshake::{Identity, Proven, Prover};
 use super::key::{BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of};
 use super::near_cells::{NearCells, are_numbered};
 use super::node_id::NodeId;
-use super::notices::{Notice, Notices};
+use super::notices::{GossipNotice, Notices};
 use super::reply_throttle::ReplyThrottle;
 use crate::platform::throttle::TokenBucket;
 use peers::PeerTable;
@@ -303,7 +303,7 @@ impl Sessions {
     }
 
     /// Troubles with other hosts since the last call.
-    pub(crate) fn take_notices(&mut self) -> Vec<Notice> {
+    pub(crate) fn take_notices(&mut self) -> Vec<GossipNotice> {
         let mut notices = self.notices.take();
         notices.extend(self.prover.iter_mut().flat_map(Prover::take_notices));
         notices

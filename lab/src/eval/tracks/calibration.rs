@@ -7,7 +7,7 @@
 use serde::Serialize;
 
 use super::matching::{best, near_pairs};
-use super::{Frame, SaidObject, ZERO_DISTANCE_M, percent};
+use super::{SaidObject, ScoredFrame, ZERO_DISTANCE_M, percent};
 
 /// Bins of equal width.
 const BINS: usize = 10;
@@ -45,7 +45,7 @@ pub struct ReliabilityBin {
     pub objects: u64,
 }
 
-pub(super) fn judge(frames: &[Frame]) -> ReliabilityBins {
+pub(super) fn judge(frames: &[ScoredFrame]) -> ReliabilityBins {
     let states_existence = frames.iter().flat_map(|frame| &frame.said).any(|said| said.existence.is_some());
     ReliabilityBins {
         confidence: reliability(frames, CONFIDENCE_DISTANCE_M, |said| Some(said.score)),
@@ -54,7 +54,7 @@ pub(super) fn judge(frames: &[Frame]) -> ReliabilityBins {
 }
 
 /// Objects and true ones of the same label are matched one to one, so that the sum of their nearness is greatest.
-fn reliability(frames: &[Frame], limit_m: f64, stated: impl Fn(&SaidObject) -> Option<f64>) -> Reliability {
+fn reliability(frames: &[ScoredFrame], limit_m: f64, stated: impl Fn(&SaidObject) -> Option<f64>) -> Reliability {
     let mut sums = [(0u64, 0u64, 0.0); BINS];
     for frame in frames {
         let mut pairs = near_pairs(frame, limit_m);

@@ -9,7 +9,7 @@
 use hashbrown::HashMap;
 
 use super::matching::{MatchedPair, best, near_pairs};
-use super::{Frame, MATCH_DISTANCE_M, ZERO_DISTANCE_M};
+use super::{MATCH_DISTANCE_M, ScoredFrame, ZERO_DISTANCE_M};
 
 /// Counts of a whole sequence.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -25,7 +25,7 @@ pub(super) struct Clear {
 /// Bonus of a pair that goes on, beside its similarity of at most 1: more than all others of a frame.
 const GOES_ON: f64 = 1000.0;
 
-pub(super) fn judge(frames: &[Frame]) -> Clear {
+pub(super) fn judge(frames: &[ScoredFrame]) -> Clear {
     let mut clear = Clear::default();
     // By true identity the identity it matched in the frame before, and at last.
     let (mut before, mut last): (HashMap<u32, u32>, HashMap<u32, u32>) = Default::default();

@@ -7,7 +7,7 @@
 use hashbrown::HashMap;
 
 use super::matching::{MatchedPair, best, near_pairs};
-use super::{Frame, ZERO_DISTANCE_M};
+use super::{ScoredFrame, ZERO_DISTANCE_M};
 
 /// Means over all thresholds, 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -36,7 +36,7 @@ struct AtThreshold {
     matches: HashMap<(u32, u32), f64>,
 }
 
-pub(super) fn judge(frames: &[Frame]) -> Hota {
+pub(super) fn judge(frames: &[ScoredFrame]) -> Hota {
     let similar: Vec<Vec<MatchedPair>> = frames.iter().map(similarities).collect();
     let lives = Lives::of(frames, &similar);
     let mut at: Vec<AtThreshold> = TWENTIETHS.map(|_| AtThreshold::default()).collect();
@@ -61,14 +61,14 @@ pub(super) fn judge(frames: &[Frame]) -> Hota {
     Hota { hota: mean(|s| s.hota), deta: mean(|s| s.deta), assa: mean(|s| s.assa), loca: mean(|s| s.loca) }
 }
 
-fn similarities(frame: &Frame) -> Vec<MatchedPair> {
+fn similarities(frame: &ScoredFrame) -> Vec<MatchedPair> {
     let mut pairs = near_pairs(frame, ZERO_DISTANCE_M);
     pairs.iter_mut().for_each(|pair| pair.value = 1.0 - pair.value / ZERO_DISTANCE_M);
     pairs
 }
 
 impl Lives {
-    fn of(frames: &[Frame], similar: &[Vec<MatchedPair>]) -> Self {
+    fn of(frames: &[ScoredFrame], similar: &[Vec<MatchedPair>]) -> Self {
         let mut lives = Self::default();
         for (frame, pairs) in frames.iter().zip(similar) {
             let (mut of_truth, mut of_said) = (vec![0.0; frame.truth.len()], vec![0.0; frame.said.len()]);

@@ -6,7 +6,7 @@
 use hashbrown::HashMap;
 
 use super::matching::{MatchedPair, best, near_pairs};
-use super::{Frame, MATCH_DISTANCE_M};
+use super::{MATCH_DISTANCE_M, ScoredFrame};
 
 /// Counts of a whole sequence.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -24,7 +24,7 @@ impl IdentityScore {
     }
 }
 
-pub(super) fn judge(frames: &[Frame]) -> IdentityScore {
+pub(super) fn judge(frames: &[ScoredFrame]) -> IdentityScore {
     let mut together: HashMap<(u32, u32), u64> = HashMap::new();
     for frame in frames {
         for pair in near_pairs(frame, MATCH_DISTANCE_M) {

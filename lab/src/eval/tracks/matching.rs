@@ -2,7 +2,7 @@
 
 use ecod::association::{Candidate, assign};
 
-use super::{Frame, SaidObject, TrueObject};
+use super::{SaidObject, ScoredFrame, TrueObject};
 
 /// A true object and one that was said, by their places in a frame or in a table of identities.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,7 +20,7 @@ pub(super) fn distance_m(truth: &TrueObject, said: &SaidObject, limit_m: f64) ->
 }
 
 /// All pairs of a frame within `limit_m`, with their distance.
-pub(super) fn near_pairs(frame: &Frame, limit_m: f64) -> Vec<MatchedPair> {
+pub(super) fn near_pairs(frame: &ScoredFrame, limit_m: f64) -> Vec<MatchedPair> {
     let mut pairs = Vec::new();
     for (said, object) in frame.said.iter().enumerate() {
         let of_said = frame.truth.iter().enumerate().filter_map(|(truth, candidate)| {

@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 use ecod::model::names::Label;
 
 use super::matching::{MatchedPair, near_pairs};
-use super::{AP_DISTANCES_M, Frame, MATCH_DISTANCE_M};
+use super::{AP_DISTANCES_M, MATCH_DISTANCE_M, ScoredFrame};
 
 /// The threshold at which F1 is greatest.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,7 +25,7 @@ pub(super) struct BestF1 {
 }
 
 /// The average precisions in percent of every class of the truth; a class that is only said counts nowhere.
-pub(super) fn by_class(frames: &[Frame]) -> BTreeMap<Label, [Option<f64>; AP_DISTANCES_M.len()]> {
+pub(super) fn by_class(frames: &[ScoredFrame]) -> BTreeMap<Label, [Option<f64>; AP_DISTANCES_M.len()]> {
     let mut objects: BTreeMap<Label, u64> = BTreeMap::new();
     for object in frames.iter().flat_map(|frame| &frame.truth) {
         *objects.entry(object.label.clone()).or_default() += 1;
@@ -43,7 +43,7 @@ pub(super) fn by_class(frames: &[Frame]) -> BTreeMap<Label, [Option<f64>; AP_DIS
 }
 
 /// `None` if nothing was said or nothing is true.
-pub(super) fn best_f1(frames: &[Frame]) -> Option<BestF1> {
+pub(super) fn best_f1(frames: &[ScoredFrame]) -> Option<BestF1> {
     let objects: usize = frames.iter().map(|frame| frame.truth.len()).sum();
     if objects == 0 {
         return None;
@@ -57,7 +57,7 @@ pub(super) fn best_f1(frames: &[Frame]) -> Option<BestF1> {
 }
 
 /// The greatest MODA in percent over all thresholds, at every distance; `None` if nothing is true.
-pub(super) fn best_moda_pct(frames: &[Frame]) -> [Option<f64>; AP_DISTANCES_M.len()] {
+pub(super) fn best_moda_pct(frames: &[ScoredFrame]) -> [Option<f64>; AP_DISTANCES_M.len()] {
     let objects: usize = frames.iter().map(|frame| frame.truth.len()).sum();
     let moda = |point: &Point| point.recall * (2.0 - 1.0 / point.precision.max(f64::MIN_POSITIVE));
     AP_DISTANCES_M.map(|limit_m| {
@@ -82,7 +82,7 @@ struct Point {
     recall: f64,
 }
 
-fn verdicts(frames: &[Frame], limit_m: f64) -> Vec<RankedObject<'_>> {
+fn verdicts(frames: &[ScoredFrame], limit_m: f64) -> Vec<RankedObject<'_>> {
     let mut verdicts = Vec::new();
     for frame in frames {
         let mut by_said: Vec<Vec<MatchedPair>> = vec![Vec::new(); frame.said.len()];

@@ -19,7 +19,7 @@ fn near(found: Option<f64>, expected: f64) {
 
 #[test]
 fn what_is_perfect_is_a_hundred_percent() {
-    let frame = |at: f64| Frame {
+    let frame = |at: f64| ScoredFrame {
         truth: vec![truth(0, at), truth(1, 10.0 + at)],
         said: vec![said(5, 10.0 + at, 0.9), said(6, at, 0.8)],
     };
@@ -36,12 +36,12 @@ fn what_is_perfect_is_a_hundred_percent() {
 
 #[test]
 fn nothing_said_is_nothing_found_and_nothing_true_is_not_judged() {
-    let silent = score(&[Frame { truth: vec![truth(0, 0.0)], said: vec![] }]);
+    let silent = score(&[ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![] }]);
     assert_eq!((silent.ap_pct, silent.best_f1_pct), ([Some(0.0); 4], None));
     let at = silent.at_default;
     assert_eq!((at.misses, at.moda_pct, at.mota_pct, at.modp_pct), (1, Some(0.0), Some(0.0), None));
     assert_eq!((at.idf1_pct, at.hota_pct), (Some(0.0), Some(0.0)));
-    let empty = score(&[Frame { truth: vec![], said: vec![said(0, 0.0, 0.9)] }]);
+    let empty = score(&[ScoredFrame { truth: vec![], said: vec![said(0, 0.0, 0.9)] }]);
     assert_eq!((empty.ap_pct, empty.best_f1_pct, empty.at_default.hota_pct), ([None; 4], None, None));
     assert_eq!(empty.at_default.false_alarms, 1);
 }
@@ -50,7 +50,7 @@ fn nothing_said_is_nothing_found_and_nothing_true_is_not_judged() {
 /// 1.
 #[test]
 fn average_precision_is_that_worked_out_by_hand() {
-    let frame = Frame {
+    let frame = ScoredFrame {
         truth: vec![truth(0, 0.0), truth(1, 20.0)],
         said: vec![said(0, 0.3, 0.9), said(1, 50.0, 0.8), said(2, 21.5, 0.7)],
     };
@@ -72,7 +72,7 @@ fn equal_confidences_enter_together() {
         if wrong_first {
             said.reverse();
         }
-        Frame { truth: vec![truth(0, 0.0)], said }
+        ScoredFrame { truth: vec![truth(0, 0.0)], said }
     };
     let [one, other] = [false, true].map(|wrong_first| score(&[frame(wrong_first)]).ap_pct[0]);
     assert_eq!((one, other), (Some(50.0), Some(50.0)));
@@ -81,7 +81,7 @@ fn equal_confidences_enter_together() {
 #[test]
 fn another_label_is_another_object() {
     let mut frame =
-        Frame { truth: vec![truth(0, 0.0), truth(1, 9.0)], said: vec![said(0, 0.0, 0.9), said(1, 9.0, 0.9)] };
+        ScoredFrame { truth: vec![truth(0, 0.0), truth(1, 9.0)], said: vec![said(0, 0.0, 0.9), said(1, 9.0, 0.9)] };
     frame.truth[1].label = "person".into();
     let scores = score(&[frame]);
     assert_eq!(scores.class_ap_pct.len(), 2);
@@ -94,7 +94,7 @@ fn another_label_is_another_object() {
 /// One object over four frames, two with one identity and two with another.
 #[test]
 fn one_switch_costs_what_it_should() {
-    let frame = |id| Frame { truth: vec![truth(0, 0.0)], said: vec![said(id, 0.0, 0.9)] };
+    let frame = |id| ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![said(id, 0.0, 0.9)] };
     let at = score(&[frame(1), frame(1), frame(2), frame(2)]).at_default;
     assert_eq!(at.id_switches, 1);
     near(at.moda_pct, 100.0);
@@ -108,7 +108,7 @@ fn one_switch_costs_what_it_should() {
 /// One object over six frames, missed in two runs, found by another identity at last.
 #[test]
 fn an_object_that_is_found_again_is_a_fragment() {
-    let frame = |id: Option<u32>| Frame {
+    let frame = |id: Option<u32>| ScoredFrame {
         truth: vec![truth(0, 0.0)],
         said: id.map_or_else(|| vec![said(9, 50.0, 0.9)], |id| vec![said(id, 0.0, 0.9)]),
     };
@@ -122,7 +122,7 @@ fn an_object_that_is_found_again_is_a_fragment() {
 /// Bins: 0.9 to 1 states 0.95 and 2 of 3 are right, 0.55 with none, 0.05 with one.
 #[test]
 fn calibration_is_that_worked_out_by_hand() {
-    let frame = Frame {
+    let frame = ScoredFrame {
         truth: vec![truth(0, 0.0), truth(1, 10.0), truth(2, 20.0)],
         said: vec![
             said(0, 1.4, 0.95),
@@ -141,7 +141,7 @@ fn calibration_is_that_worked_out_by_hand() {
 
     let mut exists = said(0, 3.0, 0.5);
     exists.existence = Some(1.0);
-    let frame = Frame { truth: vec![truth(0, 0.0)], said: vec![exists, said(1, 50.0, 0.1)] };
+    let frame = ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![exists, said(1, 50.0, 0.1)] };
     let ReliabilityBins { confidence, existence } = score(&[frame]).calibration;
     near(confidence.ece_pct, 30.0);
     near(existence.unwrap().ece_pct, 0.0);
@@ -152,11 +152,11 @@ fn calibration_is_that_worked_out_by_hand() {
 #[test]
 fn a_match_is_kept_while_it_is_near_enough() {
     let frames = [
-        Frame { truth: vec![truth(0, 0.0)], said: vec![said(1, 0.0, 0.9)] },
-        Frame { truth: vec![truth(0, 0.0)], said: vec![said(1, 1.9, 0.9), said(2, 0.1, 0.9)] },
-        Frame { truth: vec![truth(0, 0.0)], said: vec![said(1, 2.1, 0.9), said(2, 0.1, 0.9)] },
+        ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![said(1, 0.0, 0.9)] },
+        ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![said(1, 1.9, 0.9), said(2, 0.1, 0.9)] },
+        ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![said(1, 2.1, 0.9), said(2, 0.1, 0.9)] },
     ];
-    let switches = |frames: &[Frame]| score(frames).at_default.id_switches;
+    let switches = |frames: &[ScoredFrame]| score(frames).at_default.id_switches;
     assert_eq!((switches(&frames[..2]), switches(&frames)), (0, 1));
 }
 

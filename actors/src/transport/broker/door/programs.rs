@@ -27,7 +27,7 @@ use rmqtt::types::Publish;
 
 use super::refusals::RefusalReason;
 use super::{
-    DESCRIPTION_INTERVAL, Door, DoorSetup, DoorState, MAX_NODELESS, PART_RETENTION, Publication, Refusal, lock,
+    DESCRIPTION_INTERVAL, Door, DoorRefusal, DoorSetup, DoorState, MAX_NODELESS, PART_RETENTION, Publication, lock,
 };
 use crate::platform::clock;
 use crate::telemetry::counters::{Event, ShedReason};
@@ -35,7 +35,7 @@ use crate::transport::broker::principal::{Principal, PrincipalRegistry, is_run};
 
 /// Where a message is inside the broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::transport::broker) enum Place {
+pub(in crate::transport::broker) enum TopicPlace {
     /// Among nodes, and vehicles without a node.
     Cell,
     /// Among programs.
@@ -48,7 +48,7 @@ pub(in crate::transport::broker) enum Place {
 const DOOR: &str = "$door/";
 const INBOUND: &str = "$inbound/";
 
-impl Place {
+impl TopicPlace {
     /// The topic or filter inside the broker.
     pub(in crate::transport::broker) fn topic(self, topic: &str) -> String {
         let prefix = match self {
@@ -97,23 +97,23 @@ impl Door {
     pub(in crate::transport::broker) fn take(
         &self,
         principal: &Principal,
-        (place, topic): (Place, &str),
+        (place, topic): (TopicPlace, &str),
         publish: &Publish,
-    ) -> Result<(), Refusal> {
+    ) -> Result<(), DoorRefusal> {
         let Some(door) = self.0.as_deref() else { return Ok(()) };
         match place {
-            Place::Cell if publish.retain => door.take_nodeless(topic, &publish.payload),
-            Place::Cell => Ok(()),
-            Place::Door => door.may_say(principal, topic),
-            Place::Inbound if door.setup.topics.parse(topic) == Some(Topic::Cell) => {
+            TopicPlace::Cell if publish.retain => door.take_nodeless(topic, &publish.payload),
+            TopicPlace::Cell => Ok(()),
+            TopicPlace::Door => door.may_say(principal, topic),
+            TopicPlace::Inbound if door.setup.topics.parse(topic) == Some(Topic::Cell) => {
                 door.take_description(principal, &publish.payload)
             }
-            Place::Inbound => door.take_report(principal, topic, &publish.payload),
+            TopicPlace::Inbound => door.take_report(principal, topic, &publish.payload),
         }
     }
 
     /// Counts and shows a refusal.
-    pub(in crate::transport::broker) fn note_refusal(&self, client_id: &str, topic: &str, refusal: &Refusal) {
+    pub(in crate::transport::broker) fn note_refusal(&self, client_id: &str, topic: &str, refusal: &DoorRefusal) {
         let Some(door) = self.0.as_deref() else { return };
         let setup = &door.setup;
         // A client that connects anew stays the same.
@@ -135,15 +135,15 @@ impl Door {
     }
 
     /// The place for what a program publishes.
-    fn place_of(&self, principal: &Principal, topic: &str) -> Place {
-        let Some(door) = self.0.as_deref() else { return Place::Cell };
+    fn place_of(&self, principal: &Principal, topic: &str) -> TopicPlace {
+        let Some(door) = self.0.as_deref() else { return TopicPlace::Cell };
         match door.setup.topics.parse(topic) {
             Some(Topic::Detections(name) | Topic::VoteDetections(name)) if door.is_nodeless(principal, &name) => {
-                Place::Cell
+                TopicPlace::Cell
             }
-            Some(Topic::Nodes(name)) if door.is_nodeless_name(principal, &name) => Place::Cell,
-            Some(Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Cell) => Place::Inbound,
-            _ => Place::Door,
+            Some(Topic::Nodes(name)) if door.is_nodeless_name(principal, &name) => TopicPlace::Cell,
+            Some(Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Cell) => TopicPlace::Inbound,
+            _ => TopicPlace::Door,
         }
     }
 }
@@ -159,27 +159,27 @@ impl DoorState {
         principal.identity.is_none() && vehicle != setup.node && setup.serves_nodes && !(setup.is_member)(&vehicle)
     }
 
-    fn may_say(&self, principal: &Principal, topic: &str) -> Result<(), Refusal> {
+    fn may_say(&self, principal: &Principal, topic: &str) -> Result<(), DoorRefusal> {
         let node = &self.setup.node;
         match self.setup.topics.parse(topic) {
             Some(Topic::Nodes(name)) if name.vehicle() == *node && name != *node && self.is_own(principal) => Ok(()),
             None if principal.identity.is_none() => Ok(()),
-            _ => Err(Refusal::not_permitted(format!(
+            _ => Err(DoorRefusal::not_permitted(format!(
                 "programs do not publish {topic}; reports go to detections/{node}--<part> and vote_detections/{node}--<part>"
             ))),
         }
     }
 
-    fn take_report(&self, principal: &Principal, topic: &str, payload: &Bytes) -> Result<(), Refusal> {
+    fn take_report(&self, principal: &Principal, topic: &str, payload: &Bytes) -> Result<(), DoorRefusal> {
         let setup = &self.setup;
         let (kind, name) = match setup.topics.parse(topic) {
             Some(Topic::Detections(name)) => (ReportKind::Detections, name),
             Some(Topic::VoteDetections(name)) => (ReportKind::VoteDetections, name),
-            _ => return Err(Refusal::not_permitted(format!("{topic} is no topic for reports"))),
+            _ => return Err(DoorRefusal::not_permitted(format!("{topic} is no topic for reports"))),
         };
         let node = &setup.node;
         if name.vehicle() != *node || !self.is_own(principal) || (name != *node && (setup.is_member)(&name)) {
-            return Err(Refusal::not_permitted(format!(
+            return Err(DoorRefusal::not_permitted(format!(
                 "this is the door of {node}: its programs report as {node} or {node}--<part>, not as {name}"
             )));
         }
@@ -189,21 +189,21 @@ impl DoorState {
             let most = setup.max_report_hz / 2;
             let text =
                 format!("the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz");
-            return Err(Refusal::new(RefusalReason::Throttled, text));
+            return Err(DoorRefusal::new(RefusalReason::Throttled, text));
         }
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
             let flaw = Flaw::of_report(payload, reason, &setup.limits);
             let told = if flaw.fault.is_empty() { String::new() } else { format!(" ({flaw})") };
             let text = format!("the report on {topic} is not usable: {reason}{told}; see docs/protocol.md#rejections");
-            Refusal::new(RefusalReason::Rejected(reason), text)
+            DoorRefusal::new(RefusalReason::Rejected(reason), text)
         })?;
         if !(setup.fuses)(kind) {
             let text = format!("the cell does not use {topic}: `fusion.algorithms` leaves it out");
-            return Err(Refusal::new(RefusalReason::Rejected(RejectReason::NotFused), text));
+            return Err(DoorRefusal::new(RefusalReason::Rejected(RejectReason::NotFused), text));
         }
         if !self.admits_part(&name, now) {
             let text = format!("{node} has {MAX_PARTS} parts that report, and {name} would be one more");
-            return Err(Refusal::new(RefusalReason::Rejected(RejectReason::TooManyVehicles), text));
+            return Err(DoorRefusal::new(RefusalReason::Rejected(RejectReason::TooManyVehicles), text));
         }
         (setup.report)(kind, Arc::new(report));
         Ok(())
@@ -231,7 +231,7 @@ impl DoorState {
     }
 
     /// Bounds the vehicles without a node whose statuses are retained; an empty status ends one's.
-    fn take_nodeless(&self, topic: &str, payload: &Bytes) -> Result<(), Refusal> {
+    fn take_nodeless(&self, topic: &str, payload: &Bytes) -> Result<(), DoorRefusal> {
         let Some(Topic::Nodes(name)) = self.setup.topics.parse(topic) else { return Ok(()) };
         let mut names = lock(&self.nodeless);
         if payload.is_empty() {
@@ -241,30 +241,30 @@ impl DoorState {
         } else if !names.contains(&name) {
             let text =
                 format!("{MAX_NODELESS} vehicles without a node have a retained status here, and {name} has no room");
-            return Err(Refusal::not_permitted(text));
+            return Err(DoorRefusal::not_permitted(text));
         }
         Ok(())
     }
 
     /// Takes the cell's description from a program that may act as the node.
-    fn take_description(&self, principal: &Principal, payload: &Bytes) -> Result<(), Refusal> {
+    fn take_description(&self, principal: &Principal, payload: &Bytes) -> Result<(), DoorRefusal> {
         let DoorSetup { node, limits, .. } = &self.setup;
         if !principal.is_of(node) {
             let text = format!("only programs on the machine of {node}, or with its certificate, set the description");
-            return Err(Refusal::not_permitted(text));
+            return Err(DoorRefusal::not_permitted(text));
         }
         if !lock(&self.descriptions).allow(clock::now()) {
             let text = format!("{node} takes no more than one description in {} s", DESCRIPTION_INTERVAL.as_secs());
-            return Err(Refusal::new(RefusalReason::Throttled, text));
+            return Err(DoorRefusal::new(RefusalReason::Throttled, text));
         }
-        let malformed = |text: String| Refusal::new(RefusalReason::Rejected(RejectReason::Malformed), text);
+        let malformed = |text: String| DoorRefusal::new(RefusalReason::Rejected(RejectReason::Malformed), text);
         let request: CellDescription = decode(payload, limits).map_err(|reason| malformed(reason.to_string()))?;
         (self.setup.describe)(request.text).map_err(malformed)
     }
 
     /// True if a filter of a program matches reports.
     fn is_of_reports(&self, filter: &str) -> bool {
-        let (_, filter) = Place::of(filter);
+        let (_, filter) = TopicPlace::of(filter);
         let node = &self.setup.node;
         ReportKind::ALL.into_iter().any(|kind| {
             let topic = self.setup.topics.path(&kind.topic(node.clone()));
@@ -331,7 +331,7 @@ impl Handler for DoorHooks {
         let Some(door) = self.door.0.as_deref() else { return (true, before) };
         match parameter {
             Parameter::ClientSubscribe(session, subscribe) if self.program(session).is_some() => {
-                (true, Some(HookResult::TopicFilter(Some(Place::Door.topic(&subscribe.topic_filter).into()))))
+                (true, Some(HookResult::TopicFilter(Some(TopicPlace::Door.topic(&subscribe.topic_filter).into()))))
             }
             Parameter::MessagePublish(Some(session), _, publish) => {
                 let Some(principal) = self.program(session) else { return (true, before) };
@@ -344,12 +344,14 @@ impl Handler for DoorHooks {
                 (true, Some(HookResult::Publish(moved)))
             }
             Parameter::MessageDelivered(_, _, publish) => {
-                let (Place::Door, topic) = Place::of(&publish.topic) else { return (true, before) };
+                let (TopicPlace::Door, topic) = TopicPlace::of(&publish.topic) else { return (true, before) };
                 let mut shown = (*publish).clone();
                 shown.topic = topic.to_owned().into();
                 (true, Some(HookResult::Publish(shown)))
             }
-            Parameter::SessionSubscribed(session, subscribe) if Place::of(&subscribe.topic_filter).0 == Place::Door => {
+            Parameter::SessionSubscribed(session, subscribe)
+                if TopicPlace::of(&subscribe.topic_filter).0 == TopicPlace::Door =>
+            {
                 let filter = subscribe.topic_filter.clone();
                 let of_reports = door.is_of_reports(&filter);
                 door.change_filters(|filters| {

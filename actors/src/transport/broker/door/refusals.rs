@@ -13,7 +13,7 @@ use crate::telemetry::counters::ShedReason;
 
 /// The refusal of one message.
 #[derive(Debug)]
-pub(in crate::transport::broker) struct Refusal {
+pub(in crate::transport::broker) struct DoorRefusal {
     pub(super) reason: RefusalReason,
     /// The fault and its remedy.
     pub(super) text: String,
@@ -29,7 +29,7 @@ pub(super) enum RefusalReason {
 /// Maximum length of a refusal's text in bytes: it may quote what the program sent, and is shown to all.
 const MAX_TEXT: usize = 500;
 
-impl Refusal {
+impl DoorRefusal {
     pub(super) fn new(reason: RefusalReason, text: impl AsRef<str>) -> Self {
         Self { reason, text: plain_text(text.as_ref(), MAX_TEXT) }
     }
@@ -80,7 +80,7 @@ impl Refusals {
         &mut self,
         node: &NodeName,
         (client, topic): (&str, &str),
-        refusal: &Refusal,
+        refusal: &DoorRefusal,
         now: Timestamp,
     ) -> Option<Vec<u8>> {
         let client: String = client.chars().take(MAX_CLIENT).collect();
@@ -111,7 +111,7 @@ mod tests {
     use super::*;
 
     fn shown(refusals: &mut Refusals, client: &str, at_s: u64) -> Option<Vec<String>> {
-        let (node, refusal) = (NodeName::from_static("euclid"), Refusal::not_permitted("no"));
+        let (node, refusal) = (NodeName::from_static("euclid"), DoorRefusal::not_permitted("no"));
         let status = refusals.note(&node, (client, "detections/gauss"), &refusal, Timestamp(at_s * 1_000_000))?;
         let status: ClientRefusals = serde_json::from_slice(&status).unwrap();
         Some(status.refused.into_iter().map(|refusal| refusal.client).collect())
@@ -134,9 +134,9 @@ mod tests {
 
     #[test]
     fn what_a_program_sent_is_not_quoted_at_length() {
-        let refusal = Refusal::not_permitted("é".repeat(100_000));
+        let refusal = DoorRefusal::not_permitted("é".repeat(100_000));
         assert_eq!(refusal.text.len(), MAX_TEXT);
-        assert_eq!(Refusal::not_permitted("named\0\n").text, "named  ", "MQTT forbids the first");
+        assert_eq!(DoorRefusal::not_permitted("named\0\n").text, "named  ", "MQTT forbids the first");
         let mut refusals = Refusals::default();
         let clients = shown(&mut refusals, &"x".repeat(60_000), 0).unwrap();
         assert_eq!(clients[0].len(), MAX_CLIENT);
