@@ -1,4 +1,5 @@
-//! Report about a log as one HTML page, in the cell's time: map and timeline, leadership, latency and gaps of rounds, reputations, coverage, losses.
+//! Report about a log as one HTML page, in the cell's time: map and timeline, leadership, latency and gaps of rounds,
+//! reputations, coverage, losses.
 //!
 //! Call [`Report::file`] with every file of a node's log in order, then [`Report::page`]. A [`Section`] adds to the page.
 

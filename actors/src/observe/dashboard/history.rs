@@ -98,7 +98,7 @@ impl Default for History {
 }
 
 impl History {
-    /// The whole history as JSON, with the samples, events and times of maps after `time` only.
+    /// The whole history as JSON, with the samples and events after `time` only.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
         let samples: Vec<_> = self.samples.iter().filter(|(at, _)| *at > time).map(|(_, sample)| &**sample).collect();
         let (terms, samples, failovers) = (json(&self.terms), samples.join(&b','), json(&self.failovers));

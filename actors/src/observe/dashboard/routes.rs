@@ -148,7 +148,7 @@ async fn show_snapshot(State(api): Api) -> Response {
     typed(JSON, api.monitor.json())
 }
 
-/// The history, with the samples, events and times of maps after `?since=` only.
+/// The history, with the samples and events after `?since=` only.
 async fn show_history(State(api): Api, uri: Uri) -> Response {
     typed(JSON, api.monitor.observed().history.json_since(time_in(&uri, "since=").unwrap_or_default()))
 }

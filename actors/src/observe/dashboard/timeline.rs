@@ -157,11 +157,11 @@ impl Timeline {
         self.events.push_back(TimelineEvent { at_us, kind, text });
     }
 
-    /// The fields `events` and `frames` of a JSON object: events, and the times of maps, after `time` and in order.
+    /// The fields `events` and `frames` of a JSON object: events after `time`, and the times of all maps, in order.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
         let mut events: Vec<_> = self.events.iter().filter(|event| event.at_us > time).collect();
         events.sort_by_key(|event| event.at_us);
-        let mut times: Vec<_> = self.frames.items.iter().map(|(at, _)| at).filter(|at| **at > time).collect();
+        let mut times: Vec<_> = self.frames.items.iter().map(|(at, _)| at).collect();
         times.sort();
         [&b"\"events\":"[..], &json(&events), b",\"frames\":", &json(&times)].concat()
     }

@@ -98,17 +98,16 @@ export class Live {
       this.#follow();
     }
     // The old history stays until the new one arrives: the node may end before that.
-    const known = this.#afresh ? { samples: [], events: [], frames: [] } : this.history;
+    const known = this.#afresh ? { samples: [], events: [] } : this.history;
     const since = known.samples.at(-1)?.at_us ?? 0;
     const news = await this.#get(`/api/history?since=${since}`);
     if (!news) return;
     this.#afresh = false;
-    const extended = (name, time) => {
-      const last = known[name].length > 0 ? time(known[name].at(-1)) : 0;
-      return [...known[name], ...news[name].filter((item) => time(item) > last)].filter((item) => time(item) > this.now - SPAN_US);
-    };
-    const [samples, events] = ["samples", "events"].map((name) => extended(name, (item) => item.at_us));
-    this.history = { ...news, samples, events, frames: extended("frames", (time) => time) };
+    const [samples, events] = ["samples", "events"].map((name) => {
+      const last = known[name].at(-1)?.at_us ?? 0;
+      return [...known[name], ...news[name].filter(({ at_us }) => at_us > last)].filter(({ at_us }) => at_us > this.now - SPAN_US);
+    });
+    this.history = { ...news, samples, events };
     this.onHistory();
   }
 

@@ -72,6 +72,8 @@ function drawTimeline({ colour, now }) {
   const first = Math.min(now - 60e6, reigns[0]?.from_us ?? now, events[0]?.at_us ?? now, frames[0] ?? now);
   timeline.colour = colour;
   timeline.draw({ reigns, events, frames, from: Math.max(first, now - SPAN_US), until: now });
+  // The chosen map may be too old to be held any more.
+  if (timeline.frame !== (past?.at ?? null)) scrub();
 }
 
 function drawText(picture, scene) {
