@@ -197,5 +197,5 @@ fn is_cut(b: &BoundingBox, right: bool, lower: bool) -> bool {
     cut(b.x_min, b.x_max, right) || cut(b.y_min, b.y_max, lower)
 }
 
-#[cfg(all(test, feature = "coco-weights"))]
+#[cfg(test)]
 mod tests;

@@ -15,7 +15,6 @@ use std::path::PathBuf;
 use ecod::config::{ConfigError, check_range};
 use ecod::model::detection::Detection;
 use ecod::model::names::Label;
-use opencv::prelude::*;
 use serde::{Deserialize, Serialize};
 
 pub use self::family::{Family, Normalization};
@@ -110,7 +109,7 @@ pub enum OnnxError {
         source: std::io::Error,
     },
     /// The runtime refuses the file.
-    #[error("model {path:?} cannot be run: {reason}; export it to onnx with 32-bit weights inside and without plugins")]
+    #[error("model {path:?} cannot be run: {reason}; export it to onnx with 32-bit weights and standard operators")]
     NotRunnable {
         /// The model.
         path: PathBuf,
@@ -165,6 +164,12 @@ pub enum OnnxError {
         size: ImageSize,
         /// The configured family, or all.
         family: String,
+    },
+    /// A YOLOX model with other outputs than its family's.
+    #[error("model {path:?} gives boxes of yolox in pixels: export it without `--decode_in_inference`")]
+    InPixels {
+        /// The model.
+        path: PathBuf,
     },
     /// The count of labels is not that of the classes.
     #[error("{labels} labels in {path:?}, but the model has {classes} classes: list one on each line, in its order")]
@@ -240,6 +245,9 @@ impl OnnxDetector {
         let clues =
             Clues { told: config.family, description: &description, input: size, scales_boxes: network.scales_boxes() };
         let head = Head::find(&clues, &outputs).ok_or_else(|| unknown_outputs(&config, size, &outputs))?;
+        if head.is_in_pixels(&outputs, size) {
+            return Err(OnnxError::InPixels { path: path.clone() });
+        }
         let labels = head.classes(&outputs).labels(names.as_deref()).map_err(|classes| {
             let classes = classes.unwrap_or_default();
             match &names {
@@ -248,13 +256,16 @@ impl OnnxDetector {
             }
         })?;
         let classes = classes(&config, labels)?;
-        tracing::info!(model = %path.display(), family = ?head.family, input = %size, "model loaded");
+        tracing::info!(model = %path.display(), family = %head.family, input = %size, "model loaded");
         Ok(Self { head, classes, network, config })
     }
+}
 
-    fn detect_in(&self, image: &Mat) -> Result<Vec<Detection>, DetectError> {
+impl Detect for OnnxDetector {
+    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+        let image = bgr(frame)?;
         let failed = |step| move |source| DetectError::OpenCv { step, source };
-        let size = ImageSize::of(image);
+        let size = ImageSize::of(&image);
         let input = self.network.input_size();
         let letterbox = Letterbox::new(self.head.fit(), size, input);
         let factors = self.config.normalization.unwrap_or_else(|| self.head.normalization()).factors();
@@ -264,7 +275,7 @@ impl OnnxDetector {
             std::array::from_fn(|c| f32::from(channels[c]) * factors[c].0 + factors[c].1)
         };
         let pixels = letterbox
-            .fill(image, self.network.has_channels_last(), convert)
+            .fill(&image, self.network.has_channels_last(), convert)
             .map_err(failed("fitting a frame into the network"))?;
         let outputs = self.network.run(pixels).map_err(DetectError::Model)?;
         let least = self.classes.iter().flatten().map(|class| class.threshold).fold(1.0, f32::min);
@@ -287,13 +298,6 @@ impl OnnxDetector {
     }
 }
 
-impl Detect for OnnxDetector {
-    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
-        let image = bgr(frame)?;
-        self.detect_in(&image)
-    }
-}
-
 /// Names of the classes in their order, if they are known, and their file.
 fn names(config: &OnnxConfig, network: &Network) -> Result<(Option<Vec<String>>, PathBuf), OnnxError> {
     let (names, path) = match &config.labels {
@@ -313,8 +317,7 @@ fn names(config: &OnnxConfig, network: &Network) -> Result<(Option<Vec<String>>,
 
 fn unknown_outputs(config: &OnnxConfig, size: ImageSize, outputs: &[Output]) -> OnnxError {
     let outputs = outputs.iter().map(Output::to_string).collect::<Vec<_>>().join("; ");
-    let family =
-        config.family.map_or_else(|| "any known family".to_owned(), |family| format!("{family:?}").to_lowercase());
+    let family = config.family.map_or_else(|| "any known family".to_owned(), |family| family.to_string());
     OnnxError::UnknownOutputs { path: config.model.clone(), outputs, size, family }
 }
 

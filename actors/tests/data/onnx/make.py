@@ -142,6 +142,16 @@ def yolox(seed):
     g.save("yolox.onnx", {"output": g("Concat", *parts, axis=1)})
 
 
+def yolox_in_pixels(seed):
+    """YOLOX exported with --decode_in_inference, which the node must refuse."""
+    g, parts = Graph(seed), []
+    for stride in STRIDES:
+        features = g.features(stride, 5 + len(NAMES), 4 / 255)
+        scores = g("Sigmoid", g.columns(features, 4, 5 + len(NAMES)))
+        parts.append(g("Concat", *pixel_boxes(g, features, stride), scores, axis=2))
+    g.save("yolox_in_pixels.onnx", {"output": g("Concat", *parts, axis=1)})
+
+
 def shares(g, features):
     """Centres and sizes in shares of the image."""
     centre = g("Sigmoid", g.columns(features, 0, 2))
@@ -233,6 +243,7 @@ def ssd_tensorflow(seed):
     outputs = {
         "detection_boxes": g("Concat", swap(low), swap(high), axis=2),
         "detection_classes": g("Add", classes, np.float32(1)),
+        "detection_multiclass_scores": scores,
         "detection_scores": g("ReduceMax", scores, axes=[2], keepdims=0),
         "num_detections": g("Identity", np.array([SIDE // 16 * SIDE // 16], np.float32)),
     }
@@ -468,6 +479,7 @@ def main():
         (HERE / "frame.png").write_bytes(png(image))
         (HERE / "labels.txt").write_text("".join(f"{name}\n" for name in NAMES))
         yolov8_segments(0)
+        yolox_in_pixels(0)
         boxes = {name: make(model, find, image) for name, model, find in MODELS}
         lines = lambda rows: ",\n".join(json.dumps(row) for row in rows)
         models = ",\n".join(f'"{name}": [\n{lines(rows)}\n]' for name, rows in boxes.items())

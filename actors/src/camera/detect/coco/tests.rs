@@ -1,3 +1,6 @@
+//! Tests with the weights inside the program.
+#![cfg(feature = "coco-weights")]
+
 use ecod::model::time::Timestamp;
 use opencv::{imgcodecs, imgproc};
 

@@ -8,8 +8,9 @@ use super::network::Output;
 use crate::camera::image_size::ImageSize;
 
 /// Family of a model, by the project that exported it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::Display, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
 pub enum Family {
     /// YOLOv5 and YOLOv7.
     Yolov5,
@@ -120,6 +121,14 @@ impl Head {
         Classes { scores, first: usize::from(self.family == Family::Ssd), has_none_last }
     }
 
+    /// True if the network has turned the cells of YOLOX into pixels itself, for which [`Layout::Cells`] does not hold.
+    pub(super) fn is_in_pixels(&self, outputs: &[Output], input: ImageSize) -> bool {
+        let Layout::Cells(output) = self.layout else { return false };
+        let row = outputs[output].shape[2];
+        // Centres are within a few cells of their own; in pixels they reach the right edge.
+        outputs[output].values.chunks_exact(row).any(|row| row[0] > (input.width / STRIDES[0]) as f32)
+    }
+
     /// True if one object has several boxes.
     pub(super) fn needs_suppression(&self) -> bool {
         match self.layout {
@@ -187,14 +196,13 @@ fn by_names(clues: &Clues<'_>, outputs: &[Output]) -> Option<(Family, Layout)> {
     if let Some(logits) = find(&["labels"], 3..=3).filter(is_table) {
         return Some((Family::Rfdetr, Layout::Queries { boxes, logits }));
     }
-    let scores = find(&["scores"], 1..=3)?;
-    match find(&["labels", "classes"], 1..=2).filter(is_list) {
-        Some(classes) if is_list(&scores) => {
-            let family = if clues.scales_boxes { Family::Rtdetr } else { Family::Ssd };
-            Some((family, Layout::Listed { boxes, scores, classes }))
-        }
-        _ => is_table(&scores).then_some((Family::Ssd, Layout::Priors { boxes, scores })),
+    let lists = [["scores", "scores"], ["labels", "classes"]].map(|words| find(&words, 1..=2).filter(is_list));
+    if let [Some(scores), Some(classes)] = lists {
+        let family = if clues.scales_boxes { Family::Rtdetr } else { Family::Ssd };
+        return Some((family, Layout::Listed { boxes, scores, classes }));
     }
+    let scores = find(&["scores"], 3..=3).filter(is_table)?;
+    Some((Family::Ssd, Layout::Priors { boxes, scores }))
 }
 
 /// Networks with one output, beside the grids that early exports of YOLOv5 also had.

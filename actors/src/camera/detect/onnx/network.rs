@@ -42,8 +42,8 @@ impl Network {
     /// # Errors
     /// [`OnnxError`] when the file cannot be read or run, takes something else than an image, or another size.
     pub(super) fn load(path: &Path, told: Option<ImageSize>) -> Result<Self, OnnxError> {
-        let bytes = std::fs::read(path).map_err(|source| OnnxError::Unreadable { path: path.to_owned(), source })?;
-        let model = Model::load(bytes)
+        std::fs::File::open(path).map_err(|source| OnnxError::Unreadable { path: path.to_owned(), source })?;
+        let model = Model::load_file(path)
             .map_err(|error| OnnxError::NotRunnable { path: path.to_owned(), reason: error.to_string() })?;
         let refused = || OnnxError::UnknownInputs { path: path.to_owned(), inputs: inputs(&model) };
         let (image, scaled_to) = match model.input_ids() {

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use ecod::model::detection::BoundingBox;
 use ecod::model::time::Timestamp;
-use opencv::core::{CV_8UC3, Scalar};
+use opencv::core::{CV_8UC3, Mat, Scalar};
 use opencv::imgcodecs;
 
 use super::*;
@@ -92,6 +92,12 @@ fn outputs_of_no_family_are_printed() {
     for part in ["output0 [1, 39, 84]; output1 [1, 32, 4, 4]", "64x64", "any known family", "docs/cameras.md"] {
         assert!(error.contains(part), "{error}");
     }
+}
+
+#[test]
+fn yolox_in_pixels_is_refused() {
+    let error = refusal(OnnxConfig { labels: Some(path("labels.txt")), ..config("yolox_in_pixels") });
+    assert!(error.contains("export it without `--decode_in_inference`"), "{error}");
 }
 
 #[test]
