@@ -42,7 +42,9 @@ impl Letterbox {
             Fit::Stretched => (most_x, most_y),
             Fit::Centred | Fit::TopLeft => (most_x.min(most_y), most_x.min(most_y)),
         };
-        let side = |length: f64, most: u32| (length.round() as u32).clamp(1, most);
+        // YOLOX cuts off parts of a pixel, the others round.
+        let whole = |length: f64| if fit == Fit::TopLeft { length.floor() } else { length.round() };
+        let side = |length: f64, most: u32| (whole(length) as u32).clamp(1, most);
         let (width, height) = (side(image_width * scale_x, input.width), side(image_height * scale_y, input.height));
         let (left, top) = match fit {
             // An odd pixel goes to the right and below, as in Ultralytics' `LetterBox`.
