@@ -13,7 +13,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -144,6 +144,12 @@ verify-handshake: ## the membership's handshake against an attacker that has the
 asyncapi-check: PACKAGES := ca-certificates $(if $(shell command -v npm),,npm)
 asyncapi-check: setup ## validate docs/asyncapi.yaml by the parser of its standard; installs npm where there is none
 	packaging/check-asyncapi
+
+models-check: PACKAGES += python3-venv
+models-check: setup ## the boxes that the detector's tests expect, found once more by ONNX Runtime and Python
+	python3 -m venv $(BUILD)/models-venv
+	$(BUILD)/models-venv/bin/pip install --quiet numpy onnx onnxruntime
+	$(BUILD)/models-venv/bin/python3 actors/tests/data/onnx/make.py --check
 
 # PYTHONS="python3.9 python3.13" tests it with these.
 python-client-check: PACKAGES += mosquitto python3-venv

@@ -14,6 +14,7 @@ use ecod::perception::projection::{Cut, ObjectSize, ObjectSizes, Projection, Pro
 use ecod_actors::camera::corner_pose::locate_target;
 use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::coco::{CocoConfig, CocoDetector};
+use ecod_actors::camera::detect::onnx::{OnnxConfig, OnnxDetector};
 use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
 use ecod_actors::camera::frame::Frame;
 use ecod_lab::testbed::Testbed;
@@ -33,10 +34,25 @@ fn main() -> anyhow::Result<()> {
         let mut coco = CocoDetector::new(CocoConfig { tiling, ..CocoConfig::default() })?;
         time(&mut figures, name, &mut coco, &photograph)?;
     }
+    models(&mut figures, &photograph)?;
     let lot = lot()?;
     time(&mut figures, "placard", &mut PlacardDetector::new(PlacardConfig::default()), &lot)?;
     corners(&mut figures)?;
     figures.save();
+    Ok(())
+}
+
+/// Every model of the directory that `ONNX_MODELS` names, if any.
+fn models(figures: &mut Figures, photograph: &Frame) -> anyhow::Result<()> {
+    let Some(directory) = std::env::var_os("ONNX_MODELS") else { return Ok(()) };
+    let mut paths: Vec<_> =
+        std::fs::read_dir(directory)?.map(|file| Ok(file?.path())).collect::<anyhow::Result<_>>()?;
+    paths.retain(|path| path.extension().is_some_and(|end| end == "onnx"));
+    paths.sort();
+    for path in paths {
+        let name = path.file_stem().context("a file name")?.to_string_lossy().into_owned();
+        time(figures, &name, &mut OnnxDetector::new(OnnxConfig::of(path))?, photograph)?;
+    }
     Ok(())
 }
 

@@ -58,7 +58,7 @@ pub struct DetectorState {
     lens: Lens,
     /// The size mismatch of the last frame.
     mismatch: Option<SizeMismatch>,
-    /// True if the last frame failed; only the first failure in a row is logged.
+    /// True if the detector failed on the last frame.
     failing: bool,
     projector: ActorSlot<ProjectorMessage>,
     images: Option<ImageRecorder>,
@@ -106,7 +106,9 @@ impl Actor for Detector {
         (state.detect, state.images) = (Some(detect), images);
         match outcome {
             Ok(mut detections) => {
-                state.failing = false;
+                if std::mem::take(&mut state.failing) {
+                    state.counters.troubles().settle(TroubleKind::Camera, None);
+                }
                 if let Some(lens) = state.scale(size, &mut detections) {
                     state.counters.count(Event::FrameDetected);
                     state.projector.send(ProjectorMessage::Report { detections, lens, captured_at });
@@ -116,9 +118,8 @@ impl Actor for Detector {
             }
             Err(error) => {
                 state.counters.count(Event::FrameFailed);
-                if !std::mem::replace(&mut state.failing, true) {
-                    tracing::warn!(%error, "cannot use frame, first failure in a row");
-                }
+                state.counters.troubles().note(TroubleKind::Camera, &error.to_string());
+                state.failing = true;
             }
         }
         drop(permit);

@@ -1,11 +1,18 @@
 //! Detectors of objects in images: one trait, one file per detector.
 
+mod candidates;
 pub mod coco;
 mod config;
+pub mod onnx;
 pub mod placard;
 pub mod recorded;
 
+use std::borrow::Cow;
+
 use ecod::model::detection::Detection;
+use opencv::core::{CV_8UC1, CV_8UC3, Mat};
+use opencv::imgproc;
+use opencv::prelude::*;
 
 pub use config::{CustomDetector, DetectorConfig};
 
@@ -42,7 +49,35 @@ pub enum DetectError {
         #[source]
         source: opencv::Error,
     },
+    /// The runtime failed to run the model.
+    #[error("the model failed: {0}")]
+    Model(String),
+    /// The model found an object of a class without a label.
+    #[error("the model found class {class}, but there are {labels} labels: list all of its classes in `labels`")]
+    UnknownClass {
+        /// The class's number.
+        class: usize,
+        /// Count of labels.
+        labels: usize,
+    },
     /// The decoder refused the image.
     #[error("placard decoder failed: {0}")]
     Decoder(String),
+}
+
+/// The frame's pixels, blue, green and red.
+fn bgr(frame: &Frame) -> Result<Cow<'_, Mat>, DetectError> {
+    let image = &frame.image;
+    let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };
+    match image.typ() {
+        _ if image.empty() => Err(unusable("no pixels".into())),
+        CV_8UC3 => Ok(Cow::Borrowed(image)),
+        CV_8UC1 => {
+            let mut coloured = Mat::default();
+            imgproc::cvt_color_def(image, &mut coloured, imgproc::COLOR_GRAY2BGR)
+                .map_err(|source| DetectError::OpenCv { step: "gray to colour", source })?;
+            Ok(Cow::Owned(coloured))
+        }
+        other => Err(unusable(format!("pixels of opencv type {other}"))),
+    }
 }

@@ -68,7 +68,7 @@ async fn detector(camera: &CameraConfig) -> Finding {
     let detector = camera.detector.clone();
     match tokio::task::spawn_blocking(move || detector.build().map(drop)).await {
         Ok(Ok(())) => Finding::fine(check, "loaded"),
-        Ok(Err(error)) => Finding::broken(check, format!("{error:#}"), "set `camera.detector` to existing files"),
+        Ok(Err(error)) => Finding::broken(check, format!("{error:#}"), "correct `camera.detector` or its files"),
         Err(error) => Finding::broken(check, error.to_string(), "use another model"),
     }
 }

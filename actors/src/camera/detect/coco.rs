@@ -1,22 +1,23 @@
 //! Detector of the 80 COCO classes: SSDLite-MobileNetV2 run by OpenCV.
 //!
-//! The weights are compiled into the program; see `models/README.md` for their source, inputs and outputs.
+//! Feature `coco-weights` compiles the weights into the program; see `models/README.md` for their source, inputs and
+//! outputs.
 
 mod anchors;
-mod labels;
+pub(super) mod labels;
 
 use std::path::PathBuf;
 
 use ecod::config::{ConfigError, check_range};
 use ecod::model::detection::{BoundingBox, Detection};
-use opencv::core::{CV_8UC1, CV_8UC3, CV_32F, Mat, Rect, Rect2d, Scalar, Size, Vector};
+use opencv::core::{CV_8UC3, CV_32F, Mat, Rect, Scalar, Size, Vector};
 use opencv::dnn::{self, Net};
-use opencv::imgproc;
 use opencv::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use self::anchors::Anchor;
-use super::{Detect, DetectError};
+use super::candidates::{ScoredBox, suppress};
+use super::{Detect, DetectError, bgr};
 use crate::camera::frame::Frame;
 
 /// Configuration of the COCO detector.
@@ -63,6 +64,9 @@ pub enum ModelError {
         #[source]
         source: std::io::Error,
     },
+    /// The program has no weights inside, and no file is configured.
+    #[error("this program has no weights inside: set `model` to a file, such as models/ssdlite_mobilenet_v2_coco.onnx")]
+    NoWeights,
     /// OpenCV cannot run the file, or its inputs and outputs differ.
     #[error("model {path} is not an ssdlite network that opencv can run: {reason}")]
     Unusable {
@@ -73,8 +77,11 @@ pub enum ModelError {
     },
 }
 
-static BUILT_IN: &[u8] =
-    include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/ssdlite_mobilenet_v2_coco.onnx"));
+#[cfg(feature = "coco-weights")]
+static BUILT_IN: Option<&[u8]> =
+    Some(include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/ssdlite_mobilenet_v2_coco.onnx")));
+#[cfg(not(feature = "coco-weights"))]
+static BUILT_IN: Option<&[u8]> = None;
 
 /// Side of the network's input in pixels.
 const INPUT_PX: i32 = 300;
@@ -104,7 +111,7 @@ impl CocoDetector {
                     std::fs::read(path).map_err(|source| ModelError::Unreadable { path: path.clone(), source })?;
                 Vector::from_slice(&bytes)
             }
-            None => Vector::from_slice(BUILT_IN),
+            None => Vector::from_slice(BUILT_IN.ok_or(ModelError::NoWeights)?),
         };
         let net = dnn::read_net_from_onnx_buffer(&weights).map_err(|e| unusable(e.message))?;
         let mut detector = Self { config, net, anchors: anchors::all() };
@@ -156,65 +163,18 @@ impl CocoDetector {
                     .extend(whole.map(|c| ScoredBox { bounds: placed(&c.bounds, x, y, tile_width, tile_height), ..c }));
             }
         }
-        found.retain_mut(|candidate| {
-            let b = &mut candidate.bounds;
-            (b.x_min, b.x_max) = (b.x_min.clamp(0.0, width), b.x_max.clamp(0.0, width));
-            (b.y_min, b.y_max) = (b.y_min.clamp(0.0, height), b.y_max.clamp(0.0, height));
-            b.is_valid()
-        });
-        Ok(found)
-    }
-
-    /// Non-maximum suppression per class.
-    fn suppress(&self, candidates: &[ScoredBox]) -> opencv::Result<Vec<Detection>> {
-        let mut detections = Vec::new();
-        for (class, label) in labels::all() {
-            let of_class: Vec<&ScoredBox> = candidates.iter().filter(|c| c.class == class).collect();
-            let boxes: Vector<Rect2d> = of_class
-                .iter()
-                .map(|c| Rect2d::new(c.bounds.x_min, c.bounds.y_min, c.bounds.width(), c.bounds.height()))
-                .collect();
-            let scores: Vector<f32> = of_class.iter().map(|c| c.score).collect();
-            let mut kept = Vector::<i32>::new();
-            let CocoConfig { threshold, max_overlap, .. } = self.config;
-            dnn::nms_boxes_f64(&boxes, &scores, threshold as f32, max_overlap as f32, &mut kept, 1.0, 0)?;
-            detections.extend(kept.iter().filter_map(|index| of_class.get(index as usize)).map(|c| Detection {
-                label: label.into(),
-                confidence: f64::from(c.score).clamp(0.0, 1.0),
-                bounding_box: c.bounds,
-                corners: None,
-            }));
-        }
-        Ok(detections)
+        Ok(found.into_iter().filter_map(|candidate| candidate.inside(width, height)).collect())
     }
 }
 
 impl Detect for CocoDetector {
     fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
-        let image = &frame.image;
-        let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };
         let failed = |step| move |source| DetectError::OpenCv { step, source };
-        let candidates = match image.typ() {
-            _ if image.empty() => return Err(unusable("no pixels".into())),
-            CV_8UC3 => self.run_on_image(image),
-            CV_8UC1 => {
-                let mut colour = Mat::default();
-                imgproc::cvt_color_def(image, &mut colour, imgproc::COLOR_GRAY2BGR)
-                    .map_err(failed("gray to colour"))?;
-                self.run_on_image(&colour)
-            }
-            other => return Err(unusable(format!("pixels of opencv type {other}"))),
-        };
-        self.suppress(&candidates.map_err(failed("the coco network"))?).map_err(failed("non-maximum suppression"))
+        let image = bgr(frame)?;
+        let candidates = self.run_on_image(&image).map_err(failed("the coco network"))?;
+        let best = suppress(candidates, self.config.max_overlap).map_err(failed("non-maximum suppression"))?;
+        Ok(best.iter().filter_map(|found| Some(found.labelled(labels::name(found.class)?.into()))).collect())
     }
-}
-
-/// A box of one anchor before suppression.
-#[derive(Debug, Clone, Copy)]
-struct ScoredBox {
-    class: usize,
-    score: f32,
-    bounds: BoundingBox,
 }
 
 fn best_class(scores: &[f32]) -> Option<(usize, f32)> {

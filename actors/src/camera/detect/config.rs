@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::Detect;
 use super::coco::{CocoConfig, CocoDetector};
+use super::onnx::{OnnxConfig, OnnxDetector};
 use super::placard::{PlacardConfig, PlacardDetector};
 use super::recorded::{RecordedConfig, RecordedDetector};
 
@@ -19,6 +20,8 @@ pub enum DetectorConfig {
     Placard(PlacardConfig),
     /// The 80 kinds of objects of COCO.
     Coco(CocoConfig),
+    /// An exported model.
+    Onnx(OnnxConfig),
     /// Detections from a file.
     Recorded(RecordedConfig),
     /// A detector of the embedding program; not available in files.
@@ -60,6 +63,7 @@ impl DetectorConfig {
         match self {
             Self::Placard(config) => config.validate(),
             Self::Coco(config) => config.validate(),
+            Self::Onnx(config) => config.validate(),
             Self::Recorded(_) | Self::Custom(_) => Ok(()),
         }
     }
@@ -72,6 +76,7 @@ impl DetectorConfig {
         Ok(match self {
             Self::Placard(config) => Box::new(PlacardDetector::new(config.clone())),
             Self::Coco(config) => Box::new(CocoDetector::new(config.clone())?),
+            Self::Onnx(config) => Box::new(OnnxDetector::new(config.clone())?),
             Self::Recorded(config) => Box::new(RecordedDetector::open(config)?),
             Self::Custom(custom) => (custom.build)()?,
         })

@@ -1,5 +1,8 @@
+//! Tests with the weights inside the program.
+#![cfg(feature = "coco-weights")]
+
 use ecod::model::time::Timestamp;
-use opencv::imgcodecs;
+use opencv::{imgcodecs, imgproc};
 
 use super::*;
 
@@ -78,7 +81,7 @@ fn an_unusable_model_is_named() {
     assert!(error.contains("cannot read model") && error.contains("no/such/model.onnx"), "{error}");
 
     let file = tempfile::NamedTempFile::new().unwrap();
-    for junk in [&b""[..], b"this is not a network", &BUILT_IN[..100_000]] {
+    for junk in [&b""[..], b"this is not a network", &BUILT_IN.unwrap()[..100_000]] {
         std::fs::write(file.path(), junk).unwrap();
         let config = CocoConfig { model: Some(file.path().to_owned()), ..CocoConfig::default() };
         let error = CocoDetector::new(config).err().expect("junk").to_string();

@@ -1,0 +1,336 @@
+//! Detector that runs an exported model: YOLO, SSD and DETR families, in ONNX.
+//!
+//! The file says the input's size and often the labels. One run on a plain image shows the shapes of the outputs, which
+//! tell the family.
+
+mod decode;
+mod family;
+mod labels;
+mod letterbox;
+mod network;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use ecod::config::{ConfigError, check_range};
+use ecod::model::detection::Detection;
+use ecod::model::names::Label;
+use serde::{Deserialize, Serialize};
+
+pub use self::family::{Family, Normalization};
+
+use self::family::{Clues, Head};
+use self::letterbox::Letterbox;
+use self::network::{Network, Output};
+use super::candidates::{ScoredBox, suppress};
+use super::{Detect, DetectError, bgr};
+use crate::camera::frame::Frame;
+use crate::camera::image_size::ImageSize;
+
+/// Configuration of the detector of exported models.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OnnxConfig {
+    /// The model's ONNX file.
+    pub model: PathBuf,
+    /// File with the label of each class on a line. Default none: labels of the model's metadata, or COCO's.
+    #[serde(default)]
+    pub labels: Option<PathBuf>,
+    /// Family of the model. Default none: found by its outputs.
+    #[serde(default)]
+    pub family: Option<Family>,
+    /// Width and height of the network's input in pixels. Default none: those of the model.
+    #[serde(default)]
+    pub input_px: Option<[u16; 2]>,
+    /// Values of pixels. Default none: those of the family.
+    #[serde(default)]
+    pub normalization: Option<Normalization>,
+    /// Minimum confidence of a detection. Default 0.4.
+    #[serde(default = "default_threshold")]
+    pub threshold: f64,
+    /// Minimum confidence by label, in place of `threshold`.
+    #[serde(default)]
+    pub thresholds: BTreeMap<String, f64>,
+    /// Intersection over union above which two boxes of one class count as the same object. Default 0.5. Not for models
+    /// that suppress such boxes themselves.
+    #[serde(default = "default_max_overlap")]
+    pub max_overlap: f64,
+}
+
+fn default_threshold() -> f64 {
+    0.4
+}
+
+fn default_max_overlap() -> f64 {
+    0.5
+}
+
+impl OnnxConfig {
+    /// A model with the defaults of the other keys.
+    pub fn of(model: PathBuf) -> Self {
+        Self {
+            model,
+            labels: None,
+            family: None,
+            input_px: None,
+            normalization: None,
+            threshold: default_threshold(),
+            thresholds: BTreeMap::new(),
+            max_overlap: default_max_overlap(),
+        }
+    }
+
+    /// Checks every value; files are checked when they are loaded.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the first key out of range.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        for side in self.input_px.into_iter().flatten() {
+            check_range("input_px", f64::from(side), 32.0, 4096.0)?;
+        }
+        check_range("threshold", self.threshold, 0.01, 1.0)?;
+        for (label, threshold) in &self.thresholds {
+            check_range(&format!("thresholds.{label}"), *threshold, 0.01, 1.0)?;
+        }
+        check_range("max_overlap", self.max_overlap, 0.0, 1.0)
+    }
+}
+
+/// Error of loading a model.
+#[derive(Debug, thiserror::Error)]
+pub enum OnnxError {
+    /// A file cannot be read.
+    #[error("cannot read {path:?}")]
+    Unreadable {
+        /// The model or the labels.
+        path: PathBuf,
+        /// The operating system's error.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The runtime refuses the file.
+    #[error("model {path:?} cannot be run: {reason}; export it to onnx with 32-bit weights and standard operators")]
+    NotRunnable {
+        /// The model.
+        path: PathBuf,
+        /// The runtime's words.
+        reason: String,
+    },
+    /// The network does not take one image.
+    #[error("model {path:?} takes {inputs}; export it for one image, such as images tensor(f32) [1, 3, 640, 640]")]
+    UnknownInputs {
+        /// The model.
+        path: PathBuf,
+        /// Names, types and shapes.
+        inputs: String,
+    },
+    /// The file says no size of the image.
+    #[error("model {path:?} takes images of any size: set `input_px` to the size of its training, such as [640, 640]")]
+    AnySize {
+        /// The model.
+        path: PathBuf,
+    },
+    /// The network takes another size than the configured one.
+    #[error("model {path:?} takes images of {taken}, not {told}: remove `input_px` or export it for that size")]
+    OtherSize {
+        /// The model.
+        path: PathBuf,
+        /// Size of the network.
+        taken: ImageSize,
+        /// The configured size.
+        told: ImageSize,
+    },
+    /// The network fails at the configured size.
+    #[error("model {path:?} fails with an image of {size}: {reason}; try sides that are multiples of 32 in `input_px`")]
+    RefusedSize {
+        /// The model.
+        path: PathBuf,
+        /// Size of the image.
+        size: ImageSize,
+        /// The runtime's words.
+        reason: String,
+    },
+    /// The outputs fit no family, or not the configured one.
+    #[error(
+        "model {path:?} has outputs {outputs} for an image of {size}, which are not those of {family}; \
+         docs/cameras.md lists the shapes"
+    )]
+    UnknownOutputs {
+        /// The model.
+        path: PathBuf,
+        /// Names and shapes.
+        outputs: String,
+        /// Size of the input.
+        size: ImageSize,
+        /// The configured family, or all.
+        family: String,
+    },
+    /// A YOLOX model with other outputs than its family's.
+    #[error("model {path:?} gives boxes of yolox in pixels: export it without `--decode_in_inference`")]
+    InPixels {
+        /// The model.
+        path: PathBuf,
+    },
+    /// The count of labels is not that of the classes.
+    #[error("{labels} labels in {path:?}, but the model has {classes} classes: list one on each line, in its order")]
+    LabelCount {
+        /// The file of the labels or of the model.
+        path: PathBuf,
+        /// Count of labels.
+        labels: usize,
+        /// Count of classes.
+        classes: usize,
+    },
+    /// A name cannot be a label.
+    #[error("label {label:?} in {path:?} must have 1 to 64 bytes without control characters")]
+    BadLabel {
+        /// The file of the labels or of the model.
+        path: PathBuf,
+        /// The name.
+        label: String,
+    },
+    /// No labels are known.
+    #[error("model {path:?} has {classes} classes without names: set `labels` to a file with one on each line")]
+    NoLabels {
+        /// The model.
+        path: PathBuf,
+        /// Count of classes.
+        classes: usize,
+    },
+    /// A threshold is for a label that the model does not have.
+    #[error("`thresholds` names {label:?}, but the labels of model {path:?} are {labels}")]
+    UnknownLabel {
+        /// The model.
+        path: PathBuf,
+        /// The label.
+        label: String,
+        /// The model's labels.
+        labels: String,
+    },
+}
+
+/// A class of a model.
+#[derive(Debug, Clone, PartialEq)]
+struct Class {
+    label: Label,
+    threshold: f32,
+}
+
+/// Detector of the objects that a model was trained for.
+pub struct OnnxDetector {
+    config: OnnxConfig,
+    network: Network,
+    head: Head,
+    /// By the network's numbers; none for numbers that are no class.
+    classes: Vec<Option<Class>>,
+}
+
+impl OnnxDetector {
+    /// Loads the model and runs it once to see its outputs.
+    ///
+    /// # Errors
+    /// [`OnnxError`] with the file and the remedy.
+    pub fn new(config: OnnxConfig) -> Result<Self, OnnxError> {
+        let path = &config.model;
+        let told = config.input_px.map(|[width, height]| ImageSize { width: width.into(), height: height.into() });
+        let network = Network::load(path, told)?;
+        let size = network.input_size();
+        let outputs =
+            network.run(vec![0.0; 3 * size.width as usize * size.height as usize]).map_err(|reason| match told {
+                Some(size) => OnnxError::RefusedSize { path: path.clone(), size, reason },
+                None => OnnxError::NotRunnable { path: path.clone(), reason },
+            })?;
+        let (names, names_path) = names(&config, &network)?;
+        let description = ["description", "head"].map(|key| network.metadata(key).unwrap_or_default()).join(" ");
+        let clues =
+            Clues { told: config.family, description: &description, input: size, scales_boxes: network.scales_boxes() };
+        let head = Head::find(&clues, &outputs).ok_or_else(|| unknown_outputs(&config, size, &outputs))?;
+        if head.is_in_pixels(&outputs, size) {
+            return Err(OnnxError::InPixels { path: path.clone() });
+        }
+        let labels = head.classes(&outputs).labels(names.as_deref()).map_err(|classes| {
+            let classes = classes.unwrap_or_default();
+            match &names {
+                Some(names) => OnnxError::LabelCount { path: names_path, labels: names.len(), classes },
+                None => OnnxError::NoLabels { path: path.clone(), classes },
+            }
+        })?;
+        let classes = classes(&config, labels)?;
+        tracing::info!(model = %path.display(), family = %head.family, input = %size, "model loaded");
+        Ok(Self { head, classes, network, config })
+    }
+}
+
+impl Detect for OnnxDetector {
+    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+        let image = bgr(frame)?;
+        let failed = |step| move |source| DetectError::OpenCv { step, source };
+        let size = ImageSize::of(&image);
+        let input = self.network.input_size();
+        let letterbox = Letterbox::new(self.head.fit(), size, input);
+        let factors = self.config.normalization.unwrap_or_else(|| self.head.normalization()).factors();
+        let is_bgr = self.head.is_bgr();
+        let convert = |[blue, green, red]: [u8; 3]| {
+            let channels = if is_bgr { [blue, green, red] } else { [red, green, blue] };
+            std::array::from_fn(|c| f32::from(channels[c]) * factors[c].0 + factors[c].1)
+        };
+        let pixels = letterbox
+            .fill(&image, self.network.has_channels_last(), convert)
+            .map_err(failed("fitting a frame into the network"))?;
+        let outputs = self.network.run(pixels).map_err(DetectError::Model)?;
+        let least = self.classes.iter().flatten().map(|class| class.threshold).fold(1.0, f32::min);
+        let mut found = Vec::new();
+        for candidate in self.head.decode(&outputs, input, least) {
+            let class = self.classes.get(candidate.class).ok_or(DetectError::UnknownClass {
+                class: candidate.class,
+                labels: self.classes.iter().flatten().count(),
+            })?;
+            if class.as_ref().is_some_and(|class| candidate.score >= class.threshold) {
+                let bounds = letterbox.to_image(&candidate.bounds);
+                found.extend(ScoredBox { bounds, ..candidate }.inside(size.width.into(), size.height.into()));
+            }
+        }
+        if self.head.needs_suppression() {
+            found = suppress(found, self.config.max_overlap).map_err(failed("non-maximum suppression"))?;
+        }
+        let labelled = |found: &ScoredBox| Some(found.labelled(self.classes[found.class].as_ref()?.label.clone()));
+        Ok(found.iter().filter_map(labelled).collect())
+    }
+}
+
+/// Names of the classes in their order, if they are known, and their file.
+fn names(config: &OnnxConfig, network: &Network) -> Result<(Option<Vec<String>>, PathBuf), OnnxError> {
+    let (names, path) = match &config.labels {
+        Some(path) => {
+            let text =
+                std::fs::read_to_string(path).map_err(|source| OnnxError::Unreadable { path: path.clone(), source })?;
+            (Some(labels::read(&text)), path)
+        }
+        None => (network.metadata("names").map(labels::parse), &config.model),
+    };
+    let path = path.clone();
+    match names.as_deref().and_then(labels::first_unusable) {
+        Some(label) => Err(OnnxError::BadLabel { label: label.to_owned(), path }),
+        None => Ok((names, path)),
+    }
+}
+
+fn unknown_outputs(config: &OnnxConfig, size: ImageSize, outputs: &[Output]) -> OnnxError {
+    let outputs = outputs.iter().map(Output::to_string).collect::<Vec<_>>().join("; ");
+    let family = config.family.map_or_else(|| "any known family".to_owned(), |family| family.to_string());
+    OnnxError::UnknownOutputs { path: config.model.clone(), outputs, size, family }
+}
+
+fn classes(config: &OnnxConfig, labels: Vec<Option<Label>>) -> Result<Vec<Option<Class>>, OnnxError> {
+    let is_known = |label: &str| labels.iter().flatten().any(|known| known == label);
+    if let Some(label) = config.thresholds.keys().find(|label| !is_known(label)) {
+        let labels = labels.iter().flatten().map(Label::as_str).collect::<Vec<_>>().join(", ");
+        return Err(OnnxError::UnknownLabel { path: config.model.clone(), label: label.clone(), labels });
+    }
+    let threshold = |label: &Label| config.thresholds.get(label.as_str()).copied().unwrap_or(config.threshold) as f32;
+    let class = |label: Label| Class { threshold: threshold(&label), label };
+    Ok(labels.into_iter().map(|label| label.map(class)).collect())
+}
+
+#[cfg(test)]
+mod tests;

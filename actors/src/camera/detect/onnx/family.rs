@@ -1,0 +1,236 @@
+//! Families of exported models, and how each arranges its outputs.
+
+use serde::{Deserialize, Serialize};
+
+use super::labels::Classes;
+use super::letterbox::Fit;
+use super::network::Output;
+use crate::camera::image_size::ImageSize;
+
+/// Family of a model, by the project that exported it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, strum::Display, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[strum(serialize_all = "lowercase")]
+pub enum Family {
+    /// YOLOv5 and YOLOv7.
+    Yolov5,
+    /// YOLOv8, 11 and others of Ultralytics, with non-maximum suppression or without.
+    Yolov8,
+    /// YOLOX.
+    Yolox,
+    /// SSD of torchvision, of TensorFlow's Object Detection API and of pytorch-ssd.
+    Ssd,
+    /// DETR of Hugging Face.
+    Detr,
+    /// RT-DETR of Ultralytics, of Hugging Face and of its authors; D-FINE.
+    Rtdetr,
+    /// RF-DETR.
+    Rfdetr,
+}
+
+/// Values that a network takes for the levels 0 to 255 of a pixel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Normalization {
+    /// 0 to 255.
+    Raw,
+    /// 0 to 1.
+    Unit,
+    /// -1 to 1.
+    Signed,
+    /// 0 to 1, less the mean of ImageNet, over its standard deviation.
+    Imagenet,
+}
+
+impl Normalization {
+    /// Factor and offset of each channel, red first.
+    pub(super) fn factors(self) -> [(f32, f32); 3] {
+        const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
+        const SIGMA: [f32; 3] = [0.229, 0.224, 0.225];
+        match self {
+            Self::Raw => [(1.0, 0.0); 3],
+            Self::Unit => [(1.0 / 255.0, 0.0); 3],
+            Self::Signed => [(1.0 / 127.5, -1.0); 3],
+            Self::Imagenet => std::array::from_fn(|c| (1.0 / (255.0 * SIGMA[c]), -MEAN[c] / SIGMA[c])),
+        }
+    }
+}
+
+/// Arrangement of a network's outputs. The numbers are places in the list of outputs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Layout {
+    /// `[1, boxes, 5 + classes]`: centre and size in pixels, objectness, scores.
+    Objectness(usize),
+    /// The same, with centre and logarithm of the size in cells of a grid.
+    Cells(usize),
+    /// `[1, 4 + classes, boxes]`: centre and size in pixels, scores.
+    Columns(usize),
+    /// `[1, boxes, 4 + classes]`: centre and size in shares of the image, scores.
+    Rows(usize),
+    /// `[1, boxes, 6]`: box, score, class.
+    Picked(usize),
+    /// `[1, boxes, 4]` and `[1, boxes, classes]`: centre and size in shares, logits.
+    Queries { boxes: usize, logits: usize },
+    /// `[1, boxes, 4]` and `[1, boxes, 1 + classes]`: corners in shares, scores with the background first.
+    Priors { boxes: usize, scores: usize },
+    /// `[…, boxes, 4]`, `[…, boxes]` and `[…, boxes]`: corners, score, class.
+    Listed { boxes: usize, scores: usize, classes: usize },
+}
+
+/// Family and layout of a network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Head {
+    pub(super) family: Family,
+    pub(super) layout: Layout,
+    /// True for TensorFlow's lists: upper, left, lower and right edge in shares of the image.
+    pub(super) is_tensorflow: bool,
+}
+
+/// Signs of a network's family beside its outputs.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Clues<'a> {
+    /// The configured family.
+    pub(super) told: Option<Family>,
+    /// The exporter's name of the model.
+    pub(super) description: &'a str,
+    pub(super) input: ImageSize,
+    /// True if the network is told the size that it scales boxes to.
+    pub(super) scales_boxes: bool,
+}
+
+impl Head {
+    /// The family and layout that the outputs fit; none if they fit none, or another than the configured family.
+    pub(super) fn find(clues: &Clues<'_>, outputs: &[Output]) -> Option<Self> {
+        let (family, layout) = by_names(clues, outputs).or_else(|| by_shape(clues, outputs))?;
+        let is_tensorflow = outputs.iter().any(|output| output.name.starts_with("detection_boxes"));
+        clues.told.is_none_or(|told| told == family).then_some(Self { family, layout, is_tensorflow })
+    }
+
+    /// Numbers of the classes.
+    pub(super) fn classes(&self, outputs: &[Output]) -> Classes {
+        let last = |output: usize| outputs[output].shape.last().copied().unwrap_or(0);
+        let scores = match self.layout {
+            Layout::Objectness(output) | Layout::Cells(output) => Some(last(output) - 5),
+            Layout::Columns(output) => Some(outputs[output].shape[1] - 4),
+            Layout::Rows(output) => Some(last(output) - 4),
+            Layout::Queries { logits, .. } => Some(last(logits)),
+            Layout::Priors { scores, .. } => Some(last(scores)),
+            Layout::Picked(_) | Layout::Listed { .. } => None,
+        };
+        let has_none_last = self.family == Family::Detr;
+        Classes { scores, first: usize::from(self.family == Family::Ssd), has_none_last }
+    }
+
+    /// True if the network has turned the cells of YOLOX into pixels itself, for which [`Layout::Cells`] does not hold.
+    pub(super) fn is_in_pixels(&self, outputs: &[Output], input: ImageSize) -> bool {
+        let Layout::Cells(output) = self.layout else { return false };
+        let row = outputs[output].shape[2];
+        // Centres are within a few cells of their own; in pixels they reach the right edge.
+        outputs[output].values.chunks_exact(row).any(|row| row[0] > (input.width / STRIDES[0]) as f32)
+    }
+
+    /// True if one object has several boxes.
+    pub(super) fn needs_suppression(&self) -> bool {
+        match self.layout {
+            Layout::Objectness(_) | Layout::Cells(_) | Layout::Columns(_) | Layout::Priors { .. } => true,
+            Layout::Rows(_) | Layout::Picked(_) | Layout::Queries { .. } | Layout::Listed { .. } => false,
+        }
+    }
+
+    /// Values of pixels in the training of the family.
+    pub(super) fn normalization(&self) -> Normalization {
+        match self.family {
+            Family::Yolov5 | Family::Yolov8 | Family::Rtdetr => Normalization::Unit,
+            Family::Yolox => Normalization::Raw,
+            Family::Detr | Family::Rfdetr => Normalization::Imagenet,
+            Family::Ssd if matches!(self.layout, Layout::Priors { .. }) => Normalization::Signed,
+            Family::Ssd if self.is_tensorflow => Normalization::Raw,
+            Family::Ssd => Normalization::Unit,
+        }
+    }
+
+    /// True if the network takes blue first.
+    pub(super) fn is_bgr(&self) -> bool {
+        self.family == Family::Yolox
+    }
+
+    /// The image's place in the network's input.
+    pub(super) fn fit(&self) -> Fit {
+        match self.family {
+            Family::Yolov5 | Family::Yolov8 => Fit::Centred,
+            Family::Yolox => Fit::TopLeft,
+            Family::Ssd | Family::Detr | Family::Rtdetr | Family::Rfdetr => Fit::Stretched,
+        }
+    }
+}
+
+/// Strides of the grids of YOLO.
+pub(super) const STRIDES: [u32; 3] = [8, 16, 32];
+/// Stride of one more grid, in variants for large images.
+const COARSE_STRIDE: u32 = 64;
+
+/// Boxes of DETR. RT-DETR, whose outputs have the same names, has 300.
+const DETR_QUERIES: usize = 100;
+/// Logits of DETR for COCO: 91 ids and no object.
+const DETR_COCO_LOGITS: usize = 92;
+
+fn cells(input: ImageSize, stride: u32) -> usize {
+    (input.width / stride * (input.height / stride)) as usize
+}
+
+/// Networks with an output for boxes and others for their classes.
+fn by_names(clues: &Clues<'_>, outputs: &[Output]) -> Option<(Family, Layout)> {
+    let find = |words: &[&str], rank: std::ops::RangeInclusive<usize>| {
+        outputs.iter().position(|o| rank.contains(&o.shape.len()) && words.iter().any(|word| o.name.contains(word)))
+    };
+    let boxes = find(&["box", "dets"], 2..=3).filter(|boxes| outputs[*boxes].shape.last() == Some(&4))?;
+    let count = outputs[boxes].shape[outputs[boxes].shape.len() - 2];
+    let is_list = |at: &usize| outputs[*at].shape.last() == Some(&count);
+    let is_table = |at: &usize| matches!(outputs[*at].shape[..], [_, rows, _] if rows == count);
+    if let Some(logits) = find(&["logits"], 3..=3).filter(is_table) {
+        let is_detr = count == DETR_QUERIES || outputs[logits].shape[2] == DETR_COCO_LOGITS;
+        let found = clues.told.unwrap_or(if is_detr { Family::Detr } else { Family::Rtdetr });
+        let fits = matches!(found, Family::Detr | Family::Rtdetr | Family::Rfdetr);
+        return fits.then_some((found, Layout::Queries { boxes, logits }));
+    }
+    if let Some(logits) = find(&["labels"], 3..=3).filter(is_table) {
+        return Some((Family::Rfdetr, Layout::Queries { boxes, logits }));
+    }
+    let lists = [["scores", "scores"], ["labels", "classes"]].map(|words| find(&words, 1..=2).filter(is_list));
+    if let [Some(scores), Some(classes)] = lists {
+        let family = if clues.scales_boxes { Family::Rtdetr } else { Family::Ssd };
+        return Some((family, Layout::Listed { boxes, scores, classes }));
+    }
+    let scores = find(&["scores"], 3..=3).filter(is_table)?;
+    Some((Family::Ssd, Layout::Priors { boxes, scores }))
+}
+
+/// Networks with one output, beside the grids that early exports of YOLOv5 also had.
+fn by_shape(clues: &Clues<'_>, outputs: &[Output]) -> Option<(Family, Layout)> {
+    let (main, others) = outputs.split_first()?;
+    let [1, rows, columns] = main.shape[..] else { return None };
+    if others.iter().any(|other| other.shape.len() != 5) {
+        return None;
+    }
+    let fine: usize = STRIDES.iter().map(|stride| cells(clues.input, *stride)).sum();
+    let grids = [fine, fine + cells(clues.input, COARSE_STRIDE)];
+    let description = clues.description.to_ascii_lowercase().replace('-', "");
+    match clues.told {
+        Some(Family::Rtdetr) => rtdetr(columns),
+        None if description.contains("rtdetr") => rtdetr(columns),
+        Some(Family::Yolov5) if columns > 5 => Some((Family::Yolov5, Layout::Objectness(0))),
+        Some(Family::Yolov8) if columns != 6 && rows > 4 => Some((Family::Yolov8, Layout::Columns(0))),
+        _ if rows == fine && columns > 5 => Some((Family::Yolox, Layout::Cells(0))),
+        _ if grids.iter().any(|cells| rows == 3 * cells) && columns > 5 => {
+            Some((Family::Yolov5, Layout::Objectness(0)))
+        }
+        _ if grids.contains(&columns) && rows > 4 => Some((Family::Yolov8, Layout::Columns(0))),
+        _ if columns == 6 => Some((Family::Yolov8, Layout::Picked(0))),
+        _ => None,
+    }
+}
+
+fn rtdetr(columns: usize) -> Option<(Family, Layout)> {
+    let layout = if columns == 6 { Layout::Picked(0) } else { Layout::Rows(0) };
+    (columns > 4).then_some((Family::Rtdetr, layout))
+}
