@@ -122,8 +122,8 @@ fn a_report_says_who_led_how_late_how_steadily_on_whom_it_rests_and_what_was_los
     row(&["PACE", "100", "2", "50.0"]);
     row(&["edge", "4", "2024-11-21 02:00:00.000", "4.9", "50"]);
     row(&["gauss", "5", "2024-11-21 02:00:05.300", "4.9", "50"]);
-    row(&["maps: oldest capture to end of round", "100", "20.0", "20.0", "20.0", "20.0"]);
-    row(&["maps: end of round to this node", "100", "5.0", "5.0", "5.0", "5.0"]);
+    row(&["maps: from the oldest frame in a map to the map", "100", "20.0", "20.0", "20.0", "20.0"]);
+    row(&["maps: from the leader to this node", "100", "5.0", "5.0", "5.0", "5.0"]);
     row(&["verdicts", "99", "100.0", "100.0", "100.0", "400.0"]);
     row(&["euclid", "0.896"]);
     row(&["euclid", "100", "9.7", "1.0", "200"]);

@@ -23,16 +23,7 @@ use crate::http::get;
 
 /// A client that sends one report after the other, made by its number; ends when dropped. Its id is that of a node's run.
 fn send(broker: SocketAddr, node: &'static str, report: impl Fn(u64) -> String + Send + 'static) -> JoinSet<()> {
-    send_as(format!("{node}-{}", Uuid::from_u128(7).simple()), broker, node, report)
-}
-
-/// The same under a client id.
-fn send_as(
-    id: String,
-    broker: SocketAddr,
-    node: &'static str,
-    report: impl Fn(u64) -> String + Send + 'static,
-) -> JoinSet<()> {
+    let id = format!("{node}-{}", Uuid::from_u128(7).simple());
     let options = MqttOptions::new(id, broker.ip().to_string(), broker.port());
     let (client, mut events) = AsyncClient::new(options, 16);
     let mut tasks = JoinSet::new();
@@ -133,7 +124,7 @@ async fn who_is_alone_says_why() {
     stop([last, other, cav, edge]).await;
 }
 
-/// What a leader does not take is named with its sender: reports for the other algorithm, too many, in another's name.
+/// What a leader does not take is named with its sender: reports for the other algorithm, and too many.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn reports_that_are_not_taken_are_named_with_their_sender() {
     let mut voting = config("edge", Role::Edge, 1);
@@ -145,10 +136,6 @@ async fn reports_that_are_not_taken_are_named_with_their_sender() {
     until_told(page, ["edge", "watson", "not_fused"], "for an algorithm that the cell does not run").await;
     until_told(page, ["edge", "watson", "overload"], "sends more than is taken").await;
     drop(watson);
-    // A program at the door of a node speaks for that node alone.
-    let program = send_as("program".into(), broker, "hertz", |seq| report("hertz", seq, 0, "1"));
-    until_told(page, ["edge", "hertz", "not_permitted"], "rejected: not permitted").await;
-    drop(program);
     edge.stop().await;
 }
 

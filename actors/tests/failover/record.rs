@@ -33,10 +33,11 @@ impl Record {
         self.maps.last().map_or(0, |received| received.map.round)
     }
 
-    /// Number of epochs from which maps were taken.
-    pub(crate) fn leaderships(&self) -> usize {
-        let epoch = |received: &ReceivedMap| (received.map.epoch, received.map.aggregator.clone());
-        self.maps.iter().map(epoch).collect::<BTreeSet<_>>().len()
+    /// Epochs of the maps from the round on, which is of the leader at that time.
+    pub(crate) fn epochs_from(&self, round: u64, leader: &str) -> BTreeSet<Epoch> {
+        let is_earlier = |taken: &&ReceivedMap| taken.map.aggregator.as_str() != leader || taken.map.round < round;
+        let taken = self.maps.iter().skip_while(is_earlier);
+        taken.map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone())).collect()
     }
 
     pub(crate) fn longest_gap(&self) -> Duration {
