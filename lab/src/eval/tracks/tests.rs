@@ -24,7 +24,7 @@ fn what_is_perfect_is_a_hundred_percent() {
         said: vec![said(5, 10.0 + at, 0.9), said(6, at, 0.8)],
     };
     let scores = score(&[frame(0.0), frame(1.0), frame(2.0)]);
-    scores.ap_pct.iter().chain([&scores.best_f1_pct]).for_each(|share| near(*share, 100.0));
+    scores.ap_pct.iter().chain(&scores.best_moda_pct).chain([&scores.best_f1_pct]).for_each(|share| near(*share, 100.0));
     assert_eq!(scores.at_best_f1.threshold, 0.8);
     for at in [scores.at_best_f1, scores.at_default] {
         let shares =
@@ -59,6 +59,7 @@ fn average_precision_is_that_worked_out_by_hand() {
     near(scores.ap_pct[1], 50.0);
     near(scores.ap_pct[2], 100.0 * (0.5 + 0.5 * 2.0 / 3.0));
     near(scores.best_f1_pct, 80.0);
+    scores.best_moda_pct.iter().for_each(|moda_pct| near(*moda_pct, 50.0));
     assert_eq!(scores.at_best_f1.threshold, 0.7);
     near(scores.at_best_f1.moda_pct, 50.0);
     near(scores.at_best_f1.modp_pct, 100.0 * (0.85 + 0.25) / 2.0);
