@@ -13,7 +13,7 @@ use ecod::perception::projection::{ObjectSize, ObjectSizes, ProjectionConfig, Ra
 use ecod::wire::Role;
 use ecod_actors::camera::config::{CameraConfig, OpticsConfig};
 use ecod_actors::camera::detect::{CustomDetector, Detect, DetectError, DetectorConfig};
-use ecod_actors::camera::frame::Frame;
+use ecod_actors::camera::frame::CameraFrame;
 use ecod_actors::camera::frame_source::SourceConfig;
 use ecod_actors::node;
 use ecod_actors::node::config::NodeConfig;
@@ -27,7 +27,7 @@ const LEAST_AREA_PX: f64 = 100.0;
 struct RedBalls;
 
 impl Detect for RedBalls {
-    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+    fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
         find(&frame.image).map_err(|source| DetectError::OpenCv { step: "red balls", source })
     }
 }

@@ -16,7 +16,7 @@ use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::coco::{CocoConfig, CocoDetector};
 use ecod_actors::camera::detect::onnx::{OnnxConfig, OnnxDetector};
 use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
-use ecod_actors::camera::frame::Frame;
+use ecod_actors::camera::frame::CameraFrame;
 use ecod_lab::testbed::Testbed;
 use ecod_lab::testbed::camera::TestbedCamera;
 use nalgebra::Point2;
@@ -43,7 +43,7 @@ fn main() -> anyhow::Result<()> {
 }
 
 /// Every model of the directory that `ONNX_MODELS` names, if any.
-fn models(figures: &mut Figures, photograph: &Frame) -> anyhow::Result<()> {
+fn models(figures: &mut Figures, photograph: &CameraFrame) -> anyhow::Result<()> {
     let Some(directory) = std::env::var_os("ONNX_MODELS") else { return Ok(()) };
     let mut paths: Vec<_> =
         std::fs::read_dir(directory)?.map(|file| Ok(file?.path())).collect::<anyhow::Result<_>>()?;
@@ -99,16 +99,16 @@ fn target(index: usize) -> [Point2<f64>; 4] {
 }
 
 /// Frame of the first vehicle in the first recorded parking lot.
-fn lot() -> anyhow::Result<Frame> {
+fn lot() -> anyhow::Result<CameraFrame> {
     let path = format!("{}/../examples/testbed/pace_setup1.json", env!("CARGO_MANIFEST_DIR"));
     let testbed = Testbed::from_json(&std::fs::read_to_string(path)?)?;
     let scene = testbed.scenes.first().context("a scene")?;
     let cav = scene.cavs.first().context("a vehicle")?;
     let image = TestbedCamera::new(&testbed, scene, cav, 1)?.frame(0)?;
-    Ok(Frame { image, captured_at: Timestamp(0), seq: 1 })
+    Ok(CameraFrame { image, captured_at: Timestamp(0), seq: 1 })
 }
 
-fn time(figures: &mut Figures, name: &str, detector: &mut dyn Detect, frame: &Frame) -> anyhow::Result<()> {
+fn time(figures: &mut Figures, name: &str, detector: &mut dyn Detect, frame: &CameraFrame) -> anyhow::Result<()> {
     let found = detector.detect(frame)?.len();
     let mut times_ms = Vec::new();
     for _ in 0..FRAMES {
@@ -126,8 +126,8 @@ fn time(figures: &mut Figures, name: &str, detector: &mut dyn Detect, frame: &Fr
     Ok(())
 }
 
-fn photograph(name: &str) -> anyhow::Result<Frame> {
+fn photograph(name: &str) -> anyhow::Result<CameraFrame> {
     let path = format!("{}/../actors/tests/data/photos/{name}.jpg", env!("CARGO_MANIFEST_DIR"));
     let image = imgcodecs::imread(&path, imgcodecs::IMREAD_COLOR)?;
-    Ok(Frame { image, captured_at: Timestamp(0), seq: 1 })
+    Ok(CameraFrame { image, captured_at: Timestamp(0), seq: 1 })
 }

@@ -16,7 +16,7 @@ use opencv::prelude::*;
 
 pub use config::{CustomDetector, DetectorConfig};
 
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 
 /// Detector of objects in images.
 ///
@@ -26,7 +26,7 @@ pub trait Detect: Send {
     ///
     /// # Errors
     /// [`DetectError`] when the image is unusable or a library fails; the next frame may succeed.
-    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError>;
+    fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError>;
 }
 
 /// Error on one frame; the detector remains usable.
@@ -66,7 +66,7 @@ pub enum DetectError {
 }
 
 /// The frame's pixels, blue, green and red.
-fn bgr(frame: &Frame) -> Result<Cow<'_, Mat>, DetectError> {
+fn bgr(frame: &CameraFrame) -> Result<Cow<'_, Mat>, DetectError> {
     let image = &frame.image;
     let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };
     match image.typ() {

@@ -5,7 +5,7 @@ use opencv::core::Mat;
 
 /// One image of one camera.
 #[derive(Debug, Clone)]
-pub struct Frame {
+pub struct CameraFrame {
     /// 8-bit pixels, BGR or gray.
     pub image: Mat,
     /// Time of capture by the node's clock.

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use self::images::ImageSequence;
 use self::video::Video;
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 
 /// Source of successive frames.
 pub trait FrameSource: Send {
@@ -20,7 +20,7 @@ pub trait FrameSource: Send {
     ///
     /// # Errors
     /// [`FrameError`]. After [`FrameError::Unusable`] the source continues; after other errors it must be reopened.
-    fn next_frame(&mut self) -> Result<Frame, FrameError>;
+    fn next_frame(&mut self) -> Result<CameraFrame, FrameError>;
 }
 
 /// Error of a frame source.

@@ -2,7 +2,7 @@
 
 use tokio::sync::OwnedSemaphorePermit;
 
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 
 /// Requests to the detector.
 #[derive(Debug)]
@@ -10,7 +10,7 @@ pub enum DetectorMessage {
     /// Find the objects in a frame.
     Detect {
         /// The frame.
-        frame: Frame,
+        frame: CameraFrame,
         /// Admits the next frame when dropped.
         permit: OwnedSemaphorePermit,
     },

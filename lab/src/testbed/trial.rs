@@ -14,7 +14,7 @@ use ecod::wire::{ObjectReport, RejectReason, ReportKind};
 use ecod_actors::actors::projector::votes;
 use ecod_actors::camera::detect::Detect;
 use ecod_actors::camera::detect::placard::{PlacardConfig, PlacardDetector};
-use ecod_actors::camera::frame::Frame;
+use ecod_actors::camera::frame::CameraFrame;
 
 use super::camera::TestbedCamera;
 use super::score::{SceneResult, SpotScore};
@@ -116,7 +116,7 @@ impl Trial<'_> {
         (0..self.verdicts * self.frames_per_verdict())
             .map(|seq| {
                 let captured_at = START + interval * u32::try_from(seq)?;
-                let frame = Frame { image: camera.frame(seq)?, captured_at, seq };
+                let frame = CameraFrame { image: camera.frame(seq)?, captured_at, seq };
                 let report = perception.report(detector.detect(&frame)?, captured_at);
                 progress();
                 Ok(report)

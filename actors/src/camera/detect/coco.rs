@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use self::anchors::Anchor;
 use super::candidates::{ScoredBox, suppress};
 use super::{Detect, DetectError, bgr};
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 
 /// Configuration of the COCO detector.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -168,7 +168,7 @@ impl CocoDetector {
 }
 
 impl Detect for CocoDetector {
-    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+    fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
         let failed = |step| move |source| DetectError::OpenCv { step, source };
         let image = bgr(frame)?;
         let candidates = self.run_on_image(&image).map_err(failed("the coco network"))?;

@@ -21,10 +21,10 @@ pub use self::family::{Family, Normalization};
 
 use self::family::{Clues, Head};
 use self::letterbox::Letterbox;
-use self::network::{Network, Output};
+use self::network::{NamedTensor, Network};
 use super::candidates::{ScoredBox, suppress};
 use super::{Detect, DetectError, bgr};
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 use crate::camera::image_size::ImageSize;
 
 /// Configuration of the detector of exported models.
@@ -262,7 +262,7 @@ impl OnnxDetector {
 }
 
 impl Detect for OnnxDetector {
-    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+    fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
         let image = bgr(frame)?;
         let failed = |step| move |source| DetectError::OpenCv { step, source };
         let size = ImageSize::of(&image);
@@ -315,8 +315,8 @@ fn names(config: &OnnxConfig, network: &Network) -> Result<(Option<Vec<String>>,
     }
 }
 
-fn unknown_outputs(config: &OnnxConfig, size: ImageSize, outputs: &[Output]) -> OnnxError {
-    let outputs = outputs.iter().map(Output::to_string).collect::<Vec<_>>().join("; ");
+fn unknown_outputs(config: &OnnxConfig, size: ImageSize, outputs: &[NamedTensor]) -> OnnxError {
+    let outputs = outputs.iter().map(NamedTensor::to_string).collect::<Vec<_>>().join("; ");
     let family = config.family.map_or_else(|| "any known family".to_owned(), |family| family.to_string());
     OnnxError::UnknownOutputs { path: config.model.clone(), outputs, size, family }
 }

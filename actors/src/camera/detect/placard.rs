@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use zxingcpp::{Barcode, BarcodeFormat, BarcodeReader, ImageFormat, ImageView};
 
 use super::{Detect, DetectError};
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 
 /// Configuration of the placard detector.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -89,7 +89,7 @@ impl PlacardDetector {
 }
 
 impl Detect for PlacardDetector {
-    fn detect(&mut self, frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+    fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
         let mut gray = gray(frame)?;
         let reader = zxingcpp::read()
             .formats(BarcodeFormat::QRCode)
@@ -167,7 +167,7 @@ fn confidence(corners: &[Point2<f64>; 4], modules: f64) -> f64 {
 }
 
 /// A continuous grayscale copy of the frame.
-fn gray(frame: &Frame) -> Result<Mat, DetectError> {
+fn gray(frame: &CameraFrame) -> Result<Mat, DetectError> {
     let image = &frame.image;
     let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };
     if image.empty() || image.dims() != 2 {

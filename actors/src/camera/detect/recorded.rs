@@ -14,7 +14,7 @@ use ecod::model::detection::{Detection, parse_detections};
 use serde::{Deserialize, Serialize};
 
 use super::{Detect, DetectError};
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 
 /// Where recorded detections come from.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -74,7 +74,7 @@ impl RecordedDetector {
 }
 
 impl Detect for RecordedDetector {
-    fn detect(&mut self, _frame: &Frame) -> Result<Vec<Detection>, DetectError> {
+    fn detect(&mut self, _frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
         if self.looping && self.next >= self.frames.len() {
             self.next = 0;
         }
@@ -107,7 +107,7 @@ mod tests {
     }
 
     fn counts(mut detector: RecordedDetector, frames: usize) -> Vec<usize> {
-        let frame = Frame { image: Mat::default(), captured_at: Timestamp(0), seq: 0 };
+        let frame = CameraFrame { image: Mat::default(), captured_at: Timestamp(0), seq: 0 };
         (0..frames).map(|_| detector.detect(&frame).unwrap().len()).collect()
     }
 

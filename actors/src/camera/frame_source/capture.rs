@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 
 use super::{FrameError, FrameSource};
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 use crate::platform::latest_slot::LatestSlot;
 
 /// Stall timeout and retries of a source.
@@ -84,7 +84,7 @@ pub type Opener = Arc<dyn Fn() -> Result<Box<dyn FrameSource>, FrameError> + Sen
 /// A running capture; stops when dropped.
 #[derive(Debug)]
 pub struct Capture {
-    slot: Arc<LatestSlot<Frame>>,
+    slot: Arc<LatestSlot<CameraFrame>>,
     status: watch::Receiver<CaptureStatus>,
     events: SyncSender<CaptureEvent>,
     unusable: Arc<AtomicU64>,
@@ -119,7 +119,7 @@ impl Capture {
     }
 
     /// Waits for the latest frame; `None` once the source ended. Numbers continue when the source is reopened.
-    pub async fn next_frame(&self) -> Option<Frame> {
+    pub async fn next_frame(&self) -> Option<CameraFrame> {
         self.slot.take().await
     }
 
@@ -183,7 +183,7 @@ const MAX_ABANDONED: usize = 4;
 
 enum CaptureEvent {
     /// A result of the reader with this number.
-    Read(u64, Result<Frame, FrameError>),
+    Read(u64, Result<CameraFrame, FrameError>),
     Stop,
 }
 
@@ -196,7 +196,7 @@ enum Outcome {
 struct CaptureLoop {
     open: Opener,
     config: CaptureConfig,
-    slot: Arc<LatestSlot<Frame>>,
+    slot: Arc<LatestSlot<CameraFrame>>,
     status: watch::Sender<CaptureStatus>,
     events: SyncSender<CaptureEvent>,
     inbox: Receiver<CaptureEvent>,
@@ -275,7 +275,7 @@ impl CaptureLoop {
                     self.status.send_if_modified(|status| {
                         std::mem::replace(status, CaptureStatus::Running) != CaptureStatus::Running
                     });
-                    self.slot.put(Frame { seq: self.captured, ..frame });
+                    self.slot.put(CameraFrame { seq: self.captured, ..frame });
                     self.captured += 1;
                 }
             }
@@ -317,7 +317,7 @@ impl Reader {
         }
     }
 
-    fn send(&self, read: Result<Frame, FrameError>) {
+    fn send(&self, read: Result<CameraFrame, FrameError>) {
         // The receiver is gone once the capture has ended.
         let _ = self.events.send(CaptureEvent::Read(self.opening, read));
     }

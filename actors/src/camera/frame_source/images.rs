@@ -6,7 +6,7 @@ use opencv::core::MatTraitConst;
 use opencv::imgcodecs;
 
 use super::{FrameError, FramePacer, FrameSource};
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 use crate::platform::clock;
 
 const EXTENSIONS: [&str; 7] = ["bmp", "jpeg", "jpg", "pgm", "png", "ppm", "webp"];
@@ -39,7 +39,7 @@ impl ImageSequence {
 }
 
 impl FrameSource for ImageSequence {
-    fn next_frame(&mut self) -> Result<Frame, FrameError> {
+    fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
         let count = self.files.len() as u64;
         if self.next >= count && !self.looping {
             return Err(FrameError::Ended { origin: self.origin.clone() });
@@ -54,7 +54,7 @@ impl FrameSource for ImageSequence {
             let reason = std::fs::File::open(file).map_or_else(|error| error.to_string(), |_| "not an image".into());
             return Err(unusable(reason));
         }
-        Ok(Frame { image, captured_at: clock::now(), seq })
+        Ok(CameraFrame { image, captured_at: clock::now(), seq })
     }
 }
 

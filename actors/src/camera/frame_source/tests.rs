@@ -14,7 +14,7 @@ fn gray(value: u8) -> Mat {
     Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::all(f64::from(value))).unwrap()
 }
 
-fn brightness(frame: &Frame) -> u8 {
+fn brightness(frame: &CameraFrame) -> u8 {
     frame.image.at_2d::<Vec3b>(24, 32).unwrap()[1]
 }
 

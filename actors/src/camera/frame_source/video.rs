@@ -10,7 +10,7 @@ use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
 
 use super::{FrameError, FramePacer, FrameSource};
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 use crate::platform::clock;
 
 /// Rate of a video file without one.
@@ -102,7 +102,7 @@ impl Video {
 }
 
 impl FrameSource for Video {
-    fn next_frame(&mut self) -> Result<Frame, FrameError> {
+    fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
         if let Some(playback) = &mut self.playback {
             playback.pace.wait();
         }
@@ -117,7 +117,7 @@ impl FrameSource for Video {
             Some(_) => FrameError::Ended { origin: origin() },
             None => FrameError::Lost { origin: origin(), reason: "no further frame".into() },
         })?;
-        let frame = Frame { image, captured_at: clock::now(), seq: self.seq };
+        let frame = CameraFrame { image, captured_at: clock::now(), seq: self.seq };
         self.seq += 1;
         Ok(frame)
     }

@@ -17,7 +17,7 @@ use super::map_latency::MapLatency;
 use super::node_sources::NodeSources;
 use super::response_cache::{CachedResponse, ResponseCache};
 use super::snapshot::{API_VERSION, LeadershipFacts, Snapshot, TroubleEntry, json, nodes};
-use super::timeline::Frame;
+use super::timeline::TimelineFrame;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::newest::Received;
 use crate::observe::readiness::Probe;
@@ -258,7 +258,7 @@ impl NodeMonitor {
         }
         if let Some(now_us) = received.into_iter().flatten().max() {
             let vehicles = || sources.live_state.reports_since(now - MAX_REPORT_AGE);
-            let frame = || json(&Frame { now_us, map, verdicts, vehicles: vehicles() });
+            let frame = || json(&TimelineFrame { now_us, map, verdicts, vehicles: vehicles() });
             history.timeline.frames.push(now_us, frame);
         }
     }

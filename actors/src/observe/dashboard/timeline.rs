@@ -15,7 +15,7 @@ use crate::messages::newest::Received;
 /// Events and maps, oldest first, in bounded memory: [`MAX_EVENTS`] and [`MAX_SERIES_BYTES`].
 #[derive(Debug)]
 pub(crate) struct Timeline {
-    /// Each map as a [`Frame`] in JSON.
+    /// Each map as a [`TimelineFrame`] in JSON.
     pub frames: ThinnedSeries,
     events: VecDeque<TimelineEvent>,
     alive: BTreeSet<NodeName>,
@@ -53,7 +53,7 @@ pub(crate) enum EventKind {
 
 /// A map and what it rests on, with the field names of a [`Snapshot`](super::snapshot::Snapshot).
 #[derive(Debug, Serialize)]
-pub(crate) struct Frame {
+pub(crate) struct TimelineFrame {
     /// Time of receipt.
     pub now_us: Timestamp,
     /// The map.

@@ -7,7 +7,7 @@ use opencv::core::Vector;
 use opencv::imgcodecs;
 
 use super::{LogItem, LogSender, RecordConfig};
-use crate::camera::frame::Frame;
+use crate::camera::frame::CameraFrame;
 
 /// Records frames as JPEG at a fixed rate.
 #[derive(Debug, Clone)]
@@ -25,7 +25,7 @@ impl ImageRecorder {
     }
 
     /// Records the frame if one is due, which takes some milliseconds.
-    pub fn offer(&mut self, frame: &Frame) {
+    pub fn offer(&mut self, frame: &CameraFrame) {
         if frame.captured_at < self.due {
             return;
         }

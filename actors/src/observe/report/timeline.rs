@@ -15,7 +15,7 @@ use crate::messages::newest::Received;
 use crate::observe::dashboard::history::LeaderTerm;
 use crate::observe::dashboard::node_monitor::MAX_REPORT_AGE;
 use crate::observe::dashboard::snapshot::json;
-use crate::observe::dashboard::timeline::{EventKind, Frame, ThinnedSeries, Timeline};
+use crate::observe::dashboard::timeline::{EventKind, ThinnedSeries, Timeline, TimelineFrame};
 use crate::observe::dashboard::{LandmarkFacts, LiveState, assets};
 use crate::observe::recorder::{LogError, LogEvent, LogIdentity, LogReader, SchemaName};
 use crate::transport::mqtt::Incoming;
@@ -139,7 +139,7 @@ impl LogTimeline {
         timeline.frames.push(now_us, || {
             let map = map.map(|map| Received { received_at: now_us, message: Arc::new(map.clone()) });
             let vehicles = vehicles.reports_since(now_us - MAX_REPORT_AGE);
-            json(&Frame { now_us, map, verdicts: verdicts.clone(), vehicles })
+            json(&TimelineFrame { now_us, map, verdicts: verdicts.clone(), vehicles })
         });
     }
 

@@ -13,8 +13,8 @@ fn photograph(name: &str, flags: i32) -> Mat {
     image
 }
 
-fn frame(image: Mat) -> Frame {
-    Frame { image, captured_at: Timestamp(0), seq: 7 }
+fn frame(image: Mat) -> CameraFrame {
+    CameraFrame { image, captured_at: Timestamp(0), seq: 7 }
 }
 
 fn best(detections: &[Detection]) -> &Detection {

@@ -3,7 +3,7 @@
 use ecod::model::detection::BoundingBox;
 
 use super::family::{Family, Head, Layout, STRIDES};
-use super::network::Output;
+use super::network::NamedTensor;
 use crate::camera::detect::candidates::ScoredBox;
 use crate::camera::image_size::ImageSize;
 
@@ -33,7 +33,7 @@ impl Edges {
 
 impl Head {
     /// Boxes with a score of `least` or more, in pixels of the network's input.
-    pub(super) fn decode(&self, outputs: &[Output], input: ImageSize, least: f32) -> Vec<ScoredBox> {
+    pub(super) fn decode(&self, outputs: &[NamedTensor], input: ImageSize, least: f32) -> Vec<ScoredBox> {
         let values = |output: usize| outputs.get(output).map_or(&[][..], |output| &output.values);
         let width = |output: usize| outputs.get(output).and_then(|o| o.shape.last()).map_or(1, |last| (*last).max(1));
         let (pixels, shares) = ((1.0, 1.0), (f64::from(input.width), f64::from(input.height)));

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::labels::Classes;
 use super::letterbox::Fit;
-use super::network::Output;
+use super::network::NamedTensor;
 use crate::camera::image_size::ImageSize;
 
 /// Family of a model, by the project that exported it.
@@ -100,14 +100,14 @@ pub(super) struct Clues<'a> {
 
 impl Head {
     /// The family and layout that the outputs fit; none if they fit none, or another than the configured family.
-    pub(super) fn find(clues: &Clues<'_>, outputs: &[Output]) -> Option<Self> {
+    pub(super) fn find(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<Self> {
         let (family, layout) = by_names(clues, outputs).or_else(|| by_shape(clues, outputs))?;
         let is_tensorflow = outputs.iter().any(|output| output.name.starts_with("detection_boxes"));
         clues.told.is_none_or(|told| told == family).then_some(Self { family, layout, is_tensorflow })
     }
 
     /// Numbers of the classes.
-    pub(super) fn classes(&self, outputs: &[Output]) -> Classes {
+    pub(super) fn classes(&self, outputs: &[NamedTensor]) -> Classes {
         let last = |output: usize| outputs[output].shape.last().copied().unwrap_or(0);
         let scores = match self.layout {
             Layout::Objectness(output) | Layout::Cells(output) => Some(last(output) - 5),
@@ -122,7 +122,7 @@ impl Head {
     }
 
     /// True if the network has turned the cells of YOLOX into pixels itself, for which [`Layout::Cells`] does not hold.
-    pub(super) fn is_in_pixels(&self, outputs: &[Output], input: ImageSize) -> bool {
+    pub(super) fn is_in_pixels(&self, outputs: &[NamedTensor], input: ImageSize) -> bool {
         let Layout::Cells(output) = self.layout else { return false };
         let row = outputs[output].shape[2];
         // Centres are within a few cells of their own; in pixels they reach the right edge.
@@ -179,7 +179,7 @@ fn cells(input: ImageSize, stride: u32) -> usize {
 }
 
 /// Networks with an output for boxes and others for their classes.
-fn by_names(clues: &Clues<'_>, outputs: &[Output]) -> Option<(Family, Layout)> {
+fn by_names(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layout)> {
     let find = |words: &[&str], rank: std::ops::RangeInclusive<usize>| {
         outputs.iter().position(|o| rank.contains(&o.shape.len()) && words.iter().any(|word| o.name.contains(word)))
     };
@@ -206,7 +206,7 @@ fn by_names(clues: &Clues<'_>, outputs: &[Output]) -> Option<(Family, Layout)> {
 }
 
 /// Networks with one output, beside the grids that early exports of YOLOv5 also had.
-fn by_shape(clues: &Clues<'_>, outputs: &[Output]) -> Option<(Family, Layout)> {
+fn by_shape(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layout)> {
     let (main, others) = outputs.split_first()?;
     let [1, rows, columns] = main.shape[..] else { return None };
     if others.iter().any(|other| other.shape.len() != 5) {

@@ -12,13 +12,13 @@ use crate::camera::image_size::ImageSize;
 
 /// One output of a network.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Output {
+pub(super) struct NamedTensor {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
     pub(super) values: Vec<f32>,
 }
 
-impl fmt::Display for Output {
+impl fmt::Display for NamedTensor {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{} {:?}", self.name, self.shape)
     }
@@ -107,7 +107,7 @@ impl Network {
     ///
     /// # Errors
     /// The runtime's words.
-    pub(super) fn run(&self, pixels: Vec<f32>) -> Result<Vec<Output>, String> {
+    pub(super) fn run(&self, pixels: Vec<f32>) -> Result<Vec<NamedTensor>, String> {
         let image: Value = if self.is_bytes {
             let bytes: Vec<u8> = pixels.into_iter().map(|value| value as u8).collect();
             Tensor::<u8>::from_data(self.shape.as_slice(), bytes).into()
@@ -129,14 +129,14 @@ impl Network {
 }
 
 /// The output's numbers; none of a type that no detector needs.
-fn output(name: String, value: &Value) -> Output {
+fn output(name: String, value: &Value) -> NamedTensor {
     let shape = value.shape().to_vec();
     let values = match value {
         Value::FloatTensor(tensor) => tensor.to_vec(),
         Value::Int32Tensor(tensor) => tensor.iter().map(|value| *value as f32).collect(),
         _ => Vec::new(),
     };
-    Output { name, shape, values }
+    NamedTensor { name, shape, values }
 }
 
 /// The size that the exporter wrote: `imgsz` of Ultralytics, `[height, width]`.

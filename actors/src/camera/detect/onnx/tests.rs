@@ -23,9 +23,9 @@ fn labelled(model: &str) -> OnnxConfig {
     OnnxConfig { labels: (!has_names).then(|| path("labels.txt")), ..config(model) }
 }
 
-fn frame() -> Frame {
+fn frame() -> CameraFrame {
     let image = imgcodecs::imread(path("frame.png").to_str().unwrap(), imgcodecs::IMREAD_COLOR).unwrap();
-    Frame { image, captured_at: Timestamp(0), seq: 7 }
+    CameraFrame { image, captured_at: Timestamp(0), seq: 7 }
 }
 
 fn refusal(config: OnnxConfig) -> String {
@@ -202,7 +202,7 @@ fn frames_of_any_shape_give_boxes_inside_them() {
         let mut detector = OnnxDetector::new(OnnxConfig { threshold: 0.01, ..labelled(model) }).unwrap();
         for (width, height) in [(1, 1), (2000, 3), (3, 2000), (64, 64)] {
             let image = Mat::new_rows_cols_with_default(height, width, CV_8UC3, Scalar::all(255.0)).unwrap();
-            for found in detector.detect(&Frame { image, captured_at: Timestamp(0), seq: 1 }).unwrap() {
+            for found in detector.detect(&CameraFrame { image, captured_at: Timestamp(0), seq: 1 }).unwrap() {
                 let b = found.bounding_box;
                 assert!(b.is_valid() && b.x_min >= 0.0 && b.y_min >= 0.0, "{model}: {b:?}");
                 assert!(b.x_max <= f64::from(width) && b.y_max <= f64::from(height), "{model}: {b:?}");

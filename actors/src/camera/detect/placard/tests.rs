@@ -49,7 +49,7 @@ impl Scene {
     }
 
     /// The picture that a camera makes of it: blur of 0.7 and noise of 5 gray levels, both standard deviations.
-    fn seen(&self) -> Frame {
+    fn seen(&self) -> CameraFrame {
         let (mut small, mut blurred, mut image) = (Mat::default(), Mat::default(), Mat::default());
         let size = Size::new(640, 480);
         imgproc::resize(&self.0, &mut small, size, 0.0, 0.0, imgproc::INTER_AREA).unwrap();
@@ -82,11 +82,11 @@ fn code(text: impl AsRef<[u8]>) -> QrCode {
     QrCode::with_error_correction_level(text, EcLevel::M).unwrap()
 }
 
-fn frame(image: Mat) -> Frame {
-    Frame { image, captured_at: Timestamp::default(), seq: 7 }
+fn frame(image: Mat) -> CameraFrame {
+    CameraFrame { image, captured_at: Timestamp::default(), seq: 7 }
 }
 
-fn detect(frame: &Frame) -> Vec<Detection> {
+fn detect(frame: &CameraFrame) -> Vec<Detection> {
     PlacardDetector::new(PlacardConfig::default()).detect(frame).unwrap()
 }
 

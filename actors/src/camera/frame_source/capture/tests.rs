@@ -8,7 +8,7 @@ use super::*;
 
 /// Action of a scripted source on one call.
 enum Step {
-    Frame,
+    CameraFrame,
     Fail,
     Spoil,
     /// Blocks until the test drops the other end.
@@ -18,9 +18,9 @@ enum Step {
 struct Script(VecDeque<Step>);
 
 impl FrameSource for Script {
-    fn next_frame(&mut self) -> Result<Frame, FrameError> {
+    fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
         match self.0.pop_front() {
-            Some(Step::Frame) => Ok(Frame { image: Mat::default(), captured_at: Timestamp(0), seq: 0 }),
+            Some(Step::CameraFrame) => Ok(CameraFrame { image: Mat::default(), captured_at: Timestamp(0), seq: 0 }),
             Some(Step::Fail) => Err(FrameError::Lost { origin: "script".into(), reason: "unplugged".into() }),
             Some(Step::Spoil) => Err(FrameError::Unusable { origin: "script".into(), reason: "torn".into() }),
             Some(Step::Block(until)) => {
@@ -54,7 +54,7 @@ async fn wait_for(capture: &Capture, wanted: impl Fn(&CaptureStatus) -> bool) {
 #[tokio::test]
 async fn a_source_that_fails_twice_works_the_third_time() {
     let capture =
-        Capture::start(scripted(vec![None, Some(vec![Step::Fail]), Some(vec![Step::Frame])]), hasty()).unwrap();
+        Capture::start(scripted(vec![None, Some(vec![Step::Fail]), Some(vec![Step::CameraFrame])]), hasty()).unwrap();
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
     assert!(capture.next_frame().await.is_none(), "it ended");
     assert_eq!(*capture.status().borrow(), CaptureStatus::Ended);
@@ -62,7 +62,7 @@ async fn a_source_that_fails_twice_works_the_third_time() {
 
 #[tokio::test]
 async fn an_unusable_frame_is_counted_and_costs_no_new_opening() {
-    let openings = vec![Some(vec![Step::Spoil, Step::Frame, Step::Spoil])];
+    let openings = vec![Some(vec![Step::Spoil, Step::CameraFrame, Step::Spoil])];
     let capture = Capture::start(scripted(openings), hasty()).unwrap();
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
     assert!(capture.next_frame().await.is_none(), "it ended and was not opened again");
@@ -86,7 +86,7 @@ async fn a_failure_is_reported_with_its_reason() {
 async fn a_blocked_source_counts_as_stalled_and_is_opened_again() {
     let (release, blocked) = mpsc::channel();
     let config = CaptureConfig { stall_timeout_s: 1.0, retry_min_s: 0.2, retry_max_s: 0.2 };
-    let openings = vec![Some(vec![Step::Frame, Step::Block(blocked)]), Some(vec![Step::Frame])];
+    let openings = vec![Some(vec![Step::CameraFrame, Step::Block(blocked)]), Some(vec![Step::CameraFrame])];
     let capture = Capture::start(scripted(openings), config).unwrap();
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
     wait_for(&capture, |status| matches!(status, CaptureStatus::Failed { error: FrameError::Stalled(_), .. })).await;
@@ -96,7 +96,8 @@ async fn a_blocked_source_counts_as_stalled_and_is_opened_again() {
 
 #[tokio::test]
 async fn frames_that_nobody_took_in_time_are_skipped_and_counted() {
-    let openings = vec![Some(vec![Step::Frame, Step::Frame, Step::Frame, Step::Frame, Step::Frame])];
+    let openings =
+        vec![Some(vec![Step::CameraFrame, Step::CameraFrame, Step::CameraFrame, Step::CameraFrame, Step::CameraFrame])];
     let capture = Capture::start(scripted(openings), hasty()).unwrap();
     wait_for(&capture, |status| *status == CaptureStatus::Ended).await;
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(4), "the latest");
