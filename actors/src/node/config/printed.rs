@@ -50,15 +50,17 @@ impl NodeConfig {
 
 /// Removes each key and table below `path` without which the configuration is still `config`.
 fn remove_defaults(keys: &mut Table, path: &mut Vec<String>, config: &NodeConfig) {
-    let names: Vec<String> = at(keys, path).keys().cloned().collect();
+    let names: Vec<String> = at(keys, path).into_iter().flat_map(|table| table.keys().cloned()).collect();
     for name in names {
-        let Some(value) = at(keys, path).remove(&name) else { continue };
+        let Some(value) = at(keys, path).and_then(|table| table.remove(&name)) else { continue };
         let rest = Figment::from(Serialized::defaults(&*keys));
         if NodeConfig::of_keys(&rest).is_ok_and(|rest| rest == *config) {
             continue;
         }
         let is_table = value.is_table();
-        at(keys, path).insert(name.clone(), value);
+        if let Some(table) = at(keys, path) {
+            table.insert(name.clone(), value);
+        }
         if is_table {
             path.push(name);
             remove_defaults(keys, path, config);
@@ -68,9 +70,6 @@ fn remove_defaults(keys: &mut Table, path: &mut Vec<String>, config: &NodeConfig
 }
 
 /// The table at a path of tables.
-fn at<'a>(keys: &'a mut Table, path: &[String]) -> &'a mut Table {
-    path.iter().fold(keys, |table, name| match table.entry(name.clone()).or_insert_with(|| Table::new().into()) {
-        Value::Table(inner) => inner,
-        _ => unreachable!("the path is one of tables"),
-    })
+fn at<'a>(keys: &'a mut Table, path: &[String]) -> Option<&'a mut Table> {
+    path.iter().try_fold(keys, |table, name| table.get_mut(name).and_then(Value::as_table_mut))
 }

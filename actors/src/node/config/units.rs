@@ -133,7 +133,7 @@ mod tests {
             ("fusion.round.period_s", 50.0, "seconds"),
             ("fusion.window.max_age_s", 1000.0, "seconds"),
             ("camera.capture.stall_timeout_s", 500.0, "seconds"),
-            ("pose.heading_deg", -1.5708, "degrees"),
+            ("pose.heading_deg", -1.57, "degrees"),
             ("landmarks[2].facing_deg", 2.356, "degrees"),
             ("camera.optics.horizontal_fov_deg", 1.0856, "degrees"),
             ("camera.projection.tilt_sigma_rad", 1.0, "radians"),
@@ -147,7 +147,7 @@ mod tests {
             ("pose.heading_deg", 90.0),
             ("camera.mount.pitch_deg", 0.0),
             ("camera.mount.pitch_deg", 3.0),
-            ("origin.longitude_deg", 3.1416),
+            ("origin.longitude_deg", 2.356),
             ("camera.capture.retry_max_s", 600.0),
             ("broker.connects_per_s", 500.0),
         ] {
