@@ -24,7 +24,12 @@ fn what_is_perfect_is_a_hundred_percent() {
         said: vec![said(5, 10.0 + at, 0.9), said(6, at, 0.8)],
     };
     let scores = score(&[frame(0.0), frame(1.0), frame(2.0)]);
-    scores.ap_pct.iter().chain(&scores.best_moda_pct).chain([&scores.best_f1_pct]).for_each(|share| near(*share, 100.0));
+    scores
+        .ap_pct
+        .iter()
+        .chain(&scores.best_moda_pct)
+        .chain([&scores.best_f1_pct])
+        .for_each(|share| near(*share, 100.0));
     assert_eq!(scores.at_best_f1.threshold, 0.8);
     for at in [scores.at_best_f1, scores.at_default] {
         let shares =
