@@ -149,7 +149,7 @@ fn a_camera_that_joins_an_hour_later_is_aligned_and_does_not_pull_the_others() {
             }
         }
         let [before, after] = [before, after].map(|common| common.iter().sum::<Vector2<f64>>() / common.len() as f64);
-        assert!((after - before).norm() < 0.03, "poses {is_posed}: from {before:?} to {after:?}");
+        assert!((after - before).norm() < 0.05, "poses {is_posed}: from {before:?} to {after:?}");
         assert!(rest_m < 0.2, "poses {is_posed}: {rest_m} m apart");
     }
 }
