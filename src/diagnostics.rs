@@ -279,20 +279,20 @@ impl TroubleRegister {
         if about.is_none() {
             return true;
         }
-        let crowds: [(usize, &dyn Fn(&Key) -> bool); 3] = [
-            (MAX_ABOUT_ONE, &|(other, _)| other == about),
-            (MAX_OF_STRANGERS, &|(_, other)| kind.is_of_strangers() && other.is_of_strangers()),
-            (MAX_ABOUT_OTHERS, &|(other, _)| other.is_some()),
-        ];
-        crowds.into_iter().all(|(most, is_in)| {
-            while self.entries.keys().filter(|key| is_in(key)).count() >= most {
-                let lapsed = self.entries.iter().filter(|(key, entry)| is_in(key) && !entry.is_present(key.1, now));
-                let oldest = lapsed.min_by_key(|(_, entry)| entry.seen_at);
-                let Some(key) = oldest.map(|(key, _)| key.clone()) else { return false };
-                self.entries.remove(&key);
-            }
-            true
-        })
+        self.make_room_in(MAX_ABOUT_ONE, now, |(other, _)| other == about)
+            && (!kind.is_of_strangers() || self.make_room_in(MAX_OF_STRANGERS, now, |(_, kind)| kind.is_of_strangers()))
+            && self.make_room_in(MAX_ABOUT_OTHERS, now, |(other, _)| other.is_some())
+    }
+
+    /// The same for one crowd of at most so many entries.
+    fn make_room_in(&mut self, most: usize, now: Timestamp, is_in: impl Fn(&Key) -> bool) -> bool {
+        while self.entries.keys().filter(|key| is_in(key)).count() >= most {
+            let lapsed = self.entries.iter().filter(|(key, entry)| is_in(key) && !entry.is_present(key.1, now));
+            let oldest = lapsed.min_by_key(|(_, entry)| entry.seen_at);
+            let Some(key) = oldest.map(|(key, _)| key.clone()) else { return false };
+            self.entries.remove(&key);
+        }
+        true
     }
 }
 
