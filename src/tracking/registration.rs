@@ -383,7 +383,7 @@ mod tests {
         for round in 0..10 * seconds {
             let delay_s = registration.delay_s(&prior);
             let pair = |n: u32| {
-                let velocity = Vector2::new(if n % 2 == 0 { 8.0 } else { -8.0 }, 0.0);
+                let velocity = Vector2::new(if n.is_multiple_of(2) { 8.0 } else { -8.0 }, 0.0);
                 let reported = Vector2::new(f64::from(n) * 10.0 - 30.0, 5.0);
                 let noise = Vector2::new(rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
                 let reference = reported + noise + velocity * (late_s - delay_s);
