@@ -7,6 +7,8 @@
 //! 1965). Vehicles err alike, too, so that existence counts a part of their evidence only. The odds before any evidence are
 //! those of the cell's own tracks ([`BaseRate`]).
 
+use std::collections::BTreeMap;
+
 use nalgebra::Vector2;
 
 use super::sensors::SensorId;
@@ -289,6 +291,9 @@ impl BaseRate {
     const USUAL: f64 = 0.33;
     const USUAL_TRACKS: f64 = 5.0;
 
+    /// Number of tracks as which those that one vehicle alone detects count at most: its clutter is its own.
+    const MAX_OF_ONE: f64 = 10.0;
+
     /// Log-odds of the usual share.
     pub(super) fn usual_log_odds() -> f64 {
         (Self::USUAL / (1.0 - Self::USUAL)).ln()
@@ -301,9 +306,20 @@ impl BaseRate {
         (objects / clutter).ln()
     }
 
-    /// Learns from the existences of all tracks of a round.
-    pub(super) fn learn(&mut self, at: Timestamp, existences: impl Iterator<Item = f64>) {
-        let (tracks, objects) = existences.fold((0.0, 0.0), |(count, sum), existence| (count + 1.0, sum + existence));
+    /// Learns from the existences of all tracks of a round, each with the only vehicle that detects the object, if there is
+    /// but one.
+    pub(super) fn learn(&mut self, at: Timestamp, existences: impl Iterator<Item = (Option<SensorId>, f64)>) {
+        let mut sums: BTreeMap<Option<SensorId>, (f64, f64)> = BTreeMap::new();
+        for (witness, existence) in existences {
+            let (tracks, objects) = sums.entry(witness).or_default();
+            (*tracks, *objects) = (*tracks + 1.0, *objects + existence);
+        }
+        let weight = |witness: &Option<SensorId>, tracks| {
+            if witness.is_none() { 1.0 } else { f64::min(1.0, Self::MAX_OF_ONE / tracks) }
+        };
+        let weighted = sums.iter().map(|(witness, sums)| (weight(witness, sums.0), sums));
+        let (tracks, objects) =
+            weighted.fold((0.0, 0.0), |all, (weight, sums)| (all.0 + weight * sums.0, all.1 + weight * sums.1));
         let kept = (-at.since(self.at).as_secs_f64() / Self::MEMORY_S).exp();
         self.tracks += (1.0 - kept) * (tracks - self.tracks);
         self.objects += (1.0 - kept) * (objects - self.objects);

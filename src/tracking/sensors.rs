@@ -25,7 +25,7 @@ const STAYS: f64 = 0.25;
 const STAYS_FOR: Duration = Duration::from_secs(120);
 
 /// Number of a vehicle that is heard. [`Sensors::forget_silent`] frees it for another vehicle.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct SensorId(u32);
 
 impl SensorId {

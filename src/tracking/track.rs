@@ -166,7 +166,7 @@ impl Track {
     /// log-odds of any track, `trust` weighs the evidence of each vehicle.
     pub(super) fn estimate_existence(&mut self, at: Timestamp, base_rate: f64, trust: impl Fn(SensorId) -> f64) -> f64 {
         let (mut evidence, mut denied, mut detected) = (0.0, 0.0, 0.0);
-        let has_one_witness = self.history.iter().filter(|history| history.last_hit.is_some()).nth(1).is_none();
+        let has_one_witness = self.witnesses().nth(1).is_none();
         for history in self.history.iter() {
             let trust = trust(history.sensor);
             let (shared, denial) = history.shared_nats(at);
@@ -180,6 +180,16 @@ impl Track {
         let nats = base_rate + ALONE_NATS + evidence + detected * persistence + inherited;
         self.clutter = Some(logistic(-nats));
         logistic(nats + SURVIVAL_POWER * self.survival(at).ln())
+    }
+
+    /// The only vehicle that detects the object, if there is but one.
+    pub(super) fn only_witness(&self) -> Option<SensorId> {
+        let mut witnesses = self.witnesses();
+        witnesses.next().filter(|_| witnesses.next().is_none())
+    }
+
+    fn witnesses(&self) -> impl Iterator<Item = SensorId> {
+        self.history.iter().filter(|history| history.last_hit.is_some()).map(|history| history.sensor)
     }
 
     /// Probability that an object that existed is still there.

@@ -9,6 +9,7 @@ use super::lifecycle::{adopt_map, merge, prune};
 use super::registration::{RegistrationFrame, register};
 use super::sensors::Sensors;
 use super::store::TrackStore;
+use super::track::Track;
 use super::turning::TurningFrame;
 use super::update::{ReportOutcome, ReportUpdate};
 use super::{TracksLosses, TracksRound};
@@ -173,7 +174,8 @@ impl Tracker {
         let base_rate = self.base_rate.log_odds();
         let mut existences = Vec::with_capacity(self.tracks.len());
         existences.extend(self.tracks.iter_mut().map(|track| track.estimate_existence(now, base_rate, trust)));
-        self.base_rate.learn(now, existences.iter().copied());
+        let witnesses = self.tracks.iter().map(Track::only_witness);
+        self.base_rate.learn(now, witnesses.zip(existences.iter().copied()));
         let tracks = self.tracks.iter().zip(existences);
         let objects = tracks.map(|(track, existence)| track.object(now, &self.config, existence, name));
         let mut published = Vec::with_capacity(self.tracks.len());

@@ -145,3 +145,25 @@ fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
     }
     counts
 }
+
+/// Clutter of one vehicle says nothing about the detections of others.
+#[test]
+fn a_vehicle_that_invents_objects_makes_those_of_others_hardly_less_sure() {
+    let least_existence = |invented: usize| {
+        let (mut tracker, mut rng, mut round) = (tracker(), ChaCha8Rng::seed_from_u64(1), TracksRound::default());
+        for frame in 0..50 {
+            tracker.observe(report("a", frame, (0..5).map(|n| car(f64::from(n) * 8.0, 0.0)).collect()), at(frame));
+            let mut place = || 1500.0 + noise(&mut rng, 500.0);
+            let clutter = (0..invented).map(|_| PerceivedObject::new("car", 0.5, place(), place())).collect();
+            tracker.observe(report("flooder", frame, clutter), at(frame));
+            round = tracker.close(at(frame));
+        }
+        let cars = round.objects.iter().filter(|object| object.x_m < 100.0);
+        cars.map(|object| object.existence.unwrap()).fold(1.0, f64::min)
+    };
+    let (without, beside) = (least_existence(0), least_existence(300));
+    assert!(
+        without > 0.5 && beside > without - 0.1,
+        "{without:.2} without, {beside:.2} beside 300 invented ones a frame"
+    );
+}
