@@ -279,6 +279,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn rejected_evidence_does_not_pass_for_rejected_reports() {
+        let counters = Counters::default();
+        counters.reject(RejectReason::Unattested, "euclid");
+        counters.reject(RejectReason::Superseded, "gauss");
+        let present = counters.troubles().present();
+        let shown: Vec<_> = present.iter().map(|trouble| (&*trouble.kind, trouble.about.as_deref())).collect();
+        assert_eq!(shown, [("message_refused", Some("euclid"))]);
+        assert!(!TroubleKind::MessageRefused.refuses_reports());
+    }
+
+    #[test]
     fn every_reason_and_event_has_its_own_counter() {
         let counters = Counters::default();
         for (times, reason) in RejectReason::ALL.into_iter().enumerate() {
