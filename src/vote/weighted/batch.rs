@@ -32,6 +32,11 @@ impl WeightedVoting {
         let votes: usize = self.landmarks.values().map(|landmark_votes| landmark_votes.votes.len()).sum();
         if before - after > MAX_LOSS * votes as f64 {
             (self.model, self.calibration, self.landmarks) = in_turn;
+            // By their order in time, labels that lead by little stay.
+            for landmark_votes in self.landmarks.values_mut() {
+                landmark_votes.published = None;
+                landmark_votes.publish(0.0);
+            }
         }
         self.dependence = online;
         let calibration = std::mem::replace(&mut self.calibration, settled);
