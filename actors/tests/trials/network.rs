@@ -92,6 +92,8 @@ impl Drop for Bridged {
     fn drop(&mut self) {
         // One that was never made is not there to be removed.
         for node in 0..self.nodes {
+            // With its namespace alone it would go a while later, when the next trial makes its own.
+            let _ = ip(&["link", "delete", &port(node)]);
             let _ = ip(&["netns", "delete", &namespace(node)]);
         }
         for side in ['a', 'b'] {
