@@ -234,7 +234,7 @@ impl DawidSkene {
         self.saving = (0.0, 0.0);
     }
 
-    /// Recomputes the shares of the classes and the advantages of `vehicles`; call it before [`Self::posterior`] when
+    /// Recomputes the shares of the classes and the advantages of `vehicles`; call it before [`Self::judge`] when
     /// evidence has changed.
     pub(super) fn refresh(&mut self, vehicles: impl Iterator<Item = usize>) {
         self.refresh_shares();

@@ -27,7 +27,7 @@ struct OpenConnections {
 struct TrackedConnection {
     source: IpAddr,
     kept: bool,
-    /// Closes [`ConnectionSlot::displaced`] when dropped.
+    /// Closes [`AdmittedConnection::displaced`] when dropped.
     _displace: oneshot::Sender<()>,
 }
 
