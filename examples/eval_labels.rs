@@ -244,7 +244,7 @@ fn placed_config(options: &Options, algorithms: &str) -> anyhow::Result<PathBuf>
     Ok(path)
 }
 
-/// What `ecod-lab eval` says of a replay of the reports, by the truth.
+/// Scores of a replay of the reports by `ecod-lab eval`.
 fn judge(
     options: &Options,
     work: &Path,

@@ -32,7 +32,8 @@ use std::time::Duration;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{CellDescription, ContentHash, DescriptionStamp, MAX_INTEGER, SCHEMA_VERSION};
-pub use history::{AttributedDescription, DescriptionHistory, MAX_AUTHORS};
+use history::MAX_AUTHORS;
+pub use history::{AttributedDescription, DescriptionHistory};
 
 /// Largest rise of the version that one message may state. A cell uses one version for each change by a person.
 pub const MAX_VERSION_STEP: u64 = 1 << 20;

@@ -158,7 +158,7 @@ const MAX_ABOUT_ONE: usize = 4;
 const MAX_OF_STRANGERS: usize = 3;
 const MAX_ABOUT_OTHERS: usize = MAX_TROUBLES - 4;
 
-/// Who a trouble is about, if not the node, and its kind.
+/// The subject of a trouble, none for the node itself, and its kind.
 type Key = (Option<String>, TroubleKind);
 
 /// The troubles that a node knows of.

@@ -27,7 +27,7 @@ use anyhow::{Context, anyhow};
 use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, Parser, Subcommand};
 
-pub use logging::{LogFormat, start as start_log};
+pub use logging::{LogArguments, start as start_log};
 pub use replay::cell;
 #[cfg(fuzzing)]
 pub use replay::rounds_of_log;
@@ -49,18 +49,8 @@ struct Cli {
     command: Option<Command>,
     #[command(flatten)]
     run: RunArguments,
-    /// Format of log lines: auto, text, json or journal; `ecod-node --help` explains them
-    #[arg(
-        long,
-        global = true,
-        value_enum,
-        value_name = "FORM",
-        default_value_t,
-        help_heading = "Logging",
-        hide_short_help = true,
-        hide_possible_values = true
-    )]
-    log_format: LogFormat,
+    #[command(flatten)]
+    log: LogArguments,
 }
 
 #[derive(Debug, Subcommand)]
@@ -169,7 +159,7 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
         Some(Command::Cell(_)) => "warn,rumqttc=off",
         _ => "warn",
     };
-    let _export = logging::start(cli.log_format, is_service, level);
+    let _export = logging::start(cli.log.log_format, is_service, level);
     match cli.command {
         None => run::run(&cli.run),
         #[cfg(feature = "camera")]

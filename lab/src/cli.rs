@@ -13,7 +13,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use clap::{Parser, Subcommand};
-use ecod_actors::cli::{LogFormat, exit, start_log};
+use ecod_actors::cli::{LogArguments, exit, start_log};
 use serde::Serialize;
 
 /// Measures and shows a cell of ECOD; its nodes are the program `ecod-node`, which lies beside this one.
@@ -22,18 +22,8 @@ use serde::Serialize;
 struct Cli {
     #[command(subcommand)]
     command: Command,
-    /// Format of log lines: auto, text, json or journal; RUST_LOG sets their level
-    #[arg(
-        long,
-        global = true,
-        value_enum,
-        value_name = "FORM",
-        default_value_t,
-        help_heading = "Logging",
-        hide_short_help = true,
-        hide_possible_values = true
-    )]
-    log_format: LogFormat,
+    #[command(flatten)]
+    log: LogArguments,
 }
 
 #[derive(Debug, Subcommand)]
@@ -53,7 +43,7 @@ enum Command {
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    start_log(cli.log_format, false, "warn");
+    start_log(cli.log.log_format, false, "warn");
     let outcome = match cli.command {
         Command::Demo(arguments) => demo::run(&arguments),
         Command::Testbed(arguments) => testbed::run(&arguments),

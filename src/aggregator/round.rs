@@ -75,15 +75,15 @@ struct Reporter {
     last_report: Timestamp,
     /// Times between its last three reports; [`Duration::ZERO`] where it has sent fewer.
     gaps: [Duration; 2],
-    /// True if the present round does not wait for it: it has reported, or its next report is not expected yet.
-    reported: bool,
+    /// True if the present round waits for it: its next report is expected, and has not come.
+    is_awaited: bool,
     /// True if its report was due when the last round closed.
     due: bool,
 }
 
 impl Reporter {
     fn new(now: Timestamp) -> Self {
-        Self { last_report: now, gaps: [Duration::ZERO; 2], reported: true, due: false }
+        Self { last_report: now, gaps: [Duration::ZERO; 2], is_awaited: false, due: false }
     }
 
     fn note(&mut self, now: Timestamp) {
@@ -100,8 +100,8 @@ impl Reporter {
     fn begin_round(&mut self, now: Timestamp, period: Duration) -> bool {
         let (silent, interval) = (now.since(self.last_report), self.interval(period));
         let expected_within = interval.saturating_sub(silent);
-        self.reported = silent >= interval * LIVE_INTERVALS || expected_within > period + period / DELAY_DIVISOR;
-        !self.reported
+        self.is_awaited = silent < interval * LIVE_INTERVALS && expected_within <= period + period / DELAY_DIVISOR;
+        self.is_awaited
     }
 }
 
@@ -176,9 +176,7 @@ impl RoundTrigger {
         let mut was_last_due = false;
         if let Some(vehicle) = live.get_mut(node) {
             vehicle.note(now);
-            if !std::mem::replace(&mut vehicle.reported, true) {
-                self.missing -= 1;
-            }
+            self.missing -= usize::from(std::mem::take(&mut vehicle.is_awaited));
             if std::mem::take(&mut vehicle.due) {
                 self.due -= 1;
                 was_last_due = self.due == 0;

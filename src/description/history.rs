@@ -13,13 +13,13 @@ pub struct AttributedDescription {
     #[serde(flatten)]
     pub description: Arc<CellDescription>,
     /// Certificates in base64 of the candidates that stated it when it was adopted. Empty for one that was set here, in a
-    /// cell without certificates, and where more candidates than [`MAX_AUTHORS`] stated it.
+    /// cell without certificates, and where more than eight candidates stated it.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub authors: Vec<String>,
 }
 
 /// Maximum number of candidates of which one is taken for the author of a description.
-pub const MAX_AUTHORS: usize = 8;
+pub(super) const MAX_AUTHORS: usize = 8;
 
 impl AttributedDescription {
     /// True if it is of no other than revoked nodes. One that has it from many hears who passes it on, too: it goes back

@@ -202,7 +202,7 @@ impl SensorModel {
         has_jumped
     }
 
-    /// Whether the vehicle is known to be where it was at the report before. Estimates of the pose of one that drives, and
+    /// True if the vehicle is known to be where it was at the report before. Estimates of the pose of one that drives, and
     /// even waits, differ from report to report. Without a pose, the detections of one that stands stay about a place for
     /// longer than any signal is red.
     fn stands(&mut self, report: &ObjectReport, at: Timestamp) -> bool {

@@ -53,7 +53,7 @@ impl VehicleEvidence {
     }
 }
 
-/// What the fleet's mean vehicle states where one label is true.
+/// Statements of the fleet's mean vehicle where one label is true.
 struct FleetRow {
     truth: LabelIndex,
     /// Log-odds that the statement is right.

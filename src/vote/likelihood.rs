@@ -18,7 +18,7 @@ pub(super) struct WeightedVote {
 /// Probabilities of labels.
 pub(super) type Posterior = Vec<(LabelIndex, f64)>;
 
-/// What a landmark's votes say together.
+/// Judgement of a landmark by all its votes.
 pub(super) struct LandmarkPosterior {
     pub(super) labels: Posterior,
     /// Probability of each vote's label given the other votes.

@@ -23,6 +23,23 @@ Log formats (--log-format):
 
 RUST_LOG sets the log level, such as RUST_LOG=debug.";
 
+/// Arguments about the log, of every program.
+#[derive(Debug, clap::Args)]
+pub struct LogArguments {
+    /// Format of log lines: auto, text, json or journal; `ecod-node --help` explains them
+    #[arg(
+        long,
+        global = true,
+        value_enum,
+        value_name = "FORM",
+        default_value_t,
+        help_heading = "Logging",
+        hide_short_help = true,
+        hide_possible_values = true
+    )]
+    pub log_format: LogFormat,
+}
+
 /// Format of the log.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {

@@ -2,6 +2,7 @@
 
 pub(crate) mod config;
 pub(crate) mod connection;
+mod delivery;
 pub(crate) mod hearing;
 pub(crate) mod inbox;
 pub(crate) mod link;
@@ -10,9 +11,9 @@ mod round_signature;
 pub(crate) mod security;
 pub(crate) mod subscription_role;
 pub use config::{MqttConfig, MqttVersion};
+pub use delivery::{Delivery, Incoming, Subscriber};
 pub use ecod::leadership::links::{DataPlane, LinkState};
 pub use ecod::leadership::{BrokerAddress, InvalidAddress};
-pub use inbox::{Delivery, Incoming, Subscriber};
 pub use link::LinkEvent;
 pub use probe::probe;
 #[cfg(fuzzing)]

@@ -124,7 +124,7 @@ async fn who_is_alone_says_why() {
     stop([last, other, cav, edge]).await;
 }
 
-/// What a leader does not take is named with its sender: reports for the other algorithm, and too many.
+/// The leader names the sender of reports that it does not take: of the other algorithm, or too many.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn reports_that_are_not_taken_are_named_with_their_sender() {
     let mut voting = config("edge", Role::Edge, 1);

@@ -58,7 +58,7 @@ struct Doors {
     wrong_maps: u64,
     /// Programs that were without maps at the end of a phase.
     unserved: u64,
-    /// Whether more nodes share a processor than is so on vehicles, so that what they are late is not their own.
+    /// True if so many nodes share a processor that they wait for each other.
     #[serde(skip)]
     is_crowded: bool,
 }
