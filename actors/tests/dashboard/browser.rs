@@ -56,6 +56,11 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
         browser.screenshot(&pictures.join(format!("{name}.png"))).await;
         let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
         assert_eq!(browser.evaluate(wider).await, false, "{name}: the page scrolls sideways");
+        let cut_off = "[...document.querySelectorAll('.scroll')].filter((it) => it.scrollWidth > it.clientWidth + 1)\
+                       .map((it) => it.getAttribute('aria-labelledby')).join()";
+        if width >= 1440 {
+            assert_eq!(browser.evaluate(cut_off).await, "", "{name}: tables that go on at the right");
+        }
     }
     browser.look(1440, 900, "light").await;
 
