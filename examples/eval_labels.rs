@@ -10,13 +10,14 @@
 //! `ecod-node`. All files stay in the work folder.
 //!
 //! A second table compares PACE, VOTE and the answer that both agree on, by default settings but for the bounds of memory:
-//! [`PLACES`] known locations hold one item after the other, and each annotator reports it for both.
+//! [`PLACES`] known locations hold one item after the other, and each annotator reports it for both. Ties fall to the
+//! label that sorts first, so each figure is the mean of two runs: labels in the set's order, and in reverse.
 //!
 //! The recording is as from a drive: items one after the other in random order, all annotators of an item in random
 //! order within the round in which the item is in view. `--keep` drops labels at random, to see what an accuracy rests
 //! on.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fmt::Write as _;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write as _};
@@ -50,6 +51,9 @@ const ROUND_US: u64 = 100_000;
 /// Known locations of the comparison; an item is forgotten before the next one comes to its place.
 const PLACES: u64 = 50;
 const PLACE_DISTANCE_M: f64 = 10.0;
+
+/// Orders of the labels in the comparison.
+const ORDERS: [&str; 2] = ["as-given", "reversed"];
 
 const ANSWER_HEADER: &str = "| set | PACE alone | VOTE alone | one answer |\n|---|---|---|---|\n";
 
@@ -159,39 +163,57 @@ fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
     let mut order: Vec<_> = items.into_iter().collect();
     order.shuffle(&mut rng);
     let mut sequence: HashMap<String, u64> = HashMap::new();
-    let mut recording = BufWriter::new(File::create(work.join("reports.jsonl"))?);
-    let mut placed = BufWriter::new(File::create(work.join("placed.jsonl"))?);
-    let mut spans: BTreeMap<String, Vec<Value>> = BTreeMap::new();
+    let mut reports = Vec::new();
     for (round, (item, mut votes)) in (0..).zip(order) {
-        let place = round % PLACES;
-        // An item without a known truth would be judged by that of the item before it.
-        let judged = truth.get(&item);
-        if let Some(label) = judged {
-            let span = json!({"from_us": START_US + round * ROUND_US, "label": label});
-            spans.entry(format!("place-{place}")).or_default().push(span);
-        }
         votes.shuffle(&mut rng);
         for (worker, label, confidence) in votes {
             let seq = sequence.entry(worker.clone()).or_default();
             *seq += 1;
             let object = json!({"label": label, "confidence": confidence, "x_m": 0.0, "y_m": 0.0, "landmark": item});
             let at = START_US + round * ROUND_US;
-            let report = json!({"schema": 1, "node": worker, "seq": seq, "captured_at_us": at, "objects": [object],
-                "topic": "vote_detections"});
-            writeln!(recording, "{report}")?;
-            let mut placed_report = report;
-            placed_report["objects"][0]["landmark"] = format!("place-{place}").into();
-            placed_report["objects"][0]["x_m"] = (place as f64 * PLACE_DISTANCE_M).into();
-            for topic in ["vote_detections", "detections"].into_iter().filter(|_| judged.is_some()) {
-                placed_report["topic"] = topic.into();
-                writeln!(placed, "{placed_report}")?;
-            }
+            reports.push(json!({"schema": 1, "node": worker, "seq": seq, "captured_at_us": at, "objects": [object],
+                "topic": "vote_detections"}));
         }
     }
+    let mut recording = BufWriter::new(File::create(work.join("reports.jsonl"))?);
+    reports.iter().try_for_each(|report| writeln!(recording, "{report}"))?;
     recording.flush()?;
-    placed.flush()?;
-    fs::write(work.join("placed-truth.json"), json!({ "landmarks": spans }).to_string())?;
     fs::write(work.join("truth.json"), json!({ "landmarks": truth }).to_string())?;
+    ORDERS.iter().try_for_each(|order| place(&reports, &truth, work, order))
+}
+
+/// Writes a set for the comparison: its items at known locations, for both algorithms, labels named by their order.
+fn place(reports: &[Value], truth: &BTreeMap<String, String>, work: &Path, order: &str) -> anyhow::Result<()> {
+    let reported = reports.iter().filter_map(|report| report["objects"][0]["label"].as_str());
+    let labels: BTreeSet<&str> = reported.chain(truth.values().map(String::as_str)).collect();
+    let named = |label: &str| {
+        let rank = labels.range(..label).count();
+        format!("{:04}", if order == ORDERS[0] { rank } else { labels.len() - rank })
+    };
+    let mut placed = BufWriter::new(File::create(work.join(format!("placed-{order}.jsonl")))?);
+    let mut spans: BTreeMap<String, Vec<Value>> = BTreeMap::new();
+    let mut item_before = None;
+    for report in reports {
+        let (mut report, object) = (report.clone(), &report["objects"][0]);
+        // An item without a known truth would be judged by that of the item before it.
+        let Some(true_label) = object["landmark"].as_str().and_then(|item| truth.get(item)) else { continue };
+        let at = report["captured_at_us"].as_u64().context("a report without time")?;
+        let place = (at - START_US) / ROUND_US % PLACES;
+        if item_before.replace(at) != Some(at) {
+            let span = json!({"from_us": at, "label": named(true_label)});
+            spans.entry(format!("place-{place}")).or_default().push(span);
+        }
+        let label = named(object["label"].as_str().context("a report without label")?);
+        report["objects"][0]["label"] = label.into();
+        report["objects"][0]["landmark"] = format!("place-{place}").into();
+        report["objects"][0]["x_m"] = (place as f64 * PLACE_DISTANCE_M).into();
+        for topic in ["vote_detections", "detections"] {
+            report["topic"] = topic.into();
+            writeln!(placed, "{report}")?;
+        }
+    }
+    placed.flush()?;
+    fs::write(work.join(format!("placed-{order}-truth.json")), json!({ "landmarks": spans }).to_string())?;
     Ok(())
 }
 
@@ -216,11 +238,21 @@ fn measure(options: &Options, work: &Path, name: &str, config: &Path, passes: u3
 
 /// Accuracy in percent of PACE, of VOTE, and of the map where both run.
 fn compare(options: &Options, work: &Path) -> anyhow::Result<[f64; 3]> {
-    let files = ["placed.jsonl", "placed-truth.json"];
     let accuracy = |algorithms: &str, judged: &str| -> anyhow::Result<f64> {
         let config = placed_config(options, algorithms)?;
-        let result = judge(options, work, &format!("placed-{algorithms}"), &config, 0, files)?;
-        result[judged]["accuracy_pct"].as_f64().with_context(|| format!("{algorithms}: eval gave no accuracy"))
+        let in_order = |order: &str| {
+            let files = [format!("placed-{order}.jsonl"), format!("placed-{order}-truth.json")];
+            let result = judge(
+                options,
+                work,
+                &format!("placed-{order}-{algorithms}"),
+                &config,
+                0,
+                files.each_ref().map(|f| &**f),
+            )?;
+            result[judged]["accuracy_pct"].as_f64().with_context(|| format!("{algorithms}: eval gave no accuracy"))
+        };
+        Ok((in_order(ORDERS[0])? + in_order(ORDERS[1])?) / ORDERS.len() as f64)
     };
     Ok([accuracy("pace", "pace")?, accuracy("vote", "vote")?, accuracy("both", "pace")?])
 }
