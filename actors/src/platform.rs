@@ -1,8 +1,10 @@
-//! The machine below a node: clock, state files, bounded slots, throttles.
+//! The machine below a node: clock, state files, bounded slots, throttles, installed files.
 
 pub mod cell_clock;
 pub mod clock;
 pub mod content_hash;
+#[cfg(feature = "camera")]
+pub(crate) mod installed;
 pub mod latest_slot;
 pub mod secret;
 pub mod state_file;

@@ -1,6 +1,7 @@
 //! The program as a newcomer meets it: what it accepts, what it prints, and what it says when something is wrong.
 
 use std::io::{BufRead, BufReader, Write};
+use std::os::unix::fs::PermissionsExt;
 use std::process::{Command, Output, Stdio};
 
 use ecod::model::names::NodeName;
@@ -326,4 +327,27 @@ fn evidence_and_term_are_reset_while_the_node_is_stopped() {
         .output()
         .unwrap();
     assert!(stderr(&vehicle).contains("never leads"), "{}", stderr(&vehicle));
+}
+
+/// As a package installs them: the program, and beside it one without OpenCV.
+#[test]
+fn a_node_without_camera_goes_on_as_the_program_without_opencv() {
+    let prefix = tempfile::tempdir().unwrap();
+    let (bin, lib) = (prefix.path().join("bin"), prefix.path().join("lib/ecod-node"));
+    std::fs::create_dir_all(&bin).unwrap();
+    std::fs::create_dir_all(&lib).unwrap();
+    let (program, other) = (bin.join("ecod-node"), lib.join("ecod-node"));
+    std::fs::copy(env!("CARGO_BIN_EXE_ecod-node"), &program).unwrap();
+    std::fs::write(&other, "#!/bin/sh\necho \"without camera: $@\"\n").unwrap();
+    std::fs::set_permissions(&other, std::fs::Permissions::from_mode(0o755)).unwrap();
+    let run = |arguments: &[&str]| Command::new(&program).args(arguments).stdin(Stdio::null()).output().unwrap();
+    let edge = run(&["--role", "edge", "--name", "kerb", "--no-dashboard"]);
+    assert_eq!(String::from_utf8_lossy(&edge.stdout), "without camera: --role edge --name kerb --no-dashboard\n");
+
+    let config = prefix.path().join("node.toml");
+    let text = "role = \"cav\"\nname = \"kerb\"\nlisten = \"127.0.0.1:0\"\n[membership]\nbind = \"127.0.0.1:0\"\nseeds = [\"127.0.0.1:9\"]\n\
+                [camera.source]\nkind = \"images\"\npath = \"no-such-directory\"\n[camera.detector]\nkind = \"placard\"\n";
+    std::fs::write(&config, text).unwrap();
+    let vehicle = run(&["--config", config.to_str().unwrap(), "--no-dashboard", "--stop-at-eof"]);
+    assert!(vehicle.stdout.is_empty(), "{}", String::from_utf8_lossy(&vehicle.stdout));
 }

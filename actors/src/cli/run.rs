@@ -1,7 +1,11 @@
 //! `ecod-node --role …`: one node of a cell.
 
 use std::net::SocketAddr;
+#[cfg(feature = "camera")]
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
+#[cfg(feature = "camera")]
+use std::process::Command;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -17,6 +21,8 @@ use super::{Failure, print};
 use crate::node::config::NodeConfig;
 use crate::node::service::ServiceManager;
 use crate::node::{self, NodeError};
+#[cfg(feature = "camera")]
+use crate::platform::installed;
 use crate::transport::mqtt::BrokerAddress;
 use crate::transport::pki::OBSERVER_MARK;
 
@@ -91,7 +97,21 @@ pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
         let text = if arguments.changed { config.to_toml_changed() } else { config.to_toml() };
         return Ok(print(&text.context("the configuration cannot be written as TOML")?)?);
     }
+    #[cfg(feature = "camera")]
+    if config.camera.is_none() {
+        continue_without_opencv();
+    }
     run_node(config, arguments.stop_at_eof)
+}
+
+/// Becomes the program without camera that a package has put beside this one, under the same process id and with the same
+/// arguments, so that no library of OpenCV is loaded. Returns where there is none.
+#[cfg(feature = "camera")]
+fn continue_without_opencv() {
+    if let Some(program) = installed::file("lib/ecod-node/ecod-node") {
+        let error = Command::new(&program).args(std::env::args_os().skip(1)).exec();
+        tracing::warn!(?program, %error, "cannot run the program without OpenCV; this one goes on, with more memory");
+    }
 }
 
 /// Runs a node until it is told to stop or gives up.

@@ -19,6 +19,7 @@ use self::anchors::Anchor;
 use super::candidates::{ScoredBox, suppress};
 use super::{Detect, DetectError, bgr};
 use crate::camera::frame::CameraFrame;
+use crate::platform::installed;
 
 /// Configuration of the COCO detector.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -64,8 +65,11 @@ pub enum ModelError {
         #[source]
         source: std::io::Error,
     },
-    /// The program has no weights inside, and no file is configured.
-    #[error("this program has no weights inside: set `model` to a file, such as models/ssdlite_mobilenet_v2_coco.onnx")]
+    /// The program has no weights inside or beside it, and no file is configured.
+    #[error(
+        "there are no weights for coco: install the package ecod-node-coco, or set `model` to a file, such as \
+         models/ssdlite_mobilenet_v2_coco.onnx"
+    )]
     NoWeights,
     /// OpenCV cannot run the file, or its inputs and outputs differ.
     #[error("model {path} is not an ssdlite network that opencv can run: {reason}")]
@@ -82,6 +86,9 @@ static BUILT_IN: Option<&[u8]> =
     Some(include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/ssdlite_mobilenet_v2_coco.onnx")));
 #[cfg(not(feature = "coco-weights"))]
 static BUILT_IN: Option<&[u8]> = None;
+
+/// Weights of the package `ecod-node-coco`.
+const PACKAGED: &str = "share/ecod-node/models/ssdlite_mobilenet_v2_coco.onnx";
 
 /// Side of the network's input in pixels.
 const INPUT_PX: i32 = 300;
@@ -103,14 +110,15 @@ impl CocoDetector {
     /// # Errors
     /// [`ModelError`] naming the file.
     pub fn new(config: CocoConfig) -> Result<Self, ModelError> {
-        let name = config.model.as_ref().map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
+        let packaged = || installed::file(PACKAGED).filter(|_| BUILT_IN.is_none());
+        let file = config.model.clone().or_else(packaged);
+        let name = file.as_ref().map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
         let unusable = |reason: String| ModelError::Unusable { path: name.clone(), reason };
-        let weights = match &config.model {
-            Some(path) => {
-                let bytes =
-                    std::fs::read(path).map_err(|source| ModelError::Unreadable { path: path.clone(), source })?;
-                Vector::from_slice(&bytes)
-            }
+        let weights = match file {
+            Some(path) => match std::fs::read(&path) {
+                Ok(bytes) => Vector::from_slice(&bytes),
+                Err(source) => return Err(ModelError::Unreadable { path, source }),
+            },
             None => Vector::from_slice(BUILT_IN.ok_or(ModelError::NoWeights)?),
         };
         let net = dnn::read_net_from_onnx_buffer(&weights).map_err(|e| unusable(e.message))?;
