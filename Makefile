@@ -13,7 +13,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb deb-arm64 package-check package-check-arm64 clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -115,13 +115,13 @@ core-only: ## prove that the core needs no runtime: it depends on a list of crat
 	packaging/check-core
 
 rooms: ## print the modules of each crate by floor, and prove that imports run downward without a circle
-	cargo test --quiet --locked -p ecod --test rooms -- --nocapture
+	cargo test --quiet --locked --test rooms -- --nocapture
 
 code-lines: ## count the lines of code of each room, without tests and comments
 	packaging/code-lines
 
 replay-check: ## prove that replays of a release build have the bytes that the tests of the debug build demand
-	cargo test --locked --release -p ecod --test replays
+	cargo test --locked --release --test replays
 
 recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
@@ -157,8 +157,17 @@ python-client-check: setup ## the Python client: built, installed in clean envir
 	cargo build --locked --bin ecod-node
 	packaging/check-python-client $(PYTHONS)
 
-deb: setup ## Debian packages of a node, with camera and without, in target/debian
+deb: setup ## Debian packages of a node, with camera and without, and of the COCO weights, in target/debian
 	packaging/deb
+
+deb-arm64: PACKAGES += debootstrap systemd-container
+deb-arm64: setup ## the same packages for arm64, built in a Debian of its own in target/arm64-root; needs root
+	packaging/arm64 packaging/deb
+
+package-check-arm64: PACKAGES += mosquitto-clients python3
+package-check-arm64: deb-arm64 ## install the arm64 packages in that Debian, and hold their program, under qemu, against the amd64 one
+	cargo build --release --locked --bin ecod-node
+	packaging/check-arm64 $(BUILD)/release/ecod-node
 
 package-check: PACKAGES += debootstrap systemd-container
 package-check: setup ## build the package without camera, and install, run, upgrade and remove it in a Debian of its own; needs root
