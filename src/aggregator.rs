@@ -239,9 +239,9 @@ impl Aggregator {
         self.windows[kind as usize].untimely_for(name, now)
     }
 
-    /// True if PACE knows a location of this id, or does not run; `None` if it knows none at all.
+    /// True if a location of this id is known; `None` if none is known at all.
     pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
-        let Some(pace) = &self.pace else { return Some(true) };
+        let Some(pace) = &self.pace else { return self.vote.as_ref()?.knows_location(id) };
         let landmarks = pace.landmarks();
         (!landmarks.landmarks().is_empty()).then(|| landmarks.position_of(id).is_some())
     }

@@ -93,6 +93,8 @@ trouble_kinds! {
     OtherCell = "other_cell", LONG, "give both nodes the same `cell`, if they belong together";
     /// A node that cannot show a certificate which this one accepts.
     NotAdmitted = "not_admitted", LONG, "give it a certificate of the cell (`ecod-node pki issue`), or set the clock";
+    /// A seed that does not answer a node which knows of no other.
+    SeedSilent = "seed_silent", LONG, "start it, give both nodes the same `cell` and key, or let UDP through; without such a node, remove it from `membership.seeds`";
     /// A host name without an address.
     Unresolved = "unresolved", LONG, "correct the name, or the name service of this machine";
     /// A broker that cannot be reached.
@@ -136,6 +138,7 @@ impl TroubleKind {
             Self::WrongKey
                 | Self::OtherCell
                 | Self::NotAdmitted
+                | Self::SeedSilent
                 | Self::Unresolved
                 | Self::BrokerUnreachable
                 | Self::BrokerRefuses

@@ -138,6 +138,11 @@ impl Vote {
         Self { config, open: is_open, landmarks: known, ..self }
     }
 
+    /// True if a location of this id is listed; `None` without a list, where reports name the locations.
+    pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
+        (!self.open).then(|| self.landmarks.contains_key(id))
+    }
+
     /// Counts the votes of a report that was received at `received_at`.
     ///
     /// # Errors

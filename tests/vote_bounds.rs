@@ -67,7 +67,7 @@ proptest! {
                 let sum: f64 = verdict.votes.values().sum();
                 prop_assert!(verdict.votes.values().all(|s| s.is_finite() && *s >= 0.0), "{verdict:?}");
                 prop_assert!(sum <= 3.0 * verdict.contributors.len() as f64 + 1e-9, "{verdict:?}");
-                prop_assert!(verdict.margin.is_finite() && verdict.margin.abs() <= sum + 1e-9, "{verdict:?}");
+                prop_assert!(verdict.margin >= 0.0 && verdict.margin <= sum + 1e-9, "{verdict:?}");
             }
             for reputation in vote.reputations().values() {
                 prop_assert!((REPUTATION_RANGE.0..=REPUTATION_RANGE.1).contains(&reputation.score), "{reputation:?}");

@@ -176,13 +176,14 @@ async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: A
                 CaptureStatus::Failed { error, .. } => {
                     counters.troubles().note(TroubleKind::Camera, &format!("the camera gives no frames: {error}"));
                 }
-                CaptureStatus::Ended => {
-                    counters.troubles().note(TroubleKind::Camera, "the camera's frames have ended");
-                }
+                CaptureStatus::Ended => {}
                 _ => counters.troubles().settle(TroubleKind::Camera, None),
             }
         };
-        let Some(frame) = frame else { return };
+        let Some(frame) = frame else {
+            counters.troubles().note(TroubleKind::Camera, "the camera's frames have ended");
+            return;
+        };
         let span = spans.frame(frame.captured_at);
         if span.in_scope(|| detector.cast(DetectorMessage::Detect { frame, permit })).is_err() {
             return;

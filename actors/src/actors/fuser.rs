@@ -258,9 +258,6 @@ impl FuserState {
 
     /// Compares a location that a report names with the known ones; another one each time.
     fn compare_locations(&self, kind: ReportKind, report: &ObjectReport) {
-        if kind != ReportKind::Detections {
-            return;
-        }
         let named = report.objects.iter().filter_map(|object| object.landmark.as_ref());
         let named: Vec<_> = named.chain(report.seen.iter().flatten()).collect();
         let next = (report.seq as usize).checked_rem(named.len()).and_then(|place| named.get(place));
@@ -272,6 +269,8 @@ impl FuserState {
                 let cause = format!("names the location {id}, which this node does not know");
                 troubles.note_about(node, TroubleKind::UnknownLocation, &cause);
             }
+            // Votes name locations themselves where no list is configured.
+            None if kind == ReportKind::VoteDetections => {}
             None => {
                 let cause = format!("{node} names known locations, such as {id}, and this node has none");
                 troubles.note(TroubleKind::NoLocations, &cause);

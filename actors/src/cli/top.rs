@@ -1,11 +1,14 @@
 //! `ecod-node top`: a cell in a terminal.
 
 use std::io::IsTerminal;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use clap::Args;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind, KeyModifiers};
+use tokio::signal::unix::{SignalKind, signal};
 
 use super::Failure;
 use super::run::ObserverArguments;
@@ -36,14 +39,35 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
     config.record = None;
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads for the node")?;
     let node = runtime.block_on(node::start(config.clone())).map_err(|error| anyhow!(error))?;
-    let shown = ratatui::run(|terminal| show(terminal, &node, &config));
+    let is_gone = runtime.block_on(async { terminal_gone() }).context("cannot wait for signals")?;
+    let shown = ratatui::run(|terminal| show(terminal, &node, &config, &is_gone));
     runtime.block_on(node.stop());
     Ok(shown.context("cannot draw to the terminal")?)
 }
 
-fn show(terminal: &mut ratatui::DefaultTerminal, node: &NodeHandle, config: &NodeConfig) -> std::io::Result<()> {
+/// Flag that is set when the terminal is closed or the program is told to end: the observer then leaves properly.
+fn terminal_gone() -> std::io::Result<Arc<AtomicBool>> {
+    let (mut hangup, mut terminate) = (signal(SignalKind::hangup())?, signal(SignalKind::terminate())?);
+    let is_gone = Arc::new(AtomicBool::new(false));
+    let flag = Arc::clone(&is_gone);
+    tokio::spawn(async move {
+        tokio::select! {
+            _ = hangup.recv() => {}
+            _ = terminate.recv() => {}
+        }
+        flag.store(true, Ordering::Relaxed);
+    });
+    Ok(is_gone)
+}
+
+fn show(
+    terminal: &mut ratatui::DefaultTerminal,
+    node: &NodeHandle,
+    config: &NodeConfig,
+    is_gone: &AtomicBool,
+) -> std::io::Result<()> {
     let mut view = CellView::of(node, config, None, clock::now());
-    loop {
+    while !is_gone.load(Ordering::Relaxed) {
         terminal.draw(|frame| draw(frame, &mut view))?;
         if event::poll(PERIOD)?
             && let Event::Key(key) = event::read()?
@@ -63,4 +87,5 @@ fn show(terminal: &mut ratatui::DefaultTerminal, node: &NodeHandle, config: &Nod
         }
         view = CellView::of(node, config, Some(view), clock::now());
     }
+    Ok(())
 }

@@ -167,5 +167,15 @@ fn locations_that_only_one_side_knows_are_named() {
     assert_eq!(troubles(&with), []);
     take(&mut with, report(2), now, Some("slot-9"));
     let cause = "names the location slot-9, which this node does not know";
-    assert_eq!(troubles(&with), [(Some("euclid".into()), "unknown_location".into(), cause.into())]);
+    let unknown = [(Some("euclid".to_owned()), "unknown_location".to_owned(), cause.to_owned())];
+    assert_eq!(troubles(&with), unknown);
+
+    // Votes for a location that no list has are ignored: that is told too.
+    let mut votes = standby();
+    votes.aggregator = Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
+    let seen = Some(vec!["slot-9".into()]);
+    let message =
+        QueuedReport { kind: ReportKind::VoteDetections, report: Arc::new(ObjectReport { seen, ..report(1) }) };
+    votes.take(&Delivery::local(message, now));
+    assert_eq!(troubles(&votes), unknown);
 }

@@ -6,12 +6,13 @@
 //! [`GossipMachine::next_deadline`], and the commands at any time. After each, [`GossipMachine::poll`] until nothing is
 //! left. A caller that was stalled hands in all datagrams that wait before it ticks; the time of the stall does not count.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
+use ecod::diagnostics::TroubleKind;
 use ecod::leadership::election::AwakeClock;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
@@ -65,6 +66,10 @@ pub(crate) struct GossipMachine {
     hello: Duration,
     hello_at: Timestamp,
     hello_count: u64,
+    /// Greetings since this node last knew of another.
+    unanswered: u32,
+    /// Seeds from which something readable has come since then, this node's own address among them.
+    answered: BTreeSet<SocketAddr>,
     seeds: Vec<SocketAddr>,
     /// Frames that wait for a session with their addressee.
     pending: HashMap<NodeName, PendingFrames>,
@@ -109,6 +114,8 @@ impl GossipMachine {
             hello: config.hello(),
             hello_at: now,
             hello_count: 0,
+            unanswered: 0,
+            answered: BTreeSet::new(),
             seeds: Vec::new(),
             pending: HashMap::new(),
             unproven: HashMap::new(),
@@ -148,7 +155,12 @@ impl GossipMachine {
         let is_alone = gossip.alive().is_empty();
         let arrival = Arrival { from, now: at, own: gossip.own(), is_alone, known: &|name| gossip.known(name) };
         let taken = match self.sessions.open(datagram, &arrival) {
-            Ok(opened) => self.take(opened, from, at, now),
+            Ok(opened) => {
+                if self.seeds.contains(&from) {
+                    self.answered.insert(from);
+                }
+                self.take(opened, from, at, now)
+            }
             Err(reason) => Err(reason),
         };
         if let Err(reason) = taken {
@@ -363,6 +375,19 @@ impl GossipMachine {
             self.outputs.push_back(GossipOutput::Multicast { frame });
         }
         self.hello_count += 1;
+        self.unanswered = if self.gossip.alive().is_empty() { self.unanswered + 1 } else { 0 };
+        // A seed alone does not see whose key or cell is wrong: what it cannot read has no answer.
+        if self.unanswered <= 1 {
+            self.answered.clear();
+        } else if self.unanswered.is_multiple_of(SILENT_SEED_HELLOS) {
+            let silent = self.seeds.iter().filter(|seed| !self.answered.contains(*seed));
+            self.outputs.extend(silent.map(|seed| {
+                let cause =
+                    "this seed does not answer: it does not run, its cell or key is another, or UDP does not pass";
+                let (about, kind) = (seed.to_string(), TroubleKind::SeedSilent);
+                GossipOutput::Tell(MembershipEvent::Troubled { about, kind, cause: cause.into() })
+            }));
+        }
     }
 
     fn schedule_hello(&mut self, at: Timestamp) {
@@ -415,6 +440,9 @@ const SESSION_TIMEOUT: Duration = Duration::from_millis(200);
 /// Maximum nodes for which frames wait, and maximum frames of each.
 const MAX_PENDING: usize = 64;
 const MAX_PENDING_FRAMES: usize = 4;
+
+/// Greetings without an answer, ten seconds' worth by default, after which silent seeds are named, and named again.
+const SILENT_SEED_HELLOS: u32 = 20;
 
 /// Greetings of seeds for each greeting of the multicast group, once other nodes are alive.
 const MULTICAST_EVERY: u64 = 10;

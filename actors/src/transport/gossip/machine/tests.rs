@@ -421,3 +421,30 @@ fn nodes_with_another_key_are_not_seen() {
     assert!(cell.nodes[&1].machine.counters.get(FrameEvent::BadSeal) > 0);
     assert!(cell.nodes[&3].machine.counters.get(FrameEvent::BadSeal) > 0);
 }
+
+/// Only the other side can tell whose key is wrong; this side has at least a seed that is silent.
+#[test]
+fn a_node_that_no_seed_answers_says_which_and_does_not_take_itself_for_one() {
+    let mut cell = Cell::new(false);
+    cell.start(1, "node-1");
+    cell.start_at(2, "node-2", "another passphrase", 5);
+    let seeds = vec![address(1), address(2)];
+    for node in [1, 2] {
+        cell.nodes.get_mut(&node).unwrap().machine.set_seeds(seeds.clone());
+    }
+    let silent = |cell: &Cell, node: usize| -> Vec<String> {
+        let told = cell.nodes[&node].troubles.iter();
+        told.filter(|(_, kind)| *kind == TroubleKind::SeedSilent).map(|(about, _)| about.clone()).collect()
+    };
+    cell.run(5000);
+    assert_eq!(silent(&cell, 2), [""; 0], "they may still be starting");
+    cell.run(20_000);
+    assert_eq!(silent(&cell, 2), [address(1).to_string()]);
+
+    let mut whole = Cell::new(false);
+    whole.start(1, "node-1");
+    whole.start(2, "node-2");
+    whole.nodes.get_mut(&2).unwrap().machine.set_seeds(vec![address(1), address(9)]);
+    whole.run(25_000);
+    assert_eq!(silent(&whole, 2), [""; 0], "a cell does without one that is not there");
+}
