@@ -13,7 +13,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -156,6 +156,11 @@ python-client-check: PACKAGES += mosquitto python3-venv
 python-client-check: setup ## the Python client: built, installed in clean environments, its types and tests at real brokers and nodes
 	cargo build --locked --bin ecod-node
 	packaging/check-python-client $(PYTHONS)
+
+# ASN1=DIR takes another copy of ETSI's modules, such as vanetza/asn1/release2.
+cpm-check: PACKAGES := build-essential ca-certificates python3-venv
+cpm-check: setup ## messages of ecod-interop, read by asn1tools with ETSI's ASN.1 and written again to the same bytes
+	packaging/check-cpm
 
 deb: setup ## Debian packages of a node, with camera and without, in target/debian
 	packaging/deb
