@@ -36,12 +36,12 @@ pub struct CpmBridge {
     settings: Settings,
     origin: Mutex<(Instant, GeographicOrigin)>,
     numbers: Mutex<StationIds>,
-    refusals: Mutex<BTreeMap<(NodeName, Refusal), u64>>,
+    refusals: Mutex<BTreeMap<(NodeName, CpmRefusal), u64>>,
 }
 
 /// Reason why a received message is no report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
-pub enum Refusal {
+pub enum CpmRefusal {
     /// The message is not usable.
     #[error(transparent)]
     Cpm(#[from] CpmError),
@@ -95,7 +95,7 @@ impl CpmBridge {
     }
 
     /// Messages that became no report, by receiver and reason.
-    pub fn refusals(&self) -> BTreeMap<(NodeName, Refusal), u64> {
+    pub fn refusals(&self) -> BTreeMap<(NodeName, CpmRefusal), u64> {
         lock(&self.refusals).clone()
     }
 
@@ -156,10 +156,10 @@ impl CpmBridge {
         Ok(())
     }
 
-    fn take(&self, stations: &mut Stations<'_>, message: &ForeignMessage) -> Result<(), Refusal> {
+    fn take(&self, stations: &mut Stations<'_>, message: &ForeignMessage) -> Result<(), CpmRefusal> {
         let received = cpm::decode(&message.payload, &self.origin())?;
         if lock(&self.numbers).is_own(received.station_id) {
-            return Err(Refusal::Own);
+            return Err(CpmRefusal::Own);
         }
         stations.report(received)
     }
@@ -179,7 +179,7 @@ impl CpmBridge {
     }
 
     /// Counts a message that became no report, and tells of the first of each kind.
-    fn note(&self, receiver: &NodeName, refusal: Refusal) {
+    fn note(&self, receiver: &NodeName, refusal: CpmRefusal) {
         let mut refusals = lock(&self.refusals);
         let key = (receiver.clone(), refusal);
         if refusals.len() >= MAX_RECEIVERS && !refusals.contains_key(&key) {
@@ -207,15 +207,15 @@ struct Station {
 }
 
 impl Stations<'_> {
-    fn report(&mut self, received: ReceivedCpm) -> Result<(), Refusal> {
+    fn report(&mut self, received: ReceivedCpm) -> Result<(), CpmRefusal> {
         let number = received.station_id;
         self.connected.retain(|other, station| *other == number || station.heard_at.elapsed() < STATION_RETENTION);
         if !self.connected.contains_key(&number) {
             if self.connected.len() >= MAX_STATIONS {
-                return Err(Refusal::TooManyStations);
+                return Err(CpmRefusal::TooManyStations);
             }
             let settings = Settings { part: format!("{PART}{number}"), ..self.settings.clone() };
-            let cell = Cell::connect(settings).map_err(|_| Refusal::Report)?;
+            let cell = Cell::connect(settings).map_err(|_| CpmRefusal::Report)?;
             self.connected.insert(number, Station { cell, heard_at: Instant::now(), segments: BTreeMap::new() });
         }
         let Some(station) = self.connected.get_mut(&number) else { return Ok(()) };
@@ -223,7 +223,7 @@ impl Stations<'_> {
         let Some(whole) = station.join(received) else { return Ok(()) };
         let since_epoch = Duration::from_micros(whole.captured_at.micros());
         let frame = Frame { captured_at: SystemTime::UNIX_EPOCH + since_epoch, ..Frame::new(whole.objects) };
-        station.cell.report(frame).map(drop).map_err(|_| Refusal::Report)
+        station.cell.report(frame).map(drop).map_err(|_| CpmRefusal::Report)
     }
 }
 

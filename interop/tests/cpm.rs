@@ -13,7 +13,7 @@ use ecod_actors::transport::pki::{Authority, TlsConfig};
 use ecod_client::{
     Cell, Error, Frame, GeographicOrigin, NodeName, ObjectReport, PerceivedObject, Role, Settings, Timestamp, Tls, now,
 };
-use ecod_interop::bridge::{CpmBridge, Refusal};
+use ecod_interop::bridge::{CpmBridge, CpmRefusal};
 use ecod_interop::cpm::{self, CpmError, ReceivedCpm};
 use rumqttc::{Client, Event, Incoming, MqttOptions, QoS};
 use tokio::runtime::Runtime;
@@ -149,7 +149,7 @@ fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
     let bus = map.objects.iter().find(|object| object.label == "bus").unwrap();
     assert!((bus.x_m - 12.0).abs() < 0.5 && (bus.y_m + 3.0).abs() < 0.5, "{bus:?}");
     assert!((vehicle.objects[0].x_m - 4.0).abs() < 0.01 && vehicle.objects[0].label == "car", "{vehicle:?}");
-    let broken = (NodeName::from_static("broken"), Refusal::Cpm(CpmError::Malformed));
+    let broken = (NodeName::from_static("broken"), CpmRefusal::Cpm(CpmError::Malformed));
     assert!(bridge.refusals()[&broken] > 0, "{:?}", bridge.refusals());
     bridge.close();
     drop(bridge);
