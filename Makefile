@@ -13,7 +13,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check deb package-check clean
+.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check deb package-check clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -161,6 +161,12 @@ python-client-check: setup ## the Python client: built, installed in clean envir
 cpm-check: PACKAGES := build-essential ca-certificates python3-venv
 cpm-check: setup ## messages of ecod-interop, read by asn1tools with ETSI's ASN.1 and written again to the same bytes
 	packaging/check-cpm
+
+ros2-check: PACKAGES := build-essential ca-certificates python3-venv
+ros2-check: setup ## a node's log for ROS 2, read by mcap-ros2-support and written again to the same bytes by rosbags
+	python3 -m venv $(BUILD)/ros2-venv
+	$(BUILD)/ros2-venv/bin/pip install --quiet mcap-ros2-support rosbags
+	ROS2_PYTHON=$(abspath $(BUILD))/ros2-venv/bin/python3 cargo test --locked -p ecod-interop --test ros2 -- --include-ignored --nocapture
 
 deb: setup ## Debian packages of a node, with camera and without, in target/debian
 	packaging/deb

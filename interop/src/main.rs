@@ -20,6 +20,14 @@ enum Command {
     /// Maps and reports of the cell as ETSI CPM on `cpm/map` and `cpm/vehicles/<node>`; CPMs on `cpm/received/<name>` as
     /// reports.
     Cpm(Connection),
+    /// A log as MCAP of profile ros2: detections, markers, poses of cameras, pictures.
+    #[cfg(feature = "ros2")]
+    Ros2 {
+        /// Log that a node recorded (MCAP).
+        log: PathBuf,
+        /// File to be written.
+        output: PathBuf,
+    },
 }
 
 /// Where the node is, and its name. All can be set by the environment, as for nodes.
@@ -61,8 +69,13 @@ impl Connection {
 
 fn main() -> ExitCode {
     env_logger::Builder::from_env(env_logger::Env::default().default_filter_or("info")).init();
-    let Command::Cpm(connection) = Cli::parse().command;
-    let ended = CpmBridge::connect(connection.settings()).and_then(|bridge| bridge.run());
+    let ended = match Cli::parse().command {
+        Command::Cpm(connection) => {
+            CpmBridge::connect(connection.settings()).and_then(|bridge| bridge.run()).map_err(|error| error.to_string())
+        }
+        #[cfg(feature = "ros2")]
+        Command::Ros2 { log, output } => convert(&log, &output),
+    };
     match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -70,4 +83,16 @@ fn main() -> ExitCode {
             ExitCode::from(2)
         }
     }
+}
+
+#[cfg(feature = "ros2")]
+fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String> {
+    let bytes = std::fs::read(log).map_err(|error| format!("{}: {error}", log.display()))?;
+    let file = std::fs::File::create_new(output).map_err(|error| format!("{}: {error}", output.display()))?;
+    let done = ecod_interop::ros2::convert(&bytes, file).map_err(|error| format!("{}: {error}", log.display()))?;
+    log::info!("{} messages written, {} of other kinds, {} unusable", done.written, done.passed_over, done.unusable);
+    if done.is_cut {
+        log::warn!("{} ends in the middle or is damaged there", log.display());
+    }
+    Ok(())
 }

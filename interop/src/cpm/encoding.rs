@@ -38,13 +38,13 @@ pub fn encode_map(
     station_id: u32,
     ids: &mut ObjectIds,
 ) -> Result<EncodedCpm, CpmError> {
-    let mut sources: Vec<_> = map.objects.iter().map(|object| (object.id, Source::of_object(object, map))).collect();
+    let mut sources: Vec<_> = map.objects.iter().map(|object| (object.id, CpmObject::of_object(object, map))).collect();
     sources.extend(map.landmarks.iter().filter_map(|landmark| {
         let id = Uuid::new_v5(&Uuid::NAMESPACE_OID, landmark.id.as_bytes());
-        Some((id, Source::of_landmark(landmark)?))
+        Some((id, CpmObject::of_landmark(landmark)?))
     }));
     let numbers = ids.assign(&sources.iter().map(|(id, _)| *id).collect::<Vec<_>>());
-    let sources = sources.into_iter().map(|(id, source)| Source { number: numbers.get(&id).copied(), ..source });
+    let sources = sources.into_iter().map(|(id, source)| CpmObject { number: numbers.get(&id).copied(), ..source });
     let sources: Vec<_> = sources.collect();
     let (x_m, y_m) = centre(&sources);
     let frame = MessageFrame::at(origin, x_m, y_m)?;
@@ -65,7 +65,7 @@ pub fn encode_report(
     let first = (report.seq as u16).wrapping_mul(256);
     let numbers = (0..=u16::MAX).map(|index| first.wrapping_add(index));
     let sources = report.objects.iter().zip(numbers);
-    let sources: Vec<_> = sources.map(|(object, number)| Source::of_detection(object, number)).collect();
+    let sources: Vec<_> = sources.map(|(object, number)| CpmObject::of_detection(object, number)).collect();
     let (x_m, y_m) = report.pose.map_or_else(|| centre(&sources), |pose| (pose.x_m, pose.y_m));
     let frame = MessageFrame::at(origin, x_m, y_m)?;
     let station = match report.pose {
@@ -83,7 +83,7 @@ pub fn encode_report(
 
 /// An object of any kind of message, in the cell's frame.
 #[derive(Debug, Default)]
-struct Source {
+struct CpmObject {
     number: Option<u16>,
     label: Label,
     confidence: f64,
@@ -96,7 +96,7 @@ struct Source {
     age_ms: Option<u16>,
 }
 
-impl Source {
+impl CpmObject {
     fn of_object(object: &FusedObject, map: &GlobalMap) -> Self {
         let age = object.first_seen_us.map(|first| map.fused_at_us.since(first).as_millis());
         Self {
@@ -206,7 +206,7 @@ fn encode(
     time: Timestamp,
     frame: &MessageFrame,
     station: (pdu::CpmContainerId, Vec<u8>),
-    mut sources: Vec<Source>,
+    mut sources: Vec<CpmObject>,
 ) -> Result<EncodedCpm, CpmError> {
     let reference_time = (time.micros() / 1000).checked_sub(ITS_EPOCH_MS).ok_or(CpmError::NoTime)?;
     let all = sources.len();
@@ -235,8 +235,8 @@ fn uper<T: rasn::Encode>(value: &T) -> Result<Vec<u8>, CpmError> {
 }
 
 /// The origin if all objects are near enough, or else the middle between the outermost.
-fn centre(sources: &[Source]) -> (f64, f64) {
-    let middle = |axis: fn(&Source) -> f64| {
+fn centre(sources: &[CpmObject]) -> (f64, f64) {
+    let middle = |axis: fn(&CpmObject) -> f64| {
         let all = || sources.iter().map(axis);
         let (least, most) = (all().fold(f64::INFINITY, f64::min), all().fold(f64::NEG_INFINITY, f64::max));
         let is_near = sources.is_empty() || (least > -900.0 && most < 900.0);
