@@ -178,11 +178,15 @@ impl ConnectionState {
     fn take(&self, state: &mut State, topic: &[u8], payload: &[u8]) {
         let text = std::str::from_utf8(topic).ok();
         let received = text.and_then(|topic| topic.strip_prefix(&self.topics.filter(RECEIVED)));
-        if let Some(receiver) = received.and_then(|receiver| NodeName::new(receiver.strip_prefix('/')?).ok()) {
-            return state.streams.take_foreign(receiver, payload);
-        }
-        let parsed = text.and_then(|topic| self.topics.parse(topic));
-        let Err(reason) = state.streams.take(parsed, payload, Instant::now()) else { return };
+        let receiver = received.and_then(|receiver| NodeName::new(receiver.strip_prefix('/')?).ok());
+        let taken = match receiver {
+            Some(receiver) => state.streams.take_foreign(receiver, payload),
+            None => {
+                let parsed = text.and_then(|topic| self.topics.parse(topic));
+                state.streams.take(parsed, payload, Instant::now())
+            }
+        };
+        let Err(reason) = taken else { return };
         let count = state.counts.entry(reason.as_str()).or_default();
         *count += 1;
         // An order that is not kept is usual after a reconnection.

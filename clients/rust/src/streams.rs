@@ -92,8 +92,12 @@ impl Streams {
     }
 
     /// Takes a message of a station that is no node.
-    pub(crate) fn take_foreign(&mut self, receiver: NodeName, payload: &[u8]) {
+    pub(crate) fn take_foreign(&mut self, receiver: NodeName, payload: &[u8]) -> Result<(), RejectReason> {
+        if payload.len() > Limits::default().payload_bytes {
+            return Err(RejectReason::TooLarge);
+        }
         self.foreign.put(Some(receiver.clone()), ForeignMessage { receiver, payload: payload.to_vec() });
+        Ok(())
     }
 }
 
