@@ -13,10 +13,10 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check deb deb-arm64 package-check package-check-arm64 clean
+.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check deb deb-arm64 package-check package-check-arm64 clean
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 setup: ## install the system packages that are missing
 	@missing=$$(for p in $(PACKAGES); do dpkg-query -W -f='$${Status}' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
@@ -156,6 +156,17 @@ python-client-check: PACKAGES += mosquitto python3-venv
 python-client-check: setup ## the Python client: built, installed in clean environments, its types and tests at real brokers and nodes
 	cargo build --locked --bin ecod-node
 	packaging/check-python-client $(PYTHONS)
+
+# ASN1=DIR takes another copy of ETSI's modules, such as vanetza/asn1/release2.
+cpm-check: PACKAGES := build-essential ca-certificates python3-venv
+cpm-check: setup ## messages of ecod-interop, read by asn1tools with ETSI's ASN.1 and written again to the same bytes
+	packaging/check-cpm
+
+ros2-check: PACKAGES := build-essential ca-certificates python3-venv
+ros2-check: setup ## a node's log for ROS 2, read by mcap-ros2-support and written again to the same bytes by rosbags
+	python3 -m venv $(BUILD)/ros2-venv
+	$(BUILD)/ros2-venv/bin/pip install --quiet mcap-ros2-support rosbags
+	ROS2_PYTHON=$(abspath $(BUILD))/ros2-venv/bin/python3 cargo test --locked -p ecod-interop --test ros2 -- --include-ignored --nocapture
 
 deb: setup ## Debian packages of a node, with camera and without, and of the COCO weights, in target/debian
 	packaging/deb

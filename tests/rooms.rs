@@ -13,8 +13,13 @@ use syn::visit::{self, Visit};
 type Module = Vec<String>;
 
 /// Crates by name in paths, and their sources.
-const CRATES: [(&str, &str); 4] =
-    [("ecod", "src"), ("ecod_actors", "actors/src"), ("ecod_client", "clients/rust/src"), ("ecod_lab", "lab/src")];
+const CRATES: [(&str, &str); 5] = [
+    ("ecod", "src"),
+    ("ecod_actors", "actors/src"),
+    ("ecod_client", "clients/rust/src"),
+    ("ecod_interop", "interop/src"),
+    ("ecod_lab", "lab/src"),
+];
 
 #[test]
 fn imports_run_downward_without_a_circle() {

@@ -17,8 +17,8 @@ use rumqttc::Transport;
 use rumqttc::v5::MqttOptions;
 use uuid::Uuid;
 
-use crate::connection::ConnectionState;
-use crate::streams::{MessageStream, Streams};
+use crate::connection::{ConnectionState, RECEIVED};
+use crate::streams::{ForeignMessage, MessageStream, Streams};
 use crate::{Error, Tls};
 
 /// Where a cell is, and who the program is.
@@ -188,6 +188,24 @@ impl Cell {
         self.read("nodes/+", |streams| &streams.statuses, true)
     }
 
+    /// The reports of all vehicles for the map, from now on: of each vehicle the newest.
+    pub fn reports(&self) -> Messages<ObjectReport> {
+        self.read("detections/+", |streams| &streams.reports, false)
+    }
+
+    /// The collective perception messages (CPM) of other stations, from now on: of each receiver the newest.
+    pub fn received_cpms(&self) -> Messages<ForeignMessage> {
+        self.read(&format!("{RECEIVED}/+"), |streams| &streams.foreign, false)
+    }
+
+    /// Publishes a collective perception message (CPM) on `cpm/<level>`, as [`Cell::report`] does a report.
+    ///
+    /// # Errors
+    /// [`Error::Refused`] when the broker refused the login or an earlier message there.
+    pub fn publish_cpm(&self, level: &str, payload: Vec<u8>) -> Result<bool, Error> {
+        self.publish(&self.topics.filter(&format!("cpm/{level}")), payload)
+    }
+
     /// The settings that all nodes of the cell share, as they are now; version 0 if there are none.
     ///
     /// # Errors
@@ -275,11 +293,15 @@ impl Cell {
             let objects = report.objects.len();
             return Err(Error::Invalid(format!("not sent: {bytes} bytes with {objects} objects, at most {at_most}")));
         }
-        let topic = self.topics.path(&kind.topic(self.name.clone()));
-        let mut state = self.shared.state();
-        state.check_refusal(&topic, &self.shared.at)?;
+        let is_sent = self.publish(&self.topics.path(&kind.topic(self.name.clone())), payload)?;
         *seq += 1;
-        let is_sent = state.publish(&topic, payload);
+        Ok(is_sent)
+    }
+
+    fn publish(&self, topic: &str, payload: Vec<u8>) -> Result<bool, Error> {
+        let mut state = self.shared.state();
+        state.check_refusal(topic, &self.shared.at)?;
+        let is_sent = state.publish(topic, payload);
         if !is_sent {
             *state.counts.entry("unsent").or_default() += 1;
         }

@@ -5,6 +5,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use ecod::model::names::NodeName;
 use ecod::wire::{RejectReason, Topics};
 use rumqttc::Outgoing;
 use rumqttc::v5::mqttbytes::QoS;
@@ -49,6 +50,9 @@ pub(crate) struct State {
 
 /// Messages that wait for the network at most; more are dropped, as late ones are worthless.
 const MAX_WAITING: usize = 16;
+
+/// Topic below which receivers bring collective perception messages (CPM) of other stations.
+pub(crate) const RECEIVED: &str = "cpm/received";
 
 /// Wait before the first new attempt, doubled with every failure, and the longest.
 const RETRY_MIN: Duration = Duration::from_millis(100);
@@ -172,8 +176,17 @@ impl ConnectionState {
 
     /// Takes a message. An unusable one is counted, and told of once.
     fn take(&self, state: &mut State, topic: &[u8], payload: &[u8]) {
-        let parsed = std::str::from_utf8(topic).ok().and_then(|topic| self.topics.parse(topic));
-        let Err(reason) = state.streams.take(parsed, payload, Instant::now()) else { return };
+        let text = std::str::from_utf8(topic).ok();
+        let received = text.and_then(|topic| topic.strip_prefix(&self.topics.filter(RECEIVED)));
+        let receiver = received.and_then(|receiver| NodeName::new(receiver.strip_prefix('/')?).ok());
+        let taken = match receiver {
+            Some(receiver) => state.streams.take_foreign(receiver, payload),
+            None => {
+                let parsed = text.and_then(|topic| self.topics.parse(topic));
+                state.streams.take(parsed, payload, Instant::now())
+            }
+        };
+        let Err(reason) = taken else { return };
         let count = state.counts.entry(reason.as_str()).or_default();
         *count += 1;
         // An order that is not kept is usual after a reconnection.

@@ -13,9 +13,10 @@ pub use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPositi
 pub use ecod::model::time::Timestamp;
 pub use ecod::wire::{
     CellDescription, FieldOfView, FusedObject, GlobalMap, LabelReading, LandmarkState, NodeState, NodeStatus,
-    PerceivedObject, Reputation, Reputations, Role, Trouble, Verdict, Verdicts, WirePose,
+    ObjectReport, PerceivedObject, Reputation, Reputations, Role, Trouble, Verdict, Verdicts, WirePose,
 };
 pub use error::Error;
+pub use streams::ForeignMessage;
 pub use tls::Tls;
 
 #[cfg(doctest)]

@@ -9,7 +9,8 @@ use ecod::leadership::timers::EPOCH_MEMORY;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::wire::{
-    CellDescription, GlobalMap, Limits, NodeStatus, Payload, RejectReason, Reputations, Topic, Verdicts, decode,
+    CellDescription, GlobalMap, Limits, NodeStatus, ObjectReport, Payload, RejectReason, Reputations, Topic, Verdicts,
+    decode, decode_report,
 };
 
 /// All payloads of one connection.
@@ -20,6 +21,17 @@ pub(crate) struct Streams {
     pub(crate) reputations: MessageStream<Reputations>,
     pub(crate) statuses: MessageStream<NodeStatus>,
     pub(crate) descriptions: MessageStream<CellDescription>,
+    pub(crate) reports: MessageStream<ObjectReport>,
+    pub(crate) foreign: MessageStream<ForeignMessage>,
+}
+
+/// A message of a station that is no node, in its own language.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ForeignMessage {
+    /// Name of the receiver that brought it: the last level of its topic.
+    pub receiver: NodeName,
+    /// The message as it is.
+    pub payload: Vec<u8>,
 }
 
 /// One kind of payload: the newest, of statuses the newest of each node.
@@ -70,8 +82,22 @@ impl Streams {
                 self.statuses.put(Some(node), status);
                 Ok(())
             }
+            Some(Topic::Detections(node)) => {
+                let report = decode_report(payload, &node, &Limits::default())?;
+                self.reports.put(Some(node), report);
+                Ok(())
+            }
             _ => Err(RejectReason::UnknownTopic),
         }
+    }
+
+    /// Takes a message of a station that is no node.
+    pub(crate) fn take_foreign(&mut self, receiver: NodeName, payload: &[u8]) -> Result<(), RejectReason> {
+        if payload.len() > Limits::default().payload_bytes {
+            return Err(RejectReason::TooLarge);
+        }
+        self.foreign.put(Some(receiver.clone()), ForeignMessage { receiver, payload: payload.to_vec() });
+        Ok(())
     }
 }
 

@@ -6,6 +6,7 @@
 //! | `cell` | is the cell's new description, if `euclid` may lead |
 //! | `nodes/euclid--…` | reaches the programs at this door |
 //! | other topics of the cell | is refused |
+//! | `cpm/…` | reaches the programs at this door |
 //! | anything else | without certificates reaches the programs at this door |
 //!
 //! Without certificates, the broker of the leader and of its standby also takes reports of vehicles that have no node; so does
@@ -164,6 +165,7 @@ impl DoorState {
         match self.setup.topics.parse(topic) {
             Some(Topic::Nodes(name)) if name.vehicle() == *node && name != *node && self.is_own(principal) => Ok(()),
             None if principal.identity.is_none() => Ok(()),
+            None if self.is_own(principal) && topic.starts_with(&self.setup.topics.filter("cpm/")) => Ok(()),
             _ => Err(DoorRefusal::not_permitted(format!(
                 "programs do not publish {topic}; reports go to detections/{node}--<part> and vote_detections/{node}--<part>"
             ))),

@@ -1,0 +1,24 @@
+//! Collective perception messages of strangers: what is taken is a valid report, and can be sent on.
+
+#![no_main]
+
+use ecod::model::names::NodeName;
+use ecod::model::origin::GeographicOrigin;
+use ecod::wire::{Limits, ObjectReport};
+use ecod_interop::cpm::{decode, encode_report};
+use libfuzzer_sys::fuzz_target;
+
+const ORIGIN: GeographicOrigin =
+    GeographicOrigin { latitude_deg: 52.2, longitude_deg: 21.0, height_m: 113.0, rotation_deg: 30.0 };
+
+fuzz_target!(|input: &[u8]| {
+    let Ok(received) = decode(input, &ORIGIN) else { return };
+    let report = ObjectReport::new(NodeName::from_static("edge"), 1, received.captured_at);
+    let report = ObjectReport { objects: received.objects, ..report };
+    // 8 containers of 255 objects are more than a report may have.
+    assert!(
+        report.objects.len() > Limits::default().objects || report.validate(&Limits::default()).is_ok(),
+        "{report:?}"
+    );
+    assert!(encode_report(&report, &ORIGIN, received.station_id).is_ok());
+});

@@ -1,0 +1,80 @@
+//! Collective perception messages of ETSI TS 103 324 V2.1.1, in UPER.
+//!
+//! Positions in a message are metres east and north of its reference position, which is on Earth (WGS 84). So a cell needs an
+//! origin on Earth. Confidences of positions are half widths at a level of 95 %: 1.96 standard deviations.
+
+mod classes;
+mod decoding;
+mod encoding;
+mod frame;
+mod identifiers;
+
+use ecod::model::time::Timestamp;
+use ecod::wire::PerceivedObject;
+
+pub use decoding::decode;
+pub use encoding::{encode_map, encode_report};
+pub use identifiers::{ObjectIds, StationIds};
+
+/// Maximum size of a message in bytes: 255 objects with all that a message may say of each need less than half of it.
+pub const MAX_BYTES: usize = 64 * 1024;
+
+/// Standard deviations in the half width of an interval of 95 %.
+const SIGMAS: f64 = 1.96;
+
+/// Version of the protocol in the header of all messages of release 2.
+const PROTOCOL_VERSION: u8 = 2;
+
+/// Kind of message in the header: CPM.
+const MESSAGE_ID: u8 = 14;
+
+/// Milliseconds from the Unix epoch to 2004-01-01, less the five leap seconds since then, which `TimestampIts` counts.
+const ITS_EPOCH_MS: u64 = 1_072_915_200_000 - 5_000;
+
+/// A message to be sent.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EncodedCpm {
+    /// The message in UPER.
+    pub bytes: Vec<u8>,
+    /// Objects that it has no room for: beyond 255, or more than 1310 m from the reference position.
+    pub left_out: usize,
+}
+
+/// A station's objects at one time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReceivedCpm {
+    /// Number of the station.
+    pub station_id: u32,
+    /// Reference time of the message. All objects are moved to it by their velocities.
+    pub captured_at: Timestamp,
+    /// Number of this segment and of all, if the station's objects are spread over several messages.
+    pub segment: Option<(u8, u8)>,
+    /// The objects in the cell's frame.
+    pub objects: Vec<PerceivedObject>,
+}
+
+/// A message that cannot be written or used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
+pub enum CpmError {
+    /// More than [`MAX_BYTES`].
+    #[error("too large")]
+    TooLarge,
+    /// Not UPER of a CPM.
+    #[error("not a CPM in UPER")]
+    Malformed,
+    /// Another version or kind of message.
+    #[error("not a CPM of release 2")]
+    OtherMessage,
+    /// A reference position that is unavailable.
+    #[error("no reference position")]
+    NoPosition,
+    /// A reference position more than 100 km from the cell's origin.
+    #[error("more than 100 km from the cell's origin")]
+    TooFar,
+    /// A time before 2004.
+    #[error("a time before 2004")]
+    NoTime,
+}
+
+#[cfg(test)]
+mod tests;

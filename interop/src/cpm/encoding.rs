@@ -1,0 +1,270 @@
+//! Messages of maps and reports.
+
+use std::collections::BTreeMap;
+
+use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd as cdd;
+use c_its_parser::standards::cpm_2_1_1::cpm_originating_station_containers::{
+    OriginatingRsuContainer, OriginatingVehicleContainer,
+};
+use c_its_parser::standards::cpm_2_1_1::cpm_pdu_descriptions as pdu;
+use c_its_parser::standards::cpm_2_1_1::cpm_perceived_object_container::{PerceivedObjectContainer, PerceivedObjects};
+use ecod::model::names::Label;
+use ecod::model::origin::GeographicOrigin;
+use ecod::model::time::Timestamp;
+use ecod::wire::{FusedObject, GlobalMap, LandmarkState, ObjectReport, PerceivedObject};
+use rasn::types::Any;
+use uuid::Uuid;
+
+use super::frame::MessageFrame;
+use super::identifiers::ObjectIds;
+use super::{CpmError, EncodedCpm, ITS_EPOCH_MS, MESSAGE_ID, PROTOCOL_VERSION, SIGMAS, classes};
+
+/// Maximum number of objects in a message.
+const MAX_OBJECTS: usize = 255;
+
+/// Largest coordinate in centimetres.
+const MAX_CENTIMETRES: f64 = 131_071.0;
+
+/// Greatest age that a message states, in milliseconds: at least so old.
+const MAX_AGE_MS: u16 = 1500;
+
+/// A map as the message of a roadside unit: its objects, and known locations at which a road user stands.
+///
+/// # Errors
+/// [`CpmError::NoTime`] before 2004, [`CpmError::TooFar`] if all objects are far from the origin.
+pub fn encode_map(
+    map: &GlobalMap,
+    origin: &GeographicOrigin,
+    station_id: u32,
+    ids: &mut ObjectIds,
+) -> Result<EncodedCpm, CpmError> {
+    let mut sources: Vec<_> = map.objects.iter().map(|object| (object.id, CpmObject::of_object(object, map))).collect();
+    sources.extend(map.landmarks.iter().filter_map(|landmark| {
+        let id = Uuid::new_v5(&Uuid::NAMESPACE_OID, landmark.id.as_bytes());
+        Some((id, CpmObject::of_landmark(landmark)?))
+    }));
+    let numbers = ids.assign(&sources.iter().map(|(id, _)| *id).collect::<Vec<_>>());
+    let sources = sources.into_iter().map(|(id, source)| CpmObject { number: numbers.get(&id).copied(), ..source });
+    let sources: Vec<_> = sources.collect();
+    let (x_m, y_m) = centre(&sources);
+    let frame = MessageFrame::at(origin, x_m, y_m)?;
+    let rsu = uper(&OriginatingRsuContainer::new(None))?;
+    encode(station_id, map.fused_at_us, &frame, (pdu::ORIGINATING_RSU_CONTAINER, rsu), sources)
+}
+
+/// A vehicle's report as its message. A report without a pose is that of a roadside unit. Detections are no tracks: an object
+/// has a new number in every message, for 256 reports.
+///
+/// # Errors
+/// As [`encode_map`].
+pub fn encode_report(
+    report: &ObjectReport,
+    origin: &GeographicOrigin,
+    station_id: u32,
+) -> Result<EncodedCpm, CpmError> {
+    let first = (report.seq as u16).wrapping_mul(256);
+    let numbers = (0..=u16::MAX).map(|index| first.wrapping_add(index));
+    let sources = report.objects.iter().zip(numbers);
+    let sources: Vec<_> = sources.map(|(object, number)| CpmObject::of_detection(object, number)).collect();
+    let (x_m, y_m) = report.pose.map_or_else(|| centre(&sources), |pose| (pose.x_m, pose.y_m));
+    let frame = MessageFrame::at(origin, x_m, y_m)?;
+    let station = match report.pose {
+        Some(pose) => {
+            let azimuth_deg = 90.0 - frame.heading_to_message(pose.heading_rad).to_degrees();
+            let (value, confidence) =
+                (cdd::Wgs84AngleValue(tenth_degrees(azimuth_deg)), cdd::Wgs84AngleConfidence(127));
+            let vehicle = OriginatingVehicleContainer::new(cdd::Wgs84Angle { value, confidence }, None, None, None);
+            (pdu::ORIGINATING_VEHICLE_CONTAINER, uper(&vehicle)?)
+        }
+        None => (pdu::ORIGINATING_RSU_CONTAINER, uper(&OriginatingRsuContainer::new(None))?),
+    };
+    encode(station_id, report.captured_at_us, &frame, station, sources)
+}
+
+/// An object of any kind of message, in the cell's frame.
+#[derive(Debug, Default)]
+struct CpmObject {
+    number: Option<u16>,
+    label: Label,
+    confidence: f64,
+    position_m: [f64; 2],
+    covariance_m2: Option<[f64; 3]>,
+    velocity_mps: Option<[f64; 2]>,
+    heading_rad: Option<f64>,
+    size_m: Option<[f64; 2]>,
+    scores: BTreeMap<Label, f64>,
+    age_ms: Option<u16>,
+}
+
+impl CpmObject {
+    fn of_object(object: &FusedObject, map: &GlobalMap) -> Self {
+        let age = object.first_seen_us.map(|first| map.fused_at_us.since(first).as_millis());
+        Self {
+            number: None,
+            label: object.label.clone(),
+            confidence: object.confidence,
+            position_m: [object.x_m, object.y_m],
+            covariance_m2: Some(object.covariance_m2),
+            velocity_mps: object.velocity_mps,
+            heading_rad: object.heading_rad,
+            size_m: object.size_m,
+            scores: object.scores.clone(),
+            age_ms: age.map(|age| u16::try_from(age).unwrap_or(MAX_AGE_MS).min(MAX_AGE_MS)),
+        }
+    }
+
+    fn of_landmark(landmark: &LandmarkState) -> Option<Self> {
+        let label = landmark.label.clone()?;
+        classes::road_user(&label)?;
+        let position_m = [landmark.x_m, landmark.y_m];
+        Some(Self { label, confidence: landmark.confidence, position_m, ..Self::default() })
+    }
+
+    fn of_detection(object: &PerceivedObject, number: u16) -> Self {
+        Self {
+            number: Some(number),
+            label: object.label.clone(),
+            confidence: object.confidence,
+            position_m: [object.x_m, object.y_m],
+            covariance_m2: object.covariance_m2,
+            velocity_mps: object.velocity_mps,
+            heading_rad: object.heading_rad,
+            size_m: object.size_m,
+            scores: object.scores.clone(),
+            age_ms: None,
+        }
+    }
+
+    /// The object as a message has it; `None` if it is too far from the reference position.
+    fn perceived(&self, frame: &MessageFrame) -> Option<cdd::PerceivedObject> {
+        let [x_m, y_m] = self.position_m;
+        let [east_m, north_m] = frame.to_message(x_m, y_m);
+        let variances = self.covariance_m2.map(|covariance| frame.variances_to_message(covariance));
+        let position = cdd::CartesianPosition3dWithConfidence {
+            x_coordinate: coordinate(east_m, variances.map(|[east, _]| east))?,
+            y_coordinate: coordinate(north_m, variances.map(|[_, north]| north))?,
+            z_coordinate: None,
+        };
+        let velocity = self.velocity_mps.map(|velocity| {
+            let [east_mps, north_mps] = frame.velocity_to_message(velocity);
+            cdd::Velocity3dWithConfidence::cartesianVelocity(cdd::VelocityCartesian {
+                x_velocity: velocity_component(east_mps),
+                y_velocity: velocity_component(north_mps),
+                z_velocity: None,
+            })
+        });
+        let angles = self.heading_rad.map(|heading_rad| {
+            let value = cdd::CartesianAngleValue(tenth_degrees(frame.heading_to_message(heading_rad).to_degrees()));
+            let z_angle = cdd::CartesianAngle { value, confidence: cdd::AngleConfidence(127) };
+            cdd::EulerAnglesWithConfidence { z_angle, y_angle: None, x_angle: None }
+        });
+        let [length, width] = self.size_m.map_or([None, None], |[length, width]| [Some(length), Some(width)]);
+        Some(cdd::PerceivedObject::new(
+            self.number.map(cdd::Identifier2B),
+            cdd::DeltaTimeMilliSecondSigned(0),
+            position,
+            velocity,
+            None,
+            angles,
+            None,
+            None,
+            None,
+            width.map(dimension),
+            length.map(dimension),
+            self.age_ms.map(|age| cdd::DeltaTimeMilliSecondSigned(age as i16)),
+            Some(cdd::ObjectPerceptionQuality((self.confidence * 15.0).round().clamp(0.0, 15.0) as u8)),
+            None,
+            Some(self.classification()),
+            None,
+        ))
+    }
+
+    /// The eight most probable classes, or the only one without a confidence.
+    fn classification(&self) -> cdd::ObjectClassDescription {
+        let mut classes: Vec<(cdd::ObjectClass, u8)> = Vec::new();
+        for (label, score) in &self.scores {
+            let (class, percent) = (classes::of_label(label), (score * 100.0).round().clamp(1.0, 100.0) as u8);
+            match classes.iter_mut().find(|(other, _)| *other == class) {
+                Some((_, most)) => *most = percent.max(*most),
+                None => classes.push((class, percent)),
+            }
+        }
+        if classes.is_empty() {
+            classes.push((classes::of_label(&self.label), 101));
+        }
+        classes.sort_by_key(|(_, percent)| std::cmp::Reverse(*percent));
+        let described = classes.into_iter().take(8).map(|(object_class, percent)| cdd::ObjectClassWithConfidence {
+            object_class,
+            confidence: cdd::ConfidenceLevel(percent),
+        });
+        cdd::ObjectClassDescription(described.collect())
+    }
+}
+
+fn encode(
+    station_id: u32,
+    time: Timestamp,
+    frame: &MessageFrame,
+    station: (pdu::CpmContainerId, Vec<u8>),
+    mut sources: Vec<CpmObject>,
+) -> Result<EncodedCpm, CpmError> {
+    let reference_time = (time.micros() / 1000).checked_sub(ITS_EPOCH_MS).ok_or(CpmError::NoTime)?;
+    let all = sources.len();
+    sources.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
+    let mut objects: Vec<_> = sources.iter().filter_map(|source| source.perceived(frame)).collect();
+    objects.truncate(MAX_OBJECTS);
+    let left_out = all - objects.len();
+    let number = cdd::CardinalNumber1B(u8::try_from(all).unwrap_or(u8::MAX));
+    let objects = uper(&PerceivedObjectContainer::new(number, PerceivedObjects(objects)))?;
+    let containers = [station, (pdu::PERCEIVED_OBJECT_CONTAINER, objects)];
+    let containers = containers.map(|(id, bytes)| pdu::WrappedCpmContainer::new(id, Any::new(bytes)));
+    let containers = pdu::ConstraintWrappedCpmContainers(pdu::WrappedCpmContainers(containers.into()));
+    let position = frame.reference_position();
+    let management = pdu::ManagementContainer::new(cdd::TimestampIts(reference_time), position, None, None);
+    let header = cdd::ItsPduHeader {
+        protocol_version: cdd::OrdinalNumber1B(PROTOCOL_VERSION),
+        message_id: cdd::MessageId(MESSAGE_ID),
+        station_id: cdd::StationId(station_id),
+    };
+    let message = pdu::CollectivePerceptionMessage::new(header, pdu::CpmPayload::new(management, containers));
+    Ok(EncodedCpm { bytes: uper(&message)?, left_out })
+}
+
+fn uper<T: rasn::Encode>(value: &T) -> Result<Vec<u8>, CpmError> {
+    rasn::uper::encode(value).map_err(|_| CpmError::Malformed)
+}
+
+/// The origin if all objects are near enough, or else the middle between the outermost.
+fn centre(sources: &[CpmObject]) -> (f64, f64) {
+    let middle = |axis: fn(&CpmObject) -> f64| {
+        let all = || sources.iter().map(axis);
+        let (least, most) = (all().fold(f64::INFINITY, f64::min), all().fold(f64::NEG_INFINITY, f64::max));
+        let is_near = sources.is_empty() || (least > -900.0 && most < 900.0);
+        if is_near { 0.0 } else { (least + most) / 2.0 }
+    };
+    (middle(|source| source.position_m[0]), middle(|source| source.position_m[1]))
+}
+
+fn coordinate(metres: f64, variance_m2: Option<f64>) -> Option<cdd::CartesianCoordinateWithConfidence> {
+    let centimetres = (metres * 100.0).round();
+    let half_width = variance_m2.map(|variance| (SIGMAS * variance.max(0.0).sqrt() * 100.0).ceil().clamp(1.0, 4095.0));
+    (centimetres.abs() <= MAX_CENTIMETRES).then(|| cdd::CartesianCoordinateWithConfidence {
+        value: cdd::CartesianCoordinateLarge(centimetres as i32),
+        confidence: cdd::CoordinateConfidence(half_width.map_or(4096, |half_width| half_width as u16)),
+    })
+}
+
+fn velocity_component(mps: f64) -> cdd::VelocityComponent {
+    let value = cdd::VelocityComponentValue((mps * 100.0).round().clamp(-16_382.0, 16_381.0) as i16);
+    cdd::VelocityComponent { value, confidence: cdd::SpeedConfidence(127) }
+}
+
+fn dimension(metres: f64) -> cdd::ObjectDimension {
+    let value = cdd::ObjectDimensionValue((metres * 10.0).round().clamp(1.0, 255.0) as u16);
+    cdd::ObjectDimension { value, confidence: cdd::ObjectDimensionConfidence(32) }
+}
+
+/// Tenths of a degree from 0 to 3599.
+fn tenth_degrees(degrees: f64) -> u16 {
+    ((degrees.rem_euclid(360.0) * 10.0).round() as u16) % 3600
+}

@@ -1,0 +1,124 @@
+//! The frame of a message: east and north of its reference position.
+
+use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd as cdd;
+use ecod::model::geometry::wrap_angle;
+use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition};
+
+use super::CpmError;
+
+/// Unavailable values of latitude, longitude and altitude.
+const NO_LATITUDE: i32 = 900_000_001;
+const NO_LONGITUDE: i32 = 1_800_000_001;
+const NO_ALTITUDE: i32 = 800_001;
+
+/// A cell's frame and that of a message.
+pub(super) struct MessageFrame {
+    cell: GeographicOrigin,
+    reference: GeographicOrigin,
+    /// Direction of the cell's x axis in the message's frame, in radians counter-clockwise from east.
+    pub(super) rotation_rad: f64,
+}
+
+impl MessageFrame {
+    /// The frame of a message about a place in the cell's frame. Its reference position is one that a message can state.
+    pub(super) fn at(cell: &GeographicOrigin, x_m: f64, y_m: f64) -> Result<Self, CpmError> {
+        let place = cell.to_wgs84(x_m, y_m, 0.0);
+        Self::new(
+            cell,
+            GeographicPosition {
+                latitude_deg: (place.latitude_deg * 1e7).round() / 1e7,
+                longitude_deg: (place.longitude_deg * 1e7).round() / 1e7,
+                height_m: (place.height_m * 100.0).round().clamp(-1e5, 8e5) / 100.0,
+            },
+        )
+    }
+
+    /// The frame of a received message.
+    pub(super) fn of(cell: &GeographicOrigin, position: &cdd::ReferencePosition) -> Result<Self, CpmError> {
+        let (latitude, longitude) = (position.latitude.0, position.longitude.0);
+        if latitude == NO_LATITUDE || longitude == NO_LONGITUDE {
+            return Err(CpmError::NoPosition);
+        }
+        let altitude = position.altitude.altitude_value.0;
+        let height_m = if altitude == NO_ALTITUDE { cell.height_m } else { f64::from(altitude) / 100.0 };
+        let (latitude_deg, longitude_deg) = (f64::from(latitude) / 1e7, f64::from(longitude) / 1e7);
+        Self::new(cell, GeographicPosition { latitude_deg, longitude_deg, height_m })
+    }
+
+    fn new(cell: &GeographicOrigin, at: GeographicPosition) -> Result<Self, CpmError> {
+        let GeographicPosition { latitude_deg, longitude_deg, height_m } = at;
+        let east = GeographicPose { latitude_deg, longitude_deg, height_m: Some(height_m), azimuth_deg: 90.0 };
+        let east = cell.pose_to_map(&east).map_err(|_| CpmError::TooFar)?;
+        let reference = GeographicOrigin { latitude_deg, longitude_deg, height_m, rotation_deg: 0.0 };
+        Ok(Self { cell: *cell, reference, rotation_rad: -east.heading_rad })
+    }
+
+    /// The reference position as a message states it, without confidence.
+    pub(super) fn reference_position(&self) -> cdd::ReferencePosition {
+        let tenth_microdegrees = |degrees: f64| (degrees * 1e7).round() as i32;
+        cdd::ReferencePosition {
+            latitude: cdd::Latitude(tenth_microdegrees(self.reference.latitude_deg)),
+            longitude: cdd::Longitude(tenth_microdegrees(self.reference.longitude_deg)),
+            position_confidence_ellipse: cdd::PosConfidenceEllipse {
+                semi_major_confidence: cdd::SemiAxisLength(4095),
+                semi_minor_confidence: cdd::SemiAxisLength(4095),
+                semi_major_orientation: cdd::HeadingValue(3601),
+            },
+            altitude: cdd::Altitude {
+                altitude_value: cdd::AltitudeValue((self.reference.height_m * 100.0).round() as i32),
+                altitude_confidence: cdd::AltitudeConfidence::unavailable,
+            },
+        }
+    }
+
+    /// Metres east and north of the reference position.
+    pub(super) fn to_message(&self, x_m: f64, y_m: f64) -> [f64; 2] {
+        let local = self.reference.to_map(&self.cell.to_wgs84(x_m, y_m, 0.0));
+        [local.x, local.y]
+    }
+
+    /// A position in the cell's frame.
+    pub(super) fn to_cell(&self, [east_m, north_m]: [f64; 2]) -> [f64; 2] {
+        let local = self.cell.to_map(&self.reference.to_wgs84(east_m, north_m, 0.0));
+        [local.x, local.y]
+    }
+
+    /// A velocity in the message's frame.
+    pub(super) fn velocity_to_message(&self, velocity: [f64; 2]) -> [f64; 2] {
+        rotated(velocity, self.rotation_rad)
+    }
+
+    /// A velocity in the cell's frame.
+    pub(super) fn velocity_to_cell(&self, velocity: [f64; 2]) -> [f64; 2] {
+        rotated(velocity, -self.rotation_rad)
+    }
+
+    /// A direction in the message's frame.
+    pub(super) fn heading_to_message(&self, heading_rad: f64) -> f64 {
+        wrap_angle(heading_rad + self.rotation_rad)
+    }
+
+    /// A direction in the cell's frame.
+    pub(super) fn heading_to_cell(&self, heading_rad: f64) -> f64 {
+        wrap_angle(heading_rad - self.rotation_rad)
+    }
+
+    /// Variances east and north of a covariance in the cell's frame.
+    pub(super) fn variances_to_message(&self, covariance_m2: [f64; 3]) -> [f64; 2] {
+        let [xx, xy, yy] = covariance_m2;
+        let (sin, cos) = self.rotation_rad.sin_cos();
+        [cos * cos * xx - 2.0 * sin * cos * xy + sin * sin * yy, sin * sin * xx + 2.0 * sin * cos * xy + cos * cos * yy]
+    }
+
+    /// The covariance in the cell's frame of variances east and north.
+    pub(super) fn variances_to_cell(&self, [east_m2, north_m2]: [f64; 2]) -> [f64; 3] {
+        let (sin, cos) = self.rotation_rad.sin_cos();
+        let (xx, yy) = (cos * cos * east_m2 + sin * sin * north_m2, sin * sin * east_m2 + cos * cos * north_m2);
+        [xx, sin * cos * (north_m2 - east_m2), yy]
+    }
+}
+
+fn rotated([x, y]: [f64; 2], angle_rad: f64) -> [f64; 2] {
+    let (sin, cos) = angle_rad.sin_cos();
+    [x * cos - y * sin, x * sin + y * cos]
+}

@@ -1,0 +1,76 @@
+//! Numbers of stations and objects, which have names and UUIDs in a cell.
+
+use std::collections::{HashMap, HashSet};
+
+use ecod::model::names::NodeName;
+use uuid::Uuid;
+
+/// Station numbers of the nodes of a cell.
+///
+/// A number is the first four bytes of the name-based UUID (version 5) of `<cell>/<node>` in the namespace of URLs, so that
+/// it is the same in every run. Where two nodes collide, the later gets the next free number.
+#[derive(Debug)]
+pub struct StationIds {
+    cell: NodeName,
+    by_name: HashMap<NodeName, u32>,
+    used: HashSet<u32>,
+}
+
+/// Maximum number of nodes with a number.
+const MAX_STATIONS: usize = 4096;
+
+impl StationIds {
+    /// Numbers for a cell of this name.
+    pub fn new(cell: NodeName) -> Self {
+        Self { cell, by_name: HashMap::new(), used: HashSet::new() }
+    }
+
+    /// The number of a node; `None` if the cell has had 4096 others.
+    pub fn of(&mut self, node: &NodeName) -> Option<u32> {
+        if let Some(number) = self.by_name.get(node) {
+            return Some(*number);
+        }
+        if self.by_name.len() >= MAX_STATIONS {
+            return None;
+        }
+        let name = Uuid::new_v5(&Uuid::NAMESPACE_URL, format!("{}/{node}", self.cell).as_bytes());
+        let mut number = name.as_fields().0;
+        while !self.used.insert(number) {
+            number = number.wrapping_add(1);
+        }
+        self.by_name.insert(node.clone(), number);
+        Some(number)
+    }
+
+    /// True if a node here has the number.
+    pub fn is_own(&self, number: u32) -> bool {
+        self.used.contains(&number)
+    }
+}
+
+/// Object numbers of a map. An object keeps its number as long as it is on the map.
+#[derive(Debug, Default)]
+pub struct ObjectIds {
+    by_id: HashMap<Uuid, u16>,
+}
+
+impl ObjectIds {
+    /// Numbers of all objects of a map: the first two bytes of the UUID, or the next free number. Objects that are gone lose
+    /// theirs.
+    pub(super) fn assign(&mut self, objects: &[Uuid]) -> HashMap<Uuid, u16> {
+        let present: HashSet<_> = objects.iter().collect();
+        self.by_id.retain(|id, _| present.contains(id));
+        let mut used: HashSet<_> = self.by_id.values().copied().collect();
+        for id in objects.iter().take(usize::from(u16::MAX)) {
+            self.by_id.entry(*id).or_insert_with(|| {
+                let [first, second, ..] = *id.as_bytes();
+                let mut number = u16::from_be_bytes([first, second]);
+                while !used.insert(number) {
+                    number = number.wrapping_add(1);
+                }
+                number
+            });
+        }
+        self.by_id.clone()
+    }
+}

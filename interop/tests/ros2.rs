@@ -1,0 +1,118 @@
+//! The log of a real node, written for ROS 2 and read by others.
+
+#![cfg(feature = "ros2")]
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
+
+use std::collections::BTreeMap;
+use std::io::Cursor;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use ecod_actors::node;
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::observe::recorder::{RecordConfig, files};
+use ecod_client::{Cell, Frame, NodeName, PerceivedObject, Role, Settings, WirePose};
+use ecod_interop::ros2::convert;
+use tokio::runtime::Runtime;
+
+/// Has a vehicle report a car to an edge until the map has it for a second; gives the edge's log.
+fn log(directory: &Path) -> Vec<u8> {
+    let loopback = SocketAddr::from(([127, 0, 0, 1], 0));
+    let mut config = NodeConfig {
+        name: Some(NodeName::from_static("edge")),
+        cell: NodeName::from_static("lot-1"),
+        role: Role::Edge,
+        listen: Some(loopback),
+        record: Some(RecordConfig { dir: directory.to_owned(), ..RecordConfig::default() }),
+        ..NodeConfig::default()
+    };
+    config.membership.bind = Some(loopback);
+    config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
+    let runtime = Runtime::new().unwrap();
+    let handle = runtime.block_on(node::start(config)).unwrap();
+    let (broker, cell) = (handle.listens_at().unwrap().to_string(), "lot-1".into());
+    let settings = Settings { broker, cell, node: "euclid-2".into(), part: String::new(), ..Settings::default() };
+    let vehicle = Cell::connect(settings).unwrap();
+    let (began, mut with_car) = (Instant::now(), 0);
+    for map in vehicle.maps() {
+        with_car += usize::from(map.unwrap().objects.iter().any(|object| object.label == "car"));
+        let car = PerceivedObject { heading_rad: Some(1.5), ..PerceivedObject::new("car", 0.93, 12.5, -3.0) };
+        let pose = Some(WirePose { x_m: 1.0, y_m: 6.0, heading_rad: -1.57 });
+        vehicle.report(Frame { pose, ..Frame::new(vec![car]) }).unwrap();
+        assert!(began.elapsed() < Duration::from_secs(30));
+        if with_car >= 10 {
+            break;
+        }
+    }
+    runtime.block_on(handle.stop());
+    std::fs::read(&files(&directory.join("edge")).unwrap_or(files(directory).unwrap())[0]).unwrap()
+}
+
+#[test]
+fn a_log_has_detections_markers_and_poses_for_ros() {
+    let directory = tempfile::tempdir().unwrap();
+    let log = log(directory.path());
+    let mut bytes = Vec::new();
+    let done = convert(&log, Cursor::new(&mut bytes)).unwrap();
+    assert!(done.written > 20 && done.unusable == 0 && !done.is_cut, "{done:?}");
+    let mut counts = BTreeMap::<_, u32>::new();
+    for message in mcap::MessageStream::new(&bytes).unwrap() {
+        let channel = message.unwrap().channel;
+        let schema = channel.schema.as_ref().unwrap();
+        assert_eq!((channel.message_encoding.as_str(), schema.encoding.as_str()), ("cdr", "ros2msg"));
+        *counts.entry((channel.topic.clone(), schema.name.clone())).or_default() += 1;
+    }
+    let topics: Vec<_> = counts.keys().map(|(topic, schema)| (topic.as_str(), schema.as_str())).collect();
+    assert_eq!(
+        topics,
+        [
+            ("/ecod/euclid_2/detections", "vision_msgs/msg/Detection3DArray"),
+            ("/ecod/map/detections", "vision_msgs/msg/Detection3DArray"),
+            ("/ecod/map/markers", "visualization_msgs/msg/MarkerArray"),
+            ("/tf", "tf2_msgs/msg/TFMessage"),
+        ]
+    );
+    let cut = convert(&log[..log.len() / 4], Cursor::new(Vec::new())).unwrap();
+    assert!(cut.is_cut && cut.written < done.written && cut.unusable == 0, "{cut:?} {done:?}");
+}
+
+#[test]
+fn a_picture_of_the_camera_is_the_same_picture() {
+    let mut log = Vec::new();
+    let mut writer = mcap::Writer::new(Cursor::new(&mut log)).unwrap();
+    let channel_id = writer.add_channel(0, "camera", "json", &BTreeMap::new()).unwrap();
+    let at = 1_795_239_882_123_000_000;
+    let header = mcap::records::MessageHeader { channel_id, sequence: 0, log_time: at, publish_time: at };
+    for image in [
+        r#"{"frame_id":"camera","data":"/9j/","format":"jpeg"}"#,
+        r#"{"frame_id":"camera","data":"?","format":"jpeg"}"#,
+    ] {
+        writer.write_to_known_channel(&header, image.as_bytes()).unwrap();
+    }
+    writer.finish().unwrap();
+    drop(writer);
+    let mut bytes = Vec::new();
+    let done = convert(&log, Cursor::new(&mut bytes)).unwrap();
+    assert_eq!((done.written, done.unusable), (1, 1));
+    let message = mcap::MessageStream::new(&bytes).unwrap().next().unwrap().unwrap();
+    assert_eq!(message.channel.schema.as_ref().unwrap().name, "sensor_msgs/msg/CompressedImage");
+    // Header, seconds, nanoseconds; two texts with their lengths; three bytes.
+    assert_eq!(message.data[4..8], 1_795_239_882_i32.to_le_bytes());
+    assert!(message.data.ends_with(&[3, 0, 0, 0, 0xff, 0xd8, 0xff]), "{:?}", message.data);
+}
+
+#[test]
+#[ignore = "needs Python packages, which `make ros2-check` installs"]
+fn readers_of_ros_read_it_and_write_the_same_bytes() {
+    let python = std::env::var("ROS2_PYTHON").unwrap();
+    let directory = tempfile::tempdir().unwrap();
+    let output = directory.path().join("ros2.mcap");
+    convert(&log(directory.path()), std::fs::File::create(&output).unwrap()).unwrap();
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../packaging/check-ros2.py");
+    let run = Command::new(python).arg(script).arg(&output).output().unwrap();
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    print!("{}", String::from_utf8_lossy(&run.stdout));
+}
