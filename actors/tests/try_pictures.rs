@@ -63,6 +63,17 @@ fn objects(page: &str) -> Option<Vec<(String, f64)>> {
     Some(picture["map"]["message"]["objects"].as_array()?.iter().map(object).collect())
 }
 
+/// Labels of the boxes in the next picture on a page.
+fn boxes(page: &str) -> Vec<String> {
+    let mut stream = TcpStream::connect(page).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    write!(stream, "GET /api/camera HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    let mut lines = BufReader::new(stream).lines().map_while(Result::ok);
+    let picture = lines.find_map(|line| serde_json::from_str::<Value>(line.strip_prefix("data: ")?).ok()).unwrap();
+    let boxes = picture["boxes"].as_array().unwrap();
+    boxes.iter().map(|seen| seen["label"].as_str().unwrap().to_owned()).collect()
+}
+
 #[test]
 fn photographs_of_two_cameras_become_objects_on_one_map() {
     let directory = tempfile::tempdir().unwrap();
@@ -73,6 +84,9 @@ fn photographs_of_two_cameras_become_objects_on_one_map() {
     let mut trial = Trial(command.stderr(Stdio::piped()).spawn().unwrap());
     let mut lines = BufReader::new(trial.0.stderr.take().unwrap()).lines().map_while(Result::ok);
     let page = lines.find_map(|line| Some(line.strip_prefix("page: http://")?.split('/').next()?.to_owned())).unwrap();
+    let second = lines
+        .find_map(|line| Some(line.strip_prefix("page of images-2: http://")?.split('/').next()?.to_owned()))
+        .unwrap();
     let (sender, progress) = std::sync::mpsc::channel();
     std::thread::spawn(move || lines.try_for_each(|line| sender.send(line)));
 
@@ -86,6 +100,9 @@ fn photographs_of_two_cameras_become_objects_on_one_map() {
     let told = |line: &String| line.contains("frames/s") && line.contains("objects on the map");
     let next_line = || progress.recv_timeout(deadline.saturating_duration_since(Instant::now())).ok();
     assert!(std::iter::from_fn(next_line).any(|line| told(&line)), "progress is told of");
+    for (label, page) in [("cat", &page), ("person", &second)] {
+        assert!(boxes(page).contains(&label.to_owned()), "{label} is not in the picture on its page");
+    }
     let distance = |label: &str| found.iter().find(|(seen, _)| seen == label).unwrap().1;
     assert!(distance("cat") < 3.0, "a cat that fills the picture: {found:?}");
     assert!((45.0..55.0).contains(&distance("person")), "before the other camera, 50 m away: {found:?}");

@@ -23,6 +23,7 @@ use crate::camera::lens::Lens;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
+use crate::observe::dashboard::CameraFeed;
 use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
@@ -41,6 +42,8 @@ pub struct DetectorArguments {
     pub projector: ActorSlot<ProjectorMessage>,
     /// Records some of the frames.
     pub images: Option<ImageRecorder>,
+    /// Shows some of the frames, if they are shown at all.
+    pub camera_feed: Option<Arc<CameraFeed>>,
     /// Counters of the node.
     pub counters: Arc<Counters>,
     /// The node's spans.
@@ -62,6 +65,7 @@ pub struct DetectorState {
     failing: bool,
     projector: ActorSlot<ProjectorMessage>,
     images: Option<ImageRecorder>,
+    camera_feed: Option<Arc<CameraFeed>>,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
 }
@@ -76,11 +80,22 @@ impl Actor for Detector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DetectorArguments { open, capture, detect, lens, projector, images, counters, spans } = arguments;
+        let DetectorArguments { open, capture, detect, lens, projector, images, camera_feed, counters, spans } =
+            arguments;
         let capture = Capture::start(open, capture)?;
         let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters), spans));
         let detect = Some(detect);
-        Ok(DetectorState { detect, lens, mismatch: None, failing: false, projector, images, counters, pump })
+        Ok(DetectorState {
+            detect,
+            lens,
+            mismatch: None,
+            failing: false,
+            projector,
+            images,
+            camera_feed,
+            counters,
+            pump,
+        })
     }
 
     async fn handle(
@@ -94,13 +109,13 @@ impl Actor for Detector {
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
         let mut images = state.images.take();
         let span = tracing::info_span!("detect");
-        let (detect, images, outcome) = spawn_blocking(move || {
+        let (detect, images, frame, outcome) = spawn_blocking(move || {
             let outcome = span.in_scope(|| detect.detect(&frame));
             drop(span);
             if let Some(images) = &mut images {
                 images.offer(&frame);
             }
-            (detect, images, outcome)
+            (detect, images, frame, outcome)
         })
         .await?;
         (state.detect, state.images) = (Some(detect), images);
@@ -111,7 +126,8 @@ impl Actor for Detector {
                 }
                 if let Some(lens) = state.scale(size, &mut detections) {
                     state.counters.count(Event::FrameDetected);
-                    state.projector.send(ProjectorMessage::Report { detections, lens, captured_at });
+                    let shown = state.camera_feed.as_ref().is_some_and(|feed| feed.takes(captured_at)).then_some(frame);
+                    state.projector.send(ProjectorMessage::Report { detections, lens, captured_at, shown });
                 } else {
                     state.counters.count(Event::FrameFailed);
                 }

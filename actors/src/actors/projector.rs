@@ -3,6 +3,7 @@
 //! ```text
 //! localisation ── UDP ──> pose feed ── TakePose ──┐
 //! Detector ── Report ────────────────────────> Projector ── PublishReport ──> Gateway
+//!                                                    └─ frame with boxes ─> CameraFeed, while a browser looks
 //! ```
 
 mod pose_feed;
@@ -20,13 +21,16 @@ use ecod::model::time::Timestamp;
 use ecod::perception::pose_history::PoseHistory;
 use ecod::wire::{ObjectReport, ReportKind};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
-use tokio::task::JoinSet;
+use tokio::task::{JoinSet, spawn_blocking};
 
+use crate::camera::frame::CameraFrame;
+use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
 use crate::camera::perception::Perception;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::projector::ProjectorMessage;
+use crate::observe::dashboard::{CameraFeed, PictureBox, camera_event};
 use crate::platform::cell_clock::CellClock;
 use crate::telemetry::counters::{Counters, Event};
 
@@ -46,6 +50,8 @@ pub struct ProjectorArguments {
     pub clock: CellClock,
     /// Publisher of the reports.
     pub gateway: ActorSlot<GatewayMessage>,
+    /// Shows frames with their boxes, if they are shown at all.
+    pub camera_feed: Option<Arc<CameraFeed>>,
     /// Counters of the node.
     pub counters: Arc<Counters>,
 }
@@ -66,6 +72,7 @@ pub struct ProjectorState {
     algorithms: Algorithms,
     clock: CellClock,
     gateway: ActorSlot<GatewayMessage>,
+    camera_feed: Option<Arc<CameraFeed>>,
     counters: Arc<Counters>,
     /// Ends with the actor.
     _feed: JoinSet<()>,
@@ -81,8 +88,17 @@ impl Actor for Projector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let ProjectorArguments { perception, standing, origin, poses, algorithms, clock, gateway, counters } =
-            arguments;
+        let ProjectorArguments {
+            perception,
+            standing,
+            origin,
+            poses,
+            algorithms,
+            clock,
+            gateway,
+            camera_feed,
+            counters,
+        } = arguments;
         let mut feed = JoinSet::new();
         if let Some(address) = poses {
             feed.spawn(pose_feed::listen(address, myself, Arc::clone(&counters)));
@@ -96,6 +112,7 @@ impl Actor for Projector {
             algorithms,
             clock,
             gateway,
+            camera_feed,
             counters,
             _feed: feed,
         })
@@ -108,7 +125,15 @@ impl Actor for Projector {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         match message {
-            ProjectorMessage::Report { detections, lens, captured_at } => state.report(detections, &lens, captured_at),
+            ProjectorMessage::Report { detections, lens, captured_at, shown } => {
+                let image = ImageSize::from(&lens.intrinsics);
+                let boxed = if shown.is_some() { &*detections } else { &[] };
+                let mut boxes: Vec<_> = boxed.iter().map(|detection| PictureBox::new(detection, image)).collect();
+                state.report(detections, &lens, captured_at, &mut boxes);
+                if let Some(frame) = shown {
+                    state.show(frame, boxes);
+                }
+            }
             ProjectorMessage::Configure { perception, standing, origin, algorithms } => {
                 state.perception = perception.continuing(&state.perception);
                 (state.standing, state.algorithms) = (standing, algorithms);
@@ -146,7 +171,8 @@ impl ProjectorState {
         }
     }
 
-    fn report(&mut self, detections: Vec<Detection>, lens: &Lens, captured_at: Timestamp) {
+    /// Publishes the report of a frame. Boxes of its detections get the objects that these became.
+    fn report(&mut self, detections: Vec<Detection>, lens: &Lens, captured_at: Timestamp, boxes: &mut [PictureBox]) {
         let pose = self.poses.as_ref().map_or(self.standing, |poses| poses.at(captured_at));
         let Some(pose) = pose else {
             self.counters.troubles().note(TroubleKind::NoPose, "no pose is known near the time of the camera's frames");
@@ -158,6 +184,11 @@ impl ProjectorState {
         let span = tracing::info_span!("project");
         let mut report = span.in_scope(|| self.perception.report(detections, captured_at));
         drop(span);
+        for (detection, object) in self.perception.reported().iter().zip(&report.objects) {
+            if let Some(shown) = boxes.get_mut(*detection) {
+                shown.object = Some(object.clone());
+            }
+        }
         let ClockReading { offset_us, error_us } = self.clock.reading();
         (report.captured_at_us, report.clock_error_us) = (captured_at.shifted(offset_us), error_us);
         self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
@@ -170,6 +201,19 @@ impl ProjectorState {
         if self.algorithms.pace() {
             self.publish(ReportKind::Detections, report);
         }
+    }
+
+    /// Shows the frame in browsers. The next report does not wait for that.
+    fn show(&self, frame: CameraFrame, boxes: Vec<PictureBox>) {
+        let Some(feed) = self.camera_feed.clone() else { return };
+        let counters = Arc::clone(&self.counters);
+        spawn_blocking(move || match camera_event(&frame, &boxes) {
+            Ok(event) => {
+                feed.show(event);
+                counters.count(Event::FrameShown);
+            }
+            Err(error) => tracing::debug!(%error, "cannot encode frame for browsers"),
+        });
     }
 
     fn publish(&self, kind: ReportKind, report: ObjectReport) {

@@ -42,6 +42,8 @@ pub struct Perception {
     view: ViewConfig,
     gate: LandmarkGate,
     seq: u64,
+    /// Indices of the detections behind the objects of the last report.
+    reported: Vec<usize>,
     discarded: DiscardCounts,
 }
 
@@ -92,7 +94,16 @@ impl Perception {
     ) -> Self {
         let camera = vehicle_camera.mount.camera_pose(&vehicle_camera.pose);
         let projection = Projection::new(projection, vehicle_camera.lens.intrinsics, vehicle_camera.mount);
-        Self { vehicle_camera, camera, projection, view, gate, seq: 0, discarded: DiscardCounts::default() }
+        Self {
+            vehicle_camera,
+            camera,
+            projection,
+            view,
+            gate,
+            seq: 0,
+            reported: Vec::new(),
+            discarded: DiscardCounts::default(),
+        }
     }
 
     /// The same producer with the numbers of reports and the counts of an earlier one.
@@ -123,8 +134,10 @@ impl Perception {
         if let Err(error) = self.vehicle_camera.lens.undistort(&mut detections) {
             tracing::warn!(%error, "cannot remove distortion");
         }
-        let objects: Vec<_> =
-            detections.iter().zip(cuts).filter_map(|(detection, cut)| self.place(detection, cut)).collect();
+        let all = detections.iter().zip(cuts).enumerate();
+        let placed = all.filter_map(|(index, (detection, cut))| Some((index, self.place(detection, cut)?)));
+        let (reported, objects): (Vec<_>, Vec<_>) = placed.unzip();
+        self.reported = reported;
         let VehicleCamera { landmarks, mount, lens, .. } = &self.vehicle_camera;
         let (camera, sizes) = (PosedCamera::new(self.camera, mount, lens.intrinsics), &self.projection.config().sizes);
         let seen = landmarks_in_view(landmarks.landmarks(), &camera, &objects, sizes, &self.view);
@@ -135,6 +148,11 @@ impl Perception {
             seen: Some(seen),
             ..ObjectReport::new(self.vehicle_camera.node.clone(), self.seq, captured_at)
         }
+    }
+
+    /// Indices of the detections that became the objects of the last report, in their order.
+    pub fn reported(&self) -> &[usize] {
+        &self.reported
     }
 
     /// Number of detections discarded by reason since the start.
@@ -209,6 +227,7 @@ mod tests {
             vec![seen("", 0.9, 240.0), seen("cup", f64::NAN, 240.0), seen("cup", 0.9, 480.0), seen("car", 0.9, 240.0)];
         let report = perception.report(found, Timestamp(1));
         assert_eq!(report.objects.iter().map(|object| &*object.label).collect::<Vec<_>>(), ["car"]);
+        assert_eq!(perception.reported(), [3]);
         let discarded: Vec<_> = perception.discarded().iter().map(|(reason, times)| (*reason, *times)).collect();
         assert_eq!(discarded, [("clipped", 1), ("invalid_label", 1), ("not_finite", 1)]);
     }

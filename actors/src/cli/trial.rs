@@ -46,7 +46,7 @@ pub(super) struct TryArguments {
     /// Write the configuration that is used; those of further vehicles are numbered, as in node-2.toml
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
-    /// Address of the page. Default 127.0.0.1:8080, or a free port if that is in use
+    /// Address of the first vehicle's page. Default 127.0.0.1:8080, or a free port if that is in use
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     dashboard: Option<SocketAddr>,
     /// Stop when standard input ends, as when the parent process is gone
@@ -92,7 +92,7 @@ impl TryArguments {
         videos.chain(images).chain(cameras).chain(urls).collect()
     }
 
-    /// The configurations of the vehicles. The first serves the page, and the others are told of it once it runs.
+    /// The configurations of the vehicles. The others are told of the first once it runs.
     fn configs(&self) -> Result<Vec<NodeConfig>, Failure> {
         let sources = self.sources();
         if sources.is_empty() {
@@ -106,7 +106,7 @@ impl TryArguments {
             }
             let mut config = vehicle(NodeName::new(name).map_err(Failure::usage)?, source);
             config.pose.y_m = -SPACING_M * index as f64;
-            (config.dashboard.enabled, config.dashboard.listen) = (index == 0, self.dashboard.filter(|_| index == 0));
+            config.dashboard.listen = self.dashboard.filter(|_| index == 0);
             config.validate().map_err(Failure::usage)?;
             configs.push(config);
         }
@@ -186,11 +186,13 @@ async fn start_and_watch(
         config.membership.seeds =
             nodes.first().and_then(NodeHandle::gossip_address).iter().map(ToString::to_string).collect();
         let node = node::start(config.clone()).await?;
+        let mut address = node.dashboard_address();
+        let page = address.wait_for(Option::is_some).await.context("the page ended")?.unwrap_or(DEFAULT_ADDRESS);
         if index == 0 {
             config.membership.bind = node.gossip_address();
-            let mut address = node.dashboard_address();
-            let page = address.wait_for(Option::is_some).await.context("the page ended")?.unwrap_or(DEFAULT_ADDRESS);
             eprintln!("page: http://{page}/   (Ctrl-C ends)");
+        } else {
+            eprintln!("page of {}: http://{page}/", config.name.as_ref().map_or("another", NodeName::as_str));
         }
         nodes.push(node);
         if let Some(path) = save {

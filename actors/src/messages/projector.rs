@@ -6,6 +6,7 @@ use ecod::model::geometry::Pose;
 use ecod::model::origin::{GeographicOrigin, StatedPose};
 use ecod::model::time::Timestamp;
 
+use crate::camera::frame::CameraFrame;
 use crate::camera::lens::Lens;
 use crate::camera::perception::Perception;
 
@@ -20,6 +21,8 @@ pub enum ProjectorMessage {
         lens: Lens,
         /// Time of capture.
         captured_at: Timestamp,
+        /// The frame, if browsers are to see it.
+        shown: Option<CameraFrame>,
     },
     /// Go on under other settings.
     Configure {

@@ -43,7 +43,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
-use crate::observe::dashboard::LiveState;
+use crate::observe::dashboard::{CameraFeed, LiveState};
 use crate::observe::readiness::SharedFacts;
 #[cfg(feature = "camera")]
 use crate::observe::recorder::ImageRecorder;
@@ -88,6 +88,7 @@ pub(super) struct NodeBuilder {
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
     live_state: Arc<LiveState>,
+    camera_feed: Option<Arc<CameraFeed>>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<NodeError>>,
 }
@@ -123,6 +124,11 @@ impl NodeBuilder {
         let counters = Arc::<Counters>::default();
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
+        #[cfg(feature = "camera")]
+        let shows_camera = config.camera.is_some() && config.dashboard.enabled && config.dashboard.camera;
+        #[cfg(not(feature = "camera"))]
+        let shows_camera = false;
+        let camera_feed = shows_camera.then(Arc::default);
         let mut builder = Self {
             _state_lock: directory.and_then(|directory| lock_state(directory, &config.cell, &name)),
             name,
@@ -148,6 +154,7 @@ impl NodeBuilder {
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
             live_state: Arc::default(),
+            camera_feed,
             dashboard_address: watch::Sender::new(None),
             failed,
         };
@@ -305,6 +312,7 @@ impl NodeBuilder {
                     algorithms: crate::node::camera::algorithms(&self.config),
                     clock: self.clock.clone(),
                     gateway: self.slots.gateway.clone(),
+                    camera_feed: self.camera_feed.clone(),
                     counters: self.counters(),
                 };
                 slot(&self.slots.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
@@ -313,8 +321,8 @@ impl NodeBuilder {
             ActorKind::Detector => {
                 let images = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
                 let projector = self.slots.projector.clone();
-                let (counters, spans) = (self.counters(), self.spans());
-                let arguments = crate::node::camera::detector(&self.config, projector, images, counters, spans);
+                let (feed, counters, spans) = (self.camera_feed.clone(), self.counters(), self.spans());
+                let arguments = crate::node::camera::detector(&self.config, projector, images, feed, counters, spans);
                 let arguments = arguments.map_err(in_full)?;
                 slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
             }

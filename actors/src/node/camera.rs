@@ -13,6 +13,7 @@ use crate::camera::perception::{Perception, VehicleCamera};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::projector::ProjectorMessage;
 use crate::node::config::NodeConfig;
+use crate::observe::dashboard::CameraFeed;
 use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::Counters;
 use crate::telemetry::spans::Spans;
@@ -66,6 +67,7 @@ pub fn detector(
     config: &NodeConfig,
     projector: ActorSlot<ProjectorMessage>,
     images: Option<ImageRecorder>,
+    camera_feed: Option<Arc<CameraFeed>>,
     counters: Arc<Counters>,
     spans: Spans,
 ) -> anyhow::Result<DetectorArguments> {
@@ -81,6 +83,7 @@ pub fn detector(
         lens,
         projector,
         images,
+        camera_feed,
         counters,
         spans,
     })

@@ -2,6 +2,9 @@
 
 pub(crate) mod access;
 pub(crate) mod assets;
+pub(crate) mod camera_feed;
+#[cfg(feature = "camera")]
+pub(crate) mod camera_picture;
 pub(crate) mod config;
 pub(crate) mod connection_limit;
 pub(crate) mod history;
@@ -18,6 +21,9 @@ pub(crate) mod snapshot;
 pub(crate) mod timeline;
 
 pub use assets::paths as page_paths;
+pub use camera_feed::CameraFeed;
+#[cfg(feature = "camera")]
+pub use camera_picture::{PictureBox, camera_event};
 pub use config::{DEFAULT_ADDRESS, DashboardConfig};
 pub use live_state::{LatestReport, LiveState, MAX_SHOWN};
 pub use node_sources::{LandmarkFacts, NodeFacts, NodeSources};

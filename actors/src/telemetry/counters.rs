@@ -73,6 +73,8 @@ pub enum Event {
     RoundDue,
     /// The detector processed a camera frame.
     FrameDetected,
+    /// A camera frame was encoded for browsers.
+    FrameShown,
     /// A camera frame or image file could not be used.
     FrameFailed,
     /// A later camera frame replaced this one.

@@ -100,8 +100,12 @@ pub(crate) struct Events(BufReader<TcpStream>);
 
 impl Events {
     pub(crate) async fn open(address: SocketAddr) -> Self {
+        Self::open_at(address, "/api/events").await
+    }
+
+    pub(crate) async fn open_at(address: SocketAddr, path: &str) -> Self {
         let mut stream = TcpStream::connect(address).await.unwrap();
-        stream.write_all(b"GET /api/events HTTP/1.1\r\nHost: localhost\r\n\r\n").await.unwrap();
+        stream.write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes()).await.unwrap();
         Self(BufReader::new(stream))
     }
 

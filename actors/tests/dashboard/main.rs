@@ -2,6 +2,8 @@
 
 mod access;
 mod browser;
+#[cfg(feature = "camera")]
+mod camera;
 mod cell;
 mod cost;
 mod door_page;

@@ -76,6 +76,17 @@ impl Browser {
         std::fs::write(file, png).unwrap();
     }
 
+    /// Moves the mouse to the middle of an element.
+    pub(crate) async fn point_at(&self, selector: &str) {
+        let middle = format!(
+            "(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])\
+             (document.querySelector('{selector}').getBoundingClientRect())"
+        );
+        let middle = self.evaluate(&middle).await;
+        let event = json!({ "type": "mouseMoved", "x": middle[0], "y": middle[1] });
+        self.chromium("Input.dispatchMouseEvent", event).await;
+    }
+
     /// Presses a key on what has the focus.
     pub(crate) async fn press(&self, key: &str) {
         for kind in ["keyDown", "keyUp"] {

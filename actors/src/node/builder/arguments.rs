@@ -311,6 +311,7 @@ impl NodeBuilder {
             name: self.name.clone(),
             cell: self.config.cell.clone(),
             role: self.config.role,
+            camera: self.camera_feed.is_some(),
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,
@@ -322,6 +323,7 @@ impl NodeBuilder {
             counters: self.counters(),
             frames: self.frames(),
             live_state: Arc::clone(&self.live_state),
+            camera: self.camera_feed.clone(),
         };
         DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
     }

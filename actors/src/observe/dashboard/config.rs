@@ -19,6 +19,8 @@ pub struct DashboardConfig {
     /// Secret that gives access, at least 12 characters that an address need not escape. Default none, which only a
     /// loopback address allows. Prefer `ECOD_DASHBOARD__TOKEN` to a file that others can read.
     pub token: Option<Secret>,
+    /// True if the page shows the pictures of the node's camera to those who may look. Default true.
+    pub camera: bool,
     /// Maximum snapshots a second for each browser. Default 10. Trade-off: more show a fast cell better, fewer cost less.
     pub max_rate_hz: f64,
     /// Maximum number of connections. Default 64. A visible browser tab keeps one and opens others briefly; at most
@@ -37,7 +39,7 @@ const NOT_IN_TOKENS: [char; 7] = ['"', '#', '%', '&', '\'', '<', '>'];
 
 impl Default for DashboardConfig {
     fn default() -> Self {
-        Self { enabled: true, listen: None, token: None, max_rate_hz: 10.0, max_connections: 64 }
+        Self { enabled: true, listen: None, token: None, camera: true, max_rate_hz: 10.0, max_connections: 64 }
     }
 }
 

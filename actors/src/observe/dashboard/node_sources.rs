@@ -9,6 +9,7 @@ use ecod::wire::Role;
 use serde::Serialize;
 use tokio::sync::watch;
 
+use super::camera_feed::CameraFeed;
 use super::live_state::LiveState;
 use crate::observe::readiness::Vitals;
 use crate::telemetry::counters::Counters;
@@ -29,6 +30,8 @@ pub struct NodeSources {
     pub frames: Arc<FrameCounters>,
     /// Latest reports and statuses.
     pub live_state: Arc<LiveState>,
+    /// Pictures of the node's camera, if they are shown.
+    pub camera: Option<Arc<CameraFeed>>,
 }
 
 /// Facts about a node.
@@ -40,6 +43,8 @@ pub struct NodeFacts {
     pub cell: NodeName,
     /// Its role.
     pub role: Role,
+    /// True if `/api/camera` shows the pictures of its camera.
+    pub camera: bool,
     /// Version of the software.
     pub version: &'static str,
     /// Time of start.

@@ -14,6 +14,7 @@ use axum::routing::get;
 use axum::{Json, Router};
 use ecod::model::time::Timestamp;
 use futures_util::stream;
+use tokio::sync::watch;
 
 use super::access::{AccessDecision, HEADERS, PageAccess};
 use super::assets::Asset;
@@ -71,6 +72,7 @@ impl HttpApi {
             .route("/api/frame", get(show_frame))
             .route("/api/landmarks", get(show_landmarks))
             .route("/api/events", get(show_events))
+            .route("/api/camera", get(show_camera))
             .fallback(show_asset)
             .layer(middleware::from_fn_with_state(Arc::clone(&api), guard));
         Router::new()
@@ -83,6 +85,17 @@ impl HttpApi {
 
     fn count(&self, event: Event) {
         self.monitor.sources.counters.count(event);
+    }
+
+    /// True if no further connection may stay open.
+    fn is_crowded(&self) -> bool {
+        let camera = self.monitor.sources.camera.as_ref();
+        self.monitor.viewers() + camera.map_or(0, |camera| camera.viewers()) >= self.max_viewers
+    }
+
+    fn refuse_viewer(&self) -> Response {
+        self.count(Event::BrowserRefused);
+        (StatusCode::SERVICE_UNAVAILABLE, "too many browsers\n").into_response()
     }
 }
 
@@ -170,22 +183,36 @@ async fn show_landmarks(State(api): Api) -> Response {
 
 /// Snapshots as they are taken. A browser that is too slow for one gets the next.
 async fn show_events(State(api): Api) -> Response {
-    if api.monitor.viewers() >= api.max_viewers {
-        api.count(Event::BrowserRefused);
-        return (StatusCode::SERVICE_UNAVAILABLE, "too many browsers\n").into_response();
+    if api.is_crowded() {
+        return api.refuse_viewer();
     }
-    let mut snapshots = api.monitor.snapshots();
-    snapshots.mark_unchanged();
-    let first = Some(api.monitor.event());
-    let events = stream::unfold((snapshots, first), |(mut snapshots, mut first)| async move {
+    let snapshots = api.monitor.snapshots();
+    stream_events(snapshots, Some(api.monitor.event()))
+}
+
+/// Pictures of the node's camera as they are taken.
+async fn show_camera(State(api): Api) -> Response {
+    let Some(camera) = &api.monitor.sources.camera else {
+        return (StatusCode::NOT_FOUND, "this node shows no camera\n").into_response();
+    };
+    if api.is_crowded() {
+        return api.refuse_viewer();
+    }
+    stream_events(camera.pictures(), None)
+}
+
+/// Server-sent events: the first, and then the latest whenever the browser has room.
+fn stream_events(mut events: watch::Receiver<Bytes>, first: Option<Bytes>) -> Response {
+    events.mark_unchanged();
+    let events = stream::unfold((events, first), |(mut events, mut first)| async move {
         let event = match first.take() {
             Some(event) => event,
             None => {
-                snapshots.changed().await.ok()?;
-                snapshots.borrow_and_update().clone()
+                events.changed().await.ok()?;
+                events.borrow_and_update().clone()
             }
         };
-        Some((Ok::<Bytes, Infallible>(event), (snapshots, first)))
+        Some((Ok::<Bytes, Infallible>(event), (events, first)))
     });
     typed("text/event-stream", Body::from_stream(events))
 }

@@ -1,5 +1,6 @@
 // Draws snapshots. The map follows every snapshot; text changes four times a second, so that it can be read.
 
+import { CameraView } from "./camera.js";
 import { chart } from "./charts.js";
 import { ago, byId, clock, span, text } from "./dom.js";
 import { Live, SPAN_US } from "./live.js";
@@ -14,7 +15,8 @@ let [queued, textAt, told] = [false, 0, {}];
 const faults = {};
 
 const live = new Live(draw, () => attempt("history", drawHistory));
-const map = new BirdsEye(draw);
+const map = new BirdsEye(draw, light);
+const camera = new CameraView(light);
 const timeline = new Timeline(scrub, { live: true, time: clock, moment: (at) => `${clock(at)}, ${ago((live.now - at) / 1e6)}` });
 /// The map that the timeline chose, and whether one is on its way.
 let [past, loading] = [null, false];
@@ -28,6 +30,12 @@ async function scrub() {
     past = at && { at, picture: (await live.frame(at)) ?? past?.picture };
   }
   loading = false;
+  draw();
+}
+
+/// Lights up what has this name, on the map and in the picture; without a name only draws anew.
+function light(name) {
+  if (name !== undefined) map.lit = name;
   draw();
 }
 
@@ -60,6 +68,7 @@ function drawPicture() {
   const scene = arrange(picture, landmarks, now, colour);
   const shown = past?.picture ? arrange(past.picture, landmarks, past.picture.now_us, colour) : scene;
   if (!map.asTable) map.draw(shown);
+  camera.draw(picture.node, scene, map.lit);
   if (performance.now() - textAt < TEXT_MS) return;
   if (map.asTable) tables.places(shown);
   drawText(picture, scene);

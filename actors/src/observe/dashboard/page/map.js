@@ -24,9 +24,12 @@ export class BirdsEye {
   #shift = [0, 0];
   /// Whether a table is shown in the place of the map.
   asTable = false;
+  /// Name of the symbol that is pointed at, here or elsewhere: its kind and identity.
+  lit = null;
 
-  constructor(redraw) {
-    this.redraw = redraw;
+  /// Calls `onLight` with the name of the symbol that is pointed at, or null.
+  constructor(redraw, onLight = () => {}) {
+    Object.assign(this, { redraw, onLight });
     for (const name of ["grid", "views", "places", "dots", "objects", "vehicles", "labels", "scale"]) {
       this.#layers[name] = this.#picture.appendChild(svg("g"));
     }
@@ -119,6 +122,7 @@ export class BirdsEye {
     }, (g, place) => {
       const [x, y] = at(place);
       const [line, sign, title] = g.children;
+      set(g, { class: this.#light(g, `place ${place.id}`) });
       const facing = place.facing_rad ?? null;
       const reach = facing === null ? 0 : 13;
       set(line, { x1: x, y1: y, x2: x + reach * Math.cos(facing ?? 0), y2: y - reach * Math.sin(facing ?? 0) });
@@ -144,10 +148,17 @@ export class BirdsEye {
       set(around, { rx: Math.max(a * at.scale, 5), ry: Math.max(b * at.scale, 5), transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
       set(centre, { cx: x, cy: y });
       const age = object.age_s ?? 0;
-      set(g, { class: age > OLD_S ? "old" : "" });
+      set(g, { class: `${age > OLD_S ? "old" : ""} ${this.#light(g, `object ${object.id}`)}`.trim() });
       text(title, `${object.label}, ${Math.round(object.confidence * 100)} %, ± ${a.toFixed(2)} m, seen ${ago(age)} by ${object.contributors.join(", ")}`);
       labels.put(`object ${object.id}`, aged(object.vehicle ?? object.label, age), x, y, 9, age > OLD_S ? "old" : "");
     });
+  }
+
+  /// Class of a symbol, which says when it is pointed at.
+  #light(symbol, name) {
+    symbol.onpointerenter = () => this.onLight(name);
+    symbol.onpointerleave = () => this.onLight(null);
+    return this.lit === name ? "lit" : "";
   }
 
   #vehicles(vehicles, now, at, labels) {
