@@ -1,5 +1,7 @@
 //! Check of the way to the cell: the node looks on for a moment, with its key and certificate.
 
+use std::io::ErrorKind;
+use std::net::UdpSocket;
 use std::time::Duration;
 
 use ecod::diagnostics::TroubleKind;
@@ -10,6 +12,7 @@ use tokio::time::{Instant, sleep};
 use super::Finding;
 use crate::node::config::NodeConfig;
 use crate::node::{self, NodeHandle};
+use crate::transport::gossip::Member;
 
 /// Time in which a leader is found, if there is one.
 const PATIENCE: Duration = Duration::from_secs(4);
@@ -62,9 +65,47 @@ fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
         let check = if kind == TroubleKind::ClockOff.as_str() { "cell's time" } else { "cell" };
         Finding::doubtful(check, format!("{about}{cause}"), remedy)
     });
-    [found].into_iter().chain(own).collect()
+    let name = node.members().borrow().iter().find_map(|member| used_elsewhere(config, member));
+    [found].into_iter().chain(name).chain(own).collect()
+}
+
+/// A living node of another machine that has this node's name.
+fn used_elsewhere(config: &NodeConfig, member: &Member) -> Option<Finding> {
+    let has_name = config.name.as_ref() == Some(&member.name);
+    let is_elsewhere = || UdpSocket::bind(member.gossip).is_err_and(|e| e.kind() == ErrorKind::AddrNotAvailable);
+    (has_name && is_elsewhere()).then(|| {
+        let seen = format!("{} is the name of a node that runs at {}", member.name, member.gossip.ip());
+        Finding::broken("name", seen, "give this node another `name`: only the first node of a name takes part")
+    })
 }
 
 fn is_checked_elsewhere(trouble: &Trouble) -> bool {
     trouble.kind == TroubleKind::Unresolved.as_str()
+}
+
+#[cfg(test)]
+mod tests {
+    use ecod::wire::Role;
+
+    use super::*;
+
+    #[test]
+    fn a_name_that_runs_on_another_machine_is_named_with_its_address() {
+        let own = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let config = NodeConfig { name: Some(NodeName::from_static("euclid")), ..NodeConfig::default() };
+        let member = |name, gossip| Member {
+            name: NodeName::from_static(name),
+            run: 1,
+            gossip,
+            broker: None,
+            role: Role::Auto,
+            certificate: None,
+        };
+        let here = own.local_addr().unwrap();
+        let there = "192.0.2.7:17884".parse().unwrap();
+        assert_eq!(used_elsewhere(&config, &member("euclid", here)), None, "the node itself, which runs");
+        assert_eq!(used_elsewhere(&config, &member("gauss", there)), None);
+        let found = used_elsewhere(&config, &member("euclid", there)).unwrap();
+        assert!(found.seen.contains("euclid is the name of a node that runs at 192.0.2.7"), "{found:?}");
+    }
 }
