@@ -7,5 +7,6 @@
 
 pub mod bridge;
 pub mod cpm;
+mod object;
 #[cfg(feature = "ros2")]
 pub mod ros2;

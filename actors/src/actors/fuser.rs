@@ -258,10 +258,10 @@ impl FuserState {
 
     /// Compares a location that a report names with the known ones; another one each time.
     fn compare_locations(&self, kind: ReportKind, report: &ObjectReport) {
-        let named = report.objects.iter().filter_map(|object| object.landmark.as_ref());
-        let named: Vec<_> = named.chain(report.seen.iter().flatten()).collect();
-        let next = (report.seq as usize).checked_rem(named.len()).and_then(|place| named.get(place));
-        let Some(id) = next else { return };
+        let objects = report.objects.iter().filter_map(|object| object.landmark.as_ref());
+        let mut named = objects.chain(report.seen.iter().flatten());
+        let next = (report.seq as usize).checked_rem(named.clone().count());
+        let Some(id) = next.and_then(|place| named.nth(place)) else { return };
         let (node, troubles) = (report.node.as_str(), self.counters.troubles());
         match self.aggregator.knows_location(id) {
             Some(true) => {}

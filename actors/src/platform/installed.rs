@@ -1,10 +1,10 @@
 //! Files that a package has put beside the program.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// File below the prefix under which the program is installed: of `/usr/bin/ecod-node` that is `/usr`. None where
 /// there is no such file, as beside a program that was built by hand.
 pub(crate) fn file(below_prefix: &str) -> Option<PathBuf> {
     let program = std::env::current_exe().ok()?;
-    Some(program.parent()?.parent()?.join(Path::new(below_prefix))).filter(|path| path.is_file())
+    Some(program.parent()?.parent()?.join(below_prefix)).filter(|path| path.is_file())
 }

@@ -1,23 +1,21 @@
 //! Messages of maps and reports.
 
-use std::collections::BTreeMap;
-
 use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd as cdd;
 use c_its_parser::standards::cpm_2_1_1::cpm_originating_station_containers::{
     OriginatingRsuContainer, OriginatingVehicleContainer,
 };
 use c_its_parser::standards::cpm_2_1_1::cpm_pdu_descriptions as pdu;
 use c_its_parser::standards::cpm_2_1_1::cpm_perceived_object_container::{PerceivedObjectContainer, PerceivedObjects};
-use ecod::model::names::Label;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
-use ecod::wire::{FusedObject, GlobalMap, LandmarkState, ObjectReport, PerceivedObject};
+use ecod::wire::{FusedObject, GlobalMap, ObjectReport};
 use rasn::types::Any;
 use uuid::Uuid;
 
 use super::frame::MessageFrame;
 use super::identifiers::ObjectIds;
 use super::{CpmError, EncodedCpm, ITS_EPOCH_MS, MESSAGE_ID, PROTOCOL_VERSION, SIGMAS, classes};
+use crate::object::CellObject;
 
 /// Maximum number of objects in a message.
 const MAX_OBJECTS: usize = 255;
@@ -38,14 +36,17 @@ pub fn encode_map(
     station_id: u32,
     ids: &mut ObjectIds,
 ) -> Result<EncodedCpm, CpmError> {
-    let mut sources: Vec<_> = map.objects.iter().map(|object| (object.id, CpmObject::of_object(object, map))).collect();
-    sources.extend(map.landmarks.iter().filter_map(|landmark| {
-        let id = Uuid::new_v5(&Uuid::NAMESPACE_OID, landmark.id.as_bytes());
-        Some((id, CpmObject::of_landmark(landmark)?))
-    }));
-    let numbers = ids.assign(&sources.iter().map(|(id, _)| *id).collect::<Vec<_>>());
-    let sources = sources.into_iter().map(|(id, source)| CpmObject { number: numbers.get(&id).copied(), ..source });
-    let sources: Vec<_> = sources.collect();
+    let objects = map.objects.iter().map(|object| (object.id, object.into(), age_ms(object, map)));
+    let at_places = map.landmarks.iter().filter_map(|place| {
+        let object = CellObject::at(place)?;
+        classes::road_user(object.label)?;
+        Some((Uuid::new_v5(&Uuid::NAMESPACE_OID, place.id.as_bytes()), object, None))
+    });
+    let all: Vec<_> = objects.chain(at_places).collect();
+    let numbers = ids.assign(&all.iter().map(|(id, ..)| *id).collect::<Vec<_>>());
+    let numbered =
+        all.into_iter().map(|(id, object, age_ms)| CpmObject { object, number: numbers.get(&id).copied(), age_ms });
+    let sources: Vec<_> = numbered.collect();
     let (x_m, y_m) = centre(&sources);
     let frame = MessageFrame::at(origin, x_m, y_m)?;
     let rsu = uper(&OriginatingRsuContainer::new(None))?;
@@ -64,8 +65,10 @@ pub fn encode_report(
 ) -> Result<EncodedCpm, CpmError> {
     let first = (report.seq as u16).wrapping_mul(256);
     let numbers = (0..=u16::MAX).map(|index| first.wrapping_add(index));
-    let sources = report.objects.iter().zip(numbers);
-    let sources: Vec<_> = sources.map(|(object, number)| CpmObject::of_detection(object, number)).collect();
+    let numbered = report.objects.iter().zip(numbers);
+    let numbered =
+        numbered.map(|(object, number)| CpmObject { object: object.into(), number: Some(number), age_ms: None });
+    let sources: Vec<_> = numbered.collect();
     let (x_m, y_m) = report.pose.map_or_else(|| centre(&sources), |pose| (pose.x_m, pose.y_m));
     let frame = MessageFrame::at(origin, x_m, y_m)?;
     let station = match report.pose {
@@ -81,71 +84,32 @@ pub fn encode_report(
     encode(station_id, report.captured_at_us, &frame, station, sources)
 }
 
-/// An object of any kind of message, in the cell's frame.
-#[derive(Debug, Default)]
-struct CpmObject {
+/// An object, with what a message says of it besides.
+#[derive(Debug)]
+struct CpmObject<'a> {
+    object: CellObject<'a>,
     number: Option<u16>,
-    label: Label,
-    confidence: f64,
-    position_m: [f64; 2],
-    covariance_m2: Option<[f64; 3]>,
-    velocity_mps: Option<[f64; 2]>,
-    heading_rad: Option<f64>,
-    size_m: Option<[f64; 2]>,
-    scores: BTreeMap<Label, f64>,
     age_ms: Option<u16>,
 }
 
-impl CpmObject {
-    fn of_object(object: &FusedObject, map: &GlobalMap) -> Self {
-        let age = object.first_seen_us.map(|first| map.fused_at_us.since(first).as_millis());
-        Self {
-            number: None,
-            label: object.label.clone(),
-            confidence: object.confidence,
-            position_m: [object.x_m, object.y_m],
-            covariance_m2: Some(object.covariance_m2),
-            velocity_mps: object.velocity_mps,
-            heading_rad: object.heading_rad,
-            size_m: object.size_m,
-            scores: object.scores.clone(),
-            age_ms: age.map(|age| u16::try_from(age).unwrap_or(MAX_AGE_MS).min(MAX_AGE_MS)),
-        }
-    }
+/// Age of an object on a map, as far as a message states it.
+fn age_ms(object: &FusedObject, map: &GlobalMap) -> Option<u16> {
+    let age = map.fused_at_us.since(object.first_seen_us?).as_millis();
+    Some(u16::try_from(age).unwrap_or(MAX_AGE_MS).min(MAX_AGE_MS))
+}
 
-    fn of_landmark(landmark: &LandmarkState) -> Option<Self> {
-        let label = landmark.label.clone()?;
-        classes::road_user(&label)?;
-        let position_m = [landmark.x_m, landmark.y_m];
-        Some(Self { label, confidence: landmark.confidence, position_m, ..Self::default() })
-    }
-
-    fn of_detection(object: &PerceivedObject, number: u16) -> Self {
-        Self {
-            number: Some(number),
-            label: object.label.clone(),
-            confidence: object.confidence,
-            position_m: [object.x_m, object.y_m],
-            covariance_m2: object.covariance_m2,
-            velocity_mps: object.velocity_mps,
-            heading_rad: object.heading_rad,
-            size_m: object.size_m,
-            scores: object.scores.clone(),
-            age_ms: None,
-        }
-    }
-
+impl CpmObject<'_> {
     /// The object as a message has it; `None` if it is too far from the reference position.
     fn perceived(&self, frame: &MessageFrame) -> Option<cdd::PerceivedObject> {
-        let [x_m, y_m] = self.position_m;
+        let [x_m, y_m] = self.object.position_m;
         let [east_m, north_m] = frame.to_message(x_m, y_m);
-        let variances = self.covariance_m2.map(|covariance| frame.variances_to_message(covariance));
+        let variances = self.object.covariance_m2.map(|covariance| frame.variances_to_message(covariance));
         let position = cdd::CartesianPosition3dWithConfidence {
             x_coordinate: coordinate(east_m, variances.map(|[east, _]| east))?,
             y_coordinate: coordinate(north_m, variances.map(|[_, north]| north))?,
             z_coordinate: None,
         };
-        let velocity = self.velocity_mps.map(|velocity| {
+        let velocity = self.object.velocity_mps.map(|velocity| {
             let [east_mps, north_mps] = frame.velocity_to_message(velocity);
             cdd::Velocity3dWithConfidence::cartesianVelocity(cdd::VelocityCartesian {
                 x_velocity: velocity_component(east_mps),
@@ -153,12 +117,12 @@ impl CpmObject {
                 z_velocity: None,
             })
         });
-        let angles = self.heading_rad.map(|heading_rad| {
+        let angles = self.object.heading_rad.map(|heading_rad| {
             let value = cdd::CartesianAngleValue(tenth_degrees(frame.heading_to_message(heading_rad).to_degrees()));
             let z_angle = cdd::CartesianAngle { value, confidence: cdd::AngleConfidence(127) };
             cdd::EulerAnglesWithConfidence { z_angle, y_angle: None, x_angle: None }
         });
-        let [length, width] = self.size_m.map_or([None, None], |[length, width]| [Some(length), Some(width)]);
+        let [length, width] = self.object.size_m.map_or([None, None], |[length, width]| [Some(length), Some(width)]);
         Some(cdd::PerceivedObject::new(
             self.number.map(cdd::Identifier2B),
             cdd::DeltaTimeMilliSecondSigned(0),
@@ -172,7 +136,7 @@ impl CpmObject {
             width.map(dimension),
             length.map(dimension),
             self.age_ms.map(|age| cdd::DeltaTimeMilliSecondSigned(age as i16)),
-            Some(cdd::ObjectPerceptionQuality((self.confidence * 15.0).round().clamp(0.0, 15.0) as u8)),
+            Some(cdd::ObjectPerceptionQuality((self.object.confidence * 15.0).round().clamp(0.0, 15.0) as u8)),
             None,
             Some(self.classification()),
             None,
@@ -182,7 +146,7 @@ impl CpmObject {
     /// The eight most probable classes, or the only one without a confidence.
     fn classification(&self) -> cdd::ObjectClassDescription {
         let mut classes: Vec<(cdd::ObjectClass, u8)> = Vec::new();
-        for (label, score) in &self.scores {
+        for (label, score) in self.object.scores {
             let (class, percent) = (classes::of_label(label), (score * 100.0).round().clamp(1.0, 100.0) as u8);
             match classes.iter_mut().find(|(other, _)| *other == class) {
                 Some((_, most)) => *most = percent.max(*most),
@@ -190,7 +154,7 @@ impl CpmObject {
             }
         }
         if classes.is_empty() {
-            classes.push((classes::of_label(&self.label), 101));
+            classes.push((classes::of_label(self.object.label), 101));
         }
         classes.sort_by_key(|(_, percent)| std::cmp::Reverse(*percent));
         let described = classes.into_iter().take(8).map(|(object_class, percent)| cdd::ObjectClassWithConfidence {
@@ -206,11 +170,11 @@ fn encode(
     time: Timestamp,
     frame: &MessageFrame,
     station: (pdu::CpmContainerId, Vec<u8>),
-    mut sources: Vec<CpmObject>,
+    mut sources: Vec<CpmObject<'_>>,
 ) -> Result<EncodedCpm, CpmError> {
     let reference_time = (time.micros() / 1000).checked_sub(ITS_EPOCH_MS).ok_or(CpmError::NoTime)?;
     let all = sources.len();
-    sources.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
+    sources.sort_by(|a, b| b.object.confidence.total_cmp(&a.object.confidence));
     let mut objects: Vec<_> = sources.iter().filter_map(|source| source.perceived(frame)).collect();
     objects.truncate(MAX_OBJECTS);
     let left_out = all - objects.len();
@@ -235,14 +199,14 @@ fn uper<T: rasn::Encode>(value: &T) -> Result<Vec<u8>, CpmError> {
 }
 
 /// The origin if all objects are near enough, or else the middle between the outermost.
-fn centre(sources: &[CpmObject]) -> (f64, f64) {
-    let middle = |axis: fn(&CpmObject) -> f64| {
+fn centre(sources: &[CpmObject<'_>]) -> (f64, f64) {
+    let middle = |axis: fn(&CpmObject<'_>) -> f64| {
         let all = || sources.iter().map(axis);
         let (least, most) = (all().fold(f64::INFINITY, f64::min), all().fold(f64::NEG_INFINITY, f64::max));
         let is_near = sources.is_empty() || (least > -900.0 && most < 900.0);
         if is_near { 0.0 } else { (least + most) / 2.0 }
     };
-    (middle(|source| source.position_m[0]), middle(|source| source.position_m[1]))
+    (middle(|source| source.object.position_m[0]), middle(|source| source.object.position_m[1]))
 }
 
 fn coordinate(metres: f64, variance_m2: Option<f64>) -> Option<cdd::CartesianCoordinateWithConfidence> {

@@ -1,8 +1,9 @@
 //! The frame of a message: east and north of its reference position.
 
 use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd as cdd;
-use ecod::model::geometry::wrap_angle;
+use ecod::model::geometry::{Covariance, wrap_angle};
 use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition};
+use nalgebra::{Rotation2, Vector2};
 
 use super::CpmError;
 
@@ -85,12 +86,12 @@ impl MessageFrame {
 
     /// A velocity in the message's frame.
     pub(super) fn velocity_to_message(&self, velocity: [f64; 2]) -> [f64; 2] {
-        rotated(velocity, self.rotation_rad)
+        (Rotation2::new(self.rotation_rad) * Vector2::from(velocity)).into()
     }
 
     /// A velocity in the cell's frame.
     pub(super) fn velocity_to_cell(&self, velocity: [f64; 2]) -> [f64; 2] {
-        rotated(velocity, -self.rotation_rad)
+        (Rotation2::new(-self.rotation_rad) * Vector2::from(velocity)).into()
     }
 
     /// A direction in the message's frame.
@@ -105,20 +106,12 @@ impl MessageFrame {
 
     /// Variances east and north of a covariance in the cell's frame.
     pub(super) fn variances_to_message(&self, covariance_m2: [f64; 3]) -> [f64; 2] {
-        let [xx, xy, yy] = covariance_m2;
-        let (sin, cos) = self.rotation_rad.sin_cos();
-        [cos * cos * xx - 2.0 * sin * cos * xy + sin * sin * yy, sin * sin * xx + 2.0 * sin * cos * xy + cos * cos * yy]
+        let turn = Rotation2::new(self.rotation_rad);
+        (turn * Covariance::from(covariance_m2).matrix() * turn.inverse()).diagonal().into()
     }
 
     /// The covariance in the cell's frame of variances east and north.
     pub(super) fn variances_to_cell(&self, [east_m2, north_m2]: [f64; 2]) -> [f64; 3] {
-        let (sin, cos) = self.rotation_rad.sin_cos();
-        let (xx, yy) = (cos * cos * east_m2 + sin * sin * north_m2, sin * sin * east_m2 + cos * cos * north_m2);
-        [xx, sin * cos * (north_m2 - east_m2), yy]
+        Covariance::along_bearing(-self.rotation_rad, east_m2.sqrt(), north_m2.sqrt()).into()
     }
-}
-
-fn rotated([x, y]: [f64; 2], angle_rad: f64) -> [f64; 2] {
-    let (sin, cos) = angle_rad.sin_cos();
-    [x * cos - y * sin, x * sin + y * cos]
 }

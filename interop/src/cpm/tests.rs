@@ -195,3 +195,17 @@ fn messages_that_are_not_for_here_are_refused_by_reason() {
     let early = ObjectReport { captured_at_us: Timestamp(5), ..report(Vec::new()) };
     assert_eq!(encode_report(&early, &origin(0.0), 1), Err(CpmError::NoTime));
 }
+
+#[test]
+fn a_covariance_turns_with_the_frames() {
+    // The cell's x axis points north.
+    let quarter = origin(90.0);
+    let object = PerceivedObject { covariance_m2: Some([4.0, 0.0, 1.0]), ..PerceivedObject::new("car", 0.9, 3.0, 2.0) };
+    let message = encode_report(&report(vec![object]), &quarter, 1).unwrap().bytes;
+    let there = decode(&message, &quarter).unwrap().objects.remove(0);
+    let [along_x, _, along_y] = there.covariance_m2.unwrap();
+    assert!((along_x - 4.0).abs() < 0.03 && (along_y - 1.0).abs() < 0.03, "{along_x} {along_y}");
+    let by_east = decode(&message, &origin(0.0)).unwrap().objects.remove(0);
+    let [east, _, north] = by_east.covariance_m2.unwrap();
+    assert!((east - 1.0).abs() < 0.03 && (north - 4.0).abs() < 0.03, "{east} {north}");
+}

@@ -1,11 +1,10 @@
 //! Messages of ROS 2 (Humble and later) and vision_msgs 4, as they are on the wire, and their definitions.
 
-use std::collections::BTreeMap;
-
-use ecod::model::names::Label;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, WirePose};
 use serde::Serialize;
+
+use crate::object::CellObject;
 
 /// A message with a name and a definition by which others read it.
 pub(super) trait Definition {
@@ -126,61 +125,33 @@ struct Detection3D {
     id: String,
 }
 
-/// An object of a map or report.
-struct Shape<'a> {
-    label: &'a Label,
-    confidence: f64,
-    scores: &'a BTreeMap<Label, f64>,
-    position_m: [f64; 2],
-    covariance_m2: Option<[f64; 3]>,
-    heading_rad: Option<f64>,
-    size_m: Option<[f64; 2]>,
+fn pose(object: &CellObject<'_>) -> RosPose {
+    let [x, y] = object.position_m;
+    let orientation = RosQuaternion::about_z(object.heading_rad.unwrap_or(0.0));
+    RosPose { position: RosVector { x, y, z: HEIGHT_M / 2.0 }, orientation }
 }
 
-impl Shape<'_> {
-    fn pose(&self) -> RosPose {
-        let [x, y] = self.position_m;
-        let orientation = RosQuaternion::about_z(self.heading_rad.unwrap_or(0.0));
-        RosPose { position: RosVector { x, y, z: HEIGHT_M / 2.0 }, orientation }
-    }
-
-    fn size(&self) -> RosVector {
-        let [x, y] = self.size_m.unwrap_or([UNKNOWN_SIZE_M; 2]);
-        RosVector { x, y, z: HEIGHT_M }
-    }
-
-    fn detection(&self, header: &Header, id: String) -> Detection3D {
-        let mut covariance = [[0.0; 6]; 6];
-        for (index, row) in covariance.iter_mut().enumerate() {
-            row.iter_mut().skip(index).take(1).for_each(|variance| *variance = UNKNOWN_VARIANCE);
-        }
-        if let (Some([xx, xy, yy]), [[a, b, ..], [c, d, ..], ..]) = (self.covariance_m2, &mut covariance) {
-            (*a, *b, *c, *d) = (xx, xy, xy, yy);
-        }
-        let only = [(self.label, &self.confidence)];
-        let scores: Vec<_> = if self.scores.is_empty() { only.into() } else { self.scores.iter().collect() };
-        let results = scores.into_iter().map(|(label, score)| ObjectHypothesisWithPose {
-            hypothesis: ObjectHypothesis { class_id: label.to_string(), score: *score },
-            pose: PoseWithCovariance { pose: self.pose(), covariance },
-        });
-        let bbox = BoundingBox3D { center: self.pose(), size: self.size() };
-        Detection3D { header: header.clone(), results: results.collect(), bbox, id }
-    }
+fn size(object: &CellObject<'_>) -> RosVector {
+    let [x, y] = object.size_m.unwrap_or([UNKNOWN_SIZE_M; 2]);
+    RosVector { x, y, z: HEIGHT_M }
 }
 
-fn shapes_of(map: &GlobalMap) -> impl Iterator<Item = (String, Shape<'_>)> {
-    map.objects.iter().map(|object| {
-        let shape = Shape {
-            label: &object.label,
-            confidence: object.confidence,
-            scores: &object.scores,
-            position_m: [object.x_m, object.y_m],
-            covariance_m2: Some(object.covariance_m2),
-            heading_rad: object.heading_rad,
-            size_m: object.size_m,
-        };
-        (object.id.to_string(), shape)
-    })
+fn detection(object: &CellObject<'_>, header: &Header, id: String) -> Detection3D {
+    let mut covariance = [[0.0; 6]; 6];
+    for (index, row) in covariance.iter_mut().enumerate() {
+        row.iter_mut().skip(index).take(1).for_each(|variance| *variance = UNKNOWN_VARIANCE);
+    }
+    if let (Some([xx, xy, yy]), [[a, b, ..], [c, d, ..], ..]) = (object.covariance_m2, &mut covariance) {
+        (*a, *b, *c, *d) = (xx, xy, xy, yy);
+    }
+    let only = [(object.label, &object.confidence)];
+    let scores: Vec<_> = if object.scores.is_empty() { only.into() } else { object.scores.iter().collect() };
+    let results = scores.into_iter().map(|(label, score)| ObjectHypothesisWithPose {
+        hypothesis: ObjectHypothesis { class_id: label.to_string(), score: *score },
+        pose: PoseWithCovariance { pose: pose(object), covariance },
+    });
+    let bbox = BoundingBox3D { center: pose(object), size: size(object) };
+    Detection3D { header: header.clone(), results: results.collect(), bbox, id }
 }
 
 #[derive(Debug, Serialize)]
@@ -192,35 +163,17 @@ pub(super) struct Detection3DArray {
 impl Detection3DArray {
     pub(super) fn of_map(map: &GlobalMap) -> Self {
         let header = Header::in_map(map.fused_at_us);
-        let mut detections: Vec<_> = shapes_of(map).map(|(id, shape)| shape.detection(&header, id)).collect();
-        detections.extend(map.landmarks.iter().filter_map(|landmark| {
-            let shape = Shape {
-                label: landmark.label.as_ref()?,
-                confidence: landmark.confidence,
-                scores: &BTreeMap::new(),
-                position_m: [landmark.x_m, landmark.y_m],
-                covariance_m2: None,
-                heading_rad: None,
-                size_m: None,
-            };
-            Some(shape.detection(&header, landmark.id.to_string()))
-        }));
+        let objects = map.objects.iter().map(|object| (object.into(), object.id.to_string()));
+        let at_places = map.landmarks.iter().filter_map(|place| Some((CellObject::at(place)?, place.id.to_string())));
+        let detections = objects.chain(at_places).map(|(object, id)| detection(&object, &header, id)).collect();
         Self { header, detections }
     }
 
     pub(super) fn of_report(report: &ObjectReport) -> Self {
         let header = Header::in_map(report.captured_at_us);
         let detections = report.objects.iter().map(|object| {
-            let shape = Shape {
-                label: &object.label,
-                confidence: object.confidence,
-                scores: &object.scores,
-                position_m: [object.x_m, object.y_m],
-                covariance_m2: object.covariance_m2,
-                heading_rad: object.heading_rad,
-                size_m: object.size_m,
-            };
-            shape.detection(&header, object.landmark.as_ref().map(ToString::to_string).unwrap_or_default())
+            let id = object.landmark.as_ref().map(ToString::to_string).unwrap_or_default();
+            detection(&object.into(), &header, id)
         });
         Self { detections: detections.collect(), header }
     }
@@ -388,14 +341,14 @@ impl MarkerArray {
             mesh_use_embedded_materials: false,
         };
         let mut markers = vec![Marker { action: DELETE_ALL, ..marker("objects", 0) }];
-        for ((_, shape), number) in shapes_of(map).zip(1..) {
-            let pose = shape.pose();
+        for (object, number) in map.objects.iter().map(CellObject::from).zip(1..) {
+            let pose = pose(&object);
             let mut above = pose;
             above.position.z = HEIGHT_M + 0.5;
             let scale = RosVector { z: 0.5, ..RosVector::default() };
             let color = ColorRGBA { r: 1.0, g: 1.0, b: 1.0, a: 1.0 };
-            let text = shape.label.to_string();
-            markers.push(Marker { pose, scale: shape.size(), ..marker("objects", number) });
+            let text = object.label.to_string();
+            markers.push(Marker { pose, scale: size(&object), ..marker("objects", number) });
             markers.push(Marker { kind: TEXT, pose: above, scale, color, text, ..marker("labels", number) });
         }
         Self { markers }

@@ -375,8 +375,13 @@ impl GossipMachine {
             self.outputs.push_back(GossipOutput::Multicast { frame });
         }
         self.hello_count += 1;
+        self.tell_silent_seeds();
+    }
+
+    /// Names the seeds that have not answered for some greetings of a node that knows of no other. Only the other side can
+    /// read whose key or cell is wrong.
+    fn tell_silent_seeds(&mut self) {
         self.unanswered = if self.gossip.alive().is_empty() { self.unanswered + 1 } else { 0 };
-        // A seed alone does not see whose key or cell is wrong: what it cannot read has no answer.
         if self.unanswered <= 1 {
             self.answered.clear();
         } else if self.unanswered.is_multiple_of(SILENT_SEED_HELLOS) {
