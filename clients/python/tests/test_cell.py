@@ -398,7 +398,8 @@ def test_closing_ends_the_loops_of_other_threads(broker: Server) -> None:
     cell.close()
 
 
-def test_what_was_reported_before_closing_arrives(broker: Server, cell_name: str, heard: Any) -> None:
+@pytest.mark.parametrize("_again", range(20))
+def test_what_was_reported_before_closing_arrives(broker: Server, cell_name: str, heard: Any, _again: int) -> None:
     with ecod.Cell(broker.address, cell_name) as cell:
         assert all(cell.report([CAR] * 200) for _ in range(10))
     assert [heard.get(timeout=20)[1]["seq"] for _ in range(10)] == list(range(1, 11))

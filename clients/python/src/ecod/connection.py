@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import random
 import socket
@@ -76,6 +77,7 @@ class Connection:
         client.on_subscribe = lambda _client, _userdata, mid, reasons, properties: self._on_answer(mid, reasons[0], properties)
         client.on_publish = lambda _client, _userdata, mid, reason, properties: self._on_answer(mid, reason, properties)
         client.on_socket_open = _without_delay
+        client.on_socket_close = lambda _client, _userdata, sock: self._drain(sock)
         # The thread of `_run` alone writes to the socket; otherwise every caller would.
         client.on_socket_register_write = lambda *_: None
         if tls is not None:
@@ -186,6 +188,16 @@ class Connection:
             return True
         self._lose(result)
         return False
+
+    def _drain(self, sock: Any) -> None:
+        """Reads what still comes, at the end. Otherwise the system resets the connection, and the broker loses what it has not read."""
+        deadline = time.monotonic() + FLUSH_S
+        if self.closing.is_set():
+            with contextlib.suppress(OSError):
+                sock.shutdown(socket.SHUT_WR)
+                sock.settimeout(FLUSH_S)
+                while sock.recv(65536) and time.monotonic() < deadline:
+                    pass
 
     def _lose(self, reason: Any) -> None:
         if self.is_connected and not self.closing.is_set():
