@@ -15,16 +15,6 @@ pub mod round;
 mod answer;
 mod command;
 mod config;
-/// The report as its vehicle's: what a part saw, its vehicle saw. So the parts of a vehicle are one witness, with one
-/// reputation.
-fn of_vehicle(report: &Arc<ObjectReport>) -> Arc<ObjectReport> {
-    let vehicle = report.node.vehicle();
-    if vehicle == report.node {
-        return Arc::clone(report);
-    }
-    Arc::new(ObjectReport { node: vehicle, ..ObjectReport::clone(report) })
-}
-
 #[cfg(test)]
 mod tests;
 
@@ -191,6 +181,10 @@ impl Aggregator {
             ReportKind::Detections => {
                 let pace = self.pace.as_mut().ok_or(RejectReason::NotFused)?;
                 let admitted = window.admit(report, now)?;
+                if self.tracks.is_none() && !pace.landmarks().landmarks().is_empty() && !report.objects.is_empty() {
+                    let is_placed = report.objects.iter().any(|object| pace.is_at_landmark(object));
+                    window.note_place(&report.node, is_placed, now);
+                }
                 let report = &of_vehicle(report);
                 let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
                 let tracks = self.tracks.as_mut();
@@ -237,6 +231,11 @@ impl Aggregator {
     /// Time for which reports of a vehicle or part have been rejected for their time, and nothing else.
     pub fn untimely_for(&self, kind: ReportKind, name: &NodeName, now: Timestamp) -> Duration {
         self.windows[kind as usize].untimely_for(name, now)
+    }
+
+    /// Time for which no detection of a vehicle or part has been at a known location, where nothing else is fused.
+    pub fn misplaced_for(&self, name: &NodeName, now: Timestamp) -> Duration {
+        self.windows[ReportKind::Detections as usize].misplaced_for(name, now)
     }
 
     /// True if a location of this id is known; `None` if none is known at all.
@@ -404,6 +403,16 @@ impl Aggregator {
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());
         Some(Fused { epoch, round, map, verdicts, evidence, reputations })
     }
+}
+
+/// The report as its vehicle's: what a part saw, its vehicle saw. So the parts of a vehicle are one witness, with one
+/// reputation.
+fn of_vehicle(report: &Arc<ObjectReport>) -> Arc<ObjectReport> {
+    let vehicle = report.node.vehicle();
+    if vehicle == report.node {
+        return Arc::clone(report);
+    }
+    Arc::new(ObjectReport { node: vehicle, ..ObjectReport::clone(report) })
 }
 
 /// Moves the dates of objects to another clock.

@@ -75,6 +75,8 @@ trouble_kinds! {
     NoLocations = "no_locations", SHORT, "give this node the cell's `landmarks`, or the cell a description: `ecod-node cell set`";
     /// A vehicle names a location that the aggregator does not know.
     UnknownLocation = "unknown_location", SHORT, "give all nodes the same `landmarks`: `ecod-node cell set`";
+    /// Objects that are where none can be.
+    Misplaced = "misplaced", SHORT, "positions are in metres in the cell's frame: correct its pose, its program or the list of locations";
     /// The node does not use the cell's description.
     Description = "description", UNTIL_SETTLED, "`ecod-node cell diff` shows the difference";
     /// Messages that cannot be read.
@@ -93,6 +95,8 @@ trouble_kinds! {
     OtherCell = "other_cell", LONG, "give both nodes the same `cell`, if they belong together";
     /// A node that cannot show a certificate which this one accepts.
     NotAdmitted = "not_admitted", LONG, "give it a certificate of the cell (`ecod-node pki issue`), or set the clock";
+    /// A second running node of a name.
+    NameTaken = "name_taken", LONG, "give one of the two another `name`, or stop it";
     /// A seed that does not answer a node which knows of no other.
     SeedSilent = "seed_silent", LONG, "start it, give both nodes the same `cell` and key, or let UDP through; without such a node, remove it from `membership.seeds`";
     /// A host name without an address.
@@ -101,6 +105,8 @@ trouble_kinds! {
     BrokerUnreachable = "broker_unreachable", LONG, "check its address, the firewall, the certificates on both sides, and whether the broker runs";
     /// A broker that does not let this node do what it must.
     BrokerRefuses = "broker_refuses", UNTIL_SETTLED, "check password, certificate and permissions";
+    /// More troubles than are kept.
+    NotShown = "not_shown", SHORT, "mend those that are shown; the metric `ecod_payloads_rejected_by_source_total` names all senders";
     /// State that cannot be saved.
     NotSaved = "not_saved", UNTIL_SETTLED, "free space on the disk, and make `state_dir` writable for the node's user";
 }
@@ -169,8 +175,6 @@ type Key = (Option<String>, TroubleKind);
 pub struct TroubleRegister {
     /// A lapsed entry stays until its room is needed, so that a trouble that comes and goes is not logged each time.
     entries: BTreeMap<Key, KnownTrouble>,
-    /// When the log was last told that there is no room.
-    crowded_at: Option<Timestamp>,
 }
 
 #[derive(Debug, Clone)]
@@ -212,8 +216,8 @@ impl TroubleRegister {
         let shown = |cause: &str, suffix: &str| Trouble {
             kind: kind.as_str().into(),
             about: key.0.clone(),
-            cause: plain_text(cause, MAX_TROUBLE_TEXT - suffix.len()) + suffix,
-            remedy: plain_text(remedy, MAX_TROUBLE_TEXT),
+            cause: shortened(cause, MAX_TROUBLE_TEXT - suffix.len()) + suffix,
+            remedy: shortened(remedy, MAX_TROUBLE_TEXT),
         };
         if let Some(entry) = self.entries.get_mut(&key) {
             entry.times += 1;
@@ -237,11 +241,7 @@ impl TroubleRegister {
             });
         }
         if !self.make_room(&key, now) {
-            let is_told = self.crowded_at.is_some_and(|at| now.since(at) < LOG_INTERVAL);
-            return (!is_told).then(|| {
-                self.crowded_at = Some(now);
-                shown(&cause(), "; this and more troubles are not shown, for want of room")
-            });
+            return self.note(TroubleKind::NotShown, None, "there are more troubles than have room here", now);
         }
         let cause = cause();
         let entry = KnownTrouble {
@@ -307,6 +307,16 @@ fn key(kind: TroubleKind, about: Option<&str>) -> Key {
     (about.map(name), kind)
 }
 
+/// A text of at most so many bytes, with an ellipsis after the last whole word if it is longer.
+fn shortened(text: &str, max_bytes: usize) -> String {
+    const ELLIPSIS: &str = " …";
+    if text.len() <= max_bytes {
+        return plain_text(text, max_bytes);
+    }
+    let cut = plain_text(text, max_bytes - ELLIPSIS.len());
+    cut.rsplit_once(' ').map_or(&*cut, |(words, _)| words).to_owned() + ELLIPSIS
+}
+
 /// A cause without its figures.
 fn gist(cause: &str) -> String {
     cause.chars().filter(|letter| !letter.is_ascii_digit() && !matches!(letter, '.' | '-')).collect()
@@ -343,6 +353,16 @@ mod tests {
     }
 
     #[test]
+    fn a_long_cause_ends_after_a_whole_word() {
+        let mut register = TroubleRegister::default();
+        register.note(TroubleKind::ImplausibleSize, None, &"`camera.projection` is 180 ".repeat(20), at(1));
+        let [cause] = shown(&register, at(1)).try_into().unwrap();
+        assert!(cause.ends_with(" …") && cause.len() <= MAX_TROUBLE_TEXT + 2, "{cause}");
+        let last = cause.trim_end_matches(" …").rsplit(' ').next();
+        assert!(["`camera.projection`", "is", "180"].map(Some).contains(&last), "{cause}");
+    }
+
+    #[test]
     fn what_lasts_is_over_when_its_part_says_so() {
         let mut register = TroubleRegister::default();
         assert!(register.note(TroubleKind::Camera, None, "no frame for 5 s", at(1)).is_some());
@@ -361,10 +381,11 @@ mod tests {
         }
         register.note(TroubleKind::Camera, None, "no frame", at(1));
         let present = register.present(at(1));
-        assert_eq!(present.len(), MAX_ABOUT_OTHERS + 1);
-        assert_eq!((present[0].kind.as_str(), present[0].about.as_deref()), ("camera", None));
-        assert_eq!(present[1].about.as_deref(), Some("gauss"));
-        assert_eq!(present[2].cause, "a b ");
+        assert_eq!(present.len(), MAX_ABOUT_OTHERS + 2);
+        let own = present.iter().take(2).map(|own| (own.kind.as_str(), own.about.as_deref()));
+        assert_eq!(own.collect::<Vec<_>>(), [("camera", None), ("not_shown", None)]);
+        assert_eq!(present[2].about.as_deref(), Some("gauss"));
+        assert_eq!(present[3].cause, "a b ");
         register.note(TroubleKind::Malformed, Some("late"), "x", at(60));
         assert_eq!(shown(&register, at(60)), [": no frame", "late: x"], "lapsed ones give way");
     }
@@ -378,7 +399,7 @@ mod tests {
         });
         assert_eq!(lines.count(), MAX_OF_STRANGERS + 1, "the last says that there are more");
         assert!(register.note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0)).is_some());
-        assert_eq!(register.present(at(0)).len(), MAX_OF_STRANGERS + 1);
+        assert_eq!(register.present(at(0)).len(), MAX_OF_STRANGERS + 2);
     }
 
     #[test]

@@ -98,7 +98,9 @@ pub struct Summary {
     pub unit: Option<TimeUnit>,
     /// Used lines with a time before that of an earlier line.
     pub late: u64,
-    /// Objects of used lines that did not vote or whose votes were forgotten; see [`crate::vote`].
+    /// Objects of used lines for VOTE.
+    pub votes: u64,
+    /// Those of them that did not vote or whose votes were forgotten; see [`crate::vote`].
     pub ignored_votes: u64,
     /// Lines that only tracking used, because a later one of their vehicle came before.
     pub overtaken: u64,
@@ -286,9 +288,11 @@ impl Replay {
         }
         self.close_due_rounds(before, now, &mut output);
         self.learn_landmarks(&line);
+        let votes = if line.kind == ReportKind::VoteDetections { line.report.objects.len() as u64 } else { 0 };
         match self.cell(now).report(line.kind, &Arc::new(line.report), now) {
             Ok(fused) => {
                 self.summary.late += u64::from(is_late);
+                self.summary.votes += votes;
                 self.heard[line.kind as usize] = true;
                 self.pending = fused.is_none();
                 self.write(fused, &mut output);

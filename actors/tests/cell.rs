@@ -6,7 +6,7 @@ use std::time::Duration;
 use ecod::leadership::Position;
 use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
-use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role};
+use ecod::wire::{GlobalMap, ObjectReport, PerceivedObject, ReportKind, Role, Trouble};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
@@ -230,10 +230,46 @@ async fn a_second_node_of_a_name_takes_no_part_and_says_why() {
     let mut second = node::start(near("euclid", Role::Cav)).await.unwrap();
     let error = timeout(PATIENCE, second.failed()).await.expect("it gives up").unwrap_err();
     assert!(error.to_string().contains("another running node of the cell lot-1 is called euclid"), "{error}");
+    let twin = |trouble: &Trouble| trouble.kind == "name_taken" && trouble.about.as_deref() == Some("euclid");
+    let own = second.counters().troubles().present();
+    assert!(own.iter().any(twin), "{own:?}");
+    let seen = edge.counters().troubles().present();
+    assert!(seen.iter().any(|trouble| twin(trouble) && trouble.cause.contains("at 127.0.0.1:")), "{seen:?}");
     second.stop().await;
     tokio::time::sleep(Duration::from_secs(1)).await;
     assert!(of_edge(&edge) && of_edge(&euclid) && edge.members().borrow().len() == 1);
     euclid.stop().await;
+    edge.stop().await;
+}
+
+/// A terminal that is closed ends `top` as `q` does: it leaves the cell, and does not spin on the terminal that is gone.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn top_leaves_the_cell_when_its_terminal_is_closed() {
+    let edge = edge().await;
+    let (terminal, side) = pty_process::blocking::open().unwrap();
+    terminal.resize(pty_process::Size::new(40, 120)).unwrap();
+    let seed = edge.gossip_address().unwrap().to_string();
+    let top = pty_process::blocking::Command::new(env!("CARGO_BIN_EXE_ecod-node"))
+        .args(["top", "--cell", "lot-1", "--seed", &seed])
+        .env("ECOD_MEMBERSHIP__MULTICAST__ENABLED", "false")
+        .env("ECOD_MEMBERSHIP__BIND", "127.0.0.1:0");
+    let mut top = top.spawn(side).unwrap();
+    let members = edge.members();
+    timeout(PATIENCE, members.clone().wait_for(|members| members.len() == 1)).await.expect("it joins").unwrap();
+    drop(terminal);
+    let ended = async {
+        loop {
+            if let Some(status) = top.try_wait().unwrap() {
+                break status;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    let ended = timeout(PATIENCE, ended).await;
+    top.kill().ok();
+    let ended = ended.expect("it ends");
+    assert!(ended.success(), "{ended}");
+    assert!(members.borrow().is_empty(), "it has left");
     edge.stop().await;
 }
 

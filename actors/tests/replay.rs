@@ -110,6 +110,25 @@ fn votes_by_name_are_used_without_positions_and_detections_are_told_what_they_la
     assert!(said(&detections).contains("line 1: objects[0]: missing field `x_m`"), "{}", said(&detections));
 }
 
+/// Votes for locations that the configuration does not have, and votes in centimetres, are readable and change nothing.
+#[test]
+fn votes_of_which_none_counts_fail() {
+    let folder = TempDir::new().unwrap();
+    let cell = folder.path().join("cell.toml");
+    fs::write(&cell, "[[landmarks]]\nid = \"table\"\nx_m = 3\ny_m = 0\n").unwrap();
+    for (landmark, x_m, code) in [("table", 0, 0), ("tabel", 0, 3), ("table", 300, 3)] {
+        let object = format!(r#"{{"label":"cup","confidence":0.9,"x_m":3,"y_m":0,"landmark":"{landmark}"}}"#);
+        let pose = format!(r#""pose":{{"x_m":{x_m},"y_m":0,"heading_rad":0}}"#);
+        let line = format!(
+            r#"{{"schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,{pose},"objects":[{object}],"topic":"vote_detections"}}"#
+        );
+        let arguments = ["replay", "--config", text(&cell), "--input", "-", "--output", "-"];
+        let run = ecod_with_input(&arguments, line.as_bytes());
+        assert_eq!(run.status.code(), Some(code), "{landmark}, {x_m}: {}", said(&run));
+        assert_eq!(said(&run).contains("none of 1 votes counts"), code == 3, "{}", said(&run));
+    }
+}
+
 #[test]
 fn input_that_is_no_recording_fails() {
     let folder = TempDir::new().unwrap();

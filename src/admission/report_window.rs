@@ -119,6 +119,19 @@ impl ReportWindow {
         since.map_or(Duration::ZERO, |since| now.since(since))
     }
 
+    /// Notes if any object of a known sender's report has an effect where it is.
+    pub(crate) fn note_place(&mut self, name: &NodeName, is_placed: bool, at: Timestamp) {
+        if let Some(vehicle) = self.vehicles.get_mut(name) {
+            vehicle.misplaced_since = (!is_placed).then(|| vehicle.misplaced_since.unwrap_or(at));
+        }
+    }
+
+    /// Time for which no object of a sender has been where it has an effect.
+    pub(crate) fn misplaced_for(&self, name: &NodeName, now: Timestamp) -> Duration {
+        let since = self.vehicles.get(name).and_then(|vehicle| vehicle.misplaced_since);
+        since.map_or(Duration::ZERO, |since| now.since(since))
+    }
+
     /// The share of the vehicles heard lately whose reports are admitted.
     pub fn timeliness(&self, now: Timestamp) -> Timeliness {
         // By vehicle: the parts of one must not speak for many.

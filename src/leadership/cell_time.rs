@@ -103,6 +103,11 @@ impl CellTime {
         self.reading.unwrap_or(own)
     }
 
+    /// True if the cell's time follows one of two clocks, so that either may be the wrong one.
+    pub fn is_undecided(&self, now: Timestamp) -> bool {
+        self.walls(now).len() == 2
+    }
+
     /// Errors of all wall clocks that are known in microseconds, positive if ahead of the cell's time: of the node's own,
     /// without a name, and of others. None while the node does not know the cell's time.
     pub fn wall_errors(&self, now: Timestamp) -> Vec<(Option<&NodeName>, i64)> {

@@ -335,8 +335,9 @@ fn check_between(value: f64, low: f64, high: f64) -> Result<(), RejectReason> {
 }
 
 fn check_verdict(verdict: &Verdict) -> Result<(), RejectReason> {
-    let mut scores = [verdict.score, verdict.margin].into_iter().chain(verdict.votes.values().copied());
+    let mut scores = [verdict.score].into_iter().chain(verdict.votes.values().copied());
     scores.try_for_each(|score| check_between(score, -SCORE_BOUND, SCORE_BOUND))?;
+    check_between(verdict.margin, 0.0, SCORE_BOUND)?;
     let labels = verdict.votes.keys().chain(&verdict.label);
     check_labels([&*verdict.landmark].into_iter().chain(labels.map(|label| &**label)))
 }

@@ -22,11 +22,13 @@ use ecod::aggregator::{Aggregator, Command, Fused};
 use ecod::diagnostics::TroubleKind;
 use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
 use ecod::model::epoch::Epoch;
+use ecod::model::geometry::Pose;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::replay::JournalEvent;
+use ecod::replay::{JournalEvent, TimeUnit};
 use ecod::tracking::TracksLosses;
 use ecod::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind};
+use nalgebra::Point2;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
@@ -154,14 +156,27 @@ const MIN_UNTIMELY: Duration = Duration::from_millis(500);
 /// take on their way.
 const MAX_UNNOTED_LEAD_US: i64 = 1_500_000;
 
+/// Time for which no object of a vehicle is at a known location until it is a trouble: it may see something else.
+const MIN_MISPLACED: Duration = Duration::from_secs(10);
+
+/// Greatest range in metres at which a camera tells what an object is.
+const MAX_SEEN_RANGE_M: f64 = 500.0;
+
 /// The lead of a report's time in words.
-fn lead_in_words(lead_us: i64) -> String {
+fn lead_in_words(report: &ObjectReport, lead_us: i64) -> String {
+    if let Some(unit) = TimeUnit::of(report.captured_at_us) {
+        return format!("its `captured_at_us` looks like {unit} instead of microseconds, or its clock was never set");
+    }
     let seconds = lead_us.unsigned_abs() as f64 / 1e6;
+    let lead = if seconds < DAY_S { format!("{seconds:.1} s") } else { format!("{:.0} days", seconds / DAY_S) };
     match lead_us {
-        0.. => format!("its clock is {seconds:.1} s ahead"),
-        _ => format!("its clock is {seconds:.1} s behind, or its reports take that long"),
+        0.. => format!("its clock is {lead} ahead"),
+        _ => format!("its clock is {lead} behind, or its reports take that long"),
     }
 }
+
+/// A day in seconds.
+const DAY_S: f64 = 86_400.0;
 
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
@@ -207,6 +222,7 @@ impl FuserState {
         match taken {
             Ok(fused) => {
                 self.note_clock(report, delivery.received_at);
+                self.note_place(*kind, report, delivery.received_at);
                 if self.aggregator.leads().is_some() {
                     self.spans.note(report, delivery.received_at, &mut self.reports);
                 }
@@ -231,8 +247,9 @@ impl FuserState {
             RejectReason::FromTheFuture | RejectReason::Stale => {
                 self.counters.count_reject(reason, node);
                 if self.aggregator.untimely_for(kind, &report.node, received_at) >= MIN_UNTIMELY {
-                    let clock = lead_in_words(self.lead_us(report, received_at));
-                    self.counters.troubles().note_about(node, TroubleKind::Untimely, &format!("refused, {clock}"));
+                    let cause = format!("refused, {}", lead_in_words(report, self.lead_us(report, received_at)));
+                    self.counters.troubles().settle(TroubleKind::ClockOff, Some(node));
+                    self.counters.troubles().note_about(node, TroubleKind::Untimely, &cause);
                 }
             }
             RejectReason::NotFused => self
@@ -246,8 +263,26 @@ impl FuserState {
     fn note_clock(&self, report: &ObjectReport, received_at: Timestamp) {
         let lead_us = self.lead_us(report, received_at);
         if report.clock_error_us.is_none() && lead_us.saturating_abs() > MAX_UNNOTED_LEAD_US {
-            let cause = format!("{}; its reports are put right by that", lead_in_words(lead_us));
-            self.counters.troubles().note_about(report.node.as_str(), TroubleKind::ClockOff, &cause);
+            let cause = format!("{}; its reports are put right by that", lead_in_words(report, lead_us));
+            let node = report.node.as_str();
+            self.counters.troubles().settle(TroubleKind::Untimely, Some(node));
+            self.counters.troubles().note_about(node, TroubleKind::ClockOff, &cause);
+        }
+    }
+
+    /// Notes detections that are used nowhere, or too far from their camera for any: their unit or frame is another.
+    fn note_place(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
+        let note = |cause: &str| {
+            self.counters.troubles().note_about(report.node.as_str(), TroubleKind::Misplaced, cause);
+        };
+        if kind == ReportKind::Detections && self.aggregator.misplaced_for(&report.node, received_at) >= MIN_MISPLACED {
+            note("none of its objects is at a known location");
+        }
+        let Some(pose) = report.pose.map(Pose::from) else { return };
+        let ranges = report.objects.iter().map(|object| pose.range_bearing(&Point2::new(object.x_m, object.y_m)).0);
+        let farthest_m = ranges.fold(0.0, f64::max);
+        if farthest_m > MAX_SEEN_RANGE_M {
+            note(&format!("an object of its report is {farthest_m:.0} m from its pose"));
         }
     }
 

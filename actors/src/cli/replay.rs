@@ -39,7 +39,7 @@ pub(super) struct ReplayArguments {
     /// Weigh all recorded votes together N times, and write the last verdicts only
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     passes: Option<u32>,
-    /// Share of rejected reports beyond which the program ends with code 3, as it does if none was usable
+    /// Share of rejected reports beyond which the program ends with code 3, as it does if no report or no vote was usable
     #[arg(long, value_name = "PERCENT", value_parser = clap::value_parser!(u64).range(0..=100), default_value_t = 10)]
     max_rejected: u64,
 }
@@ -103,23 +103,38 @@ struct Usable {
     reports: u64,
     used: u64,
     faulty: u64,
+    /// Objects for VOTE, and those of them that did not count.
+    votes: u64,
+    ignored_votes: u64,
 }
 
 impl Usable {
     fn of(summary: &Summary, may_repeat: bool) -> Self {
-        Self { reports: summary.lines, used: summary.used(), faulty: summary.faulty(may_repeat) }
+        let Summary { lines, votes, ignored_votes, .. } = *summary;
+        Self { reports: lines, used: summary.used(), faulty: summary.faulty(may_repeat), votes, ignored_votes }
     }
 
     fn plus(self, other: Self) -> Self {
-        let Self { reports, used, faulty } = other;
-        Self { reports: self.reports + reports, used: self.used + used, faulty: self.faulty + faulty }
+        let Self { reports, used, faulty, votes, ignored_votes } = other;
+        Self {
+            reports: self.reports + reports,
+            used: self.used + used,
+            faulty: self.faulty + faulty,
+            votes: self.votes + votes,
+            ignored_votes: self.ignored_votes + ignored_votes,
+        }
     }
 
-    /// Fails if nothing was used, or more than a share was rejected.
+    /// Fails if no report or no vote was used, or more than a share was rejected.
     fn check(self, max_rejected_pct: u64) -> Result<(), Failure> {
-        let Self { reports, used, faulty } = self;
+        let Self { reports, used, faulty, votes, ignored_votes } = self;
         if used == 0 {
             return Err(Failure::rejected(anyhow!("no report could be used: the input is no recording of reports")));
+        }
+        if votes > 0 && ignored_votes >= votes {
+            let why = "their `landmark` is none of the configuration's, or farther from their `pose` than \
+                `fusion.vote.weighted.max_range_m`";
+            return Err(Failure::rejected(anyhow!("none of {votes} votes counts: {why}")));
         }
         if faulty * 100 > max_rejected_pct * reports {
             let share = format!("{faulty} of {reports} reports were rejected, more than {max_rejected_pct} %");
@@ -185,7 +200,7 @@ impl RoundWriter {
 }
 
 fn print_summary(summary: &Summary) {
-    let Summary { lines, rejected, unit, late, ignored_votes, overtaken, tracks, written } = summary;
+    let Summary { lines, rejected, unit, late, votes: _, ignored_votes, overtaken, tracks, written } = summary;
     eprintln!("{lines} lines, {} used, {written} written", summary.used());
     for (reason, Rejections { lines, examples }) in rejected {
         eprintln!("rejected {reason} {lines}");

@@ -1,14 +1,14 @@
 //! `ecod-node top`: a cell in a terminal.
 
+use std::fs::File;
 use std::io::IsTerminal;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
 use clap::Args;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEventKind, KeyModifiers};
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::Failure;
 use super::run::ObserverArguments;
@@ -38,36 +38,76 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
     let mut config = arguments.observer.load("top")?;
     config.record = None;
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads for the node")?;
+    // From now on, so that the node never ends without having left.
+    let gone = {
+        let _context = runtime.enter();
+        [SignalKind::hangup(), SignalKind::terminate()].map(signal)
+    };
     let node = runtime.block_on(node::start(config.clone())).map_err(|error| anyhow!(error))?;
-    let is_gone = runtime.block_on(async { terminal_gone() }).context("cannot wait for signals")?;
-    let shown = ratatui::run(|terminal| show(terminal, &node, &config, &is_gone));
-    runtime.block_on(node.stop());
-    Ok(shown.context("cannot draw to the terminal")?)
-}
-
-/// Flag that is set when the terminal is closed or the program is told to end: the observer then leaves properly.
-fn terminal_gone() -> std::io::Result<Arc<AtomicBool>> {
-    let (mut hangup, mut terminate) = (signal(SignalKind::hangup())?, signal(SignalKind::terminate())?);
-    let is_gone = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&is_gone);
-    tokio::spawn(async move {
+    let node = Arc::new(Mutex::new(Some(node)));
+    let shown_node = Arc::clone(&node);
+    // Reading from a terminal that is gone never ends: this thread is not waited for then.
+    let drawing = runtime.spawn_blocking(move || draw_until_quit(&shown_node, &config));
+    let shown = runtime.block_on(async {
         tokio::select! {
-            _ = hangup.recv() => {}
-            _ = terminate.recv() => {}
+            shown = drawing => shown.context("the display failed").and_then(|shown| shown.context("cannot draw to the terminal")),
+            gone = terminal_gone(gone) => gone.context("cannot leave the terminal"),
         }
-        flag.store(true, Ordering::Relaxed);
     });
-    Ok(is_gone)
+    if let Some(node) = lock(&node).take() {
+        runtime.block_on(node.stop());
+    }
+    runtime.shutdown_background();
+    Ok(shown?)
 }
 
+/// Waits until the terminal is closed, or the program is told to end, and leaves the terminal as it was.
+async fn terminal_gone([hangup, terminate]: [std::io::Result<Signal>; 2]) -> std::io::Result<()> {
+    let (mut hangup, mut terminate) = (hangup?, terminate?);
+    let is_closed = tokio::select! {
+        _ = hangup.recv() => true,
+        _ = terminate.recv() => false,
+    };
+    if !is_closed {
+        ratatui::try_restore()?;
+    }
+    discard_output()
+}
+
+/// Takes the terminal over, and gives it back if it is still there.
+fn draw_until_quit(node: &Mutex<Option<NodeHandle>>, config: &NodeConfig) -> std::io::Result<()> {
+    let is_gone = || !std::io::stdout().is_terminal();
+    let shown = ratatui::try_init().and_then(|mut terminal| {
+        let shown = show(&mut terminal, node, config);
+        if is_gone() { discard_output() } else { shown }
+    });
+    match shown.and(ratatui::try_restore()) {
+        Err(_) if is_gone() => discard_output(),
+        shown => shown,
+    }
+}
+
+/// Lets later output go nowhere: writing to a terminal that is gone fails.
+fn discard_output() -> std::io::Result<()> {
+    let nowhere = File::options().write(true).open("/dev/null")?;
+    rustix::stdio::dup2_stderr(&nowhere)?;
+    Ok(rustix::stdio::dup2_stdout(&nowhere)?)
+}
+
+fn lock(node: &Mutex<Option<NodeHandle>>) -> MutexGuard<'_, Option<NodeHandle>> {
+    node.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Draws the node until the user quits, or the node is stopped.
 fn show(
     terminal: &mut ratatui::DefaultTerminal,
-    node: &NodeHandle,
+    node: &Mutex<Option<NodeHandle>>,
     config: &NodeConfig,
-    is_gone: &AtomicBool,
 ) -> std::io::Result<()> {
-    let mut view = CellView::of(node, config, None, clock::now());
-    while !is_gone.load(Ordering::Relaxed) {
+    let mut before = None;
+    loop {
+        let view = lock(node).as_ref().map(|node| CellView::of(node, config, before, clock::now()));
+        let Some(mut view) = view else { return Ok(()) };
         terminal.draw(|frame| draw(frame, &mut view))?;
         if event::poll(PERIOD)?
             && let Event::Key(key) = event::read()?
@@ -85,7 +125,6 @@ fn show(
                 _ => view.scroll,
             };
         }
-        view = CellView::of(node, config, Some(view), clock::now());
+        before = Some(view);
     }
-    Ok(())
 }

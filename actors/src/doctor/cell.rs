@@ -80,7 +80,8 @@ fn used_elsewhere(config: &NodeConfig, member: &Member) -> Option<Finding> {
 }
 
 fn is_checked_elsewhere(trouble: &Trouble) -> bool {
-    trouble.kind == TroubleKind::Unresolved.as_str()
+    let elsewhere = [TroubleKind::Unresolved, TroubleKind::ImplausibleSize, TroubleKind::ImplausibleUnit];
+    elsewhere.iter().any(|kind| trouble.kind == kind.as_str())
 }
 
 #[cfg(test)]

@@ -99,11 +99,6 @@ pub enum MembershipEvent {
         /// Time of arrival by this node's clock.
         received_at: Timestamp,
     },
-    /// Two running nodes have one name, perhaps this node's. Only the first one is accepted.
-    NameTaken {
-        /// The name.
-        name: NodeName,
-    },
     /// Another node or host does not fit this cell.
     Troubled {
         /// Name of the node, or address of the host.

@@ -154,7 +154,7 @@ def test_verdicts_and_reputations_are_read(cell: ecod.Cell, publisher: Publisher
     reputations = {"schema": 1, "epoch": 3, "round": 88, "reputations": {"euclid": {"score": 0.62, "correct": 410, "incorrect": 22}}}
     publisher.say("reputations", json.dumps(reputations).encode(), retain=True)
     assert next(cell.reputations(timeout=20)).reputations["euclid"].correct == 410
-    verdict = {"landmark": "ball", "label": None, "score": 0, "margin": -0.5, "votes": {"cup": 0.12}, "contributors": ["euclid"]}
+    verdict = {"landmark": "ball", "label": None, "score": 0, "margin": 0, "votes": {"cup": 0.12}, "contributors": ["euclid"]}
     verdicts = {"schema": 1, "aggregator": "edge", "epoch": 3, "round": 8, "fused_at_us": 1_500_000, "verdicts": [verdict]}
     rounds = cell.verdicts(timeout=20)
 

@@ -25,6 +25,8 @@ pub(super) struct VehicleClock {
     pub(super) last_heard: Timestamp,
     /// Time since when reports are rejected for their time only.
     pub(super) untimely_since: Option<Timestamp>,
+    /// Time since when none of its objects has an effect where it is.
+    pub(super) misplaced_since: Option<Timestamp>,
 }
 
 /// Time scale of a vehicle's stamps.
@@ -79,6 +81,7 @@ impl VehicleClock {
             candidate: None,
             last_heard: now,
             untimely_since: None,
+            misplaced_since: None,
         }
     }
 

@@ -219,6 +219,7 @@ fn clocks_that_are_off_are_known_by_name() {
     assert!(off(Some("n2")).is_some_and(|us| (us - 5 * SECOND_US).abs() < SECOND_US / 2), "{of_leader:?}");
     assert!([None, Some("n1")].map(off).iter().all(|us| us.is_some_and(|us| us.abs() < SECOND_US)), "{of_leader:?}");
     assert_eq!(off(Some("n3")), None, "a clock that was never set says nothing to others");
+    assert!(cell.nodes[0].time.is_undecided(cell.now.shifted(cell.nodes[0].steady_us)), "of two candidates");
     assert!((errors(2)[0].1 - 5 * SECOND_US).abs() < SECOND_US / 2, "{:?}", errors(2));
     assert!(errors(3)[0].1 < -SECOND_US, "and its own node knows");
 }

@@ -108,7 +108,7 @@ fn every_field_of_every_payload_survives() {
             landmark: "ball".into(),
             label: Some("sports ball".into()),
             score: 1.84375,
-            margin: -0.625,
+            margin: 0.625,
             votes: [("sports ball".into(), 1.84375), ("cup".into(), 2.46875)].into(),
             contributors: vec![node("euclid")],
         }],

@@ -60,9 +60,9 @@ fn verdicts() -> Verdicts {
         verdicts: vec![Verdict {
             landmark: "ball".into(),
             label: Some("sports ball".into()),
-            score: 1.84,
-            margin: -0.61,
-            votes: [("sports ball".into(), 1.84), ("cup".into(), 2.45)].into(),
+            score: 2.45,
+            margin: 0.61,
+            votes: [("sports ball".into(), 2.45), ("cup".into(), 1.84)].into(),
             contributors: vec![edge()],
         }],
     }
@@ -158,6 +158,7 @@ fn each_flaw_of_verdicts_has_its_reason() {
             (|v| v.fused_at_us = Timestamp(1 << 53), RejectReason::OutOfRange),
             (|v| v.verdicts[0].score = f64::NAN, RejectReason::NotFinite),
             (|v| v.verdicts[0].margin = f64::INFINITY, RejectReason::NotFinite),
+            (|v| v.verdicts[0].margin = -0.02, RejectReason::OutOfRange),
             (|v| v.verdicts[0].score = 1e300, RejectReason::OutOfRange),
             (|v| v.verdicts[0].votes = [("cup".into(), f64::NAN)].into(), RejectReason::NotFinite),
             (|v| v.verdicts[0].votes = [("".into(), 1.0)].into(), RejectReason::InvalidLabel),

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use ecod::aggregator::FusionConfig;
 use ecod::leadership::{Leadership, Position};
 use ecod::model::names::NodeName;
-use ecod::wire::SCHEMA_VERSION;
+use ecod::perception::landmark::LandmarkConfig;
+use ecod::wire::{PerceivedObject, SCHEMA_VERSION, WirePose};
 
 use super::*;
 use crate::actors::follower::{Follower, FollowerArguments};
@@ -143,9 +144,46 @@ fn a_clock_that_is_off_is_named() {
     }
     let told = troubles(&fuser);
     let about = Some("late".to_owned());
-    assert!(told.contains(&(about.clone(), "untimely".into(), "refused, its clock is 5.0 s ahead".into())), "{told:?}");
     let corrected = "its clock is 5.0 s ahead; its reports are put right by that";
-    assert!(told.contains(&(about, "clock_off".into(), corrected.into())), "{told:?}");
+    assert_eq!(told, [(about, "clock_off".into(), corrected.into())], "refused no longer");
+}
+
+#[test]
+fn a_time_in_seconds_is_told_from_a_clock_that_is_off() {
+    let mut fuser = standby();
+    for n in 1..=20 {
+        let received_at = Timestamp(1_795_000_000_000_000 + n * 100_000);
+        let report = ObjectReport::new(NodeName::from_static("late"), n, Timestamp(received_at.micros() / 1_000_000));
+        take(&mut fuser, report, received_at, None);
+    }
+    let told = troubles(&fuser);
+    assert!(told.iter().any(|(_, _, cause)| cause.contains("`captured_at_us` looks like seconds")), "{told:?}");
+}
+
+/// A vehicle in centimetres has its objects at no location, or far from its camera, whoever else is right.
+#[test]
+fn a_vehicle_whose_objects_are_nowhere_is_named() {
+    let mut fuser = standby();
+    let slot = toml::from_str::<LandmarkConfig>("id = \"slot-0\"\nx_m = 3\ny_m = 0").unwrap();
+    fuser.aggregator = Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
+    let mut told = Vec::new();
+    for n in 1..=120 {
+        let at = Timestamp(1_795_000_000_000_000 + n * 100_000);
+        for (name, scale) in [("watson", 100.0), ("euclid", 1.0)] {
+            let mut report = ObjectReport::new(NodeName::from_static(name), n, at);
+            report.objects = vec![PerceivedObject::new("car", 0.9, 3.0 * scale, 0.0)];
+            take(&mut fuser, report, at, None);
+        }
+        let mut gauss = ObjectReport::new(NodeName::from_static("gauss"), n, at);
+        gauss.pose = Some(WirePose { x_m: 0.0, y_m: 0.0, heading_rad: 0.0 });
+        gauss.objects = vec![PerceivedObject::new("car", 0.9, 3.0, 0.0), PerceivedObject::new("car", 0.9, 800.0, 0.0)];
+        take(&mut fuser, gauss, at, None);
+        told = troubles(&fuser);
+        assert_eq!(told.len(), if n <= 100 { 1 } else { 2 }, "{n}: {told:?}");
+    }
+    let of = |name: &str, cause: &str| (Some(name.to_owned()), "misplaced".to_owned(), cause.to_owned());
+    let far = of("gauss", "an object of its report is 800 m from its pose");
+    assert_eq!(told, [far, of("watson", "none of its objects is at a known location")]);
 }
 
 #[test]
@@ -160,8 +198,7 @@ fn locations_that_only_one_side_knows_are_named() {
     assert_eq!(troubles(&without), [(None, "no_locations".into(), cause.into())]);
 
     let mut with = standby();
-    let slot =
-        toml::from_str::<ecod::perception::landmark::LandmarkConfig>("id = \"slot-0\"\nx_m = 0\ny_m = 0").unwrap();
+    let slot = toml::from_str::<LandmarkConfig>("id = \"slot-0\"\nx_m = 0\ny_m = 0").unwrap();
     with.aggregator = Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
     take(&mut with, report(1), now, Some("slot-0"));
     assert_eq!(troubles(&with), []);

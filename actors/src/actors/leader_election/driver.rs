@@ -17,7 +17,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tracing::field::display;
 
-use super::term_writer::{TermWriter, saved_term};
+use super::term_writer::{TermState, TermWriter, saved_term};
 use super::{LeaderElectionArguments, Parts, probe};
 use crate::messages::description_keeper::DescriptionKeeperMessage;
 use crate::messages::fuser::FuserMessage;
@@ -120,13 +120,11 @@ impl ElectionDriver {
                     return tracing::debug!(%from, %reason, "election message dropped");
                 }
             },
-            MembershipEvent::NameTaken { name } => {
-                return tracing::error!(%name, "two nodes have this name; the first one takes part");
-            }
             MembershipEvent::Troubled { about, kind, cause } => {
                 return self.counters.troubles().note_about(&about, kind, &cause);
             }
-            MembershipEvent::Excluded => return tracing::error!("another node has this node's name"),
+            // The node ends with this as its error.
+            MembershipEvent::Excluded => return,
         };
         self.handle(input).await;
     }
@@ -183,7 +181,7 @@ impl ElectionDriver {
             Effect::TellLeadership { leadership } => self.tell(leadership),
             Effect::Lead { epoch, first_round, first } => {
                 let term = self.terms.wait_for(epoch.term).await;
-                tracing::info!(%epoch, first_round, ?first, ?term, "leading");
+                tracing::info!(%epoch, first_round, term_is_saved = term == TermState::Saved, "this node leads");
                 self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, first });
             }
             Effect::HoldRound => {
@@ -243,8 +241,9 @@ impl ElectionDriver {
     /// Notes clocks that are off, the leader's complaint, and that the cell's description is not used.
     fn note_troubles(&self) {
         let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
-        for (name, error_us) in self.cell_time.wall_errors(clock::now()) {
-            let cause = clock_words(error_us);
+        let (now, cell_time) = (clock::now(), &self.cell_time);
+        for (name, error_us) in cell_time.wall_errors(now) {
+            let cause = clock_words(error_us, cell_time.is_undecided(now));
             match name {
                 _ if error_us.unsigned_abs() < MIN_CLOCK_ERROR_US => {}
                 None => troubles.note(TroubleKind::ClockOff, &cause),
@@ -278,7 +277,7 @@ impl ElectionDriver {
         });
         if has_moved {
             let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
-            tracing::info!(?position, epoch, standby, "who leads has changed, or who stands by");
+            tracing::info!(?position, leader = epoch, standby, "the leader or the standby has changed");
         }
     }
 
@@ -309,11 +308,12 @@ fn as_seen(member: &Member) -> node::SeenMember {
 /// Error of a clock that is a trouble; smaller ones cost nothing.
 const MIN_CLOCK_ERROR_US: u64 = 1_000_000;
 
-/// The error of a clock in words; positive if it is ahead.
-fn clock_words(error_us: i64) -> String {
+/// The error of a clock in words; positive if it is ahead. Undecided is which of two clocks is wrong.
+fn clock_words(error_us: i64, is_undecided: bool) -> String {
     let seconds = error_us.unsigned_abs() as f64 / 1e6;
     let side = if error_us > 0 { "ahead of" } else { "behind" };
-    format!("its clock is {seconds:.1} s {side} the cell's time")
+    let doubt = if is_undecided { "; the cell has two clocks, and the other one may be wrong instead" } else { "" };
+    format!("its clock is {seconds:.1} s {side} the cell's time{doubt}")
 }
 
 fn log_clock(event: ClockEvent) {
@@ -326,9 +326,9 @@ fn log_clock(event: ClockEvent) {
 
 fn log(notice: Notice) {
     match notice {
-        Notice::Fit => tracing::info!("fit to lead"),
+        Notice::Fit => tracing::info!("this node's parts work: it can lead"),
         Notice::Unfit { health: Health { broker, fuser, gateway, reports, .. } } => {
-            tracing::warn!(broker, fuser, gateway, reports, "not fit to lead: a part does not work");
+            tracing::warn!(broker, fuser, gateway, reports, "this node cannot lead: a part does not work");
         }
         Notice::OutOfReach { members } => tracing::warn!(
             ?members,

@@ -124,7 +124,7 @@ impl<'a> LogReplay<'a> {
     }
 
     fn reject(&mut self, reason: RejectReason) -> Vec<FusedLine> {
-        self.usable = self.usable.plus(Usable { reports: 1, used: 0, faulty: 1 });
+        self.usable = self.usable.plus(Usable { reports: 1, faulty: 1, ..Usable::default() });
         *self.unreadable.entry(reason).or_default() += 1;
         Vec::new()
     }

@@ -255,7 +255,7 @@ impl GossipMachine {
             FrameContent::Met { introduction, answer, speaks } => {
                 let greeter = answer.is_none();
                 self.outputs.extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
-                self.meet(introduction, speaks, greeter, at);
+                self.meet(introduction, (from, speaks, greeter), at);
             }
             FrameContent::Gossip { from, body } => {
                 let is_heard = |name: &NodeName| self.sessions.is_heard(name, at);
@@ -266,20 +266,20 @@ impl GossipMachine {
                 self.outputs.push_back(GossipOutput::Tell(event));
             }
             FrameContent::Stranger => self.send_hello(from, true, at),
-            FrameContent::NameTaken(name) => self.report_taken(name, at),
+            FrameContent::NameTaken(name) => self.report_taken(name, second_run(from), at),
             FrameContent::Nothing => (),
         }
         Ok(())
     }
 
     /// Processes the handshake of an admitted node: its knowledge of this node, then its identity.
-    fn meet(&mut self, introduction: Introduction, speaks: bool, greeter: bool, at: Timestamp) {
+    fn meet(&mut self, introduction: Introduction, (from, speaks, greeter): (SocketAddr, bool, bool), at: Timestamp) {
         let Introduction { id, seen_at, claim } = introduction;
         match claim {
             NameClaim::Free => (),
             NameClaim::After(life) if life <= MAX_CLAIMED_LIFE => self.gossip.start_life_after(life, at),
             NameClaim::After(_) => (),
-            NameClaim::Taken => return self.step_back(at),
+            NameClaim::Taken => return self.step_back(from, at),
         }
         self.excluded_since = None;
         let own = self.gossip.own().gossip.ip();
@@ -287,7 +287,7 @@ impl GossipMachine {
             self.gossip.change(at, |own| own.gossip = seen_at);
         }
         if !speaks {
-            return self.report_taken(id.name, at);
+            return self.report_taken(id.name, second_run(from), at);
         }
         self.gossip.note_met(&id);
         for (kind, body) in self.pending.remove(&id.name).map(|pending| pending.frames).unwrap_or_default() {
@@ -400,22 +400,23 @@ impl GossipMachine {
         self.hello_at = at + self.hello * percent / 100;
     }
 
-    fn report_taken(&mut self, name: NodeName, at: Timestamp) {
+    fn report_taken(&mut self, name: NodeName, cause: String, at: Timestamp) {
         let lately = |(last, when): &(NodeName, Timestamp)| *last == name && at.since(*when) < REPORT_INTERVAL;
         if !self.taken.as_ref().is_some_and(lately) {
-            tracing::warn!(node = %name, "two running nodes have the same name");
             self.taken = Some((name.clone(), at));
-            self.outputs.push_back(GossipOutput::Tell(MembershipEvent::NameTaken { name }));
+            let (about, kind) = (name.to_string(), TroubleKind::NameTaken);
+            self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Troubled { about, kind, cause }));
         }
     }
 
     /// Takes the word of a node that another run has this node's name. The other one may just have ended.
-    fn step_back(&mut self, at: Timestamp) {
+    fn step_back(&mut self, informant: SocketAddr, at: Timestamp) {
         let since = *self.excluded_since.get_or_insert(at);
         if at.since(since) >= NAME_PATIENCE && self.gossip.alive().is_empty() {
             self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Excluded));
         }
-        self.report_taken(self.gossip.own().name.clone(), at);
+        let cause = format!("another run of this name takes part, says the node at {informant}; this run does not");
+        self.report_taken(self.gossip.own().name.clone(), cause, at);
     }
 
     /// A node as others are told of it: by what it has proven itself, if nodes of the cell do, and not by hearsay.
@@ -464,7 +465,12 @@ const NOTICE_BURST: u32 = 16;
 const NOTICE_INTERVAL: Duration = Duration::from_millis(250);
 
 /// Minimum time between two reports of the same taken name.
-const REPORT_INTERVAL: Duration = Duration::from_secs(60);
+const REPORT_INTERVAL: Duration = Duration::from_secs(1);
+
+/// The trouble that a second run at an address is, in words.
+fn second_run(at: SocketAddr) -> String {
+    format!("a second run of this name, at {at}, does not take part; the first one does")
+}
 
 #[cfg(test)]
 mod tests;

@@ -70,6 +70,7 @@ Speed = Annotated[float, _between(-1e4, 1e4)]
 Angle = Annotated[float, _between(-1e6, 1e6)]
 YawRate = Annotated[float, _between(-100, 100)]
 Score = Annotated[float, _between(-1e9, 1e9)]
+Margin = Annotated[float, _between(0, 1e9)]
 Amount = Annotated[float, _between(0, 2**53 - 1)]
 Covariance = Annotated[tuple[float, float, float], Rule(_is_covariance, "must be a covariance [xx, xy, yy]")]
 
@@ -217,7 +218,7 @@ class Verdict:
     landmark: Label
     label: Optional[Label]
     score: Score
-    margin: Score
+    margin: Margin
     votes: dict[Label, Score]
     contributors: list[Name]
 
