@@ -7,6 +7,7 @@ BUILD := $(or $(CARGO_TARGET_DIR),target)
 # PROFILE=dev measures with the programs of `make test`, which are there sooner.
 PROFILE ?= release
 PROGRAMS := $(BUILD)/$(if $(filter dev,$(PROFILE)),debug,$(PROFILE))
+RELEASE := $(if $(filter release,$(PROFILE)),--release)
 SETS ?= examples/crowd_labels
 VERDICTS ?= 200
 PASSES ?= 50
@@ -82,7 +83,7 @@ sim-check: setup ## bugs put in by hand, each of which the simulated cells must 
 
 trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
 trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
-	cargo test --release --locked --test trials -- --ignored --exact trials --nocapture
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact trials --nocapture
 
 joining: PACKAGES += iproute2 mosquitto-clients
 joining: setup ## three machines, in network namespaces, become a cell by the commands of the README
@@ -94,11 +95,11 @@ clocks: setup ## real cells with wrong clocks that step, as vehicle and as leade
 
 soak: PACKAGES += iproute2 nftables
 soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
-	cargo test --release --locked --test trials -- --ignored --exact soak::soak --nocapture
+	cargo test $(RELEASE) --locked --test trials -- --ignored --exact soak::soak --nocapture
 
 attack: PACKAGES += iproute2
 attack: setup ## attackers of all kinds against real cells, and a table; ROWS=text runs those named so, ATTACK=quick a part
-	cargo test --release --locked --test attacks -- --ignored --exact attacks --nocapture
+	cargo test $(RELEASE) --locked --test attacks -- --ignored --exact attacks --nocapture
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
@@ -121,7 +122,7 @@ code-lines: ## count the lines of code of each room, without tests and comments
 	packaging/code-lines
 
 replay-check: ## prove that replays of a release build have the bytes that the tests of the debug build demand
-	cargo test --locked --release --test replays
+	cargo test --locked --release -p ecod --test replays
 
 recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own

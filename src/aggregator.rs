@@ -205,7 +205,7 @@ impl Aggregator {
                 if let Admitted::OutOfOrder(_) = window.admit(report, now)? {
                     return Err(RejectReason::OutOfOrder);
                 }
-                vote.observe(&of_vehicle(report), now)?;
+                vote.observe_part(&of_vehicle(report), &report.node, now)?;
                 self.voted = true;
             }
         }

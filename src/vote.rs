@@ -36,6 +36,7 @@ pub use config::{MAX_LABELS, PaperConfig, VoteConfig, VoteMode, WeightedConfig};
 pub use paper::REPUTATION_RANGE;
 pub use visibility::{paper as paper_visibility, weighted as weighted_visibility};
 
+use crate::admission::report_window::MAX_PARTS;
 use crate::model::geometry::Pose;
 use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
@@ -55,11 +56,11 @@ pub struct VoteRound {
 }
 
 /// The last report of a vehicle.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 struct LastReport {
-    seq: u64,
-    captured_at: Timestamp,
     received_at: Timestamp,
+    /// The last report of each part, such as a camera: their reports overtake one another. At most [`MAX_PARTS`].
+    parts: BTreeMap<NodeName, PartReport>,
     /// Reports since the last verdict.
     frames: u32,
 }
@@ -72,7 +73,14 @@ const RETENTION: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(6
 /// Inverse share of the vehicles that is forgotten at once, so that the cost per newcomer stays small.
 const EVICTION_DIVISOR: usize = 8;
 
-impl LastReport {
+/// The last report of a part of a vehicle, or of the vehicle itself.
+#[derive(Debug, Clone, Copy)]
+struct PartReport {
+    seq: u64,
+    captured_at: Timestamp,
+}
+
+impl PartReport {
     /// Whether `report` was made later. A restarted node counts `seq` from the start again, but its time goes on. A
     /// corrected clock may go back, but `seq` goes on. If both happen, only the size of the step tells.
     fn is_before(&self, report: &ObjectReport) -> bool {
@@ -148,22 +156,33 @@ impl Vote {
     /// # Errors
     /// The reason why the report was not used; nothing has changed then.
     pub fn observe(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
+        self.observe_part(report, &report.node, received_at)
+    }
+
+    /// The same for a report that a part of its vehicle made.
+    ///
+    /// # Errors
+    /// As for [`Self::observe`].
+    pub fn observe_part(
+        &mut self,
+        report: &ObjectReport,
+        part: &NodeName,
+        received_at: Timestamp,
+    ) -> Result<(), RejectReason> {
         report.validate(&Limits { objects: usize::MAX, ..Limits::default() })?;
-        let frames = match self.last_reports.get(&report.node) {
-            Some(last) if last.is_before(report) => last.frames,
-            Some(_) => return Err(RejectReason::OutOfOrder),
-            None => {
-                self.evict_silent_vehicles(received_at)?;
-                0
-            }
-        };
-        let last = LastReport {
-            seq: report.seq,
-            captured_at: report.captured_at_us,
-            received_at,
-            frames: frames.saturating_add(1),
-        };
-        self.last_reports.insert(report.node.clone(), last);
+        if !self.last_reports.contains_key(&report.node) {
+            self.evict_silent_vehicles(received_at)?;
+        }
+        let new = || LastReport { received_at, parts: BTreeMap::new(), frames: 0 };
+        let last = self.last_reports.entry(report.node.clone()).or_insert_with(new);
+        if last.parts.get(part).is_some_and(|last| !last.is_before(report)) {
+            return Err(RejectReason::OutOfOrder);
+        }
+        if last.parts.len() >= MAX_PARTS && !last.parts.contains_key(part) {
+            last.parts.clear();
+        }
+        last.parts.insert(part.clone(), PartReport { seq: report.seq, captured_at: report.captured_at_us });
+        (last.received_at, last.frames) = (received_at, last.frames.saturating_add(1));
         let objects = match self.config.mode {
             VoteMode::Weighted => self.one_per_landmark(&report.objects),
             VoteMode::Paper => report.objects.iter().collect(),

@@ -54,8 +54,8 @@ async fn a_plate_goes_from_pixels_to_the_map_though_detector_and_projector_are_k
 
     let plate = scene.spots[0].truth.as_deref().unwrap();
     plate_on_a_new_map(&vehicle, plate).await;
-    let detector = vehicle.slots().detector.get().unwrap().get_cell();
-    let projector = vehicle.slots().projector.get().unwrap().get_cell();
+    let detector = vehicle.slots().detectors[0].get().unwrap().get_cell();
+    let projector = vehicle.slots().projectors[0].get().unwrap().get_cell();
     for part in [detector, projector] {
         part.kill();
         more_frames(&vehicle).await;

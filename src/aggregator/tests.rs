@@ -231,3 +231,17 @@ fn the_parts_of_a_vehicle_are_one_witness() {
     assert!((votes[0] - votes[1]).abs() < 1e-9, "three parts against one vehicle: {:?}", verdict.votes);
     assert!(map.landmarks[0].observers.iter().all(|node| !node.as_str().contains("--")), "{:?}", map.landmarks);
 }
+
+/// Frames of a slower camera are older than those of a faster one that came before, and it has sent fewer.
+#[test]
+fn the_cameras_of_a_vehicle_may_overtake_one_another() {
+    let mut cell = leader(FusionConfig::default());
+    for n in 1..=5 {
+        for (camera, captured_ms) in [("euclid", n * 100), ("euclid--rear", n * 100 - 40)] {
+            for kind in [Detections, VoteDetections] {
+                let taken = cell.report(kind, &report(camera, "cup", captured_ms), at(n * 100 + 20));
+                assert!(taken.is_ok(), "{camera} {n}: {taken:?}");
+            }
+        }
+    }
+}

@@ -27,6 +27,7 @@ use crate::observe::dashboard::CameraFeed;
 use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
+use crate::telemetry::troubles::CameraTroubles;
 
 /// Arguments of a detector's start.
 pub struct DetectorArguments {
@@ -44,6 +45,8 @@ pub struct DetectorArguments {
     pub images: Option<ImageRecorder>,
     /// Shows some of the frames, if they are shown at all.
     pub camera_feed: Option<Arc<CameraFeed>>,
+    /// Troubles of the camera.
+    pub troubles: CameraTroubles,
     /// Counters of the node.
     pub counters: Arc<Counters>,
     /// The node's spans.
@@ -66,6 +69,7 @@ pub struct DetectorState {
     projector: ActorSlot<ProjectorMessage>,
     images: Option<ImageRecorder>,
     camera_feed: Option<Arc<CameraFeed>>,
+    troubles: CameraTroubles,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
 }
@@ -80,10 +84,20 @@ impl Actor for Detector {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let DetectorArguments { open, capture, detect, lens, projector, images, camera_feed, counters, spans } =
-            arguments;
+        let DetectorArguments {
+            open,
+            capture,
+            detect,
+            lens,
+            projector,
+            images,
+            camera_feed,
+            troubles,
+            counters,
+            spans,
+        } = arguments;
         let capture = Capture::start(open, capture)?;
-        let pump = tokio::spawn(pump(capture, myself, Arc::clone(&counters), spans));
+        let pump = tokio::spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans));
         let detect = Some(detect);
         Ok(DetectorState {
             detect,
@@ -93,6 +107,7 @@ impl Actor for Detector {
             projector,
             images,
             camera_feed,
+            troubles,
             counters,
             pump,
         })
@@ -122,7 +137,7 @@ impl Actor for Detector {
         match outcome {
             Ok(mut detections) => {
                 if std::mem::take(&mut state.failing) {
-                    state.counters.troubles().settle(TroubleKind::Camera, None);
+                    state.troubles.settle(TroubleKind::Camera);
                 }
                 if let Some(lens) = state.scale(size, &mut detections) {
                     state.counters.count(Event::FrameDetected);
@@ -134,7 +149,7 @@ impl Actor for Detector {
             }
             Err(error) => {
                 state.counters.count(Event::FrameFailed);
-                state.counters.troubles().note(TroubleKind::Camera, &error.to_string());
+                state.troubles.note(TroubleKind::Camera, &error.to_string());
                 state.failing = true;
             }
         }
@@ -152,8 +167,8 @@ impl DetectorState {
         });
         let mismatch = scaled.as_ref().err().copied();
         match &mismatch {
-            Some(error) => self.counters.troubles().note(TroubleKind::Camera, &error.to_string()),
-            None if self.mismatch.is_some() => self.counters.troubles().settle(TroubleKind::Camera, None),
+            Some(error) => self.troubles.note(TroubleKind::Camera, &error.to_string()),
+            None if self.mismatch.is_some() => self.troubles.settle(TroubleKind::Camera),
             None => {}
         }
         self.mismatch = mismatch;
@@ -168,7 +183,12 @@ impl Drop for DetectorState {
 }
 
 /// Sends the latest frame whenever the detector is ready, until the source or the detector ends.
-async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: Arc<Counters>, spans: Spans) {
+async fn pump(
+    capture: Capture,
+    detector: ActorRef<DetectorMessage>,
+    (troubles, counters): (CameraTroubles, Arc<Counters>),
+    spans: Spans,
+) {
     let permits = Arc::new(Semaphore::new(1));
     let mut status = capture.status();
     let (mut skipped, mut unusable, mut failures) = (0, 0, 0);
@@ -190,14 +210,14 @@ async fn pump(capture: Capture, detector: ActorRef<DetectorMessage>, counters: A
             }
             match &*status.borrow() {
                 CaptureStatus::Failed { error, .. } => {
-                    counters.troubles().note(TroubleKind::Camera, &format!("the camera gives no frames: {error}"));
+                    troubles.note(TroubleKind::Camera, &format!("the camera gives no frames: {error}"));
                 }
                 CaptureStatus::Ended => {}
-                _ => counters.troubles().settle(TroubleKind::Camera, None),
+                _ => troubles.settle(TroubleKind::Camera),
             }
         };
         let Some(frame) = frame else {
-            counters.troubles().note(TroubleKind::Camera, "the camera's frames have ended");
+            troubles.note(TroubleKind::Camera, "the camera's frames have ended");
             return;
         };
         let span = spans.frame(frame.captured_at);

@@ -33,6 +33,7 @@ use crate::messages::projector::ProjectorMessage;
 use crate::observe::dashboard::{CameraFeed, PictureBox, camera_event};
 use crate::platform::cell_clock::CellClock;
 use crate::telemetry::counters::{Counters, Event};
+use crate::telemetry::troubles::CameraTroubles;
 
 /// Arguments of a projector's start.
 pub struct ProjectorArguments {
@@ -42,8 +43,10 @@ pub struct ProjectorArguments {
     pub standing: Option<Pose>,
     /// The place of the cell's frame on Earth.
     pub origin: Option<GeographicOrigin>,
-    /// UDP address for the poses of a moving vehicle.
-    pub poses: Option<SocketAddr>,
+    /// True for a moving vehicle, whose poses are received.
+    pub is_moving: bool,
+    /// UDP address for these poses, with the projectors of the other cameras; for one of the cameras.
+    pub poses: Option<(SocketAddr, Vec<ActorSlot<ProjectorMessage>>)>,
     /// Algorithms to report for.
     pub algorithms: Algorithms,
     /// Dates the reports.
@@ -52,6 +55,8 @@ pub struct ProjectorArguments {
     pub gateway: ActorSlot<GatewayMessage>,
     /// Shows frames with their boxes, if they are shown at all.
     pub camera_feed: Option<Arc<CameraFeed>>,
+    /// Troubles of the camera.
+    pub troubles: CameraTroubles,
     /// Counters of the node.
     pub counters: Arc<Counters>,
 }
@@ -73,6 +78,7 @@ pub struct ProjectorState {
     clock: CellClock,
     gateway: ActorSlot<GatewayMessage>,
     camera_feed: Option<Arc<CameraFeed>>,
+    troubles: CameraTroubles,
     counters: Arc<Counters>,
     /// Ends with the actor.
     _feed: JoinSet<()>,
@@ -92,27 +98,30 @@ impl Actor for Projector {
             perception,
             standing,
             origin,
+            is_moving,
             poses,
             algorithms,
             clock,
             gateway,
             camera_feed,
+            troubles,
             counters,
         } = arguments;
         let mut feed = JoinSet::new();
-        if let Some(address) = poses {
-            feed.spawn(pose_feed::listen(address, myself, Arc::clone(&counters)));
+        if let Some((address, others)) = poses {
+            feed.spawn(pose_feed::listen(address, (myself, others), Arc::clone(&counters)));
         }
         Ok(ProjectorState {
             perception,
             standing,
             origin,
-            poses: poses.map(|_| PoseHistory::default()),
+            poses: is_moving.then(PoseHistory::default),
             is_pose_problem_logged: false,
             algorithms,
             clock,
             gateway,
             camera_feed,
+            troubles,
             counters,
             _feed: feed,
         })
@@ -175,7 +184,7 @@ impl ProjectorState {
     fn report(&mut self, detections: Vec<Detection>, lens: &Lens, captured_at: Timestamp, boxes: &mut [PictureBox]) {
         let pose = self.poses.as_ref().map_or(self.standing, |poses| poses.at(captured_at));
         let Some(pose) = pose else {
-            self.counters.troubles().note(TroubleKind::NoPose, "no pose is known near the time of the camera's frames");
+            self.troubles.note(TroubleKind::NoPose, "no pose is known near the time of the camera's frames");
             return self.counters.count(Event::FrameWithoutPose);
         };
         self.perception.set_pose(pose);
@@ -193,7 +202,7 @@ impl ProjectorState {
         (report.captured_at_us, report.clock_error_us) = (captured_at.shifted(offset_us), error_us);
         self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
         if let Some(cause) = self.perception.without_size() {
-            self.counters.troubles().note(TroubleKind::NoSize, &cause);
+            self.troubles.note(TroubleKind::NoSize, &cause);
         }
         if self.algorithms.vote() {
             self.publish(ReportKind::VoteDetections, votes(&report));

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use ecod::config::{ConfigError, check_range};
+use ecod::model::names::{NodeName, PART_MARK};
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::projection::{ProjectionConfig, Ranging};
 use ecod::perception::view::ViewConfig;
@@ -18,6 +19,10 @@ use super::lens::Lens;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraConfig {
+    /// Name of the camera, distinct among those of its vehicle. Default none: it reports under the vehicle's own name, and
+    /// with a name as a part of it, such as `euclid--rear`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
     /// Source of frames.
     pub source: SourceConfig,
     /// Stall timeout and retries of the source.
@@ -42,6 +47,9 @@ pub struct CameraConfig {
     #[serde(default = "yes")]
     pub votes: bool,
 }
+
+/// Maximum length of a camera's name in bytes: the vehicle's name precedes it.
+const MAX_CAMERA_NAME: usize = 24;
 
 fn yes() -> bool {
     true
@@ -92,11 +100,23 @@ impl Default for OpticsConfig {
 }
 
 impl CameraConfig {
+    /// Name under which the camera of a vehicle reports; that of the vehicle if the two make none together.
+    pub fn reporter(&self, vehicle: &NodeName) -> NodeName {
+        let part = self.name.as_ref().and_then(|name| NodeName::new(format!("{vehicle}{PART_MARK}{name}")).ok());
+        part.unwrap_or_else(|| vehicle.clone())
+    }
+
     /// Checks every value; files and devices are checked when they are opened.
     ///
     /// # Errors
     /// [`ConfigError`] naming the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
+        if let Some(name) =
+            self.name.as_ref().filter(|name| name.len() > MAX_CAMERA_NAME || NodeName::new(name).is_err())
+        {
+            let allowed = format!("1 to {MAX_CAMERA_NAME} characters of A-Z, a-z, 0-9, _ and -");
+            return Err(ConfigError::new("name", name, allowed));
+        }
         self.source.validate().map_err(|error| error.within("source"))?;
         self.capture.validate().map_err(|error| error.within("capture"))?;
         if let SourceConfig::Images { fps, .. } = self.source

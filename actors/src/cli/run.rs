@@ -98,7 +98,7 @@ pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
         return Ok(print(&text.context("the configuration cannot be written as TOML")?)?);
     }
     #[cfg(feature = "camera")]
-    if config.camera.is_none() {
+    if !config.has_camera() {
         continue_without_opencv();
     }
     run_node(config, arguments.stop_at_eof)
@@ -176,7 +176,7 @@ const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     #[cfg(feature = "camera")]
-    if config.role == Role::Cav && config.camera.is_none() && config.record.is_none() {
+    if config.role == Role::Cav && !config.has_camera() && config.record.is_none() {
         tracing::warn!("no [camera] is configured: of this vehicle, only programs beside it report");
     }
     let mut node = node::start(config).await?;

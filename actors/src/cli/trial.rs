@@ -118,6 +118,7 @@ impl TryArguments {
 /// covariance of its objects.
 fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
     let camera = CameraConfig {
+        name: None,
         source,
         capture: CaptureConfig::default(),
         optics: OpticsConfig::default(),

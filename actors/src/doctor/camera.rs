@@ -11,10 +11,17 @@ use crate::node::config::NodeConfig;
 /// Maximum time until the first frame; network cameras take seconds.
 const TIMEOUT: Duration = Duration::from_secs(10);
 
-/// All checks of a camera, if there is one.
+/// All checks of all cameras.
 pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
-    let Some(camera) = &config.camera else { return Vec::new() };
-    vec![frame(camera).await, calibration(camera), detector(camera).await]
+    let mut findings = Vec::new();
+    for camera in config.all_cameras() {
+        let mut of_camera = [frame(camera).await, calibration(camera), detector(camera).await];
+        if let Some(name) = &camera.name {
+            of_camera.iter_mut().for_each(|finding| finding.seen = format!("{name}: {}", finding.seen));
+        }
+        findings.extend(of_camera);
+    }
+    findings
 }
 
 async fn frame(camera: &CameraConfig) -> Finding {

@@ -1,6 +1,8 @@
 //! How the parts of a node are made, connected, started and stopped.
 
 mod arguments;
+#[cfg(feature = "camera")]
+mod cameras;
 mod describe;
 
 use std::fs::File;
@@ -34,7 +36,7 @@ use crate::actors::gateway::Gateway;
 use crate::actors::leader_election::LeaderElection;
 use crate::actors::membership::Membership;
 #[cfg(feature = "camera")]
-use crate::actors::projector::{Projector, ProjectorArguments};
+use crate::actors::projector::Projector;
 use crate::actors::recorder::Recorder;
 use crate::actors::reputation_keeper::{ReputationKeeper, SharedReputations};
 use crate::messages::actor_slot::ActorSlot;
@@ -45,8 +47,6 @@ use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
 use crate::observe::dashboard::{CameraFeed, LiveState};
 use crate::observe::readiness::SharedFacts;
-#[cfg(feature = "camera")]
-use crate::observe::recorder::ImageRecorder;
 use crate::observe::recorder::LogSender;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
@@ -124,11 +124,12 @@ impl NodeBuilder {
         let counters = Arc::<Counters>::default();
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
-        #[cfg(feature = "camera")]
-        let shows_camera = config.camera.is_some() && config.dashboard.enabled && config.dashboard.camera;
-        #[cfg(not(feature = "camera"))]
-        let shows_camera = false;
+        let shows_camera = config.has_camera() && config.dashboard.enabled && config.dashboard.camera;
         let camera_feed = shows_camera.then(Arc::default);
+        #[cfg(feature = "camera")]
+        let slots = ActorSlots::with_cameras(&config);
+        #[cfg(not(feature = "camera"))]
+        let slots = ActorSlots::default();
         let mut builder = Self {
             _state_lock: directory.and_then(|directory| lock_state(directory, &config.cell, &name)),
             name,
@@ -141,7 +142,7 @@ impl NodeBuilder {
             run: Uuid::now_v7(),
             started_at: clock::now(),
             clock: CellClock::default(),
-            slots: ActorSlots::default(),
+            slots,
             recording: LogSender::new(Arc::clone(&counters)),
             counters,
             newest: Newest::default(),
@@ -252,8 +253,8 @@ impl NodeBuilder {
         parts.push(ActorKind::LeaderElection);
         parts.extend(self.config.dashboard.enabled.then_some(ActorKind::Dashboard));
         #[cfg(feature = "camera")]
-        if self.config.camera.is_some() {
-            parts.extend([ActorKind::Projector, ActorKind::Detector]);
+        for camera in 0..self.config.all_cameras().count() {
+            parts.extend([ActorKind::Projector(camera), ActorKind::Detector(camera)]);
         }
         parts
     }
@@ -303,28 +304,16 @@ impl NodeBuilder {
                 slot(&self.slots.dashboard, Actor::spawn_linked(None, Dashboard, arguments, supervisor).await)
             }
             #[cfg(feature = "camera")]
-            ActorKind::Projector => {
-                let arguments = ProjectorArguments {
-                    perception: crate::node::camera::perception(&self.config).map_err(in_full)?,
-                    standing: self.standing_pose(),
-                    origin: self.config.origin,
-                    poses: self.config.pose.listen,
-                    algorithms: crate::node::camera::algorithms(&self.config),
-                    clock: self.clock.clone(),
-                    gateway: self.slots.gateway.clone(),
-                    camera_feed: self.camera_feed.clone(),
-                    counters: self.counters(),
-                };
-                slot(&self.slots.projector, Actor::spawn_linked(None, Projector, arguments, supervisor).await)
+            ActorKind::Projector(camera) => {
+                let arguments = self.projector_arguments(camera).map_err(in_full)?;
+                let started = Actor::spawn_linked(None, Projector, arguments, supervisor).await;
+                camera_slot(&self.slots.projectors, camera, started)
             }
             #[cfg(feature = "camera")]
-            ActorKind::Detector => {
-                let images = ImageRecorder::new(self.config.record.as_ref(), self.recording.clone());
-                let projector = self.slots.projector.clone();
-                let (feed, counters, spans) = (self.camera_feed.clone(), self.counters(), self.spans());
-                let arguments = crate::node::camera::detector(&self.config, projector, images, feed, counters, spans);
-                let arguments = arguments.map_err(in_full)?;
-                slot(&self.slots.detector, Actor::spawn_linked(None, Detector, arguments, supervisor).await)
+            ActorKind::Detector(camera) => {
+                let arguments = self.detector_arguments(camera).map_err(in_full)?;
+                let started = Actor::spawn_linked(None, Detector, arguments, supervisor).await;
+                camera_slot(&self.slots.detectors, camera, started)
             }
         }
     }
@@ -333,8 +322,12 @@ impl NodeBuilder {
     pub(super) async fn stop_all(&self) {
         #[cfg(feature = "camera")]
         {
-            stop(&self.slots.detector).await;
-            stop(&self.slots.projector).await;
+            for detector in &self.slots.detectors {
+                stop(detector).await;
+            }
+            for projector in &self.slots.projectors {
+                stop(projector).await;
+            }
         }
         stop(&self.slots.dashboard).await;
         stop(&self.slots.election).await;
@@ -425,6 +418,16 @@ impl NodeBuilder {
         self.slots.membership.set(actor);
         Ok(id)
     }
+}
+
+/// The same for one of the cameras.
+#[cfg(feature = "camera")]
+fn camera_slot<M: Message>(
+    slots: &[ActorSlot<M>],
+    camera: usize,
+    spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
+) -> Result<ActorId, ActorProcessingErr> {
+    slot(slots.get(camera).ok_or("there is no such camera")?, spawned)
 }
 
 fn slot<M: Message>(

@@ -2,6 +2,7 @@
 //!
 //! Environment variables name a key with two underscores between its levels: `ECOD_MQTT__BROKER=10.0.0.2:1883`.
 
+mod cameras;
 mod extraction;
 mod observer;
 mod printed;
@@ -81,6 +82,10 @@ pub struct NodeConfig {
     /// The camera and what is made of its frames. Default none.
     #[cfg(feature = "camera")]
     pub camera: Option<CameraConfig>,
+    /// Further cameras of the vehicle, each with a name. Default none.
+    #[cfg(feature = "camera")]
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<CameraConfig>,
     /// The log of what the node takes. Default none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub record: Option<RecordConfig>,
@@ -115,6 +120,8 @@ impl Default for NodeConfig {
             dashboard: DashboardConfig::default(),
             #[cfg(feature = "camera")]
             camera: None,
+            #[cfg(feature = "camera")]
+            cameras: Vec::new(),
             record: None,
             origin: None,
             landmarks: Vec::new(),
@@ -192,7 +199,11 @@ impl NodeConfig {
         if stated.extract_inner("camera.detector.kind").is_ok_and(|kind: String| kind == "coco") {
             defaults = defaults.merge(Serialized::default("camera.projection.pixel_sigma_px", COCO_PIXEL_SIGMA_PX));
         }
-        extract(defaults.merge(stated))
+        #[cfg_attr(not(feature = "camera"), expect(unused_mut, reason = "cameras have defaults of their own"))]
+        let mut config = extract(defaults.merge(stated))?;
+        #[cfg(feature = "camera")]
+        config.set_camera_defaults(stated);
+        Ok(config)
     }
 
     /// Checks every value and that they fit together.
@@ -239,9 +250,8 @@ impl NodeConfig {
         self.reputations.validate().map_err(|error| error.within("reputations"))?;
         self.dashboard.validate().map_err(|error| error.within("dashboard"))?;
         #[cfg(feature = "camera")]
-        if let Some(camera) = &self.camera {
-            camera.validate().map_err(|error| error.within("camera"))?;
-        }
+        #[cfg(feature = "camera")]
+        self.validate_cameras()?;
         if let Some(record) = &self.record {
             record.validate().map_err(|error| error.within("record"))?;
         }

@@ -15,6 +15,8 @@ use crate::messages::membership::MembershipMessage;
 use crate::messages::projector::ProjectorMessage;
 use crate::messages::recorder::RecorderMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+#[cfg(feature = "camera")]
+use crate::node::config::NodeConfig;
 
 /// A part of a node, in the order of starting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -39,12 +41,21 @@ pub enum ActorKind {
     LeaderElection,
     /// The node's page.
     Dashboard,
-    /// The maker of reports.
+    /// The maker of the reports of a camera, by its place in [`NodeConfig::all_cameras`].
     #[cfg(feature = "camera")]
-    Projector,
-    /// The finder of objects in frames.
+    Projector(usize),
+    /// The finder of objects in a camera's frames.
     #[cfg(feature = "camera")]
-    Detector,
+    Detector(usize),
+}
+
+#[cfg(feature = "camera")]
+impl ActorSlots {
+    /// Slots of a node with this many cameras.
+    pub(super) fn with_cameras(config: &NodeConfig) -> Self {
+        let (projectors, detectors) = config.all_cameras().map(|_| Default::default()).unzip();
+        Self { projectors, detectors, ..Self::default() }
+    }
 }
 
 /// Where the parts of a node are reached.
@@ -70,10 +81,10 @@ pub struct ActorSlots {
     pub election: ActorSlot<LeaderElectionMessage>,
     /// The dashboard's.
     pub dashboard: ActorSlot<DashboardMessage>,
-    /// The projector's.
+    /// The projectors', one for each camera.
     #[cfg(feature = "camera")]
-    pub projector: ActorSlot<ProjectorMessage>,
-    /// The detector's.
+    pub projectors: Vec<ActorSlot<ProjectorMessage>>,
+    /// The detectors', one for each camera.
     #[cfg(feature = "camera")]
-    pub detector: ActorSlot<DetectorMessage>,
+    pub detectors: Vec<ActorSlot<DetectorMessage>>,
 }

@@ -52,6 +52,8 @@ pub struct Report {
     last: Timestamp,
     messages: u64,
     problems: Vec<String>,
+    /// Topic of the camera whose pictures are shown.
+    camera: Option<String>,
     maps: RoundTimes,
     verdicts: RoundTimes,
     leaders: Vec<LeaderRounds>,
@@ -175,7 +177,10 @@ impl Report {
                 self.with(message, |report, it| report.counters(CounterReading { at_us: at, ..it }))
             }
             SchemaName::NodeStatus => self.with(message, |report, it| report.timeline.status(it, at)),
-            SchemaName::CompressedImage => {
+            // Of several cameras, one is shown.
+            SchemaName::CompressedImage
+                if *self.camera.get_or_insert_with(|| message.topic.clone()) == message.topic =>
+            {
                 self.with(message, |report, it: RecordedPicture| report.timeline.picture(it, at))
             }
             _ => true,

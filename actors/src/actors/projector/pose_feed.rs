@@ -9,6 +9,7 @@ use ractor::ActorRef;
 use tokio::net::UdpSocket;
 
 use crate::camera::vehicle_pose::read_pose;
+use crate::messages::actor_slot::ActorSlot;
 use crate::messages::projector::ProjectorMessage;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
@@ -19,11 +20,14 @@ const RETRY: Duration = Duration::from_secs(1);
 /// Maximum length of a datagram in bytes.
 const MAX_BYTES: usize = 1024;
 
-/// Sends every pose to the projector; never ends. An address that cannot be bound is tried again.
-pub(super) async fn listen(address: SocketAddr, projector: ActorRef<ProjectorMessage>, counters: Arc<Counters>) {
+/// One projector, and those of the vehicle's other cameras.
+type Projectors = (ActorRef<ProjectorMessage>, Vec<ActorSlot<ProjectorMessage>>);
+
+/// Sends every pose to the projectors; never ends. An address that cannot be bound is tried again.
+pub(super) async fn listen(address: SocketAddr, projectors: Projectors, counters: Arc<Counters>) {
     let mut is_logged = false;
     loop {
-        if let Err(error) = receive(address, &projector, &counters).await
+        if let Err(error) = receive(address, &projectors, &counters).await
             && !std::mem::replace(&mut is_logged, true)
         {
             tracing::warn!(%error, %address, "cannot receive poses, trying again");
@@ -32,7 +36,7 @@ pub(super) async fn listen(address: SocketAddr, projector: ActorRef<ProjectorMes
     }
 }
 
-async fn receive(address: SocketAddr, projector: &ActorRef<ProjectorMessage>, counters: &Counters) -> io::Result<()> {
+async fn receive(address: SocketAddr, (projector, others): &Projectors, counters: &Counters) -> io::Result<()> {
     let socket = UdpSocket::bind(address).await?;
     tracing::info!(%address, "receiving poses");
     let mut datagram = [0; MAX_BYTES];
@@ -42,6 +46,9 @@ async fn receive(address: SocketAddr, projector: &ActorRef<ProjectorMessage>, co
         let datagram = datagram.get(..length).unwrap_or_default();
         match read_pose(datagram, clock::now(), clock::wall_offset_us()) {
             Ok((at, pose)) => {
+                for other in others {
+                    other.send(ProjectorMessage::TakePose { at, pose });
+                }
                 if projector.cast(ProjectorMessage::TakePose { at, pose }).is_err() {
                     return Ok(());
                 }

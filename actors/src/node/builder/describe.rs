@@ -8,8 +8,6 @@ use ecod::wire::CellDescription;
 use super::NodeBuilder;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
-#[cfg(feature = "camera")]
-use crate::messages::projector::ProjectorMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::node::config::NodeConfig;
 use crate::node::description::{HeldDescription, rates_by_evidence, shared_facts};
@@ -63,26 +61,6 @@ impl NodeBuilder {
             slots.fuser.send(FuserMessage::Adopt { ledger });
         }
         #[cfg(feature = "camera")]
-        if config.camera.is_some() {
-            match crate::node::camera::perception(config) {
-                Ok(perception) => {
-                    let (perception, algorithms) = (Box::new(perception), crate::node::camera::algorithms(config));
-                    let (standing, origin) = (self.standing_pose(), config.origin);
-                    slots.projector.send(ProjectorMessage::Configure { perception, standing, origin, algorithms });
-                }
-                Err(error) => {
-                    tracing::error!(error = format!("{error:#}"), "the camera goes on with the settings before");
-                }
-            }
-        }
-    }
-
-    /// The pose of a vehicle that stands still, if it has a place in the cell's frame. The log says why it has none.
-    #[cfg(feature = "camera")]
-    pub(super) fn standing_pose(&self) -> Option<ecod::model::geometry::Pose> {
-        crate::node::camera::standing_pose(&self.config).unwrap_or_else(|error| {
-            tracing::error!(error = format!("{error:#}"), "the camera's frames are not reported");
-            None
-        })
+        self.configure_cameras();
     }
 }

@@ -27,7 +27,7 @@ impl NodeConfig {
         }
         #[cfg(feature = "camera")]
         {
-            self.camera = None;
+            (self.camera, self.cameras) = (None, Vec::new());
         }
         (self.membership.advertise, self.state_dir, self.map_log) = (None, None, None);
         self.dashboard.enabled = false;
@@ -37,10 +37,6 @@ impl NodeConfig {
 
     /// True if the node only looks on: it neither leads nor reports, nor do programs by its door.
     pub fn looks_on(&self) -> bool {
-        #[cfg(feature = "camera")]
-        let reports = self.camera.is_some();
-        #[cfg(not(feature = "camera"))]
-        let reports = false;
-        !self.may_lead() && !reports && !self.broker.door
+        !self.may_lead() && !self.has_camera() && !self.broker.door
     }
 }

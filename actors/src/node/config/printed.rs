@@ -41,8 +41,12 @@ impl NodeConfig {
             comment.push_str("# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n");
         }
         #[cfg(feature = "camera")]
-        if shown.camera.as_mut().is_some_and(|camera| camera.source.forget_credentials()) {
-            comment.push_str("# user and password of `camera.source.url` are set but not shown: add them\n");
+        for camera in shown.camera.iter_mut().chain(&mut shown.cameras) {
+            if camera.source.forget_credentials() {
+                let of = camera.name.as_ref().map_or_else(String::new, |name| format!(" of camera {name}"));
+                let line = format!("# user and password of `camera.source.url`{of} are set but not shown: add them\n");
+                comment.push_str(&line);
+            }
         }
         (shown, comment)
     }

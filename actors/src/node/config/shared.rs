@@ -115,7 +115,7 @@ impl SharedConfig {
     /// The shared settings of a node's configuration.
     fn of(config: &NodeConfig) -> Self {
         #[cfg(feature = "camera")]
-        let sizes = config.camera.as_ref().map(|camera| camera.projection.sizes.clone()).unwrap_or_default();
+        let sizes = config.all_cameras().next().map(|camera| camera.projection.sizes.clone()).unwrap_or_default();
         #[cfg(not(feature = "camera"))]
         let sizes = ObjectSizes::default();
         Self {
@@ -130,8 +130,10 @@ impl SharedConfig {
         let Self { fusion, landmarks, origin, camera: SharedCamera { projection: SharedProjection { sizes } } } = self;
         (config.fusion, config.landmarks, config.origin) = (fusion, landmarks, origin);
         #[cfg(feature = "camera")]
-        if let Some(camera) = &mut config.camera {
-            camera.projection.sizes = sizes;
+        if config.all_cameras().next().is_some_and(|camera| camera.projection.sizes != sizes) {
+            for camera in config.camera.iter_mut().chain(&mut config.cameras) {
+                camera.projection.sizes = sizes.clone();
+            }
         }
         #[cfg(not(feature = "camera"))]
         drop(sizes);

@@ -1,5 +1,6 @@
 //! Values that are allowed, and yet look as if they were in another unit.
 
+use std::borrow::Cow;
 use std::f64::consts::{FRAC_PI_4, TAU};
 
 use ecod::diagnostics::TroubleKind;
@@ -37,7 +38,8 @@ impl NodeConfig {
         if let Ok(keys) = Value::try_from(self) {
             collect(&keys, "", &mut found);
         }
-        let (sizes, others): (Vec<_>, Vec<_>) = found.into_iter().partition(|(path, _)| path.starts_with(SIZES));
+        let (sizes, others): (Vec<_>, Vec<_>) =
+            found.into_iter().partition(|(path, _)| as_only_camera(path).starts_with(SIZES));
         let cause = |found: Vec<(String, String)>| {
             let texts: Vec<String> = found.into_iter().map(|(path, text)| format!("`{path}` is {text}")).collect();
             (!texts.is_empty()).then(|| texts.join("; "))
@@ -60,9 +62,15 @@ fn collect(value: &Value, path: &str, found: &mut Vec<(String, String)>) {
         Value::Integer(number) => *number as f64,
         _ => return,
     };
-    if let Some(unit) = missed_unit(path, number) {
+    if let Some(unit) = missed_unit(&as_only_camera(path), number) {
         found.push((path.into(), format!("{number}, and should be in {unit}")));
     }
+}
+
+/// The path of a key in `[[cameras]]` as it would be in `[camera]`.
+fn as_only_camera(path: &str) -> Cow<'_, str> {
+    let key = path.strip_prefix("cameras[").and_then(|rest| rest.split_once("].")).map(|(_, key)| key);
+    key.map_or(path.into(), |key| format!("camera.{key}").into())
 }
 
 /// The unit that a value should have, if it looks like one in another.
@@ -108,11 +116,13 @@ mod tests {
     use super::*;
 
     #[cfg(feature = "camera")]
+    const CAMERA: &str = "source = { kind = \"v4l2\" }\ndetector = { kind = \"coco\" }";
+
+    #[cfg(feature = "camera")]
     #[test]
     fn sizes_in_centimetres_are_noticed_by_what_is_usual_and_by_what_no_road_bears() {
         let of = |sizes: &str| {
-            let camera = "source = { kind = \"v4l2\" }\ndetector = { kind = \"coco\" }";
-            let text = format!("[camera]\n{camera}\n[camera.projection.sizes]\n{sizes}");
+            let text = format!("[camera]\n{CAMERA}\n[camera.projection.sizes]\n{sizes}");
             toml::from_str::<NodeConfig>(&text).unwrap().doubtful_units()
         };
         let usual = "labels.cup = { width_m = 0.09, height_m = 0.1 }\nlabels.lorry = { width_m = 2.5, height_m = 4 }";
@@ -123,6 +133,11 @@ mod tests {
         let expected = "`camera.projection.sizes.default.width_m` is 180, and should be in metres; \
                         `camera.projection.sizes.labels.cup.width_m` is 8, and should be in metres";
         assert_eq!(cause.as_deref(), Some(expected));
+        let second = format!(
+            "[[cameras]]\nname = \"rear\"\n{CAMERA}\nprojection.sizes.labels.cup = {{ width_m = 8, height_m = 0.1 }}"
+        );
+        let [(_, cause), _] = toml::from_str::<NodeConfig>(&second).unwrap().doubtful_units();
+        assert!(cause.is_some_and(|cause| cause.starts_with("`cameras[0].projection.sizes.labels.cup.width_m` is 8")));
     }
 
     #[test]

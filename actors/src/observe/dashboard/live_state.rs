@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use ecod::admission::report_window::MAX_PARTS;
 use ecod::diagnostics::TroubleKind;
-use ecod::model::names::NodeName;
+use ecod::model::names::{NodeName, PART_MARK};
 use ecod::model::time::Timestamp;
 use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind, Trouble};
 use serde::Serialize;
@@ -147,7 +147,10 @@ impl LiveState {
             let told = statuses.filter(|status| status.state != NodeState::Offline);
             told.flat_map(|status| status.troubles.iter().map(|trouble| (&status.node, trouble)))
         };
-        let of_itself = living().filter(|(_, trouble)| trouble.about.is_none());
+        let of_itself = living().filter(|(by, trouble)| match &trouble.about {
+            Some(part) => part.strip_prefix(by.as_str()).is_some_and(|rest| rest.starts_with(PART_MARK)),
+            None => true,
+        });
         let may_tell = |(by, trouble): &(&NodeName, &Trouble)| {
             let is_separating = || TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
             trouble.about.is_some() && (leader == Some(*by) || is_separating())

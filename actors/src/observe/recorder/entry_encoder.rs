@@ -101,10 +101,10 @@ impl EntryEncoder {
                 let reading = CounterReading { node, at_us: at, events, rejects, shed };
                 output.put(SchemaName::Counters, "node/counters", at, &reading)
             }
-            LogItem::Image(jpeg) => {
+            LogItem::Image(topic, jpeg) => {
                 let data = BASE64_STANDARD.encode(jpeg);
                 let image = CompressedImage { timestamp: at.into(), frame_id: node, data, format: "jpeg" };
-                output.put(SchemaName::CompressedImage, "camera", at, &image)
+                output.put(SchemaName::CompressedImage, topic, at, &image)
             }
         }
     }

@@ -46,8 +46,8 @@ pub enum LogItem {
     Link(BrokerAddress, LinkState),
     /// The node's counters.
     Counters(CounterSnapshot),
-    /// A camera image as JPEG.
-    Image(Vec<u8>),
+    /// A camera image as JPEG, with its topic.
+    Image(String, Vec<u8>),
 }
 
 impl LogItem {

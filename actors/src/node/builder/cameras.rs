@@ -1,0 +1,96 @@
+//! What the actors of the cameras are made of.
+
+use std::sync::Arc;
+
+use anyhow::Context;
+
+use super::NodeBuilder;
+use crate::actors::detector::DetectorArguments;
+use crate::actors::projector::ProjectorArguments;
+use crate::camera::config::CameraConfig;
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::projector::ProjectorMessage;
+use crate::node::camera;
+use crate::observe::dashboard::CameraFeed;
+use crate::observe::recorder::ImageRecorder;
+use crate::telemetry::troubles::CameraTroubles;
+
+impl NodeBuilder {
+    /// Arguments of the projector of a camera, by its place. That of the first camera receives the poses of a moving
+    /// vehicle for all.
+    pub(super) fn projector_arguments(&self, place: usize) -> anyhow::Result<ProjectorArguments> {
+        let camera = self.camera(place)?;
+        let others = self.slots.projectors.iter().skip(1).cloned().collect();
+        Ok(ProjectorArguments {
+            perception: camera::perception(&self.config, camera)?,
+            standing: self.standing_pose(),
+            origin: self.config.origin,
+            is_moving: self.config.pose.listen.is_some(),
+            poses: self.config.pose.listen.filter(|_| place == 0).map(|address| (address, others)),
+            algorithms: camera::algorithms(&self.config, camera),
+            clock: self.clock.clone(),
+            gateway: self.slots.gateway.clone(),
+            camera_feed: self.camera_feed(place),
+            troubles: self.camera_troubles(camera),
+            counters: self.counters(),
+        })
+    }
+
+    /// Arguments of the detector of a camera, by its place.
+    pub(super) fn detector_arguments(&self, place: usize) -> anyhow::Result<DetectorArguments> {
+        let camera = self.camera(place)?;
+        let source = camera.source.clone();
+        let timeout = camera::open_timeout(camera);
+        Ok(DetectorArguments {
+            open: Arc::new(move || source.open(timeout)),
+            capture: camera.capture.clone(),
+            detect: camera.detector.build().context("key `camera.detector`")?,
+            lens: camera::lens(camera)?,
+            projector: self.slots.projectors.get(place).map(ActorSlot::clone).unwrap_or_default(),
+            images: ImageRecorder::new(self.config.record.as_ref(), camera.name.as_deref(), self.recording.clone()),
+            camera_feed: self.camera_feed(place),
+            troubles: self.camera_troubles(camera),
+            counters: self.counters(),
+            spans: self.spans(),
+        })
+    }
+
+    /// Tells the projectors of changed settings.
+    pub(super) fn configure_cameras(&self) {
+        let (standing, origin) = (self.standing_pose(), self.config.origin);
+        for (camera, projector) in self.config.all_cameras().zip(&self.slots.projectors) {
+            match camera::perception(&self.config, camera) {
+                Ok(perception) => {
+                    let perception = Box::new(perception);
+                    let algorithms = camera::algorithms(&self.config, camera);
+                    projector.send(ProjectorMessage::Configure { perception, standing, origin, algorithms });
+                }
+                Err(error) => {
+                    tracing::error!(error = format!("{error:#}"), "the camera goes on with the settings before");
+                }
+            }
+        }
+    }
+
+    fn camera(&self, place: usize) -> anyhow::Result<&CameraConfig> {
+        self.config.all_cameras().nth(place).context("this node has no such camera")
+    }
+
+    /// The page shows the pictures of the first camera.
+    fn camera_feed(&self, place: usize) -> Option<Arc<CameraFeed>> {
+        self.camera_feed.clone().filter(|_| place == 0)
+    }
+
+    fn camera_troubles(&self, camera: &CameraConfig) -> CameraTroubles {
+        let part = camera.name.as_ref().map(|_| camera.reporter(&self.name));
+        CameraTroubles::new(self.counters(), part)
+    }
+
+    /// The pose of a vehicle that stands still, if it has a place in the cell's frame. The log says why it has none.
+    fn standing_pose(&self) -> Option<ecod::model::geometry::Pose> {
+        camera::standing_pose(&self.config).unwrap_or_else(|error| {
+            tracing::error!(error = format!("{error:#}"), "the cameras' frames are not reported");
+            None
+        })
+    }
+}

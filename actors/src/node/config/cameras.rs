@@ -1,0 +1,69 @@
+//! The cameras of a vehicle: `[camera]`, and further ones in `[[cameras]]`.
+
+#[cfg(feature = "camera")]
+use ecod::admission::report_window::MAX_PARTS;
+#[cfg(feature = "camera")]
+use ecod::config::ConfigError;
+#[cfg(feature = "camera")]
+use figment::Figment;
+
+use super::NodeConfig;
+#[cfg(feature = "camera")]
+use crate::camera::config::CameraConfig;
+#[cfg(feature = "camera")]
+use crate::camera::detect::DetectorConfig;
+
+impl NodeConfig {
+    /// Gives further cameras the defaults that depend on their detector, but for keys that are stated.
+    #[cfg(feature = "camera")]
+    pub(super) fn set_camera_defaults(&mut self, stated: &Figment) {
+        let stated = stated.extract_inner::<Vec<toml::Table>>("cameras").unwrap_or_default();
+        for (camera, keys) in self.cameras.iter_mut().zip(stated) {
+            let is_stated = keys.get("projection").is_some_and(|projection| projection.get("pixel_sigma_px").is_some());
+            if matches!(camera.detector, DetectorConfig::Coco(_)) && !is_stated {
+                camera.projection.pixel_sigma_px = super::COCO_PIXEL_SIGMA_PX;
+            }
+        }
+    }
+
+    /// Cameras need names by which they are told apart.
+    #[cfg(feature = "camera")]
+    pub(super) fn validate_cameras(&self) -> Result<(), ConfigError> {
+        if let Some(camera) = &self.camera {
+            camera.validate().map_err(|error| error.within("camera"))?;
+        }
+        if self.cameras.len() > MAX_PARTS {
+            return Err(ConfigError::new("cameras", self.cameras.len(), format!("at most {MAX_PARTS}")));
+        }
+        for (index, camera) in self.cameras.iter().enumerate() {
+            let within = |error: ConfigError| error.within(&format!("cameras[{index}]"));
+            camera.validate().map_err(within)?;
+            let earlier = self.camera.iter().chain(self.cameras.iter().take(index));
+            let Some(name) = camera.name.as_ref().filter(|_| earlier.clone().all(|other| other.name != camera.name))
+            else {
+                let name = camera.name.as_deref().unwrap_or("nothing");
+                let allowed = "a name of its own, such as \"rear\": its reports are those of that part of the vehicle";
+                return Err(within(ConfigError::new("name", name, allowed)));
+            };
+            if self.name.as_ref().is_some_and(|node| camera.reporter(node) == *node) {
+                return Err(within(ConfigError::new("name", name, "shorter, or `name` of the node")));
+            }
+        }
+        Ok(())
+    }
+
+    /// All cameras of the vehicle.
+    #[cfg(feature = "camera")]
+    pub fn all_cameras(&self) -> impl Iterator<Item = &CameraConfig> + Clone {
+        self.camera.iter().chain(&self.cameras)
+    }
+
+    /// True if the node sees for itself.
+    pub fn has_camera(&self) -> bool {
+        #[cfg(feature = "camera")]
+        let has_camera = self.all_cameras().next().is_some();
+        #[cfg(not(feature = "camera"))]
+        let has_camera = false;
+        has_camera
+    }
+}
