@@ -73,6 +73,7 @@ pub struct Aggregator {
     tracks_open_cell: bool,
     /// Reports that only tracking used, because a later one of their vehicle came before.
     overtaken: u64,
+    placed_and_misplaced: [u64; 2],
     vote: Option<Vote>,
     by_packets: bool,
     /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
@@ -100,6 +101,7 @@ impl Aggregator {
             tracks,
             tracks_open_cell,
             overtaken: 0,
+            placed_and_misplaced: [0; 2],
             vote,
             by_packets,
             voted: false,
@@ -181,9 +183,13 @@ impl Aggregator {
             ReportKind::Detections => {
                 let pace = self.pace.as_mut().ok_or(RejectReason::NotFused)?;
                 let admitted = window.admit(report, now)?;
-                if self.tracks.is_none() && !pace.landmarks().landmarks().is_empty() && !report.objects.is_empty() {
-                    let is_placed = report.objects.iter().any(|object| pace.is_at_landmark(object));
+                if !pace.landmarks().landmarks().is_empty() && !report.objects.is_empty() {
+                    let is_tracking = self.tracks.is_some();
+                    let is_placed =
+                        |object| pace.is_at_landmark(object) || is_tracking && pace.is_near_landmarks(object);
+                    let is_placed = report.objects.iter().any(is_placed);
                     window.note_place(&report.node, is_placed, now);
+                    self.placed_and_misplaced[usize::from(!is_placed)] += 1;
                 }
                 let report = &of_vehicle(report);
                 let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
@@ -233,9 +239,21 @@ impl Aggregator {
         self.windows[kind as usize].untimely_for(name, now)
     }
 
-    /// Time for which no detection of a vehicle or part has been at a known location, where nothing else is fused.
+    /// Time for which no detection of a vehicle or part has been at a known location or, where others are tracked, near
+    /// the known locations.
     pub fn misplaced_for(&self, name: &NodeName, now: Timestamp) -> Duration {
         self.windows[ReportKind::Detections as usize].misplaced_for(name, now)
+    }
+
+    /// True if two senders report under a name, as their numbers tell.
+    pub fn is_name_shared(&self, kind: ReportKind, name: &NodeName) -> bool {
+        self.windows[kind as usize].is_shared(name)
+    }
+
+    /// Numbers of reports of detections so far with an object where it has an effect, and with none there, of a cell with
+    /// known locations.
+    pub fn placed_and_misplaced(&self) -> [u64; 2] {
+        self.placed_and_misplaced
     }
 
     /// True if a location of this id is known; `None` if none is known at all.

@@ -106,7 +106,7 @@ trouble_kinds! {
     /// A broker that does not let this node do what it must.
     BrokerRefuses = "broker_refuses", UNTIL_SETTLED, "check password, certificate and permissions";
     /// More troubles than are kept.
-    NotShown = "not_shown", SHORT, "mend those that are shown; the metric `ecod_payloads_rejected_by_source_total` names all senders";
+    NotShown = "not_shown", SHORT, "mend those that are shown, others then have room";
     /// State that cannot be saved.
     NotSaved = "not_saved", UNTIL_SETTLED, "free space on the disk, and make `state_dir` writable for the node's user";
 }
@@ -144,6 +144,7 @@ impl TroubleKind {
             Self::WrongKey
                 | Self::OtherCell
                 | Self::NotAdmitted
+                | Self::NameTaken
                 | Self::SeedSilent
                 | Self::Unresolved
                 | Self::BrokerUnreachable
@@ -241,7 +242,9 @@ impl TroubleRegister {
             });
         }
         if !self.make_room(&key, now) {
-            return self.note(TroubleKind::NotShown, None, "there are more troubles than have room here", now);
+            let (about, kind) = (key.0.unwrap_or_default(), kind.as_str());
+            let cause = format!("there are more troubles than have room here, such as {kind} of {about}");
+            return self.note(TroubleKind::NotShown, None, &cause, now);
         }
         let cause = cause();
         let entry = KnownTrouble {

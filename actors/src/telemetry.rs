@@ -1,5 +1,7 @@
 //! Counters of a node, and spans of what it does.
 
+#[cfg(feature = "camera")]
+pub mod camera_troubles;
 pub mod counters;
 #[cfg(feature = "otel")]
 pub mod otlp;

@@ -125,7 +125,23 @@ fn votes_of_which_none_counts_fail() {
         let arguments = ["replay", "--config", text(&cell), "--input", "-", "--output", "-"];
         let run = ecod_with_input(&arguments, line.as_bytes());
         assert_eq!(run.status.code(), Some(code), "{landmark}, {x_m}: {}", said(&run));
-        assert_eq!(said(&run).contains("none of 1 votes counts"), code == 3, "{}", said(&run));
+        assert_eq!(said(&run).contains("1 of 1 votes do not count"), code == 3, "{}", said(&run));
+    }
+}
+
+#[test]
+fn detections_that_are_nowhere_near_a_location_fail() {
+    let folder = TempDir::new().unwrap();
+    let cell = folder.path().join("cell.toml");
+    fs::write(&cell, "[[landmarks]]\nid = \"table\"\nx_m = 3\ny_m = 0\n").unwrap();
+    for (x_m, code) in [(3, 0), (300, 3)] {
+        let object = format!(r#"{{"label":"cup","confidence":0.9,"x_m":{x_m},"y_m":0}}"#);
+        let line =
+            format!(r#"{{"schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,"objects":[{object}]}}"#);
+        let arguments = ["replay", "--config", text(&cell), "--input", "-", "--output", "-"];
+        let run = ecod_with_input(&arguments, line.as_bytes());
+        assert_eq!(run.status.code(), Some(code), "{x_m}: {}", said(&run));
+        assert_eq!(said(&run).contains("no report has an object at a known location"), code == 3, "{}", said(&run));
     }
 }
 

@@ -119,6 +119,11 @@ impl ReportWindow {
         since.map_or(Duration::ZERO, |since| now.since(since))
     }
 
+    /// True if two senders report under a name.
+    pub(crate) fn is_shared(&self, name: &NodeName) -> bool {
+        self.vehicles.get(name).is_some_and(VehicleClock::is_shared)
+    }
+
     /// Notes if any object of a known sender's report has an effect where it is.
     pub(crate) fn note_place(&mut self, name: &NodeName, is_placed: bool, at: Timestamp) {
         if let Some(vehicle) = self.vehicles.get_mut(name) {

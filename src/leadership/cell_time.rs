@@ -50,6 +50,19 @@ pub enum ClockEvent {
     CellJumped(i64),
 }
 
+/// A clock that is off.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct WrongClock<'a> {
+    /// The other node that has it; none for the node itself.
+    pub node: Option<&'a NodeName>,
+    /// Its error in microseconds, positive if it is ahead.
+    pub error_us: i64,
+    /// True if the cell's time follows it, or another wrong one: the error is against the other clocks then.
+    pub is_cell_wrong: bool,
+    /// False if another clock may be the wrong one instead.
+    pub is_certain: bool,
+}
+
 /// One node's knowledge of all clocks.
 #[derive(Debug, Clone)]
 pub struct CellTime {
@@ -103,9 +116,20 @@ impl CellTime {
         self.reading.unwrap_or(own)
     }
 
-    /// True if the cell's time follows one of two clocks, so that either may be the wrong one.
-    pub fn is_undecided(&self, now: Timestamp) -> bool {
-        self.walls(now).len() == 2
+    /// Clocks that are off by [`MIN_CLOCK_JUMP`] or more, by the time that most clocks have; the node's own is without a
+    /// name. Where no two agree on a time, each may be the wrong one.
+    pub fn wrong_clocks(&self, now: Timestamp) -> Vec<WrongClock<'_>> {
+        let errors = self.wall_errors(now);
+        let agree =
+            |time: i64| errors.iter().filter(|(_, us)| us.saturating_sub(time).abs() < micros(MIN_CLOCK_JUMP)).count();
+        // The cell's time, if as many clocks have it as any other.
+        let times = [0].into_iter().chain(errors.iter().map(|(_, us)| *us));
+        let time = times.rev().max_by_key(|time| agree(*time)).unwrap_or_default();
+        let (is_cell_wrong, is_certain) = (time.abs() >= micros(MIN_CLOCK_JUMP), agree(time) > 1);
+        let time = if is_cell_wrong && is_certain { time } else { 0 };
+        let errors = errors.into_iter().map(|(node, us)| (node, us.saturating_sub(time)));
+        let wrong = errors.filter(|(_, us)| us.abs() >= micros(MIN_CLOCK_JUMP));
+        wrong.map(|(node, error_us)| WrongClock { node, error_us, is_cell_wrong: time != 0, is_certain }).collect()
     }
 
     /// Errors of all wall clocks that are known in microseconds, positive if ahead of the cell's time: of the node's own,

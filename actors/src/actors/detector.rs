@@ -25,9 +25,9 @@ use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
 use crate::observe::dashboard::CameraFeed;
 use crate::observe::recorder::ImageRecorder;
+use crate::telemetry::camera_troubles::CameraTroubles;
 use crate::telemetry::counters::{Counters, Event};
 use crate::telemetry::spans::Spans;
-use crate::telemetry::troubles::CameraTroubles;
 
 /// Arguments of a detector's start.
 pub struct DetectorArguments {

@@ -160,7 +160,7 @@ const MAX_UNNOTED_LEAD_US: i64 = 1_500_000;
 const MIN_MISPLACED: Duration = Duration::from_secs(10);
 
 /// Greatest range in metres at which a camera tells what an object is.
-const MAX_SEEN_RANGE_M: f64 = 500.0;
+const MAX_SEEN_RANGE_M: f64 = 300.0;
 
 /// The lead of a report's time in words.
 fn lead_in_words(report: &ObjectReport, lead_us: i64) -> String {
@@ -223,6 +223,7 @@ impl FuserState {
             Ok(fused) => {
                 self.note_clock(report, delivery.received_at);
                 self.note_place(*kind, report, delivery.received_at);
+                self.note_name(*kind, report);
                 if self.aggregator.leads().is_some() {
                     self.spans.note(report, delivery.received_at, &mut self.reports);
                 }
@@ -249,7 +250,13 @@ impl FuserState {
                 if self.aggregator.untimely_for(kind, &report.node, received_at) >= MIN_UNTIMELY {
                     let cause = format!("refused, {}", lead_in_words(report, self.lead_us(report, received_at)));
                     self.counters.troubles().settle(TroubleKind::ClockOff, Some(node));
-                    self.counters.troubles().note_about(node, TroubleKind::Untimely, &cause);
+                    let remedy = match TimeUnit::of(report.captured_at_us) {
+                        Some(_) => {
+                            "correct the program that sends them, or set its clock: `captured_at_us` counts microseconds since 1970"
+                        }
+                        None => TroubleKind::Untimely.remedy(),
+                    };
+                    self.counters.troubles().note_with_remedy(Some(node), TroubleKind::Untimely, &cause, remedy);
                 }
             }
             RejectReason::NotFused => self
@@ -270,19 +277,28 @@ impl FuserState {
         }
     }
 
+    /// Notes a name that two senders use.
+    fn note_name(&self, kind: ReportKind, report: &ObjectReport) {
+        if self.aggregator.is_name_shared(kind, &report.node) {
+            let cause = "two programs report under this name: the numbers `seq` of its reports go back and forth";
+            self.counters.troubles().note_about(report.node.as_str(), TroubleKind::NameTaken, cause);
+        }
+    }
+
     /// Notes detections that are used nowhere, or too far from their camera for any: their unit or frame is another.
     fn note_place(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
         let note = |cause: &str| {
             self.counters.troubles().note_about(report.node.as_str(), TroubleKind::Misplaced, cause);
         };
-        if kind == ReportKind::Detections && self.aggregator.misplaced_for(&report.node, received_at) >= MIN_MISPLACED {
-            note("none of its objects is at a known location");
+        if let Some(pose) = report.pose.map(Pose::from) {
+            let ranges = report.objects.iter().map(|object| pose.range_bearing(&Point2::new(object.x_m, object.y_m)).0);
+            let farthest_m = ranges.fold(0.0, f64::max);
+            if farthest_m > MAX_SEEN_RANGE_M {
+                return note(&format!("an object of its report is {farthest_m:.0} m from its pose"));
+            }
         }
-        let Some(pose) = report.pose.map(Pose::from) else { return };
-        let ranges = report.objects.iter().map(|object| pose.range_bearing(&Point2::new(object.x_m, object.y_m)).0);
-        let farthest_m = ranges.fold(0.0, f64::max);
-        if farthest_m > MAX_SEEN_RANGE_M {
-            note(&format!("an object of its report is {farthest_m:.0} m from its pose"));
+        if kind == ReportKind::Detections && self.aggregator.misplaced_for(&report.node, received_at) >= MIN_MISPLACED {
+            note("none of its objects is at a known location, or near one");
         }
     }
 

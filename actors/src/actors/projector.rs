@@ -32,8 +32,8 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::projector::ProjectorMessage;
 use crate::observe::dashboard::{CameraFeed, PictureBox, camera_event};
 use crate::platform::cell_clock::CellClock;
+use crate::telemetry::camera_troubles::CameraTroubles;
 use crate::telemetry::counters::{Counters, Event};
-use crate::telemetry::troubles::CameraTroubles;
 
 /// Arguments of a projector's start.
 pub struct ProjectorArguments {

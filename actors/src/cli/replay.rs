@@ -39,7 +39,8 @@ pub(super) struct ReplayArguments {
     /// Weigh all recorded votes together N times, and write the last verdicts only
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     passes: Option<u32>,
-    /// Share of rejected reports beyond which the program ends with code 3, as it does if no report or no vote was usable
+    /// Share of rejected reports beyond which the program ends with code 3, as it does if no report was usable, most votes do not
+    /// count, or no object is at a known location
     #[arg(long, value_name = "PERCENT", value_parser = clap::value_parser!(u64).range(0..=100), default_value_t = 10)]
     max_rejected: u64,
 }
@@ -106,35 +107,44 @@ struct Usable {
     /// Objects for VOTE, and those of them that did not count.
     votes: u64,
     ignored_votes: u64,
+    placed: u64,
+    misplaced: u64,
 }
 
 impl Usable {
     fn of(summary: &Summary, may_repeat: bool) -> Self {
-        let Summary { lines, votes, ignored_votes, .. } = *summary;
-        Self { reports: lines, used: summary.used(), faulty: summary.faulty(may_repeat), votes, ignored_votes }
+        let Summary { lines, votes, ignored_votes, placed, misplaced, .. } = *summary;
+        let (used, faulty) = (summary.used(), summary.faulty(may_repeat));
+        Self { reports: lines, used, faulty, votes, ignored_votes, placed, misplaced }
     }
 
     fn plus(self, other: Self) -> Self {
-        let Self { reports, used, faulty, votes, ignored_votes } = other;
+        let Self { reports, used, faulty, votes, ignored_votes, placed, misplaced } = other;
         Self {
             reports: self.reports + reports,
             used: self.used + used,
             faulty: self.faulty + faulty,
             votes: self.votes + votes,
             ignored_votes: self.ignored_votes + ignored_votes,
+            placed: self.placed + placed,
+            misplaced: self.misplaced + misplaced,
         }
     }
 
-    /// Fails if no report or no vote was used, or more than a share was rejected.
+    /// Fails if no report was used, or none has an effect, or more than a share was rejected.
     fn check(self, max_rejected_pct: u64) -> Result<(), Failure> {
-        let Self { reports, used, faulty, votes, ignored_votes } = self;
+        let Self { reports, used, faulty, votes, ignored_votes, placed, misplaced } = self;
         if used == 0 {
             return Err(Failure::rejected(anyhow!("no report could be used: the input is no recording of reports")));
         }
-        if votes > 0 && ignored_votes >= votes {
-            let why = "their `landmark` is none of the configuration's, or farther from their `pose` than \
-                `fusion.vote.weighted.max_range_m`";
-            return Err(Failure::rejected(anyhow!("none of {votes} votes counts: {why}")));
+        if 2 * ignored_votes > votes {
+            let rule = "a vote has a `landmark`, one of the configuration's if that lists any, a `confidence` above 0, and \
+                a place within `fusion.vote.weighted.max_range_m` of the `pose`";
+            return Err(Failure::rejected(anyhow!("{ignored_votes} of {votes} votes do not count: {rule}")));
+        }
+        if placed == 0 && misplaced > 0 {
+            let rule = "positions are in metres in the frame of the configuration's `landmarks`";
+            return Err(Failure::rejected(anyhow!("no report has an object at a known location, or near one: {rule}")));
         }
         if faulty * 100 > max_rejected_pct * reports {
             let share = format!("{faulty} of {reports} reports were rejected, more than {max_rejected_pct} %");
@@ -200,7 +210,19 @@ impl RoundWriter {
 }
 
 fn print_summary(summary: &Summary) {
-    let Summary { lines, rejected, unit, late, votes: _, ignored_votes, overtaken, tracks, written } = summary;
+    let Summary {
+        lines,
+        rejected,
+        unit,
+        late,
+        votes: _,
+        ignored_votes,
+        misplaced,
+        placed: _,
+        overtaken,
+        tracks,
+        written,
+    } = summary;
     eprintln!("{lines} lines, {} used, {written} written", summary.used());
     for (reason, Rejections { lines, examples }) in rejected {
         eprintln!("rejected {reason} {lines}");
@@ -214,6 +236,7 @@ fn print_summary(summary: &Summary) {
     for (what, number) in [
         ("reports used although older than an earlier line", *late),
         ("votes ignored: no usable location, or too many labels", *ignored_votes),
+        ("reports of which no object is at a known location, or near one", *misplaced),
         ("reports used for tracking only, since a later one of the vehicle came first", *overtaken),
         ("reports too late for tracking", tracks.late),
         ("new objects not tracked: too many", tracks.refused),

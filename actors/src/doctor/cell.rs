@@ -50,8 +50,8 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
 fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
     let (cell, nodes) = (&config.cell, node.members().borrow().len());
     let leader = node.leadership().borrow().leader().map(NodeName::to_string);
-    let fix = "start another node, or check `membership.seeds`, the key, and that UDP 17884 passes; the first node of a \
-        cell is alone";
+    let fix = "start another node, or check that `cell` and key are the same on all, `membership.seeds`, and that UDP 17884 \
+        passes; the first node of a cell is alone";
     let found = match leader {
         Some(leader) => Finding::fine("cell", format!("{cell} is led by {leader}, nodes that answer: {nodes}")),
         None if nodes > 0 => {
@@ -72,9 +72,11 @@ fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
 /// A living node of another machine that has this node's name.
 fn used_elsewhere(config: &NodeConfig, member: &Member) -> Option<Finding> {
     let has_name = config.name.as_ref() == Some(&member.name);
+    let own_port = config.membership.bind.map(|bind| bind.port()).filter(|port| *port != 0);
+    let is_on_other_port = own_port.is_some_and(|port| port != member.gossip.port());
     let is_elsewhere = || UdpSocket::bind(member.gossip).is_err_and(|e| e.kind() == ErrorKind::AddrNotAvailable);
-    (has_name && is_elsewhere()).then(|| {
-        let seen = format!("{} is the name of a node that runs at {}", member.name, member.gossip.ip());
+    (has_name && (is_on_other_port || is_elsewhere())).then(|| {
+        let seen = format!("{} is the name of a node that runs at {}", member.name, member.gossip);
         Finding::broken("name", seen, "give this node another `name`: only the first node of a name takes part")
     })
 }
@@ -106,6 +108,9 @@ mod tests {
         let there = "192.0.2.7:17884".parse().unwrap();
         assert_eq!(used_elsewhere(&config, &member("euclid", here)), None, "the node itself, which runs");
         assert_eq!(used_elsewhere(&config, &member("gauss", there)), None);
+        let mut beside = config.clone();
+        beside.membership.bind = Some("127.0.0.1:1".parse().unwrap());
+        assert!(used_elsewhere(&beside, &member("euclid", here)).is_some(), "another run on this machine");
         let found = used_elsewhere(&config, &member("euclid", there)).unwrap();
         assert!(found.seen.contains("euclid is the name of a node that runs at 192.0.2.7"), "{found:?}");
     }

@@ -1,17 +1,11 @@
 //! The present troubles of a node, noted by its parts and read by whoever shows them.
 
-#[cfg(feature = "camera")]
-use std::sync::Arc;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use ecod::diagnostics::{TroubleKind, TroubleRegister};
-#[cfg(feature = "camera")]
-use ecod::model::names::NodeName;
 use ecod::wire::Trouble;
 
 use crate::platform::clock;
-#[cfg(feature = "camera")]
-use crate::telemetry::counters::Counters;
 
 /// A register that all parts of a node share. News of it are in the log: at first, and hourly while they last.
 #[derive(Debug, Default)]
@@ -36,9 +30,9 @@ impl Troubles {
         log(news);
     }
 
-    /// Notes what another node says of this one.
-    pub fn relay(&self, kind: TroubleKind, cause: &str, remedy: &str) {
-        let news = self.register().note_with(kind, None, || cause.to_owned(), remedy, clock::now());
+    /// Notes a trouble of this node itself, or about another, with a remedy of its own.
+    pub fn note_with_remedy(&self, about: Option<&str>, kind: TroubleKind, cause: &str, remedy: &str) {
+        let news = self.register().note_with(kind, about, || cause.to_owned(), remedy, clock::now());
         log(news);
     }
 
@@ -54,35 +48,6 @@ impl Troubles {
 
     fn register(&self) -> MutexGuard<'_, TroubleRegister> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-/// The troubles of one camera: a vehicle's only one is the node itself, others are parts of it.
-#[cfg(feature = "camera")]
-#[derive(Debug, Clone)]
-pub struct CameraTroubles {
-    counters: Arc<Counters>,
-    part: Option<NodeName>,
-}
-
-#[cfg(feature = "camera")]
-impl CameraTroubles {
-    /// The troubles of a camera that reports as a part, or as the node itself.
-    pub fn new(counters: Arc<Counters>, part: Option<NodeName>) -> Self {
-        Self { counters, part }
-    }
-
-    /// Notes a trouble.
-    pub fn note(&self, kind: TroubleKind, cause: &str) {
-        match &self.part {
-            Some(part) => self.counters.troubles().note_about(part.as_str(), kind, cause),
-            None => self.counters.troubles().note(kind, cause),
-        }
-    }
-
-    /// Notes that a trouble is over.
-    pub fn settle(&self, kind: TroubleKind) {
-        self.counters.troubles().settle(kind, self.part.as_ref().map(NodeName::as_str));
     }
 }
 

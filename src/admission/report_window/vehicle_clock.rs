@@ -25,6 +25,8 @@ pub(super) struct VehicleClock {
     pub(super) last_heard: Timestamp,
     /// Time since when reports are rejected for their time only.
     pub(super) untimely_since: Option<Timestamp>,
+    /// Grows while `seq` goes back and forth; a restart goes back once.
+    back_and_forth: u32,
     /// Time since when none of its objects has an effect where it is.
     pub(super) misplaced_since: Option<Timestamp>,
 }
@@ -48,6 +50,9 @@ pub(super) struct Bounds {
     pub(super) tolerance: i64,
     pub(super) cell_offset: i64,
 }
+
+/// Measure of numbers that go back and forth from which two senders are behind them: some fourteen reports.
+const MIN_BACK_AND_FORTH: u32 = 20;
 
 impl Bounds {
     /// Largest delay of a clock that is believed at once.
@@ -82,7 +87,13 @@ impl VehicleClock {
             last_heard: now,
             untimely_since: None,
             misplaced_since: None,
+            back_and_forth: 0,
         }
+    }
+
+    /// True if two senders use the name: the numbers of the reports go back and forth, and their times do not.
+    pub(super) fn is_shared(&self) -> bool {
+        self.back_and_forth >= MIN_BACK_AND_FORTH
     }
 
     /// Admits a report by its own statement, by what is known of its sender's clock, or because its stream is live.
@@ -197,6 +208,11 @@ impl VehicleClock {
     /// Notes the vehicle's latest report.
     fn advance(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
         self.remember(report)?;
+        let goes_back = self.last_seq.is_some_and(|last| report.seq < last);
+        self.back_and_forth = match goes_back {
+            true => self.back_and_forth.saturating_add(4).min(2 * MIN_BACK_AND_FORTH),
+            false => self.back_and_forth.saturating_sub(1),
+        };
         self.last_captured = report.captured_at_us;
         self.last_seq = Some(report.seq);
         self.last_received = received_at;

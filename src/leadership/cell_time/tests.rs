@@ -219,9 +219,33 @@ fn clocks_that_are_off_are_known_by_name() {
     assert!(off(Some("n2")).is_some_and(|us| (us - 5 * SECOND_US).abs() < SECOND_US / 2), "{of_leader:?}");
     assert!([None, Some("n1")].map(off).iter().all(|us| us.is_some_and(|us| us.abs() < SECOND_US)), "{of_leader:?}");
     assert_eq!(off(Some("n3")), None, "a clock that was never set says nothing to others");
-    assert!(cell.nodes[0].time.is_undecided(cell.now.shifted(cell.nodes[0].steady_us)), "of two candidates");
+    let blamed: Vec<_> = cell.nodes[0].time.wrong_clocks(cell.now.shifted(cell.nodes[0].steady_us));
+    let [WrongClock { node: Some(name), is_cell_wrong: false, is_certain: true, .. }] = &*blamed else {
+        panic!("{blamed:?}")
+    };
+    assert_eq!(name.as_str(), "n2", "two candidates agree");
     assert!((errors(2)[0].1 - 5 * SECOND_US).abs() < SECOND_US / 2, "{:?}", errors(2));
     assert!(errors(3)[0].1 < -SECOND_US, "and its own node knows");
+}
+
+/// A leader that nobody outvotes gives the cell its own wrong time; the others' clocks agree, and are not blamed. Of two
+/// clocks neither is blamed for certain.
+#[test]
+fn of_clocks_that_differ_the_ones_that_agree_are_right() {
+    let wrong = |nodes: &[(Role, i64, i64)]| {
+        let mut cell = Cell::new(nodes);
+        cell.run(10);
+        let Node { time, steady_us, .. } = &cell.nodes[0];
+        let wrong = time.wrong_clocks(cell.now.shifted(*steady_us)).into_iter();
+        let whole_s = |us: i64| (us as f64 / SECOND_US as f64).round();
+        let shown = |it: WrongClock<'_>| {
+            (it.node.map(NodeName::to_string), whole_s(it.error_us), it.is_cell_wrong, it.is_certain)
+        };
+        wrong.map(shown).collect::<Vec<_>>()
+    };
+    let (edge, cav, other) = ((Role::Edge, 0, 30 * SECOND_US), (Role::Cav, 9, 0), (Role::Cav, 7 * SECOND_US, 0));
+    assert_eq!(wrong(&[edge, cav, other]), [(None, 30.0, true, true)]);
+    assert_eq!(wrong(&[edge, cav]), [(Some("n1".into()), -30.0, false, false)]);
 }
 
 #[test]

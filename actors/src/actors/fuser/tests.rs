@@ -160,6 +160,41 @@ fn a_time_in_seconds_is_told_from_a_clock_that_is_off() {
     assert!(told.iter().any(|(_, _, cause)| cause.contains("`captured_at_us` looks like seconds")), "{told:?}");
 }
 
+/// Where objects are tracked, they may be anywhere near the locations: three metres, but not three hundred.
+#[test]
+fn a_vehicle_in_centimetres_is_named_where_objects_are_tracked() {
+    let mut fuser = standby();
+    let slot = toml::from_str::<LandmarkConfig>("id = \"slot-0\"\nx_m = 30\ny_m = 0").unwrap();
+    let mut config = FusionConfig::default();
+    config.tracks.mode = ecod::tracking::TracksMode::On;
+    fuser.aggregator = Aggregator::new_standby(config, vec![(&slot).into()], Timestamp(0));
+    for n in 1..=120 {
+        let at = Timestamp(1_795_000_000_000_000 + n * 100_000);
+        for (name, x_m) in [("watson", 300.0), ("euclid", 3.0)] {
+            let mut report = ObjectReport::new(NodeName::from_static(name), n, at);
+            report.objects = vec![PerceivedObject::new("car", 0.9, x_m, 0.0)];
+            take(&mut fuser, report, at, None);
+        }
+    }
+    let told: Vec<_> = troubles(&fuser).into_iter().map(|(about, kind, _)| (about.unwrap_or_default(), kind)).collect();
+    assert_eq!(told, [("watson".to_owned(), "misplaced".to_owned())]);
+}
+
+/// Two programs of one name are told; one that starts again is not.
+#[test]
+fn two_programs_that_report_under_one_name_are_told() {
+    for (senders, is_told) in [(1, false), (2, true)] {
+        let mut fuser = standby();
+        for n in 0..60 {
+            let at = Timestamp(1_795_000_000_000_000 + n * 50_000);
+            let seq = if senders == 2 { n / 2 + 1000 * (n % 2) } else { 1000 + n % 30 };
+            take(&mut fuser, ObjectReport::new(NodeName::from_static("watson"), seq, at), at, None);
+        }
+        let told = troubles(&fuser);
+        assert_eq!(told.iter().any(|(_, kind, _)| kind == "name_taken"), is_told, "{told:?}");
+    }
+}
+
 /// A vehicle in centimetres has its objects at no location, or far from its camera, whoever else is right.
 #[test]
 fn a_vehicle_whose_objects_are_nowhere_is_named() {
@@ -183,7 +218,7 @@ fn a_vehicle_whose_objects_are_nowhere_is_named() {
     }
     let of = |name: &str, cause: &str| (Some(name.to_owned()), "misplaced".to_owned(), cause.to_owned());
     let far = of("gauss", "an object of its report is 800 m from its pose");
-    assert_eq!(told, [far, of("watson", "none of its objects is at a known location")]);
+    assert_eq!(told, [far, of("watson", "none of its objects is at a known location, or near one")]);
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ecod::diagnostics::TroubleKind;
-use ecod::leadership::cell_time::{CellTime, ClockEvent};
+use ecod::leadership::cell_time::{CellTime, ClockEvent, WrongClock};
 use ecod::leadership::election::{ElectionMessage, Health};
 use ecod::leadership::node::{self, Effect, Input, LeadershipNode, Notice};
 use ecod::leadership::{BrokerAddress, Leadership};
@@ -241,16 +241,10 @@ impl ElectionDriver {
     /// Notes clocks that are off, the leader's complaint, and that the cell's description is not used.
     fn note_troubles(&self) {
         let (troubles, leadership) = (self.counters.troubles(), self.leadership.borrow());
-        let (now, cell_time) = (clock::now(), &self.cell_time);
-        for (name, error_us) in cell_time.wall_errors(now) {
-            let cause = clock_words(error_us, cell_time.is_undecided(now));
-            match name {
-                _ if error_us.unsigned_abs() < MIN_CLOCK_ERROR_US => {}
-                None => troubles.note(TroubleKind::ClockOff, &cause),
-                Some(name) if leadership.is_leading() => {
-                    troubles.note_about(name.as_str(), TroubleKind::ClockOff, &cause);
-                }
-                Some(_) => {}
+        for clock in self.cell_time.wrong_clocks(clock::now()) {
+            if clock.node.is_none() || leadership.is_leading() {
+                let about = clock.node.map(NodeName::as_str);
+                troubles.note_with_remedy(about, TroubleKind::ClockOff, &clock_words(&clock), clock_remedy(&clock));
             }
         }
         for name in &self.no_login {
@@ -259,7 +253,8 @@ impl ElectionDriver {
         }
         let complaint = self.complaint.as_ref().filter(|(leader, _)| leadership.leader() == Some(leader));
         if let Some((leader, Trouble { cause, remedy, .. })) = complaint {
-            troubles.relay(TroubleKind::ReportsRefused, &format!("{leader} says of this node: {cause}"), remedy);
+            let cause = format!("{leader} says of this node: {cause}");
+            troubles.note_with_remedy(None, TroubleKind::ReportsRefused, &cause, remedy);
         }
         match &self.parts.shared.borrow().problem {
             Some(problem) => troubles.note(TroubleKind::Description, problem),
@@ -305,15 +300,22 @@ fn as_seen(member: &Member) -> node::SeenMember {
     }
 }
 
-/// Error of a clock that is a trouble; smaller ones cost nothing.
-const MIN_CLOCK_ERROR_US: u64 = 1_000_000;
+/// The error of a clock in words.
+fn clock_words(clock: &WrongClock<'_>) -> String {
+    let seconds = clock.error_us.unsigned_abs() as f64 / 1e6;
+    let side = if clock.error_us > 0 { "ahead of" } else { "behind" };
+    let others =
+        if clock.is_cell_wrong { "the clocks of the others, and the cell goes by it" } else { "the cell's time" };
+    format!("its clock is {seconds:.1} s {side} {others}")
+}
 
-/// The error of a clock in words; positive if it is ahead. Undecided is which of two clocks is wrong.
-fn clock_words(error_us: i64, is_undecided: bool) -> String {
-    let seconds = error_us.unsigned_abs() as f64 / 1e6;
-    let side = if error_us > 0 { "ahead of" } else { "behind" };
-    let doubt = if is_undecided { "; the cell has two clocks, and the other one may be wrong instead" } else { "" };
-    format!("its clock is {seconds:.1} s {side} the cell's time{doubt}")
+/// The remedy where it is clear which clock is wrong, or else both.
+fn clock_remedy(clock: &WrongClock<'_>) -> &'static str {
+    if clock.is_certain {
+        TroubleKind::ClockOff.remedy()
+    } else {
+        "no two clocks of the cell agree, so that another one may be wrong: run a time service on all nodes, such as chrony"
+    }
 }
 
 fn log_clock(event: ClockEvent) {

@@ -61,7 +61,14 @@ impl Video {
             let reason = format!("GStreamer has no element `{element}` here: install the package that has it");
             return Err(FrameError::Open { origin: pipeline.into(), reason });
         }
-        Self::live(pipeline.into(), || VideoCapture::from_file(pipeline, videoio::CAP_GSTREAMER))
+        let opened = Self::live(pipeline.into(), || VideoCapture::from_file(pipeline, videoio::CAP_GSTREAMER));
+        opened.map_err(|error| match error {
+            FrameError::Open { origin, reason } if Command::new(INSPECTOR).arg("--version").output().is_err() => {
+                let remedy = "install gstreamer1.0-tools, so that a missing element is named";
+                FrameError::Open { origin, reason: format!("{reason}; {remedy}") }
+            }
+            error => error,
+        })
     }
 
     /// A network camera with a timeout for opening it and for each frame.
@@ -143,9 +150,12 @@ fn elements(pipeline: &str) -> impl Iterator<Item = &str> {
         .filter(|word| word.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-'))
 }
 
+/// GStreamer's program that knows its elements.
+const INSPECTOR: &str = "gst-inspect-1.0";
+
 /// True if GStreamer says that it does not know an element; OpenCV only waits for frames then.
 fn is_missing(element: &str) -> bool {
-    let answer = Command::new("gst-inspect-1.0").args(["--exists", element]).output();
+    let answer = Command::new(INSPECTOR).args(["--exists", element]).output();
     answer.is_ok_and(|answer| answer.status.code() == Some(1))
 }
 

@@ -8,12 +8,11 @@ use super::NodeBuilder;
 use crate::actors::detector::DetectorArguments;
 use crate::actors::projector::ProjectorArguments;
 use crate::camera::config::CameraConfig;
-use crate::messages::actor_slot::ActorSlot;
 use crate::messages::projector::ProjectorMessage;
 use crate::node::camera;
 use crate::observe::dashboard::CameraFeed;
 use crate::observe::recorder::ImageRecorder;
-use crate::telemetry::troubles::CameraTroubles;
+use crate::telemetry::camera_troubles::CameraTroubles;
 
 impl NodeBuilder {
     /// Arguments of the projector of a camera, by its place. That of the first camera receives the poses of a moving
@@ -46,7 +45,7 @@ impl NodeBuilder {
             capture: camera.capture.clone(),
             detect: camera.detector.build().context("key `camera.detector`")?,
             lens: camera::lens(camera)?,
-            projector: self.slots.projectors.get(place).map(ActorSlot::clone).unwrap_or_default(),
+            projector: self.slots.projectors.get(place).cloned().unwrap_or_default(),
             images: ImageRecorder::new(self.config.record.as_ref(), camera.name.as_deref(), self.recording.clone()),
             camera_feed: self.camera_feed(place),
             troubles: self.camera_troubles(camera),

@@ -63,6 +63,7 @@ pub(crate) struct GossipMachine {
     sessions: Sessions,
     gossip: Swim,
     clock: AwakeClock,
+    started_at: Timestamp,
     hello: Duration,
     hello_at: Timestamp,
     hello_count: u64,
@@ -111,6 +112,7 @@ impl GossipMachine {
             ),
             gossip: Swim::new(own, config, proves, seed),
             clock,
+            started_at: now,
             hello: config.hello(),
             hello_at: now,
             hello_count: 0,
@@ -267,6 +269,7 @@ impl GossipMachine {
             }
             FrameContent::Stranger => self.send_hello(from, true, at),
             FrameContent::NameTaken(name) => self.report_taken(name, second_run(from), at),
+            FrameContent::Namesake { id, answer } => self.meet_namesake(&id, answer, from, at),
             FrameContent::Nothing => (),
         }
         Ok(())
@@ -406,6 +409,20 @@ impl GossipMachine {
             self.taken = Some((name.clone(), at));
             let (about, kind) = (name.to_string(), TroubleKind::NameTaken);
             self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Troubled { about, kind, cause }));
+        }
+    }
+
+    /// Tells a node of this node's name that it is the second, or takes its word for that. A node that has just started is
+    /// the second; of two that met late, the one that started later is.
+    fn meet_namesake(&mut self, id: &NodeId, answer: Option<Vec<u8>>, from: SocketAddr, at: Timestamp) {
+        let is_new = at.since(self.started_at) < NAME_PATIENCE || self.excluded_since.is_some();
+        match answer {
+            Some(frame) if !is_new => {
+                self.outputs.push_back(GossipOutput::Send { to: from, frame });
+                self.report_taken(id.name.clone(), second_run(from), at);
+            }
+            None if is_new || self.gossip.own().run > id.run => self.step_back(from, at),
+            _ => {}
         }
     }
 

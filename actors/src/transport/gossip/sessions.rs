@@ -95,6 +95,8 @@ pub(crate) enum FrameContent {
     Stranger,
     /// Two running nodes have this name.
     NameTaken(NodeName),
+    /// A running node that has this node's own name. The answer tells it so; without one, that is what it says.
+    Namesake { id: NodeId, answer: Option<Vec<u8>> },
     /// Nothing that needs an answer.
     Nothing,
 }

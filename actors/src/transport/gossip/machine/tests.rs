@@ -336,6 +336,46 @@ fn of_two_running_nodes_with_one_name_the_first_is_heard_and_the_second_gives_up
     assert_eq!(cell.nodes[&2].machine.members().len(), 3, "the first one notices nothing else");
 }
 
+/// Asserts that node 9 has given up the name of node 1, which it alone was told of, and that node 1 has named it.
+fn assert_second_gave_up(cell: &Cell) {
+    let (first, second) = (&cell.nodes[&1], &cell.nodes[&9]);
+    assert!(second.events.contains(&MembershipEvent::Excluded), "{:?}", second.events);
+    assert!(!first.events.contains(&MembershipEvent::Excluded), "{:?}", first.events);
+    assert!(first.troubles.contains(&(name(1), TroubleKind::NameTaken)), "{:?}", first.troubles);
+}
+
+#[test]
+fn a_second_node_whose_only_seed_is_the_first_gives_up() {
+    for others in [0, 2] {
+        let mut cell = Cell::new(false);
+        (1..=1 + others).for_each(|node| cell.start(node, &name(node)));
+        for node in cell.nodes.values_mut() {
+            node.machine.set_seeds(vec![address(1)]);
+        }
+        cell.run(8000);
+        cell.start(9, &name(1));
+        cell.nodes.get_mut(&9).unwrap().machine.set_seeds(vec![address(1)]);
+        cell.run(8000);
+        assert_second_gave_up(&cell);
+        assert_eq!(cell.nodes[&1].machine.members().len(), others);
+    }
+}
+
+/// Two that met late know each other's age by when they started.
+#[test]
+fn of_two_lone_nodes_of_a_name_that_meet_late_the_later_one_gives_up() {
+    let mut cell = Cell::new(false);
+    cell.start(1, &name(1));
+    cell.run(1000);
+    cell.start(9, &name(1));
+    cell.run(8000);
+    for (node, seed) in [(1, 9), (9, 1)] {
+        cell.nodes.get_mut(&node).unwrap().machine.set_seeds(vec![address(seed)]);
+    }
+    cell.run(10_000);
+    assert_second_gave_up(&cell);
+}
+
 #[test]
 fn a_node_that_returns_at_another_address_has_its_name_as_soon_as_its_former_run_is_down() {
     let mut cell = Cell::of(4);

@@ -77,7 +77,11 @@ impl Sessions {
             Handshake::Proof { echo, cookie, introduction } => {
                 self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
                 if introduction.id.name == arrival.own.name && !self.prove_certificates() {
-                    return Ok(FrameContent::NameTaken(introduction.id.name));
+                    let taken =
+                        Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim: NameClaim::Taken };
+                    let accept = Handshake::Accept { echo: cookie, introduction: taken };
+                    let answer = Some(self.handshake(&head.sender, &accept));
+                    return Ok(FrameContent::Namesake { id: introduction.id, answer });
                 }
                 if !self.prove_certificates() {
                     let admission = Admission { proven: None, keys: None, is_proof: true };
@@ -98,7 +102,7 @@ impl Sessions {
                     Admission { proven: None, keys: None, is_proof: false }
                 };
                 if introduction.id.name == arrival.own.name {
-                    return Ok(FrameContent::NameTaken(introduction.id.name));
+                    return Ok(FrameContent::Namesake { id: introduction.id, answer: None });
                 }
                 let claim = self.admit(head, &introduction.id, admission, arrival)?;
                 Ok(FrameContent::Met { introduction, answer: None, speaks: claim != NameClaim::Taken })
@@ -174,12 +178,10 @@ impl Sessions {
         };
         let claimed = (&introduction.id.name, &head.sender, arrival.from);
         let (proven, transcript) = prover.check(&signed, attestation, claimed)?;
-        if introduction.id.name == arrival.own.name {
-            return Ok(FrameContent::NameTaken(introduction.id.name));
-        }
         let Some((private, public)) = prover.draw_ephemeral() else { return Ok(FrameContent::Nothing) };
+        let is_namesake = introduction.id.name == arrival.own.name;
         // Drawn up before the keys are known: the answer's claim depends on the gossip and the table only.
-        let claim = self.claim(head, &introduction.id, arrival);
+        let claim = if is_namesake { NameClaim::Taken } else { self.claim(head, &introduction.id, arrival) };
         let answer = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
         let accept = encode(&Handshake::Accept { echo: *echo, introduction: answer });
         let own_head = self.head(FrameKind::Handshake);
@@ -189,6 +191,10 @@ impl Sessions {
         let Some((own_attestation, transcript)) = prover.attest(&signed, public) else {
             return Ok(FrameContent::Nothing);
         };
+        if is_namesake {
+            let answer = Some(self.write_handshake(&own_head, &head.sender, &accept, &own_attestation));
+            return Ok(FrameContent::Namesake { id: introduction.id, answer });
+        }
         let keys = agree(&self.key, (private, &attestation.ephemeral), &transcript, (&self.own, &head.sender), false)?;
         let admission = Admission { proven: Some(proven), keys: Some(keys), is_proof: true };
         let claim = self.admit(head, &introduction.id, admission, arrival)?;

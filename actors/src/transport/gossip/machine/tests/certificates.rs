@@ -58,6 +58,19 @@ fn nodes_with_certificates_find_each_other() {
 }
 
 #[test]
+fn a_second_node_with_a_certificate_whose_only_seed_is_the_first_gives_up() {
+    let mut certified = CertifiedCell::new(false);
+    certified.start(1);
+    certified.cell.run(8000);
+    let identity = certified.authority.identity(&name(1), Role::Auto);
+    let run = certified.cell.now.micros();
+    certified.cell.start_as(9, &name(1), (KEY, Some(identity)), run);
+    certified.machine(9).set_seeds(vec![address(1)]);
+    certified.cell.run(8000);
+    assert_second_gave_up(&certified.cell);
+}
+
+#[test]
 fn nodes_with_certificates_find_each_other_by_one_seed() {
     let mut certified = CertifiedCell::new(false);
     for node in 1..=5 {
