@@ -61,6 +61,8 @@ function swatch() {
 
 export const n = (value) => ({ text: String(value), class: "n" });
 
+export const percent = (share) => `${Math.round(share * 100)} %`;
+
 /// A time span in seconds, in a readable unit.
 export function span(seconds) {
   if (seconds < 0) return "0 s";

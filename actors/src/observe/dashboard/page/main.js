@@ -6,6 +6,7 @@ import { ago, byId, clock, span, text } from "./dom.js";
 import { Live, SPAN_US } from "./live.js";
 import { BirdsEye } from "./map.js";
 import { arrange, colours } from "./scene.js";
+import { explainTerms } from "./terms.js";
 import * as tables from "./tables.js";
 import { Timeline } from "./timeline.js";
 
@@ -14,6 +15,7 @@ let [queued, textAt, told] = [false, 0, {}];
 /// Errors by part of the page.
 const faults = {};
 
+explainTerms();
 const live = new Live(draw, () => attempt("history", drawHistory));
 const map = new BirdsEye(draw, light);
 const camera = new CameraView(light);
@@ -67,6 +69,7 @@ function drawPicture() {
   const colour = colours([...known(picture), ...known(past?.picture), ...rated, ...live.history.reigns.map((term) => term.leader)]);
   const scene = arrange(picture, landmarks, now, colour);
   const shown = past?.picture ? arrange(past.picture, landmarks, past.picture.now_us, colour) : scene;
+  map.floor.take(picture.node.floor_plan);
   if (!map.asTable) map.draw(shown);
   camera.draw(picture.node, scene, map.lit);
   if (performance.now() - textAt < TEXT_MS) return;

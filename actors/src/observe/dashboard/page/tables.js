@@ -1,9 +1,7 @@
 // Tables and tiles of the page.
 
-import { ago, byId, clock, milliseconds, n, rows, span, text } from "./dom.js";
+import { ago, byId, clock, milliseconds, n, percent, rows, span, text } from "./dom.js";
 import { list, reasons } from "./scene.js";
-
-const percent = (value) => `${Math.round(value * 100)} %`;
 
 const inOrder = new Intl.Collator(undefined, { numeric: true }).compare;
 
