@@ -71,6 +71,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     #[cfg(feature = "camera")]
     findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));
+    findings.extend(storage::floor_plan(config));
     #[cfg(feature = "foxglove")]
     findings.extend(network::live(config));
     findings.extend(network::multicast(config));

@@ -17,8 +17,10 @@ export function ellipse([xx, xy, yy]) {
   return { a: SIGMAS_95 * Math.sqrt(mean + half), b: SIGMAS_95 * Math.sqrt(Math.max(mean - half, 0)), turn: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 
-/// Who sees something, in words.
-export const witnesses = (names) => (names.length === 0 ? "nobody at present" : names.length === 1 ? `only by ${names[0]}` : `by ${names.join(", ")}`);
+/// Who sees an object, in words.
+export const sightings = ({ contributors, vehicle }) => witnesses(contributors.map((name) => (name === vehicle ? "itself" : name)));
+
+const witnesses = (names) => (names.length === 0 ? "nobody at present" : names.length === 1 ? `only by ${names[0]}` : `by ${names.join(", ")}`);
 
 /// Shows details in a corner of the map away from the symbol at `at` in pixels; null hides them.
 export function showDetails(named, isKept, at, box) {
@@ -27,7 +29,6 @@ export function showDetails(named, isKept, at, box) {
   if (!named) return;
   panel.classList.toggle("kept", isKept);
   panel.classList.toggle("left", at !== null && at[0] > box.width / 2);
-  panel.classList.toggle("low", at !== null && at[1] < box.height / 2);
   text(byId("details-title"), named.title);
   keyed(byId("details-facts"), named.facts, ([what]) => what, ([what, , term]) => {
     const row = document.createElement("div");
@@ -56,7 +57,7 @@ function objectFacts(object) {
   return {
     ...standsAt(object), title: object.vehicle ? `${object.vehicle}, a vehicle` : object.label,
     facts: [
-      ["Seen", witnesses(object.contributors), "witnesses"],
+      ["Seen", sightings(object), "witnesses"],
       ["Confidence", percent(object.confidence), "confidence"],
       ["Existence", object.existence === undefined ? null : percent(object.existence), "existence"],
       ["Last seen", ago(object.age_s ?? 0)],

@@ -16,6 +16,8 @@ let [queued, textAt, told] = [false, 0, {}];
 const faults = {};
 
 explainTerms();
+// The heading of a table covers the shadow above its rows.
+document.addEventListener("scroll", ({ target }) => target.classList?.toggle("scrolled", target.scrollTop > 0), true);
 const live = new Live(draw, () => attempt("history", drawHistory));
 const map = new BirdsEye(draw, light);
 const camera = new CameraView(light);

@@ -1,6 +1,6 @@
 // Bird's-eye view: world metres to screen pixels, symbols of constant size, labels that do not overlap.
 
-import { details, ellipse, showDetails, witnesses } from "./details.js";
+import { details, ellipse, showDetails, sightings } from "./details.js";
 import { byId, keyed, percent, set, span, svg, text } from "./dom.js";
 import { bounds, cues, fitting, union } from "./fit.js";
 import { FloorPlan } from "./floor.js";
@@ -178,7 +178,8 @@ export class BirdsEye {
       for (const circle of [reach, centre]) set(circle, { cx: x, cy: y });
       const age = object.age_s ?? 0;
       const style = `${age > OLD_S ? "old" : ""} ${this.#light(g, `object ${object.id}`)}`.trim();
-      set(g, { class: style, "aria-label": `${object.vehicle ?? object.label}, ${percent(object.confidence)}, seen ${witnesses(object.contributors)}` });
+      // The vehicle's own symbol is reached instead.
+      set(g, { class: style, tabindex: object.vehicle ? -1 : 0, "aria-label": `${object.vehicle ?? object.label}, ${percent(object.confidence)}, seen ${sightings(object)}` });
       labels.put(`object ${object.id}`, aged(object.vehicle ?? object.label, age), x, y, 9, age > OLD_S ? "old" : "");
     });
   }

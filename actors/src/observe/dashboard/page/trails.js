@@ -33,9 +33,11 @@ export class Trails {
     return [...this.#points].flatMap(([name, { points, colour, spread_m, head }]) => {
       const moved = Math.max(...points.map((point) => Math.hypot(point.x_m - head.x_m, point.y_m - head.y_m)));
       if (moved < spread_m || moved * at.scale < MIN_PX) return [];
+      const all = [...points, head];
       return Array.from({ length: PIECES }, (_, piece) => {
         const [youngest, oldest] = [piece, piece + 1].map((n) => head.at - (n * TRAIL_US) / PIECES);
-        const inside = [...points, head].filter((point) => point.at <= youngest && point.at >= oldest - STEP_US * 1.5);
+        // With the next older point, so that the pieces meet.
+        const inside = all.filter((point, index) => point.at <= youngest && (all[index + 1] ?? head).at > oldest);
         return { key: `${name} ${piece}`, colour, piece, d: inside.map((point, index) => `${index ? "L" : "M"}${at(point).map((c) => c.toFixed(1)).join(" ")}`).join("") };
       }).filter(({ d }) => d.includes("L"));
     });
