@@ -118,7 +118,7 @@ async fn a_box_and_its_object_light_up_together() {
     let words = "[...document.querySelectorAll('#camera-boxes button')].map((box) => box.textContent).join()";
     assert_eq!(browser.evaluate(words).await, "person 87 %,cat 87 %,dragon 87 %");
     let lit_labels =
-        "[...document.querySelectorAll('#map g.lit title')].map((it) => it.textContent.split(',')[0]).join()";
+        "[...document.querySelectorAll('#map g.lit')].map((it) => it.getAttribute('aria-label').split(',')[0]).join()";
     let lit_boxes = "[...document.querySelectorAll('#camera-boxes .lit')].map((it) => it.textContent).join()";
 
     browser.point_at("#camera-boxes button:nth-child(2)").await;
@@ -139,8 +139,7 @@ async fn a_box_and_its_object_light_up_together() {
     browser.evaluate("(document.activeElement.blur(), window.scrollTo(0, 0))").await;
     browser.point_at("#camera-title").await;
     browser.until(&format!("{lit_boxes} === ''")).await;
-    let person = "[...document.querySelectorAll('#map title')].find((it) => it.textContent.startsWith('person'))";
-    browser.evaluate(&format!("{person}.parentElement.querySelector('.ellipse').id = 'person'")).await;
+    browser.evaluate("document.querySelector('#map g[aria-label^=person] .ellipse').id = 'person'").await;
     browser.point_at("#person").await;
     browser.until(&format!("{lit_labels} === 'person' && {lit_boxes} === 'person 87 %'")).await;
     assert_eq!(browser.complaints().await, Vec::<String>::new());

@@ -76,8 +76,8 @@ impl Browser {
         std::fs::write(file, png).unwrap();
     }
 
-    /// Moves the mouse to the middle of an element.
-    pub(crate) async fn point_at(&self, selector: &str) {
+    /// Moves the mouse to the middle of an element, and returns that place in CSS pixels.
+    pub(crate) async fn point_at(&self, selector: &str) -> Value {
         let middle = format!(
             "(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])\
              (document.querySelector('{selector}').getBoundingClientRect())"
@@ -85,12 +85,24 @@ impl Browser {
         let middle = self.evaluate(&middle).await;
         let event = json!({ "type": "mouseMoved", "x": middle[0], "y": middle[1] });
         self.chromium("Input.dispatchMouseEvent", event).await;
+        middle
+    }
+
+    /// Clicks the middle of an element with the mouse.
+    pub(crate) async fn click(&self, selector: &str) {
+        let middle = self.point_at(selector).await;
+        for kind in ["mousePressed", "mouseReleased"] {
+            let event = json!({ "type": kind, "x": middle[0], "y": middle[1], "button": "left", "clickCount": 1 });
+            self.chromium("Input.dispatchMouseEvent", event).await;
+        }
     }
 
     /// Presses a key on what has the focus.
     pub(crate) async fn press(&self, key: &str) {
         for kind in ["keyDown", "keyUp"] {
-            self.chromium("Input.dispatchKeyEvent", json!({ "type": kind, "key": key, "code": key })).await;
+            let code = if key == "Tab" { 9 } else { 0 };
+            let event = json!({ "type": kind, "key": key, "code": key, "windowsVirtualKeyCode": code });
+            self.chromium("Input.dispatchKeyEvent", event).await;
         }
     }
 

@@ -1,6 +1,6 @@
 // Details of the place, object or vehicle that is pointed at or chosen on the map.
 
-import { ago, byId, keyed, percent, text } from "./dom.js";
+import { ago, byId, counted, keyed, percent, text } from "./dom.js";
 import { reasons } from "./scene.js";
 import { markTerm } from "./terms.js";
 
@@ -20,7 +20,7 @@ export function ellipse([xx, xy, yy]) {
 /// Who sees an object, in words.
 export const sightings = ({ contributors, vehicle }) => witnesses(contributors.map((name) => (name === vehicle ? "itself" : name)));
 
-const witnesses = (names) => (names.length === 0 ? "nobody at present" : names.length === 1 ? `only by ${names[0]}` : `by ${names.join(", ")}`);
+const witnesses = (names) => (names.length === 0 ? "nobody at present" : names.length === 1 ? `only by ${names[0]}` : `by ${[...names].sort().join(", ")}`);
 
 /// Shows details in a corner of the map away from the symbol at `at` in pixels; null hides them.
 export function showDetails(named, isKept, at, box) {
@@ -75,7 +75,7 @@ function vehicleFacts({ node, pose, detected, inView, votes, reputation, receive
     facts: [
       ["Last report", ago((now - received_at_us) / 1e6)],
       ["Reputation", reputation?.toFixed(2) ?? null, "reputation"],
-      ["Sees", [`${detected ?? votes ?? 0} objects`, inView === undefined ? null : `${inView} places`].filter(Boolean).join(", ")],
+      ["Sees", [counted(detected ?? votes ?? 0, "object"), inView === undefined ? null : counted(inView, "place")].filter(Boolean).join(", ")],
       ["Position", pose ? position(pose) : "unknown"],
       ["Faces", pose ? direction(pose.heading_rad) : null],
     ].filter(([, words]) => words !== null),

@@ -61,6 +61,8 @@ function swatch() {
 
 export const n = (value) => ({ text: String(value), class: "n" });
 
+export const counted = (number, word) => `${number} ${word}${number === 1 ? "" : "s"}`;
+
 export const percent = (share) => `${Math.round(share * 100)} %`;
 
 /// A time span in seconds, in a readable unit.

@@ -1,6 +1,6 @@
 // Fit of the map: bounds that few far things do not rule, and signs at the border for what lies outside.
 
-const MARGIN_PX = 56;
+const MARGIN_PX = 46;
 /// Maximum pixels per metre without zoom.
 const MAX_SCALE = 4000;
 /// Maximum share of far points outside the fitted map, and the gain in scale for which they are left there.

@@ -2,7 +2,7 @@
 
 import { CameraView } from "./camera.js";
 import { chart } from "./charts.js";
-import { ago, byId, clock, span, text } from "./dom.js";
+import { ago, byId, clock, counted, span, text } from "./dom.js";
 import { Live, SPAN_US } from "./live.js";
 import { BirdsEye } from "./map.js";
 import { arrange, colours } from "./scene.js";
@@ -166,5 +166,4 @@ function takesReports({ map, verdicts }) {
   return map?.message.oldest_capture_us !== undefined || (verdicts?.message.verdicts ?? []).some((verdict) => verdict.contributors.length > 0);
 }
 
-const counted = (number, word) => `${number} ${word}${number === 1 ? "" : "s"}`;
 const sentence = (words) => words.charAt(0).toUpperCase() + words.slice(1);

@@ -147,11 +147,12 @@ export class BirdsEye {
     keyed(this.#layers.places, places, (place) => place.id, () => {
       const g = svg("g");
       g.append(svg("line", { class: "facing" }), svg("rect", { width: 11, height: 11, rx: 3 }));
-      return g;
+      // The table has all places for the keyboard.
+      return set(g, { tabindex: -1, role: "button" });
     }, (g, place) => {
       const [x, y] = at(place);
       const [line, sign] = g.children;
-      set(g, { class: this.#light(g, `place ${place.id}`) });
+      set(g, { class: this.#light(g, `place ${place.id}`), "aria-label": `${place.id}: ${place.label ?? place.words}` });
       const facing = place.facing_rad ?? null;
       const reach = facing === null ? 0 : 13;
       set(line, { x1: x, y1: y, x2: x + reach * Math.cos(facing ?? 0), y2: y - reach * Math.sin(facing ?? 0) });
