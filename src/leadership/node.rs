@@ -221,6 +221,10 @@ impl LeadershipNode {
                 self.is_status_told &= self.status.troubles == troubles;
                 self.status.troubles = troubles;
             }
+            Input::ServesPage { page } => {
+                self.is_status_told &= self.status.page == page;
+                self.status.page = page;
+            }
             Input::Leave => self.feed(ElectionInput::Leave, now),
         }
     }

@@ -44,6 +44,10 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     browser.until("document.querySelector('#leader').textContent === 'edge'").await;
     browser.until(SHOWN).await;
     let first = "performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd";
+    for (name, place) in [("edge", at_edge), ("gauss", at_gauss)] {
+        let link = format!("document.querySelector('#nodes a[href=\"http://{}/\"]')?.textContent === '{name}'", place.page);
+        browser.until(&link).await;
+    }
     println!("page loaded in {} ms by the browser's own clock", browser.evaluate(first).await);
     tokio::time::sleep(Duration::from_secs(6)).await;
     for (name, width, height, scheme) in [

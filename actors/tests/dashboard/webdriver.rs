@@ -76,8 +76,8 @@ impl Browser {
         std::fs::write(file, png).unwrap();
     }
 
-    /// Moves the mouse to the middle of an element, and returns that place in CSS pixels.
-    pub(crate) async fn point_at(&self, selector: &str) -> Value {
+    /// Moves the mouse to the middle of an element.
+    pub(crate) async fn point_at(&self, selector: &str) {
         let middle = format!(
             "(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])\
              (document.querySelector('{selector}').getBoundingClientRect())"
@@ -85,12 +85,23 @@ impl Browser {
         let middle = self.evaluate(&middle).await;
         let event = json!({ "type": "mouseMoved", "x": middle[0], "y": middle[1] });
         self.chromium("Input.dispatchMouseEvent", event).await;
-        middle
     }
 
     /// Clicks the middle of an element with the mouse.
     pub(crate) async fn click(&self, selector: &str) {
-        let middle = self.point_at(selector).await;
+        self.click_within(selector, [0.5, 0.5]).await;
+    }
+
+    /// Clicks an element at these shares of its width and height.
+    pub(crate) async fn click_within(&self, selector: &str, [across, down]: [f64; 2]) {
+        let scroll = format!("document.querySelector('{selector}').scrollIntoView({{ block: 'center' }})");
+        self.evaluate(&scroll).await;
+        self.point_at(selector).await;
+        let place = format!(
+            "(({{ x, y, width, height }}) => [x + {across} * width, y + {down} * height])\
+             (document.querySelector('{selector}').getBoundingClientRect())"
+        );
+        let middle = self.evaluate(&place).await;
         for kind in ["mousePressed", "mouseReleased"] {
             let event = json!({ "type": kind, "x": middle[0], "y": middle[1], "button": "left", "clickCount": 1 });
             self.chromium("Input.dispatchMouseEvent", event).await;

@@ -144,6 +144,11 @@ pub enum Input {
         /// All present troubles.
         troubles: Vec<Trouble>,
     },
+    /// The node's page, to be told to all. It may come with every look.
+    ServesPage {
+        /// Its address and port.
+        page: Option<String>,
+    },
     /// The node is about to stop.
     Leave,
 }

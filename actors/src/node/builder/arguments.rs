@@ -288,6 +288,7 @@ impl NodeBuilder {
             },
             term_file: self.state_file("term"),
             own_broker: self.broker_address(),
+            page: self.dashboard_address(),
             members: self.members(),
             parts: Parts {
                 membership,

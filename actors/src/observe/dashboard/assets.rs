@@ -13,7 +13,7 @@ const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const SVG: &str = "image/svg+xml";
 
-const ASSETS: [Asset; 18] = [
+const ASSETS: [Asset; 19] = [
     asset("/", HTML, include_str!("page/index.html")),
     asset("/view.css", CSS, VIEW_STYLE),
     asset("/style.css", CSS, include_str!("page/style.css")),
@@ -21,6 +21,7 @@ const ASSETS: [Asset; 18] = [
     asset("/main.js", SCRIPT, include_str!("page/main.js")),
     asset("/live.js", SCRIPT, include_str!("page/live.js")),
     asset("/camera.js", SCRIPT, include_str!("page/camera.js")),
+    asset("/mount.js", SCRIPT, include_str!("page/mount.js")),
     asset("/scene.js", SCRIPT, include_str!("page/scene.js")),
     asset("/timeline.js", SCRIPT, include_str!("page/timeline.js")),
     asset("/map.js", SCRIPT, include_str!("page/map.js")),

@@ -5,6 +5,7 @@ import { chart } from "./charts.js";
 import { ago, byId, clock, counted, span, text } from "./dom.js";
 import { Live, SPAN_US } from "./live.js";
 import { BirdsEye } from "./map.js";
+import { MountPoints } from "./mount.js";
 import { arrange, colours } from "./scene.js";
 import { explainTerms } from "./terms.js";
 import * as tables from "./tables.js";
@@ -20,7 +21,8 @@ explainTerms();
 document.addEventListener("scroll", ({ target }) => target.classList?.toggle("scrolled", target.scrollTop > 0), true);
 const live = new Live(draw, () => attempt("history", drawHistory));
 const map = new BirdsEye(draw, light);
-const camera = new CameraView(light);
+const mount = new MountPoints(map, draw);
+const camera = new CameraView(light, (picture) => mount.take(picture));
 const timeline = new Timeline(scrub, { live: true, time: clock, moment: (at) => `${clock(at)}, ${ago((live.now - at) / 1e6)}` });
 /// The map that the timeline chose, and whether one is on its way.
 let [past, loading] = [null, false];
@@ -72,7 +74,7 @@ function drawPicture() {
   const scene = arrange(picture, landmarks, now, colour);
   const shown = past?.picture ? arrange(past.picture, landmarks, past.picture.now_us, colour) : scene;
   map.floor.take(picture.node.floor_plan);
-  if (!map.asTable) map.draw(shown);
+  if (!map.asTable) map.draw(shown, mount.onMap);
   camera.draw(picture.node, scene, map.lit);
   if (performance.now() - textAt < TEXT_MS) return;
   if (map.asTable) tables.places(shown);
@@ -99,7 +101,7 @@ function drawText(picture, scene) {
   tables.troubles(picture);
   tables.tiles(picture, now, sample ? sample.rounds / 2 : null);
   tables.verdicts(picture.verdicts, now);
-  tables.vehicles(scene.vehicles, now, picture.troubles);
+  tables.vehicles(scene.vehicles, now, picture);
   tables.reputations(picture.reputations, scene.colour);
   tables.leaders(live.history, now);
   tables.nodes(picture);

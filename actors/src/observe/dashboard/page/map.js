@@ -36,8 +36,8 @@ export class BirdsEye {
   #at = null;
   /// Whether the present press dragged the map.
   #dragged = false;
-  /// Takes the position in metres of the next click on the map; null while nobody waits for one.
-  onPick = null;
+  #onPick = null;
+  #known = [];
   /// Whether a table is shown in the place of the map.
   asTable = false;
   /// Name of the symbol that is pointed at, here or elsewhere: its kind and identity.
@@ -75,6 +75,12 @@ export class BirdsEye {
     new ResizeObserver(redraw).observe(this.#picture);
   }
 
+  /// Gives the position in metres of each click on the map to `onPick`, until it is null.
+  follow(onPick) {
+    this.#onPick = onPick;
+    this.#picture.classList.toggle("picking", onPick !== null);
+  }
+
   /// Draws { places, objects, vehicles, now, fused_at }, and `picks`, numbered points in metres.
   draw(scene, picks = []) {
     const box = this.#picture.getBoundingClientRect();
@@ -84,7 +90,7 @@ export class BirdsEye {
     set(this.#picture, { viewBox: `0 0 ${Math.round(box.width)} ${Math.round(box.height)}`, "aria-label": describe(scene) });
     this.#picture.classList.toggle("zoomed", this.#zoom !== 1);
     const at = this.#projection(scene, box);
-    this.#at = at;
+    [this.#at, this.#known] = [at, scene.places];
     const labels = new Labels(box);
     this.floor.draw(at);
     this.#grid(at, box);
@@ -190,7 +196,7 @@ export class BirdsEye {
     symbol.onpointerenter = symbol.onfocus = () => this.onLight(name);
     symbol.onpointerleave = symbol.onblur = () => this.onLight(null);
     symbol.onclick = (event) => {
-      if (this.onPick || this.#dragged) return;
+      if (this.#onPick || this.#dragged) return;
       event.stopPropagation();
       this.#keep(this.#kept === name ? null : name);
     };
@@ -221,6 +227,12 @@ export class BirdsEye {
     keyed(this.#layers.trails, this.#trails.lines(at), (line) => line.key, () => svg("path"), (path, { colour, piece, d }) => {
       set(path, { class: `trail p${piece} ${colour === undefined ? "" : `c${colour}`}`.trim(), d });
     });
+  }
+
+  /// Position in metres at a place on the screen: of a known place that is drawn there, or else of the ground.
+  #positionAt(x, y) {
+    const off = (place) => Math.hypot(...this.#at(place).map((side, axis) => side - [x, y][axis]));
+    return this.#known.find((place) => off(place) < REACH_PX) ?? this.#at.back(x, y);
   }
 
   #picks(picks, at, labels) {
@@ -325,7 +337,7 @@ export class BirdsEye {
     this.#picture.addEventListener("click", (event) => {
       if (this.#dragged) return;
       const { left, top } = this.#picture.getBoundingClientRect();
-      if (this.onPick && this.#at) this.onPick(this.#at.back(event.clientX - left, event.clientY - top));
+      if (this.#onPick && this.#at) this.#onPick(this.#positionAt(event.clientX - left, event.clientY - top));
       else this.#keep(null);
     });
   }
