@@ -89,7 +89,7 @@ export class BirdsEye {
     if (Math.min(box.width, box.height) <= MIN_BOX_PX || (empty && !this.floor.bounds)) return;
     set(this.#picture, { viewBox: `0 0 ${Math.round(box.width)} ${Math.round(box.height)}`, "aria-label": describe(scene) });
     this.#picture.classList.toggle("zoomed", this.#zoom !== 1);
-    const at = this.#projection(scene, box);
+    const at = this.#projection({ ...scene, places: [...scene.places, ...picks] }, box);
     [this.#at, this.#known] = [at, scene.places];
     const labels = new Labels(box);
     this.floor.draw(at);
