@@ -45,7 +45,8 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     browser.until(SHOWN).await;
     let first = "performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd";
     for (name, place) in [("edge", at_edge), ("gauss", at_gauss)] {
-        let link = format!("document.querySelector('#nodes a[href=\"http://{}/\"]')?.textContent === '{name}'", place.page);
+        let link =
+            format!("document.querySelector('#nodes a[href=\"http://{}/\"]')?.textContent === '{name}'", place.page);
         browser.until(&link).await;
     }
     println!("page loaded in {} ms by the browser's own clock", browser.evaluate(first).await);
@@ -185,12 +186,13 @@ async fn every_table_that_goes_on_shows_it_by_a_shadow() {
     browser.until("document.querySelectorAll('#verdicts tr').length >= 24").await;
     let cut_off = "document.querySelector('#verdicts').closest('.scroll').scrollHeight > 400";
     assert_eq!(browser.evaluate(cut_off).await, true, "the table is too short for this test");
-    let rows_of_troubles = "[...document.querySelectorAll('#troubles-card thead')].map((it) => getComputedStyle(it).display).join()";
+    let rows_of_troubles =
+        "[...document.querySelectorAll('#troubles-card thead')].map((it) => getComputedStyle(it).display).join()";
     assert_eq!(browser.evaluate(rows_of_troubles).await, "none", "troubles are read without scrolling sideways");
     browser.evaluate(OVERFILL).await;
     let places = browser.evaluate(PLACES).await;
     let places: Vec<[f64; 4]> = serde_json::from_value(places).unwrap();
-    assert_eq!(places.len(), 8, "the tables of the page");
+    assert_eq!(places.len(), 9, "the tables of the page");
     // Of each table, the lightest pixel of its lower and of its right border, away from the corners.
     let lightest = async |name: &str| {
         let file = directory.path().join(name);
@@ -211,6 +213,9 @@ async fn every_table_that_goes_on_shows_it_by_a_shadow() {
         .await;
     tokio::time::sleep(Duration::from_millis(500)).await;
     let ends = lightest("end.png").await;
+    let shaded = "[...document.querySelectorAll('.scroll th:first-child')].filter((it) => it.checkVisibility()) \
+        .every((it) => getComputedStyle(it).boxShadow !== 'none')";
+    assert_eq!(browser.evaluate(shaded).await, true, "rows above are hinted at below the heading");
     for (table, (goes_on, ends)) in goes_on.iter().zip(&ends).enumerate() {
         for (side, (goes_on, ends)) in ["below", "at the right"].into_iter().zip(goes_on.iter().zip(ends)) {
             assert!(goes_on + 15 < *ends, "table {table} {side}: {goes_on} where it goes on, {ends} where it ends");
@@ -262,7 +267,9 @@ async fn a_wrong_position_is_got_over() {
     browser.until(&format!("{width} > 300 && !document.querySelector('#map-outside').hidden")).await;
 
     stray.report(1.0, FAR_M).await;
-    browser.until("document.querySelectorAll('#map .body').length === 1 && document.querySelector('#map-outside').hidden").await;
+    browser
+        .until("document.querySelectorAll('#map .body').length === 1 && document.querySelector('#map-outside').hidden")
+        .await;
     browser.evaluate("document.querySelector('#zoom-in').click()").await;
     browser.until("document.querySelector('#map').classList.contains('zoomed')").await;
     let zoomed = browser.evaluate(width).await.as_f64().unwrap();

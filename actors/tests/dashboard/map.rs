@@ -75,12 +75,15 @@ async fn a_far_object_is_pointed_to_and_things_tell_about_themselves() {
     let browser = Browser::start().await;
     browser.look(1280, 800, "light").await;
     browser.open(&format!("http://{page}/")).await;
-    let all = ["dog", "cup", "boat", "galileo"].map(|it| format!("document.querySelector('#map g[aria-label^={it}]') !== null"));
+    let all = ["dog", "cup", "boat", "galileo"]
+        .map(|it| format!("document.querySelector('#map g[aria-label^={it}]') !== null"));
     browser.until(&all.join(" && ")).await;
 
     // The fit.
     browser.until("/^boat, 6[0-9][0-9] m$/.test(document.querySelector('#map text.cue')?.textContent)").await;
-    browser.until(&format!("{WIDTH} > 300 && document.querySelector('#map-outside').textContent.startsWith('1 outside')")).await;
+    browser
+        .until(&format!("{WIDTH} > 300 && document.querySelector('#map-outside').textContent.startsWith('1 outside')"))
+        .await;
     let fill = "getComputedStyle(document.querySelector('#map g[aria-label^=boat] .ellipse')).fill";
     assert_eq!(browser.evaluate(fill).await, "none", "an ellipse over the whole map does not cover it");
     browser.click("#map-outside").await;
@@ -117,7 +120,8 @@ async fn a_far_object_is_pointed_to_and_things_tell_about_themselves() {
     browser.press("Enter").await;
     browser.evaluate("document.activeElement.blur()").await;
     browser.until("document.querySelector('#map-details').classList.contains('kept')").await;
-    for (name, width, scheme) in [("map-light", 1280, "light"), ("map-dark", 1280, "dark"), ("map-phone", 390, "light")] {
+    for (name, width, scheme) in [("map-light", 1280, "light"), ("map-dark", 1280, "dark"), ("map-phone", 390, "light")]
+    {
         browser.look(width, if width < 600 { 844 } else { 800 }, scheme).await;
         browser.evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })").await;
         browser.until(&fact("^dog ")).await;
@@ -238,11 +242,14 @@ async fn a_floor_plan_lies_under_the_map_where_it_belongs() {
         );
         assert!(browser.evaluate(&apart).await.as_f64().unwrap() < 0.5, "{index}");
     }
-    let shown = browser.evaluate("(({ width }) => width)(document.querySelector('#map image').getBoundingClientRect())").await;
+    let shown =
+        browser.evaluate("(({ width }) => width)(document.querySelector('#map image').getBoundingClientRect())").await;
     let panel = browser.evaluate("document.querySelector('#map').getBoundingClientRect().width").await;
     let share = shown.as_f64().unwrap() / panel.as_f64().unwrap();
     assert!(share > 0.8 && share <= 1.0, "the plan fills {share} of the panel");
-    for (name, width, scheme) in [("plan-light", 1280, "light"), ("plan-dark", 1280, "dark"), ("plan-phone", 390, "light")] {
+    for (name, width, scheme) in
+        [("plan-light", 1280, "light"), ("plan-dark", 1280, "dark"), ("plan-phone", 390, "light")]
+    {
         browser.look(width, if width < 600 { 844 } else { 800 }, scheme).await;
         browser.evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })").await;
         browser.screenshot(&shots().join(format!("{name}.png"))).await;

@@ -69,9 +69,7 @@ impl FloorPlanConfig {
             }
         }
         let [one, other] = self.points;
-        for (key, one, other) in
-            [("pixel", one.pixel, other.pixel), ("position_m", one.position_m, other.position_m)]
-        {
+        for (key, one, other) in [("pixel", one.pixel, other.pixel), ("position_m", one.position_m, other.position_m)] {
             if one == other {
                 let allowed = format!("two points, each with a {key} of its own");
                 return Err(ConfigError::new("points", format!("{one:?} as the {key} of both"), allowed));
@@ -153,7 +151,10 @@ mod tests {
             (&turned, [0.0, 100.0], [15.0, 5.0]),
         ] {
             let found = place(config, pixel);
-            assert!(found.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-9), "{pixel:?}: {found:?}, not {wanted:?}");
+            assert!(
+                found.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-9),
+                "{pixel:?}: {found:?}, not {wanted:?}"
+            );
         }
     }
 
