@@ -217,7 +217,7 @@ impl ElectionDriver {
                 };
                 let page = self.page.borrow().map(|page| page.to_string());
                 let troubles = self.counters.troubles().present();
-                return vec![looked, Input::Troubled { troubles }, Input::ServesPage { page }];
+                return vec![looked, Input::Telling { troubles, page }];
             }
             Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
             Effect::CountImplausible { from } => self.counters.reject(RejectReason::OutOfRange, from.as_str()),

@@ -73,7 +73,7 @@ function drawPicture() {
   const colour = colours([...known(picture), ...known(past?.picture), ...rated, ...live.history.reigns.map((term) => term.leader)]);
   const scene = arrange(picture, landmarks, now, colour);
   const shown = past?.picture ? arrange(past.picture, landmarks, past.picture.now_us, colour) : scene;
-  map.floor.take(picture.node.floor_plan);
+  map.floor.take(picture.node.floor_plan).catch((error) => (faults["floor plan"] = error));
   if (!map.asTable) map.draw(shown, mount.onMap);
   camera.draw(picture.node, scene, map.lit);
   if (performance.now() - textAt < TEXT_MS) return;

@@ -344,7 +344,7 @@ export class BirdsEye {
 }
 
 /// A symbol that the keyboard reaches.
-const reachable = (symbol) => set(symbol, { tabindex: 0, role: "button" });
+const reachable = (symbol) => set(symbol, { tabindex: 0, role: "button", "aria-describedby": "details-facts" });
 
 /// Field of view of a vehicle; estimated from its detections if it reports none.
 function wedge(vehicle, at) {
