@@ -81,7 +81,7 @@ export function vehicles(entries, now, { troubles, nodes }) {
     const age = (now - vehicle.received_at_us) / 1e6;
     const used = !refused.has(vehicle.node);
     return [
-      { text: vehicle.node, colour: vehicle.colour, href: pageOf(pages.get(vehicle.node)) }, n(vehicle.detected ?? "–"), n(vehicle.inView ?? "–"), n(vehicle.votes ?? "–"),
+      { text: vehicle.node, colour: vehicle.colour, href: pageOf(pages.get(vehicle.node.split("--")[0])) }, n(vehicle.detected ?? "–"), n(vehicle.inView ?? "–"), n(vehicle.votes ?? "–"),
       { text: used ? ago(age) : "refused", class: age > 2 || !used ? "n bad" : "n" },
     ];
   });
