@@ -13,7 +13,7 @@ use ecod_actors::platform::clock;
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use tokio::task::JoinSet;
 
-use crate::cell::{config, start};
+use crate::cell::{config, start, until};
 use crate::http::get;
 use crate::webdriver::Browser;
 
@@ -187,8 +187,13 @@ async fn terms_are_explained() {
         assert_eq!(browser.evaluate(tip).await, "");
     }
     browser.evaluate("(document.activeElement.blur(), scrollTo(0, 0))").await;
-    browser.point_at("[data-term=latency]").await;
-    browser.until(&format!("{tip}.startsWith('Time from the oldest picture')")).await;
+    // The page hides it while it scrolls, as it may still do.
+    until("the term is explained", || async {
+        browser.point_at("#cell").await;
+        browser.point_at("[data-term=latency]").await;
+        browser.evaluate(&format!("{tip}.startsWith('Time from the oldest picture')")).await == true
+    })
+    .await;
     browser.screenshot(&shots().join("term.png")).await;
     browser.point_at("#cell").await;
     browser.until(&format!("{tip} === ''")).await;
