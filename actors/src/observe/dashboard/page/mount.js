@@ -1,4 +1,4 @@
-// Points for `ecod-node calibrate mount`: each is clicked in the camera's picture and on the map, or typed.
+// Points for `ecod-node calibrate mount points`: each is clicked in the camera's picture and on the map, or typed.
 
 import { byId, counted, keyed, set, text } from "./dom.js";
 
@@ -48,7 +48,7 @@ export class MountPoints {
     const waiting = this.#points.find(isWaiting);
     text(byId("mount-hint"), waiting ? `Now click point ${waiting.number} on the map, or type its position.`
       : whole.length < MIN_POINTS ? `Click a point of the ground in the picture, then the same point on the map. ${counted(MIN_POINTS - whole.length, "point")} to go.`
-      : "Save the list as a file for `ecod-node calibrate mount`. More points make the mount more certain.");
+      : "Save the list as points.txt; its first line has the command. More points make the mount more certain.");
     byId("mount-table").hidden = this.#points.length === 0;
     keyed(byId("mount-rows"), this.#points, (point) => point.number, (point) => this.#row(point), (row, point) => {
       COLUMNS.forEach(([key], index) => {
@@ -63,10 +63,10 @@ export class MountPoints {
     });
     const isReady = whole.length >= MIN_POINTS;
     byId("mount-copy").disabled = byId("mount-list").hidden = !isReady;
-    const lines = whole.map(({ column, row, x_m, y_m }) => `    { pixel = [${column}, ${row}], position_m = [${x_m}, ${y_m}] },\n`);
-    const list = `points = [\n${lines.join("")}]\n`;
+    const lines = whole.map(({ column, row, x_m, y_m }) => `${column},${row}=${x_m},${y_m}\n`);
+    const list = `# ecod-node calibrate mount points --config node.toml --in-map points.txt\n# column,row=east,north; frames of ${this.#size?.join(" x ") ?? "?"} pixels\n${lines.join("")}`;
     if (byId("mount-list").value !== list) byId("mount-list").value = list;
-    set(byId("mount-list"), { rows: lines.length + 2 });
+    set(byId("mount-list"), { rows: lines.length + 3 });
   }
 
   get #isOpen() {
