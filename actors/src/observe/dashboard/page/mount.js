@@ -66,7 +66,7 @@ export class MountPoints {
     const lines = whole.map(({ column, row, x_m, y_m }) => `${column},${row}=${x_m},${y_m}\n`);
     const list = `# ecod-node calibrate mount points --config node.toml --in-map points.txt\n# column,row=east,north; frames of ${this.#size?.join(" x ") ?? "?"} pixels\n${lines.join("")}`;
     if (byId("mount-list").value !== list) byId("mount-list").value = list;
-    set(byId("mount-list"), { rows: lines.length + 3 });
+    set(byId("mount-list"), { rows: lines.length + 5 });
   }
 
   get #isOpen() {
