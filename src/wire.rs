@@ -357,6 +357,11 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(10), with = "skip_empty", has_nil)]
     pub troubles: Vec<Trouble>,
+    /// Address and port at which the node serves its page; absent without one. An unspecified address stands for all of
+    /// the node's own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(11)]
+    pub page: Option<String>,
 }
 
 impl NodeStatus {
@@ -374,6 +379,7 @@ impl NodeStatus {
             version: version.to_owned(),
             description: None,
             troubles: Vec::new(),
+            page: None,
         }
     }
 }

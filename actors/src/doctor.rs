@@ -71,6 +71,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     #[cfg(feature = "camera")]
     findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));
+    findings.extend(storage::floor_plan(config));
     #[cfg(feature = "foxglove")]
     findings.extend(network::live(config));
     findings.extend(network::multicast(config));
@@ -101,6 +102,7 @@ mod tests {
     use ecod::wire::Role;
 
     use super::*;
+    use crate::observe::dashboard::{FloorPlanConfig, FloorPlanPoint};
     use crate::observe::recorder::RecordConfig;
     use crate::transport::pki::{Authority, TlsConfig};
 
@@ -251,6 +253,17 @@ mod tests {
         assert!(finding(&config, "dashboard").await.verdict < CheckResult::Broken);
         config.dashboard.enabled = false;
         assert!(examine(&config, Path::new("node.toml")).await.iter().all(|finding| finding.check != "dashboard"));
+    }
+
+    #[tokio::test]
+    async fn a_floor_plan_that_is_not_there_is_broken() {
+        let mut config = config();
+        let point = |metres: f64| FloorPlanPoint { pixel: [metres; 2], position_m: [metres; 2] };
+        let image = "/nowhere/plan.png".into();
+        config.dashboard.enabled = true;
+        config.dashboard.floor_plan = Some(FloorPlanConfig { image, points: [point(0.0), point(1.0)] });
+        let finding = finding(&config, "floor plan").await;
+        assert!(finding.verdict == CheckResult::Broken && finding.seen.contains("No such file"), "{finding:?}");
     }
 
     #[cfg(feature = "foxglove")]

@@ -142,7 +142,8 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     }
     let (failed, failure) = watch::channel(None);
     let held = HeldDescription::at_start(&config)?;
-    let builder = NodeBuilder::new(config, security, held, failed);
+    let floor_plan = config.dashboard.load_floor_plan().map_err(|error| NodeError::Failed(error.to_string()))?;
+    let builder = NodeBuilder::new(config, security, held, failed).with_floor_plan(floor_plan);
     let (newest, broker, gossip) = (builder.newest(), builder.broker_address(), builder.gossip_address());
     let (members, leadership) = (builder.members(), builder.leadership());
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());

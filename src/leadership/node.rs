@@ -217,9 +217,9 @@ impl LeadershipNode {
                     self.feed(ElectionInput::Greet, now);
                 }
             }
-            Input::Troubled { troubles } => {
-                self.is_status_told &= self.status.troubles == troubles;
-                self.status.troubles = troubles;
+            Input::Telling { troubles, page } => {
+                self.is_status_told &= (&self.status.troubles, &self.status.page) == (&troubles, &page);
+                (self.status.troubles, self.status.page) = (troubles, page);
             }
             Input::Leave => self.feed(ElectionInput::Leave, now),
         }

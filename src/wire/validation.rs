@@ -1,6 +1,7 @@
 //! Validation of payloads: every value from outside is checked before it is used.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 
 use minicbor::{Decode, Encode};
 use serde::Serialize;
@@ -254,6 +255,9 @@ fn check_status(status: &NodeStatus, _: &Limits) -> Result<(), RejectReason> {
         return Err(RejectReason::TooManyObjects);
     }
     status.troubles.iter().try_for_each(check_trouble)?;
+    if status.page.as_ref().is_some_and(|page| page.parse::<SocketAddr>().is_err()) {
+        return Err(RejectReason::InvalidLabel);
+    }
     check_labels([&*status.version])
 }
 

@@ -74,6 +74,8 @@ pub struct LeaderElectionArguments {
     pub term_file: Option<StateFile>,
     /// Where the node's own broker listens.
     pub own_broker: watch::Receiver<Option<SocketAddr>>,
+    /// Where the node's page listens.
+    pub page: watch::Receiver<Option<SocketAddr>>,
     /// The other nodes.
     pub members: watch::Receiver<Vec<Member>>,
     /// The parts it commands.

@@ -1,4 +1,4 @@
-//! Checks of the cell key and of the directories that the node writes.
+//! Checks of the cell key, of the floor plan, and of the directories that the node writes.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -42,6 +42,16 @@ pub(super) fn key(config: &NodeConfig) -> Finding {
         }
         _ => Finding::fine(check, path.display().to_string()),
     }
+}
+
+/// Checks that the image under the page's map can be shown.
+pub(super) fn floor_plan(config: &NodeConfig) -> Option<Finding> {
+    let check = "floor plan";
+    let plan = config.dashboard.floor_plan.as_ref()?;
+    Some(match config.dashboard.load_floor_plan() {
+        Ok(_) => Finding::fine(check, plan.image.display().to_string()),
+        Err(error) => Finding::broken(check, error.to_string(), "correct `dashboard.floor_plan`, or leave it out"),
+    })
 }
 
 /// Checks that directories are writable and have space.

@@ -45,7 +45,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
-use crate::observe::dashboard::{CameraFeed, LiveState};
+use crate::observe::dashboard::{CameraFeed, FloorPlan, LiveState};
 use crate::observe::readiness::SharedFacts;
 use crate::observe::recorder::LogSender;
 use crate::platform::cell_clock::CellClock;
@@ -89,6 +89,7 @@ pub(super) struct NodeBuilder {
     leadership: watch::Sender<Leadership>,
     live_state: Arc<LiveState>,
     camera_feed: Option<Arc<CameraFeed>>,
+    floor_plan: Option<FloorPlan>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<NodeError>>,
 }
@@ -156,6 +157,7 @@ impl NodeBuilder {
             leadership: watch::Sender::default(),
             live_state: Arc::default(),
             camera_feed,
+            floor_plan: None,
             dashboard_address: watch::Sender::new(None),
             failed,
         };
@@ -163,6 +165,12 @@ impl NodeBuilder {
         builder.door = builder.new_door();
         builder.door.publish_description(&builder.present_description());
         builder
+    }
+
+    /// Sets the image under the map.
+    pub(super) fn with_floor_plan(mut self, floor_plan: Option<FloorPlan>) -> Self {
+        self.floor_plan = floor_plan;
+        self
     }
 
     pub(super) fn slots(&self) -> &ActorSlots {

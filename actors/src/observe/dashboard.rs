@@ -7,6 +7,7 @@ pub(crate) mod camera_feed;
 pub(crate) mod camera_picture;
 pub(crate) mod config;
 pub(crate) mod connection_limit;
+pub(crate) mod floor_plan;
 pub(crate) mod history;
 pub(crate) mod live_state;
 pub(crate) mod map_latency;
@@ -25,5 +26,6 @@ pub use camera_feed::CameraFeed;
 #[cfg(feature = "camera")]
 pub use camera_picture::{PictureBox, camera_event};
 pub use config::{DEFAULT_ADDRESS, DashboardConfig};
+pub use floor_plan::{FloorPlan, FloorPlanConfig, FloorPlanFacts, FloorPlanPoint};
 pub use live_state::{LatestReport, LiveState, MAX_SHOWN};
 pub use node_sources::{LandmarkFacts, NodeFacts, NodeSources};

@@ -12,11 +12,11 @@ async fn without_the_token_nothing_but_health_is_told() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.token = Some(Secret::new("correct-horse-battery"));
     let (node, page) = start(config).await;
-    let api = ["/api/picture", "/api/events", "/api/history", "/api/frame?at=1", "/api/camera"];
+    let api = ["/api/picture", "/api/events", "/api/history", "/api/frame?at=1", "/api/camera", "/api/floor_plan"];
     for path in api.into_iter().chain(["/", "/main.js", "/metrics", "/nowhere"]) {
         assert_eq!(get(page, path).await.status, 401, "{path}");
     }
-    assert_eq!(node.counters().events(Event::BrowserRefused), 9);
+    assert_eq!(node.counters().events(Event::BrowserRefused), 10);
     assert_eq!(get(page, "/healthz").await.status, 200);
 
     let host = ("Host", "localhost");

@@ -44,6 +44,11 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     browser.until("document.querySelector('#leader').textContent === 'edge'").await;
     browser.until(SHOWN).await;
     let first = "performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd";
+    for (name, place) in [("edge", at_edge), ("gauss", at_gauss)] {
+        let link =
+            format!("document.querySelector('#nodes a[href=\"http://{}/\"]')?.textContent === '{name}'", place.page);
+        browser.until(&link).await;
+    }
     println!("page loaded in {} ms by the browser's own clock", browser.evaluate(first).await);
     tokio::time::sleep(Duration::from_secs(6)).await;
     for (name, width, height, scheme) in [
@@ -167,45 +172,77 @@ async fn an_older_browser_shows_the_map_and_a_page_that_cannot_be_drawn_says_so(
     node.stop().await;
 }
 
-/// A table that is cut off shows a shadow where it goes on, and none where it ends.
+/// Tables that are cut off, below or at the right, show a shadow where they go on, and none where they end.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
-async fn a_table_that_goes_on_shows_it_by_a_shadow() {
+async fn every_table_that_goes_on_shows_it_by_a_shadow() {
     let (node, page) = cell::start(config("euclid", Role::Auto, 24)).await;
     let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 24);
     let directory = tempfile::tempdir().unwrap();
     let browser = Browser::start().await;
-    browser.look(1440, 900, "light").await;
+    browser.look(390, 844, "light").await;
     browser.open(&format!("http://{page}/")).await;
     browser.until("document.querySelectorAll('#verdicts tr').length >= 24").await;
-    let scroll = "document.querySelector('#verdicts').closest('.scroll')";
-    let cut_off = format!("{scroll}.scrollHeight > {scroll}.clientHeight + 100");
-    assert_eq!(browser.evaluate(&cut_off).await, true, "the table is too short for this test");
-    let lightest_at_the_end = async |name: &str| {
-        let place = "(({ left, right, bottom }) => [left + scrollX, right + scrollX, bottom + scrollY])";
-        let place = browser.evaluate(&format!("{place}({scroll}.getBoundingClientRect())")).await;
-        let [left, right, bottom] = [0, 1, 2].map(|index| place[index].as_f64().unwrap() as i32);
+    let cut_off = "document.querySelector('#verdicts').closest('.scroll').scrollHeight > 400";
+    assert_eq!(browser.evaluate(cut_off).await, true, "the table is too short for this test");
+    let rows_of_troubles =
+        "[...document.querySelectorAll('#troubles-card thead')].map((it) => getComputedStyle(it).display).join()";
+    assert_eq!(browser.evaluate(rows_of_troubles).await, "none", "troubles are read without scrolling sideways");
+    browser.evaluate(OVERFILL).await;
+    let places = browser.evaluate(PLACES).await;
+    let places: Vec<[f64; 4]> = serde_json::from_value(places).unwrap();
+    assert_eq!(places.len(), 9, "the tables of the page");
+    // Of each table, the lightest pixel of its lower and of its right border, away from the corners.
+    let lightest = async |name: &str| {
         let file = directory.path().join(name);
         browser.screenshot(&file).await;
         let picture = opencv::imgcodecs::imread(file.to_str().unwrap(), opencv::imgcodecs::IMREAD_GRAYSCALE).unwrap();
-        let pixels = (left + 4..right - 20).map(|x| *picture.at_2d::<u8>(bottom - 2, x).unwrap());
-        pixels.max().unwrap()
+        let pixel = |x: f64, y: f64| *picture.at_2d::<u8>(y as i32, x as i32).unwrap();
+        let of = |[left, top, right, bottom]: &[f64; 4]| {
+            let steps = || (40..60).map(|step| f64::from(step) / 100.0);
+            let below = steps().map(|share| pixel(left + share * (right - left), bottom - 2.0)).max();
+            let beside = steps().map(|share| pixel(right - 2.0, top + share * (bottom - top))).max();
+            [below.unwrap(), beside.unwrap()]
+        };
+        places.iter().map(of).collect::<Vec<_>>()
     };
-    let goes_on = lightest_at_the_end("begin.png").await;
-    browser.evaluate(&format!("{scroll}.scrollTo(0, {scroll}.scrollHeight)")).await;
+    let goes_on = lightest("begin.png").await;
+    browser
+        .evaluate("document.querySelectorAll('.scroll').forEach((it) => it.scrollTo(it.scrollWidth, it.scrollHeight))")
+        .await;
     tokio::time::sleep(Duration::from_millis(500)).await;
-    let ends = lightest_at_the_end("end.png").await;
-    assert!(goes_on + 15 < ends, "{goes_on} where rows follow, {ends} after the last");
+    let ends = lightest("end.png").await;
+    let shaded = "[...document.querySelectorAll('.scroll th:first-child')].filter((it) => it.checkVisibility()) \
+        .every((it) => getComputedStyle(it).boxShadow !== 'none')";
+    assert_eq!(browser.evaluate(shaded).await, true, "rows above are hinted at below the heading");
+    for (table, (goes_on, ends)) in goes_on.iter().zip(&ends).enumerate() {
+        for (side, (goes_on, ends)) in ["below", "at the right"].into_iter().zip(goes_on.iter().zip(ends)) {
+            assert!(goes_on + 15 < *ends, "table {table} {side}: {goes_on} where it goes on, {ends} where it ends");
+        }
+    }
     browser.quit().await;
     node.stop().await;
 }
 
+/// Ends the drawing of the page, and shows all tables with more columns and rows than have room.
+#[cfg(feature = "camera")]
+const OVERFILL: &str = "window.requestAnimationFrame = () => {}, document.querySelectorAll('.scroll table').forEach((table) => { \
+    for (let it = table; it !== document.body; it = it.parentElement) it.hidden = false; \
+    if (!table.closest('.troubles')) table.style.minWidth = '600px'; \
+    else table.closest('.scroll').firstElementChild.style.width = '600px'; \
+    for (let row = 0; row < 60; row++) table.tBodies[0].insertRow().insertCell().textContent = 'more'; })";
+
+/// Edges of all tables on the page, in pixels: left, upper, right, lower.
+#[cfg(feature = "camera")]
+const PLACES: &str = "[...document.querySelectorAll('.scroll')].filter((it) => it.querySelector('table')).map((it) => { \
+    const { left, top, right, bottom } = it.getBoundingClientRect(); \
+    return [left + scrollX, top + scrollY, right + scrollX, bottom + scrollY]; })";
+
 /// Far away from everything else, and a position all the same.
 const FAR_M: f64 = 9e7;
 
-/// A vehicle that is told a wrong pose makes the map a dot, until it is told a right one. What it only detects far away
-/// does not, nor does a vehicle that sees nothing.
+/// A vehicle that is told a wrong pose does not rule the map. It is pointed to, and shown on demand.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn a_wrong_position_is_got_over() {
@@ -218,25 +255,27 @@ async fn a_wrong_position_is_got_over() {
         return Math.max(...xs) - Math.min(...xs); })(document.querySelectorAll('#map .place'))";
     browser.until(&format!("{width} > 300")).await;
     stray.stand(FAR_M).await;
-    browser.until("document.querySelectorAll('#vehicles tr').length === 1").await;
-    tokio::time::sleep(Duration::from_secs(1)).await;
+    let is_pointed_to = "/^stray, 9.* km$/.test(document.querySelector('#map text.cue')?.textContent)";
+    browser.until(is_pointed_to).await;
     assert_eq!(browser.evaluate(&format!("{width} > 300")).await, true, "a vehicle that sees nothing rules nothing");
     stray.report(FAR_M, 1.0).await;
-    browser.until(&format!("{width} < 1")).await;
-    stray.report(1.0, FAR_M).await;
-    browser.until(&format!("{width} > 300")).await;
-    browser.until("document.querySelectorAll('#map .body').length === 1").await;
-    stray.report(2.0, FAR_M).await;
     tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(browser.evaluate(&format!("{width} > 300")).await, true);
+    assert_eq!(browser.evaluate(&format!("{width} > 300 && {is_pointed_to}")).await, true, "nor one that sees the lot");
+    browser.evaluate("document.querySelector('#map-outside').click()").await;
+    browser.until(&format!("{width} < 1 && document.querySelector('#map-outside').hidden")).await;
+    browser.evaluate("document.querySelector('#fit').click()").await;
+    browser.until(&format!("{width} > 300 && !document.querySelector('#map-outside').hidden")).await;
 
+    stray.report(1.0, FAR_M).await;
+    browser
+        .until("document.querySelectorAll('#map .body').length === 1 && document.querySelector('#map-outside').hidden")
+        .await;
     browser.evaluate("document.querySelector('#zoom-in').click()").await;
     browser.until("document.querySelector('#map').classList.contains('zoomed')").await;
+    let zoomed = browser.evaluate(width).await.as_f64().unwrap();
     stray.report(FAR_M, 1.0).await;
-    tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(browser.evaluate(&format!("{width} > 300")).await, true, "it stands where it was put");
-    browser.evaluate("document.querySelector('#fit').click()").await;
-    browser.until(&format!("{width} < 1")).await;
+    browser.until("!document.querySelector('#map-outside').hidden").await;
+    assert_eq!(browser.evaluate(width).await.as_f64().unwrap(), zoomed, "it stands where it was put");
     browser.quit().await;
     node.stop().await;
 }

@@ -118,7 +118,7 @@ async fn a_box_and_its_object_light_up_together() {
     let words = "[...document.querySelectorAll('#camera-boxes button')].map((box) => box.textContent).join()";
     assert_eq!(browser.evaluate(words).await, "person 87 %,cat 87 %,dragon 87 %");
     let lit_labels =
-        "[...document.querySelectorAll('#map g.lit title')].map((it) => it.textContent.split(',')[0]).join()";
+        "[...document.querySelectorAll('#map g.lit')].map((it) => it.getAttribute('aria-label').split(',')[0]).join()";
     let lit_boxes = "[...document.querySelectorAll('#camera-boxes .lit')].map((it) => it.textContent).join()";
 
     browser.point_at("#camera-boxes button:nth-child(2)").await;
@@ -139,13 +139,88 @@ async fn a_box_and_its_object_light_up_together() {
     browser.evaluate("(document.activeElement.blur(), window.scrollTo(0, 0))").await;
     browser.point_at("#camera-title").await;
     browser.until(&format!("{lit_boxes} === ''")).await;
-    let person = "[...document.querySelectorAll('#map title')].find((it) => it.textContent.startsWith('person'))";
-    browser.evaluate(&format!("{person}.parentElement.querySelector('.ellipse').id = 'person'")).await;
+    browser.evaluate("document.querySelector('#map g[aria-label^=person] .ellipse').id = 'person'").await;
     browser.point_at("#person").await;
     browser.until(&format!("{lit_labels} === 'person' && {lit_boxes} === 'person 87 %'")).await;
     assert_eq!(browser.complaints().await, Vec::<String>::new());
 
     browser.quit().await;
     until("no more are made", || async { shown_after(&node, Duration::from_millis(600)).await == 0 }).await;
+    node.stop().await;
+}
+
+/// Points of the ground are clicked in the picture and on the map, typed, corrected and copied.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "needs Chromium: make test-dashboard"]
+async fn points_for_the_mount_are_clicked_in_the_picture_and_on_the_map() {
+    let shots = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap().join("dashboard");
+    std::fs::create_dir_all(&shots).unwrap();
+    let directory = tempfile::tempdir().unwrap();
+    let mut seeing = seeing(directory.path());
+    seeing.landmarks = config("euclid", Role::Auto, 6).landmarks;
+    let (node, page) = start(seeing).await;
+    let browser = Browser::start().await;
+    browser.look(1280, 1000, "light").await;
+    browser.open(&format!("http://{page}/")).await;
+    browser.until("document.querySelectorAll('#camera-boxes button').length === 3").await;
+    browser.until("document.querySelectorAll('#map .place').length === 6").await;
+    browser.evaluate("document.querySelector('#mount').click()").await;
+    let hint = "document.querySelector('#mount-hint').textContent";
+    browser.until(&format!("{hint}.includes('4 points to go')")).await;
+
+    // Slots 0 to 2 stand at (0, 4), (0, -4) and (3, 4).
+    for (index, [across, down]) in [[0.25, 0.75], [0.5, 0.75], [0.75, 0.5]].into_iter().enumerate() {
+        browser.click_within("#camera", [across, down]).await;
+        browser.until(&format!("{hint}.startsWith('Now click point {}')", index + 1)).await;
+        browser.evaluate(&format!("document.querySelectorAll('#map .place')[{index}].id = 'slot-{index}'")).await;
+        browser.click(&format!("#slot-{index}")).await;
+        browser.until(&format!("{hint}.includes('{} point')", 3 - index)).await;
+    }
+    assert_eq!(browser.evaluate("document.querySelector('#mount-copy').disabled").await, true);
+    browser.evaluate("document.querySelector('#mount-add').click()").await;
+    for (column, value) in ["12", "34", "-1.5", "2"].into_iter().enumerate() {
+        let typed = format!(
+            "(([input]) => (input.value = '{value}', input.dispatchEvent(new Event('input'))))\
+             ([document.querySelectorAll('#mount-rows tr:last-child input')[{column}]])"
+        );
+        browser.evaluate(&typed).await;
+    }
+    browser.until("!document.querySelector('#mount-copy').disabled").await;
+    let list = browser.evaluate("document.querySelector('#mount-list').value").await;
+    let lines = list.as_str().unwrap().lines().filter(|line| !line.starts_with('#'));
+    let points: Vec<&str> = lines.collect();
+    assert!(list.as_str().unwrap().contains("frames of 512 x 512 pixels"), "{list}");
+    let (width, height) = (512.0, 512.0);
+    let wanted = [
+        [0.25 * width, 0.75 * height, 0.0, 4.0],
+        [0.5 * width, 0.75 * height, 0.0, -4.0],
+        [0.75 * width, 0.5 * height, 3.0, 4.0],
+        [12.0, 34.0, -1.5, 2.0],
+    ];
+    assert_eq!(points.len(), wanted.len());
+    for (point, wanted) in points.iter().zip(wanted) {
+        let found: Vec<f64> = point.split([',', '=']).map(|number| number.parse().unwrap()).collect();
+        assert_eq!(found.len(), 4, "{point}");
+        // A click falls on a pixel of the screen, which shows a frame smaller than it is.
+        let off = |index: usize| (found[index] - wanted[index]).abs();
+        assert!(off(0) <= 2.0 && off(1) <= 2.0 && off(2) < 1e-9 && off(3) < 1e-9, "{found:?}, not {wanted:?}");
+    }
+    browser.evaluate("document.querySelector('#mount-copy').click()").await;
+    browser.until("document.querySelector('#mount-copied').textContent === 'Copied 4 points.'").await;
+    browser.until("document.querySelectorAll('#map .pick').length >= 4 && document.querySelectorAll('#camera-picks span').length === 4").await;
+    for (name, width) in [("mount", 1280), ("mount-phone", 390)] {
+        browser.look(width, 1000, "light").await;
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        browser.screenshot(&shots.join(format!("{name}.png"))).await;
+        let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
+        assert_eq!(browser.evaluate(wider).await, false, "{name}: the page scrolls sideways");
+    }
+    browser.look(1280, 1000, "light").await;
+    browser.evaluate("document.querySelector('[aria-label=\"Remove point 2\"]').click()").await;
+    browser.until("document.querySelector('#mount-copy').disabled && document.querySelectorAll('#mount-rows tr').length === 3").await;
+    browser.evaluate("document.querySelector('#mount').click()").await;
+    browser.until("document.querySelectorAll('#map path.pick').length === 0").await;
+    assert_eq!(browser.complaints().await, Vec::<String>::new());
+    browser.quit().await;
     node.stop().await;
 }

@@ -10,6 +10,7 @@ mod door_page;
 mod health;
 mod http;
 mod load;
+mod map;
 mod metrics;
 mod pictures;
 mod processes;

@@ -18,6 +18,11 @@ fn sees(picture: &Value, vehicle: &str) -> bool {
     picture["vehicles"].as_array().unwrap().iter().any(|sighting| sighting["report"]["node"] == vehicle)
 }
 
+fn node_of<'a>(picture: &'a Value, name: &str) -> &'a Value {
+    let found = picture["nodes"].as_array().unwrap().iter().find(|node| node["name"] == name);
+    found.unwrap_or(&Value::Null)
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn pictures_follow_the_cell_on_every_node() {
     let (edge, edge_page) = start(config("edge", Role::Edge, 6)).await;
@@ -29,9 +34,10 @@ async fn pictures_follow_the_cell_on_every_node() {
         assert_eq!(first["leadership"]["leader"], "edge");
         let round = |picture: &Value| picture["map"]["message"]["round"].as_u64().unwrap();
         let next = events.until("a later map", |picture| round(picture) > round(&first)).await;
-        for name in ["edge", "euclid"] {
-            let node = next["nodes"].as_array().unwrap().iter().find(|node| node["name"] == name);
-            assert_eq!(node.unwrap()["alive"], true, "{name}");
+        for (name, its_page) in [("edge", edge_page), ("euclid", cav_page)] {
+            let linked = if its_page == page { Value::Null } else { its_page.to_string().into() };
+            events.until("the other's page is linked", |picture| node_of(picture, name)["page"] == linked).await;
+            assert_eq!(node_of(&next, name)["alive"], true, "{name}");
         }
         events.until("verdicts", |picture| picture["verdicts"].is_object()).await;
         events

@@ -87,10 +87,33 @@ impl Browser {
         self.chromium("Input.dispatchMouseEvent", event).await;
     }
 
+    /// Clicks the middle of an element with the mouse.
+    pub(crate) async fn click(&self, selector: &str) {
+        self.click_within(selector, [0.5, 0.5]).await;
+    }
+
+    /// Clicks an element at these shares of its width and height.
+    pub(crate) async fn click_within(&self, selector: &str, [across, down]: [f64; 2]) {
+        let scroll = format!("document.querySelector('{selector}').scrollIntoView({{ block: 'center' }})");
+        self.evaluate(&scroll).await;
+        self.point_at(selector).await;
+        let place = format!(
+            "(({{ x, y, width, height }}) => [x + {across} * width, y + {down} * height])\
+             (document.querySelector('{selector}').getBoundingClientRect())"
+        );
+        let middle = self.evaluate(&place).await;
+        for kind in ["mousePressed", "mouseReleased"] {
+            let event = json!({ "type": kind, "x": middle[0], "y": middle[1], "button": "left", "clickCount": 1 });
+            self.chromium("Input.dispatchMouseEvent", event).await;
+        }
+    }
+
     /// Presses a key on what has the focus.
     pub(crate) async fn press(&self, key: &str) {
         for kind in ["keyDown", "keyUp"] {
-            self.chromium("Input.dispatchKeyEvent", json!({ "type": kind, "key": key, "code": key })).await;
+            let code = if key == "Tab" { 9 } else { 0 };
+            let event = json!({ "type": kind, "key": key, "code": key, "windowsVirtualKeyCode": code });
+            self.chromium("Input.dispatchKeyEvent", event).await;
         }
     }
 

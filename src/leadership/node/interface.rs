@@ -139,10 +139,12 @@ pub enum Input {
         /// True if the node keeps reputations.
         keeps_reputations: bool,
     },
-    /// The troubles that the node knows of, to be told to all. It may come with every look.
-    Troubled {
-        /// All present troubles.
+    /// Parts of the node's status that it tells to all. It may come with every look.
+    Telling {
+        /// All present troubles that the node knows of.
         troubles: Vec<Trouble>,
+        /// Address and port of its page.
+        page: Option<String>,
     },
     /// The node is about to stop.
     Leave,

@@ -92,6 +92,7 @@ fn status() -> NodeStatus {
             cause: "refused, its clock is 5.0 s ahead".into(),
             remedy: "run a time service".into(),
         }],
+        page: Some("[fe80::1]:8080".into()),
     }
 }
 
@@ -194,6 +195,7 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
             (|s| s.troubles[0].cause = "x".repeat(MAX_TROUBLE_TEXT + 1), RejectReason::TooLarge),
             (|s| s.troubles[0].remedy = "run\nthis".into(), RejectReason::InvalidLabel),
             (|s| s.troubles[0].kind.clear(), RejectReason::InvalidLabel),
+            (|s| s.page = Some("javascript:1".into()), RejectReason::InvalidLabel),
             (|s| s.troubles[0].about = Some("a\u{202E}b".into()), RejectReason::InvalidLabel),
         ],
     );

@@ -39,6 +39,7 @@ pub struct ElectionDriver {
     terms: TermWriter,
     members: watch::Receiver<Vec<Member>>,
     own_broker: watch::Receiver<Option<SocketAddr>>,
+    page: watch::Receiver<Option<SocketAddr>>,
     parts: Parts,
     leadership: watch::Sender<Leadership>,
     counters: Arc<Counters>,
@@ -61,6 +62,7 @@ impl ElectionDriver {
             settings,
             term_file,
             mut own_broker,
+            page,
             members,
             parts,
             leadership,
@@ -79,6 +81,7 @@ impl ElectionDriver {
             terms: TermWriter::new(term_file),
             members,
             own_broker,
+            page,
             parts,
             leadership,
             counters,
@@ -212,7 +215,9 @@ impl ElectionDriver {
                     load_percent: probe::load_percent().unwrap_or(0),
                     members: self.members.borrow().iter().map(as_seen).collect(),
                 };
-                return vec![looked, Input::Troubled { troubles: self.counters.troubles().present() }];
+                let page = self.page.borrow().map(|page| page.to_string());
+                let troubles = self.counters.troubles().present();
+                return vec![looked, Input::Telling { troubles, page }];
             }
             Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
             Effect::CountImplausible { from } => self.counters.reject(RejectReason::OutOfRange, from.as_str()),

@@ -288,6 +288,7 @@ impl NodeBuilder {
             },
             term_file: self.state_file("term"),
             own_broker: self.broker_address(),
+            page: self.dashboard_address(),
             members: self.members(),
             parts: Parts {
                 membership,
@@ -312,6 +313,7 @@ impl NodeBuilder {
             cell: self.config.cell.clone(),
             role: self.config.role,
             camera: self.camera_feed.is_some(),
+            floor_plan: self.floor_plan.as_ref().map(|plan| plan.facts.clone()),
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
             round_period_s: self.config.fusion.round.period_s,
@@ -324,6 +326,7 @@ impl NodeBuilder {
             frames: self.frames(),
             live_state: Arc::clone(&self.live_state),
             camera: self.camera_feed.clone(),
+            floor_plan: self.floor_plan.clone(),
         };
         DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
     }

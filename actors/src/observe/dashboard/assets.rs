@@ -13,7 +13,7 @@ const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const SVG: &str = "image/svg+xml";
 
-const ASSETS: [Asset; 13] = [
+const ASSETS: [Asset; 19] = [
     asset("/", HTML, include_str!("page/index.html")),
     asset("/view.css", CSS, VIEW_STYLE),
     asset("/style.css", CSS, include_str!("page/style.css")),
@@ -21,9 +21,15 @@ const ASSETS: [Asset; 13] = [
     asset("/main.js", SCRIPT, include_str!("page/main.js")),
     asset("/live.js", SCRIPT, include_str!("page/live.js")),
     asset("/camera.js", SCRIPT, include_str!("page/camera.js")),
+    asset("/mount.js", SCRIPT, include_str!("page/mount.js")),
     asset("/scene.js", SCRIPT, include_str!("page/scene.js")),
     asset("/timeline.js", SCRIPT, include_str!("page/timeline.js")),
     asset("/map.js", SCRIPT, include_str!("page/map.js")),
+    asset("/fit.js", SCRIPT, include_str!("page/fit.js")),
+    asset("/floor.js", SCRIPT, include_str!("page/floor.js")),
+    asset("/trails.js", SCRIPT, include_str!("page/trails.js")),
+    asset("/details.js", SCRIPT, include_str!("page/details.js")),
+    asset("/terms.js", SCRIPT, include_str!("page/terms.js")),
     asset("/tables.js", SCRIPT, include_str!("page/tables.js")),
     asset("/charts.js", SCRIPT, include_str!("page/charts.js")),
     asset("/dom.js", SCRIPT, include_str!("page/dom.js")),
@@ -49,7 +55,19 @@ pub(crate) fn view() -> &'static str {
 
 /// The scripts that draw map and timeline, as one script without imports. No two of them have a name of their own alike.
 pub(crate) fn view_script() -> String {
-    let scripts = ["/dom.js", "/scene.js", "/tables.js", "/map.js", "/timeline.js"].into_iter().filter_map(Asset::find);
+    const PATHS: [&str; 10] = [
+        "/dom.js",
+        "/scene.js",
+        "/terms.js",
+        "/fit.js",
+        "/floor.js",
+        "/trails.js",
+        "/details.js",
+        "/tables.js",
+        "/map.js",
+        "/timeline.js",
+    ];
+    let scripts = PATHS.into_iter().filter_map(Asset::find);
     let lines = scripts.flat_map(|script| script.content.lines()).filter(|line| !line.starts_with("import "));
     lines.map(|line| line.strip_prefix("export ").unwrap_or(line).to_owned() + "\n").collect()
 }

@@ -28,6 +28,9 @@ pub struct PictureBox {
 #[derive(Serialize)]
 struct CameraPicture<'a> {
     captured_at_us: Timestamp,
+    /// Size of the camera's own frame, which may be larger than the picture.
+    width_px: u32,
+    height_px: u32,
     jpeg: String,
     boxes: &'a [PictureBox],
 }
@@ -57,7 +60,8 @@ impl PictureBox {
 /// OpenCV's.
 pub fn camera_event(frame: &CameraFrame, boxes: &[PictureBox]) -> opencv::Result<Bytes> {
     let jpeg = BASE64_STANDARD.encode(jpeg(&frame.image)?);
-    let picture = json(&CameraPicture { captured_at_us: frame.captured_at, jpeg, boxes });
+    let ImageSize { width: width_px, height: height_px } = ImageSize::of(&frame.image);
+    let picture = json(&CameraPicture { captured_at_us: frame.captured_at, width_px, height_px, jpeg, boxes });
     Ok([b"event: camera\ndata: ", &*picture, b"\n\n"].concat().into())
 }
 
@@ -94,6 +98,7 @@ mod tests {
         let data = event.strip_prefix(b"event: camera\ndata: ").unwrap().strip_suffix(b"\n\n").unwrap();
         let picture: serde_json::Value = serde_json::from_slice(data).unwrap();
         assert_eq!(picture["captured_at_us"], 7);
+        assert_eq!((&picture["width_px"], &picture["height_px"]), (&1920.into(), &1080.into()));
         assert_eq!(picture["boxes"][0]["edges"], serde_json::json!([0.25, 0.25, 0.5, 1.0]));
         let jpeg = BASE64_STANDARD.decode(picture["jpeg"].as_str().unwrap()).unwrap();
         let shown = imgcodecs::imdecode(&Vector::from_slice(&jpeg), imgcodecs::IMREAD_COLOR).unwrap();

@@ -5,6 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
 
+use super::floor_plan::{FloorPlan, FloorPlanConfig};
 use crate::platform::secret::Secret;
 
 /// A node's web page, metrics and health.
@@ -21,6 +22,9 @@ pub struct DashboardConfig {
     pub token: Option<Secret>,
     /// True if the page shows the pictures of the node's camera to those who may look. Default true.
     pub camera: bool,
+    /// Image under the map. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub floor_plan: Option<FloorPlanConfig>,
     /// Maximum snapshots a second for each browser. Default 10. Trade-off: more show a fast cell better, fewer cost less.
     pub max_rate_hz: f64,
     /// Maximum number of connections. Default 64. A visible browser tab keeps one and opens others briefly; at most
@@ -39,7 +43,15 @@ const NOT_IN_TOKENS: [char; 7] = ['"', '#', '%', '&', '\'', '<', '>'];
 
 impl Default for DashboardConfig {
     fn default() -> Self {
-        Self { enabled: true, listen: None, token: None, camera: true, max_rate_hz: 10.0, max_connections: 64 }
+        Self {
+            enabled: true,
+            listen: None,
+            token: None,
+            camera: true,
+            floor_plan: None,
+            max_rate_hz: 10.0,
+            max_connections: 64,
+        }
     }
 }
 
@@ -51,6 +63,9 @@ impl DashboardConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("max_rate_hz", self.max_rate_hz, 0.1, 60.0)?;
         check_range("max_connections", self.max_connections as f64, 4.0, 4096.0)?;
+        if let Some(plan) = &self.floor_plan {
+            plan.validate().map_err(|error| error.within("floor_plan"))?;
+        }
         match (&self.token, self.listen) {
             (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => {
                 Err(ConfigError::new("token", "a shorter text", format!("at least {MIN_TOKEN_BYTES} characters")))
@@ -66,6 +81,15 @@ impl DashboardConfig {
             }
             _ => Ok(()),
         }
+    }
+
+    /// The floor plan, read, if a page is to show one.
+    ///
+    /// # Errors
+    /// [`ConfigError`] as of [`FloorPlanConfig::load`].
+    pub fn load_floor_plan(&self) -> Result<Option<FloorPlan>, ConfigError> {
+        let plan = self.floor_plan.as_ref().filter(|_| self.enabled);
+        plan.map(FloorPlanConfig::load).transpose().map_err(|error| error.within("dashboard.floor_plan"))
     }
 }
 

@@ -10,6 +10,7 @@ use serde::Serialize;
 use tokio::sync::watch;
 
 use super::camera_feed::CameraFeed;
+use super::floor_plan::{FloorPlan, FloorPlanFacts};
 use super::live_state::LiveState;
 use crate::observe::readiness::Vitals;
 use crate::telemetry::counters::Counters;
@@ -32,6 +33,8 @@ pub struct NodeSources {
     pub live_state: Arc<LiveState>,
     /// Pictures of the node's camera, if they are shown.
     pub camera: Option<Arc<CameraFeed>>,
+    /// Image under the map.
+    pub floor_plan: Option<FloorPlan>,
 }
 
 /// Facts about a node.
@@ -45,6 +48,9 @@ pub struct NodeFacts {
     pub role: Role,
     /// True if `/api/camera` shows the pictures of its camera.
     pub camera: bool,
+    /// The image under the map, if there is one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub floor_plan: Option<FloorPlanFacts>,
     /// Version of the software.
     pub version: &'static str,
     /// Time of start.

@@ -19,6 +19,7 @@ use tokio::sync::watch;
 use super::access::{AccessDecision, HEADERS, PageAccess};
 use super::assets::Asset;
 use super::connection_limit::ConnectionSlot;
+use super::floor_plan;
 use super::metrics;
 use super::node_monitor::NodeMonitor;
 use super::response_cache::ResponseCache;
@@ -73,6 +74,7 @@ impl HttpApi {
             .route("/api/landmarks", get(show_landmarks))
             .route("/api/events", get(show_events))
             .route("/api/camera", get(show_camera))
+            .route(floor_plan::PATH, get(show_floor_plan))
             .fallback(show_asset)
             .layer(middleware::from_fn_with_state(Arc::clone(&api), guard));
         Router::new()
@@ -199,6 +201,14 @@ async fn show_camera(State(api): Api) -> Response {
         return api.refuse_viewer();
     }
     stream_events(camera.pictures(), None)
+}
+
+/// The image under the map.
+async fn show_floor_plan(State(api): Api) -> Response {
+    match &api.monitor.sources.floor_plan {
+        Some(plan) => typed(plan.content_type, plan.content.clone()),
+        None => (StatusCode::NOT_FOUND, "this node shows no floor plan\n").into_response(),
+    }
 }
 
 /// Server-sent events: the first, and then the latest whenever the browser has room.

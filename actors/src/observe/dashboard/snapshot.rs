@@ -1,6 +1,7 @@
 //! Everything that the page shows of a cell, as one JSON object.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::{IpAddr, SocketAddr};
 
 use ecod::leadership::Position;
 use ecod::leadership::readiness::Readiness;
@@ -95,6 +96,8 @@ pub(crate) struct NodeEntry {
     pub fit: Option<bool>,
     /// Version of its software.
     pub version: Option<String>,
+    /// Address and port of its page, where this node's users may reach it. Its own page is left out.
+    pub page: Option<SocketAddr>,
 }
 
 /// A value as JSON; truncated where it cannot be encoded, which is logged.
@@ -119,6 +122,7 @@ pub(crate) fn nodes(sources: &NodeSources, met: &BTreeSet<NodeName>, links: Opti
         state: Some(if leading { NodeState::Aggregating } else { NodeState::Following }),
         fit: None,
         version: Some(own.version.to_owned()),
+        page: None,
     });
     nodes.sort_by(|a, b| a.name.cmp(&b.name));
     nodes
@@ -138,12 +142,15 @@ fn others(
         state: status.map(|status| status.state),
         fit: status.and_then(|status| status.fit),
         version: status.map(|status| status.version.clone()),
+        page: None,
     };
     let (shown, further) = members.split_at(members.len().min(MAX_SHOWN));
     let mut nodes = Vec::new();
-    for Member { name, role, .. } in shown {
+    for Member { name, role, gossip, .. } in shown {
         let reported = statuses.remove(name);
-        nodes.push(entry(name, *role, true, reported.as_ref().map(|reported| &*reported.status)));
+        let status = reported.as_ref().map(|reported| &*reported.status);
+        let page = status.and_then(|status| page(status, gossip.ip()));
+        nodes.push(NodeEntry { page, ..entry(name, *role, true, status) });
     }
     let is_linked = |broker: &BrokerAddress| {
         links.is_none_or(|links| matches!(links.get(broker), Some(LinkState::Up | LinkState::Stalled)))
@@ -155,6 +162,16 @@ fn others(
         nodes.push(entry(name, status.role, alive, Some(status)));
     }
     nodes
+}
+
+/// Address of the page of a node whose datagrams come from `host`. One on loopback serves its own machine only.
+fn page(status: &NodeStatus, host: IpAddr) -> Option<SocketAddr> {
+    let page: SocketAddr = status.page.as_ref()?.parse().ok()?;
+    match page.ip() {
+        ip if ip.is_unspecified() => Some(SocketAddr::new(host, page.port())),
+        ip if ip.is_loopback() && !host.is_loopback() => None,
+        _ => Some(page),
+    }
 }
 
 #[cfg(test)]
@@ -206,5 +223,17 @@ mod tests {
             "what a broker said before it was lost is not its word now"
         );
         assert_eq!(alive(&[], &up), ["both"]);
+    }
+    #[test]
+    fn a_page_is_linked_where_a_browser_here_may_reach_it() {
+        let link = |announced: &str, host: &str| {
+            let starting = NodeStatus::starting(NodeName::from_static("euclid"), Uuid::nil(), Role::Cav, "0.1.0");
+            let status = NodeStatus { page: Some(announced.into()), ..starting };
+            page(&status, host.parse().unwrap()).map(|page| page.to_string())
+        };
+        assert_eq!(link("0.0.0.0:8080", "10.0.0.3").as_deref(), Some("10.0.0.3:8080"));
+        assert_eq!(link("10.0.1.3:80", "10.0.0.3").as_deref(), Some("10.0.1.3:80"));
+        assert_eq!(link("127.0.0.1:8081", "127.0.0.1").as_deref(), Some("127.0.0.1:8081"));
+        assert_eq!(link("127.0.0.1:8081", "10.0.0.3"), None, "that would be this machine");
     }
 }

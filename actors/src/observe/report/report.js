@@ -1,6 +1,7 @@
 /// Shows the map and the picture of a log at the cursor.
 
 const data = JSON.parse(byId("log-data").textContent);
+explainTerms();
 const map = new BirdsEye(show);
 const times = [...data.frames, ...data.events.map((event) => event.at_us), ...data.reigns.flatMap((term) => [term.from_us, term.until_us])];
 const [from, until] = times.reduce(([first, last], time) => [Math.min(first, time), Math.max(last, time)], [Infinity, 0]);

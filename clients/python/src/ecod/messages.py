@@ -305,3 +305,4 @@ class NodeStatus:
     version: Label
     description: Optional[DescriptionStatus]
     troubles: list[Trouble] = field(default_factory=list)
+    page: Optional[Label] = None

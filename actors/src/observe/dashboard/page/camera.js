@@ -16,9 +16,9 @@ export class CameraView {
   #scene = null;
   #node = null;
 
-  /// Calls `onLight` with the name of what is pointed at, or null.
-  constructor(onLight) {
-    this.onLight = onLight;
+  /// Calls `onLight` with the name of what is pointed at, or null, and `onPicture` with each picture's facts.
+  constructor(onLight, onPicture) {
+    Object.assign(this, { onLight, onPicture });
     document.addEventListener("visibilitychange", () => this.#follow());
     new IntersectionObserver((looks) => {
       this.#visible = looks.at(-1).isIntersecting;
@@ -69,7 +69,7 @@ export class CameraView {
     this.#source.addEventListener("camera", (event) => this.#take(JSON.parse(event.data)));
   }
 
-  async #take({ jpeg, boxes }) {
+  async #take({ jpeg, boxes, width_px, height_px }) {
     const bytes = Uint8Array.from(atob(jpeg), (letter) => letter.charCodeAt(0));
     const image = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
     const canvas = byId("camera");
@@ -77,6 +77,7 @@ export class CameraView {
     canvas.getContext("2d").drawImage(image, 0, 0);
     image.close();
     [this.#boxes, this.#shownAt] = [boxes, performance.now()];
+    this.onPicture({ width_px, height_px });
     this.onLight();
   }
 }

@@ -38,16 +38,18 @@ export function keyed(parent, items, key, create, update) {
   parent.kept = kept;
 }
 
-/// Fills a table's body; a cell is a text or { text, class, colour }.
+/// Fills a table's body; a cell is a text or { text, class, colour, href }.
 export function rows(body, items, key, cells) {
   keyed(body, items, key, () => document.createElement("tr"), (row, item) => {
     cells(item).forEach((given, index) => {
       const cell = row.cells[index] ?? row.insertCell();
       const value = typeof given === "string" ? { text: given } : given;
       if (cell.className !== (value.class ?? "")) cell.className = value.class ?? "";
-      if (value.colour === undefined) return text(cell, value.text);
-      if (!cell.lastElementChild) cell.append(swatch(), document.createElement("span"));
-      cell.firstElementChild.className = `swatch c${value.colour}`;
+      const kind = value.href ? "A" : "SPAN";
+      if (value.colour === undefined && !value.href && !cell.lastElementChild) return text(cell, value.text);
+      if (cell.lastElementChild?.tagName !== kind) cell.replaceChildren(swatch(), document.createElement(kind));
+      cell.firstElementChild.className = value.colour === undefined ? "" : `swatch c${value.colour}`;
+      if (value.href) set(cell.lastElementChild, { href: value.href });
       text(cell.lastElementChild, value.text);
     });
   });
@@ -60,6 +62,10 @@ function swatch() {
 }
 
 export const n = (value) => ({ text: String(value), class: "n" });
+
+export const counted = (number, word) => `${number} ${word}${number === 1 ? "" : "s"}`;
+
+export const percent = (share) => `${Math.round(share * 100)} %`;
 
 /// A time span in seconds, in a readable unit.
 export function span(seconds) {

@@ -2,10 +2,12 @@
 
 import { CameraView } from "./camera.js";
 import { chart } from "./charts.js";
-import { ago, byId, clock, span, text } from "./dom.js";
+import { ago, byId, clock, counted, span, text } from "./dom.js";
 import { Live, SPAN_US } from "./live.js";
 import { BirdsEye } from "./map.js";
+import { MountPoints } from "./mount.js";
 import { arrange, colours } from "./scene.js";
+import { explainTerms } from "./terms.js";
 import * as tables from "./tables.js";
 import { Timeline } from "./timeline.js";
 
@@ -14,9 +16,13 @@ let [queued, textAt, told] = [false, 0, {}];
 /// Errors by part of the page.
 const faults = {};
 
+explainTerms();
+// The heading of a table covers the shadow above its rows.
+document.addEventListener("scroll", ({ target }) => target.classList?.toggle("scrolled", target.scrollTop > 0), true);
 const live = new Live(draw, () => attempt("history", drawHistory));
 const map = new BirdsEye(draw, light);
-const camera = new CameraView(light);
+const mount = new MountPoints(map, draw);
+const camera = new CameraView(light, (picture) => mount.take(picture));
 const timeline = new Timeline(scrub, { live: true, time: clock, moment: (at) => `${clock(at)}, ${ago((live.now - at) / 1e6)}` });
 /// The map that the timeline chose, and whether one is on its way.
 let [past, loading] = [null, false];
@@ -67,7 +73,8 @@ function drawPicture() {
   const colour = colours([...known(picture), ...known(past?.picture), ...rated, ...live.history.reigns.map((term) => term.leader)]);
   const scene = arrange(picture, landmarks, now, colour);
   const shown = past?.picture ? arrange(past.picture, landmarks, past.picture.now_us, colour) : scene;
-  if (!map.asTable) map.draw(shown);
+  map.floor.take(picture.node.floor_plan).catch((error) => (faults["floor plan"] = error));
+  if (!map.asTable) map.draw(shown, mount.onMap);
   camera.draw(picture.node, scene, map.lit);
   if (performance.now() - textAt < TEXT_MS) return;
   if (map.asTable) tables.places(shown);
@@ -94,7 +101,7 @@ function drawText(picture, scene) {
   tables.troubles(picture);
   tables.tiles(picture, now, sample ? sample.rounds / 2 : null);
   tables.verdicts(picture.verdicts, now);
-  tables.vehicles(scene.vehicles, now, picture.troubles);
+  tables.vehicles(scene.vehicles, now, picture);
   tables.reputations(picture.reputations, scene.colour);
   tables.leaders(live.history, now);
   tables.nodes(picture);
@@ -161,5 +168,4 @@ function takesReports({ map, verdicts }) {
   return map?.message.oldest_capture_us !== undefined || (verdicts?.message.verdicts ?? []).some((verdict) => verdict.contributors.length > 0);
 }
 
-const counted = (number, word) => `${number} ${word}${number === 1 ? "" : "s"}`;
 const sentence = (words) => words.charAt(0).toUpperCase() + words.slice(1);

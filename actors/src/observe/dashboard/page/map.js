@@ -1,19 +1,26 @@
 // Bird's-eye view: world metres to screen pixels, symbols of constant size, labels that do not overlap.
 
-import { reasons } from "./scene.js";
-import { ago, byId, keyed, set, span, svg, text } from "./dom.js";
+import { details, ellipse, showDetails, sightings } from "./details.js";
+import { byId, keyed, percent, set, span, svg, text } from "./dom.js";
+import { bounds, cues, fitting, union } from "./fit.js";
+import { FloorPlan } from "./floor.js";
+import { Trails } from "./trails.js";
 
-/// Standard deviations of the 95 % error ellipse in two dimensions: the square root of the χ² quantile.
-const SIGMAS_95 = 2.4477;
 /// Maximum number of drawn places, and of objects; the table has all.
 const MAX_DRAWN = 2000;
 /// Age in seconds from which silent vehicles and unseen objects are drawn pale with their age.
 const OLD_S = 2;
-const MARGIN_PX = 56;
-/// Maximum pixels per metre without zoom.
-const MAX_SCALE = 4000;
-/// Time for which half of the map must have been enough before it is fitted again.
+/// Width and height in pixels below which nothing is drawn.
+const MIN_BOX_PX = 100;
+/// Time for which a part of the map must have been enough before it is fitted again, and the gain in scale for which it is.
 const ROOMY_MS = 5000;
+const ROOMY_GAIN = 1.5;
+/// Movement of a pressed pointer in pixels from which it drags the map.
+const DRAG_PX = 4;
+/// Half axis of an ellipse in pixels from which it is not filled.
+const VAST_PX = 150;
+/// Radius in pixels around an object in which it is pointed at.
+const REACH_PX = 11;
 
 export class BirdsEye {
   #picture = byId("map");
@@ -22,17 +29,32 @@ export class BirdsEye {
   #fullAt = 0;
   #zoom = 1;
   #shift = [0, 0];
+  /// Whether far things count for the fit, too.
+  #all = false;
+  #kept = null;
+  #trails = new Trails();
+  #at = null;
+  /// Whether the present press dragged the map.
+  #dragged = false;
+  #onPick = null;
+  #known = [];
   /// Whether a table is shown in the place of the map.
   asTable = false;
   /// Name of the symbol that is pointed at, here or elsewhere: its kind and identity.
   lit = null;
 
   /// Calls `onLight` with the name of the symbol that is pointed at, or null.
-  constructor(redraw, onLight = () => {}) {
+  constructor(redraw, onLight = (name) => {
+    this.lit = name;
+    redraw();
+  }) {
     Object.assign(this, { redraw, onLight });
-    for (const name of ["grid", "views", "places", "dots", "objects", "vehicles", "labels", "scale"]) {
+    for (const name of ["floor", "grid", "views", "trails", "places", "dots", "objects", "vehicles", "picks", "labels", "cues", "scale"]) {
       this.#layers[name] = this.#picture.appendChild(svg("g"));
     }
+    this.floor = new FloorPlan(this.#layers.floor, redraw);
+    byId("map-outside").onclick = () => this.#fit(true);
+    byId("details-close").onclick = () => this.#keep(null);
     byId("zoom-in").onclick = () => this.#zoomBy(1.4);
     byId("zoom-out").onclick = () => this.#zoomBy(1 / 1.4);
     byId("fit").onclick = () => this.#fit();
@@ -53,20 +75,32 @@ export class BirdsEye {
     new ResizeObserver(redraw).observe(this.#picture);
   }
 
-  /// Draws { places, objects, vehicles, now }.
-  draw(scene) {
+  /// Gives the position in metres of each click on the map to `onPick`, until it is null.
+  follow(onPick) {
+    this.#onPick = onPick;
+    this.#picture.classList.toggle("picking", onPick !== null);
+  }
+
+  /// Draws { places, objects, vehicles, now, fused_at }, and `picks`, numbered points in metres.
+  draw(scene, picks = []) {
     const box = this.#picture.getBoundingClientRect();
     const empty = scene.places.length + scene.objects.length + scene.vehicles.length === 0;
-    byId("map-empty").hidden = !empty;
-    if (Math.min(box.width, box.height) <= 2 * MARGIN_PX || empty) return;
+    byId("map-empty").hidden = !empty || this.floor.bounds !== null;
+    if (Math.min(box.width, box.height) <= MIN_BOX_PX || (empty && !this.floor.bounds)) return;
     set(this.#picture, { viewBox: `0 0 ${Math.round(box.width)} ${Math.round(box.height)}`, "aria-label": describe(scene) });
     this.#picture.classList.toggle("zoomed", this.#zoom !== 1);
-    const at = this.#projection(scene, box);
+    const at = this.#projection({ ...scene, places: [...scene.places, ...picks] }, box);
+    [this.#at, this.#known] = [at, scene.places];
     const labels = new Labels(box);
+    this.floor.draw(at);
     this.#grid(at, box);
+    this.#move(scene, at);
+    this.#picks(picks, at, labels);
     this.#places(scene.places.slice(0, MAX_DRAWN), at, labels);
     this.#objects(scene.objects.slice(0, MAX_DRAWN), at, labels);
     this.#vehicles(scene.vehicles, scene.now, at, labels);
+    this.#cues(scene, at, box, labels);
+    this.#details(scene, at, box);
     keyed(this.#layers.labels, labels.placed, (label) => label.key, () => svg("text"), (element, label) => {
       set(element, { x: label.x, y: label.y, "text-anchor": label.anchor, class: label.class });
       text(element, label.text);
@@ -79,7 +113,8 @@ export class BirdsEye {
     const scale = fitting(this.#bounds, box) * this.#zoom;
     const [cx, cy] = [box.width / 2 + this.#shift[0], box.height / 2 + this.#shift[1]];
     const at = (p) => [cx + (p.x_m - (left + right) / 2) * scale, cy - (p.y_m - (bottom + top) / 2) * scale];
-    return Object.assign(at, { scale });
+    const back = (x, y) => ({ x_m: (x - cx) / scale + (left + right) / 2, y_m: (cy - y) / scale + (bottom + top) / 2 });
+    return Object.assign(at, { scale, back });
   }
 
   /// Bounds grow at once and shrink late, so that the map stays steady while vehicles come and go, and recovers from a
@@ -88,9 +123,9 @@ export class BirdsEye {
     const moved = this.#zoom !== 1 || this.#shift.some((shift) => shift !== 0);
     if (this.#bounds && moved) return;
     const now = performance.now();
-    const needed = bounds(scene);
+    const needed = bounds(scene, this.floor.bounds, box, this.#all);
     const grown = union(this.#bounds ?? needed, needed);
-    if (fitting(needed, box) < 2 * fitting(grown, box)) this.#fullAt = now;
+    if (fitting(needed, box) < ROOMY_GAIN * fitting(grown, box)) this.#fullAt = now;
     this.#bounds = now - this.#fullAt > ROOMY_MS ? needed : grown;
   }
 
@@ -117,17 +152,17 @@ export class BirdsEye {
   #places(places, at, labels) {
     keyed(this.#layers.places, places, (place) => place.id, () => {
       const g = svg("g");
-      g.append(svg("line", { class: "facing" }), svg("rect", { width: 11, height: 11, rx: 3 }), svg("title"));
-      return g;
+      g.append(svg("line", { class: "facing" }), svg("rect", { width: 11, height: 11, rx: 3 }));
+      // The table has all places for the keyboard.
+      return set(g, { tabindex: -1, role: "button" });
     }, (g, place) => {
       const [x, y] = at(place);
-      const [line, sign, title] = g.children;
-      set(g, { class: this.#light(g, `place ${place.id}`) });
+      const [line, sign] = g.children;
+      set(g, { class: this.#light(g, `place ${place.id}`), "aria-label": `${place.id}: ${place.label ?? place.words}` });
       const facing = place.facing_rad ?? null;
       const reach = facing === null ? 0 : 13;
       set(line, { x1: x, y1: y, x2: x + reach * Math.cos(facing ?? 0), y2: y - reach * Math.sin(facing ?? 0) });
       set(sign, { x: x - 5.5, y: y - 5.5, class: `place ${place.state}` });
-      text(title, [`${place.id}: ${place.label ?? place.words}`, reasons(place)].filter(Boolean).join(", "));
       labels.put(`place ${place.id}`, place.label ?? place.id, x, y, 9, place.label ? "" : "dim");
     });
   }
@@ -135,30 +170,93 @@ export class BirdsEye {
   #objects(objects, at, labels) {
     keyed(this.#layers.objects, objects, (object) => object.id, () => {
       const g = svg("g");
-      g.append(svg("line", { class: "motion" }), svg("ellipse", { class: "ellipse" }), svg("circle", { class: "centre", r: 2.5 }), svg("title"));
-      return g;
+      g.append(svg("line", { class: "motion" }), svg("ellipse"), svg("circle", { class: "reach", r: REACH_PX }), svg("circle", { class: "centre", r: 2.5 }));
+      return reachable(g);
     }, (g, object) => {
       const [x, y] = at(object);
       const { a, b, turn } = ellipse(object.covariance_m2);
-      const [motion, around, centre, title] = g.children;
+      const [motion, around, reach, centre] = g.children;
       const [east, north] = object.velocity_mps ?? [0, 0];
       const [x2, y2] = at({ x_m: object.x_m + east, y_m: object.y_m + north });
       set(motion, { x1: x, y1: y, x2, y2 });
       const degrees = ((-turn * 180) / Math.PI).toFixed(1);
-      set(around, { rx: Math.max(a * at.scale, 5), ry: Math.max(b * at.scale, 5), transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
-      set(centre, { cx: x, cy: y });
+      // An ellipse over much of the map would hide the rest.
+      set(around, { class: a * at.scale > VAST_PX ? "ellipse vast" : "ellipse", rx: Math.max(a * at.scale, 5), ry: Math.max(b * at.scale, 5), transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
+      for (const circle of [reach, centre]) set(circle, { cx: x, cy: y });
       const age = object.age_s ?? 0;
-      set(g, { class: `${age > OLD_S ? "old" : ""} ${this.#light(g, `object ${object.id}`)}`.trim() });
-      text(title, `${object.label}, ${Math.round(object.confidence * 100)} %, ± ${a.toFixed(2)} m, seen ${ago(age)} by ${object.contributors.join(", ")}`);
+      const style = `${age > OLD_S ? "old" : ""} ${this.#light(g, `object ${object.id}`)}`.trim();
+      // The vehicle's own symbol is reached instead.
+      set(g, { class: style, tabindex: object.vehicle ? -1 : 0, "aria-label": `${object.vehicle ?? object.label}, ${percent(object.confidence)}, seen ${sightings(object)}` });
       labels.put(`object ${object.id}`, aged(object.vehicle ?? object.label, age), x, y, 9, age > OLD_S ? "old" : "");
     });
   }
 
   /// Class of a symbol, which says when it is pointed at.
   #light(symbol, name) {
-    symbol.onpointerenter = () => this.onLight(name);
-    symbol.onpointerleave = () => this.onLight(null);
-    return this.lit === name ? "lit" : "";
+    symbol.onpointerenter = symbol.onfocus = () => this.onLight(name);
+    symbol.onpointerleave = symbol.onblur = () => this.onLight(null);
+    symbol.onclick = (event) => {
+      if (this.#onPick || this.#dragged) return;
+      event.stopPropagation();
+      this.#keep(this.#kept === name ? null : name);
+    };
+    symbol.onkeydown = (event) => {
+      if (event.key !== "Enter" && event.key !== " ") return;
+      event.preventDefault();
+      this.#keep(this.#kept === name ? null : name);
+    };
+    return this.lit === name || this.#kept === name ? "lit" : "";
+  }
+
+  /// Keeps the details of what has this name, until others are chosen.
+  #keep(name) {
+    this.#kept = name;
+    this.redraw();
+  }
+
+  #details(scene, at, box) {
+    const name = this.lit ?? this.#kept;
+    const named = details(name, scene);
+    showDetails(named, name !== null && name === this.#kept, named?.x_m === undefined ? null : at(named), box);
+  }
+
+  #move({ objects, vehicles, fused_at }, at) {
+    const moving = objects.filter((object) => !object.vehicle).map((object) => ({ ...object, name: `object ${object.id}`, spread_m: ellipse(object.covariance_m2).a }));
+    const driving = vehicles.filter((v) => v.pose).map((v) => ({ ...v.pose, name: `vehicle ${v.node}`, spread_m: 0, colour: v.colour }));
+    this.#trails.take([...moving.slice(0, MAX_DRAWN), ...driving], fused_at);
+    keyed(this.#layers.trails, this.#trails.lines(at), (line) => line.key, () => svg("path"), (path, { colour, piece, d }) => {
+      set(path, { class: `trail p${piece} ${colour === undefined ? "" : `c${colour}`}`.trim(), d });
+    });
+  }
+
+  /// Position in metres at a place on the screen: of a known place that is drawn there, or else of the ground.
+  #positionAt(x, y) {
+    const off = (place) => Math.hypot(...this.#at(place).map((side, axis) => side - [x, y][axis]));
+    return this.#known.find((place) => off(place) < REACH_PX) ?? this.#at.back(x, y);
+  }
+
+  #picks(picks, at, labels) {
+    keyed(this.#layers.picks, picks, (pick) => pick.number, () => svg("path", { class: "pick", d: "M-7 0H7M0 -7V7" }), (path, pick) => {
+      const [x, y] = at(pick);
+      set(path, { transform: `translate(${x.toFixed(1)} ${y.toFixed(1)})` });
+      labels.put(`pick ${pick.number}`, String(pick.number), x, y, 9, "pick");
+    });
+  }
+
+  /// Signs at the border for what is outside, and a button that shows all of it.
+  #cues({ places, objects, vehicles }, at, box, labels) {
+    const things = [
+      ...objects.map((object) => ({ ...object, name: object.vehicle ?? object.label })),
+      ...vehicles.filter((v) => v.pose).map((v) => ({ ...v.pose, name: v.node })), ...places.map((place) => ({ ...place, name: place.id })),
+    ];
+    const outside = cues(things, at, box);
+    keyed(this.#layers.cues, outside, (cue) => cue.sector, () => svg("path", { class: "cue", d: "M8 0L-6 7L-2 0L-6 -7Z" }), (path, cue) => {
+      set(path, { transform: `translate(${cue.x.toFixed(1)} ${cue.y.toFixed(1)}) rotate(${cue.degrees.toFixed(1)})` });
+      labels.put(`cue ${cue.sector}`, cue.words, cue.x, cue.y, 12, "cue");
+    });
+    const count = outside.reduce((sum, cue) => sum + cue.count, 0);
+    byId("map-outside").hidden = count === 0;
+    text(byId("map-outside"), `${count} outside, show all`);
   }
 
   #vehicles(vehicles, now, at, labels) {
@@ -174,15 +272,15 @@ export class BirdsEye {
     });
     keyed(this.#layers.vehicles, posed, (v) => v.node, () => {
       const g = svg("g");
-      g.append(svg("path", { class: "body", d: "M12 0L-8 7.5L-4 0L-8 -7.5Z" }), svg("title"));
-      return g;
+      g.append(svg("path", { class: "body", d: "M12 0L-8 7.5L-4 0L-8 -7.5Z" }));
+      return reachable(g);
     }, (g, v) => {
       const [x, y] = at(v.pose);
       const degrees = ((-v.pose.heading_rad * 180) / Math.PI).toFixed(1);
-      set(g, { class: `c${v.colour} ${old(v)}` });
+      set(g, { class: `c${v.colour} ${old(v)} ${this.#light(g, `vehicle ${v.node}`)}`.trim() });
       set(g.firstChild, { transform: `translate(${x.toFixed(1)} ${y.toFixed(1)}) rotate(${degrees})` });
       const age = (now - v.received_at_us) / 1e6;
-      text(g.lastChild, `${v.node}, report ${span(age)} old`);
+      set(g, { "aria-label": `${v.node}, a vehicle` });
       labels.put(`vehicle ${v.node}`, aged(v.node, age), x, y, 14, `vehicle c${v.colour} ${old(v)}`);
     });
   }
@@ -194,8 +292,8 @@ export class BirdsEye {
     this.redraw();
   }
 
-  #fit() {
-    [this.#zoom, this.#shift, this.#bounds] = [1, [0, 0], null];
+  #fit(all = false) {
+    [this.#zoom, this.#shift, this.#bounds, this.#all] = [1, [0, 0], null, all];
     this.redraw();
   }
 
@@ -205,23 +303,28 @@ export class BirdsEye {
     else if (event.key === "+" || event.key === "=") return this.#zoomBy(1.4);
     else if (event.key === "-") return this.#zoomBy(1 / 1.4);
     else if (event.key === "0") return this.#fit();
+    else if (event.key === "Escape") return this.#keep(null);
     else return;
     event.preventDefault();
     this.redraw();
   }
 
-  /// Touch scrolls the page until the map is zoomed, then moves the map.
+  /// Touch scrolls the page until the map is zoomed, then moves the map. A press that does not move is a click.
   #drag() {
     let last = null;
     this.#picture.addEventListener("pointerdown", (event) => {
+      this.#dragged = false;
       if (!event.isPrimary || (event.pointerType === "touch" && this.#zoom === 1)) return;
       last = [event.clientX, event.clientY];
-      this.#picture.setPointerCapture(event.pointerId);
-      this.#picture.classList.add("dragging");
     });
     this.#picture.addEventListener("pointermove", (event) => {
       if (!last || !event.isPrimary) return;
-      this.#shift = [this.#shift[0] + event.clientX - last[0], this.#shift[1] + event.clientY - last[1]];
+      const [x, y] = [event.clientX - last[0], event.clientY - last[1]];
+      if (!this.#dragged && Math.hypot(x, y) < DRAG_PX) return;
+      if (!this.#dragged) this.#picture.setPointerCapture(event.pointerId);
+      this.#dragged = true;
+      this.#picture.classList.add("dragging");
+      this.#shift = [this.#shift[0] + x, this.#shift[1] + y];
       last = [event.clientX, event.clientY];
       this.redraw();
     });
@@ -231,32 +334,17 @@ export class BirdsEye {
         this.#picture.classList.remove("dragging");
       });
     }
+    this.#picture.addEventListener("click", (event) => {
+      if (this.#dragged) return;
+      const { left, top } = this.#picture.getBoundingClientRect();
+      if (this.#onPick && this.#at) this.#onPick(this.#positionAt(event.clientX - left, event.clientY - top));
+      else this.#keep(null);
+    });
   }
 }
 
-/// Bounds of places, objects and vehicles: west, south, east, north. Vehicles that see nothing of them, and raw detections,
-/// which are less certain, count only where there is little else.
-function bounds({ places, objects, vehicles }) {
-  const looking = vehicles.filter((v) => v.objects.length + v.seen.length > 0);
-  const sure = [...places, ...objects, ...looking.map((v) => v.pose)].filter(Boolean);
-  const points = sure.length > 1 ? sure : [...sure, ...vehicles.map((v) => v.pose).filter(Boolean), ...vehicles.flatMap((v) => v.objects)];
-  return points.length > 0 ? points.map((p) => [p.x_m, p.y_m, p.x_m, p.y_m]).reduce((a, b) => union(a, b)) : [0, 0, 0, 0];
-}
-
-const union = (a, b) => [Math.min(a[0], b[0]), Math.min(a[1], b[1]), Math.max(a[2], b[2]), Math.max(a[3], b[3])];
-
-/// Pixels per metre with which the bounds fill the box.
-function fitting([left, bottom, right, top], box) {
-  const fill = (pixels, metres) => (pixels - 2 * MARGIN_PX) / Math.max(metres, 1e-3);
-  return Math.min(fill(box.width, right - left), fill(box.height, top - bottom), MAX_SCALE);
-}
-
-/// Half axes of the 95 % ellipse in metres, and the direction of the longer one.
-function ellipse([xx, xy, yy]) {
-  const mean = (xx + yy) / 2;
-  const spread = Math.hypot((xx - yy) / 2, xy);
-  return { a: SIGMAS_95 * Math.sqrt(mean + spread), b: SIGMAS_95 * Math.sqrt(Math.max(mean - spread, 0)), turn: Math.atan2(2 * xy, xx - yy) / 2 };
-}
+/// A symbol that the keyboard reaches.
+const reachable = (symbol) => set(symbol, { tabindex: 0, role: "button", "aria-describedby": "details-facts" });
 
 /// Field of view of a vehicle; estimated from its detections if it reports none.
 function wedge(vehicle, at) {

@@ -21,8 +21,10 @@ export function arrange(picture, landmarks, now, colour) {
     const { node } = sighting.report;
     byNode.set(node, [...(byNode.get(node) ?? []), sighting]);
   }
-  const vehicles = [...byNode].map(([node, sightings]) => vehicle(node, sightings, known, colour.get(node)));
-  return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now };
+  const vehicles = [...byNode].map(([node, sightings]) => ({
+    ...vehicle(node, sightings, known, colour.get(node)), reputation: picture.reputations?.message.reputations[node]?.score,
+  }));
+  return { places, objects: picture.map?.message.objects ?? [], vehicles, colour, now, fused_at: picture.map?.message.fused_at_us ?? picture.now_us };
 }
 
 /// A vehicle may report for the map, for votes, or for both.

@@ -1,9 +1,7 @@
 // Tables and tiles of the page.
 
-import { ago, byId, clock, milliseconds, n, rows, span, text } from "./dom.js";
+import { ago, byId, clock, milliseconds, n, percent, rows, span, text } from "./dom.js";
 import { list, reasons } from "./scene.js";
-
-const percent = (value) => `${Math.round(value * 100)} %`;
 
 const inOrder = new Intl.Collator(undefined, { numeric: true }).compare;
 
@@ -73,13 +71,17 @@ export function verdicts(received, now) {
 /// Kinds of troubles for which a vehicle's reports are not used.
 const REFUSALS = ["untimely", "malformed", "not_permitted"];
 
-export function vehicles(entries, now, troubles) {
+/// Address of a node's page, if a browser here may reach it.
+const pageOf = (page) => (page ? `http://${page}/` : undefined);
+
+export function vehicles(entries, now, { troubles, nodes }) {
+  const pages = new Map(nodes.map(({ name, page }) => [name, page]));
   const refused = new Set(troubles.filter(({ kind }) => REFUSALS.includes(kind)).map(({ about }) => about));
   fill("vehicles", entries, (vehicle) => vehicle.node, (vehicle) => {
     const age = (now - vehicle.received_at_us) / 1e6;
     const used = !refused.has(vehicle.node);
     return [
-      { text: vehicle.node, colour: vehicle.colour }, n(vehicle.detected ?? "–"), n(vehicle.inView ?? "–"), n(vehicle.votes ?? "–"),
+      { text: vehicle.node, colour: vehicle.colour, href: pageOf(pages.get(vehicle.node.split("--")[0])) }, n(vehicle.detected ?? "–"), n(vehicle.inView ?? "–"), n(vehicle.votes ?? "–"),
       { text: used ? ago(age) : "refused", class: age > 2 || !used ? "n bad" : "n" },
     ];
   });
@@ -110,7 +112,7 @@ export function nodes({ nodes, node, leadership }) {
     const state = !entry.alive ? "offline" : leads ? "leads" : entry.name === leadership.standby ? "stands by" : entry.state === "aggregating" ? "follows" : states[entry.state] ?? "online";
     const unfit = entry.alive && entry.fit === false ? ", not fit to lead" : "";
     return [
-      entry.name + (entry.name === node.name ? " (this)" : ""), entry.role,
+      { text: entry.name + (entry.name === node.name ? " (this)" : ""), href: entry.alive ? pageOf(entry.page) : undefined }, entry.role,
       { text: state + unfit, class: entry.alive ? (unfit ? "warn" : "") : "bad" }, { text: entry.version ?? "–", class: "dim" },
     ];
   });
