@@ -50,7 +50,7 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
 fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
     let (cell, nodes) = (&config.cell, node.members().borrow().len());
     let leader = node.leadership().borrow().leader().map(NodeName::to_string);
-    let fix = "start another node, or check that `cell` and key are the same on all, `membership.seeds`, and that UDP 17884 \
+    let fix = "start another node, or check that `cell` and the key are the same on all, `membership.seeds`, and that UDP 17884 \
         passes; the first node of a cell is alone";
     let found = match leader {
         Some(leader) => Finding::fine("cell", format!("{cell} is led by {leader}, nodes that answer: {nodes}")),

@@ -268,7 +268,7 @@ impl GossipMachine {
                 self.outputs.push_back(GossipOutput::Tell(event));
             }
             FrameContent::Stranger => self.send_hello(from, true, at),
-            FrameContent::NameTaken(name) => self.report_taken(name, second_run(from), at),
+            FrameContent::NameTaken(name) => self.report_taken(&name, second_run(from), at),
             FrameContent::Namesake { id, answer } => self.meet_namesake(&id, answer, from, at),
             FrameContent::Nothing => (),
         }
@@ -290,7 +290,7 @@ impl GossipMachine {
             self.gossip.change(at, |own| own.gossip = seen_at);
         }
         if !speaks {
-            return self.report_taken(id.name, second_run(from), at);
+            return self.report_taken(&id.name, second_run(from), at);
         }
         self.gossip.note_met(&id);
         for (kind, body) in self.pending.remove(&id.name).map(|pending| pending.frames).unwrap_or_default() {
@@ -403,8 +403,8 @@ impl GossipMachine {
         self.hello_at = at + self.hello * percent / 100;
     }
 
-    fn report_taken(&mut self, name: NodeName, cause: String, at: Timestamp) {
-        let lately = |(last, when): &(NodeName, Timestamp)| *last == name && at.since(*when) < REPORT_INTERVAL;
+    fn report_taken(&mut self, name: &NodeName, cause: String, at: Timestamp) {
+        let lately = |(last, when): &(NodeName, Timestamp)| last == name && at.since(*when) < REPORT_INTERVAL;
         if !self.taken.as_ref().is_some_and(lately) {
             self.taken = Some((name.clone(), at));
             let (about, kind) = (name.to_string(), TroubleKind::NameTaken);
@@ -419,7 +419,7 @@ impl GossipMachine {
         match answer {
             Some(frame) if !is_new => {
                 self.outputs.push_back(GossipOutput::Send { to: from, frame });
-                self.report_taken(id.name.clone(), second_run(from), at);
+                self.report_taken(&id.name, second_run(from), at);
             }
             None if is_new || self.gossip.own().run > id.run => self.step_back(from, at),
             _ => {}
@@ -433,7 +433,8 @@ impl GossipMachine {
             self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Excluded));
         }
         let cause = format!("another run of this name takes part, says the node at {informant}; this run does not");
-        self.report_taken(self.gossip.own().name.clone(), cause, at);
+        let name = self.gossip.own().name.clone();
+        self.report_taken(&name, cause, at);
     }
 
     /// A node as others are told of it: by what it has proven itself, if nodes of the cell do, and not by hearsay.
