@@ -120,7 +120,7 @@ fn summary(view: &CellView) -> Paragraph<'_> {
     let leader = match (view.leadership.leader(), &view.leadership.epoch) {
         (Some(leader), Some(epoch)) => {
             let since = view.history.back().filter(|(newest, _)| newest == epoch);
-            let since = since.map_or_else(String::new, |(_, at)| format!(" for {}", span(view.now.since(*at))));
+            let since = since.map_or_else(String::new, |(_, at)| format!(", seen for {}", span(view.now.since(*at))));
             let standby = view.leadership.standby.as_ref().map_or_else(String::new, |name| format!(", next {name}"));
             Span::from(format!("{leader} leads in term {}{since}{standby}", epoch.term)).bold()
         }

@@ -12,9 +12,10 @@ export function arrange(picture, landmarks, now, colour) {
   const fused = picture.map?.message.landmarks ?? [];
   const source = fused.length > 0 ? fused : landmarks.map((l) => ({ ...l, label: verdicts.get(l.id)?.label ?? null, confidence: 0, contributors: verdicts.get(l.id)?.contributors ?? [] }));
   const places = source.map((place) => {
-    const empty = (place.observers ?? []).length > 0;
-    const state = place.label !== null ? "full" : empty ? "" : "unknown";
-    return { ...place, facing_rad: known.get(place.id)?.facing_rad, vacancy: known.get(place.id)?.vacancy, state, words: empty ? "seen empty" : "not seen" };
+    const { facing_rad, vacancy } = known.get(place.id) ?? {};
+    const empty = (place.observers ?? []).length > 0 || (place.label !== null && place.label === vacancy);
+    const state = place.label !== null && place.label !== vacancy ? "full" : empty ? "" : "unknown";
+    return { ...place, facing_rad, vacancy, state, words: empty ? "seen empty" : "not seen" };
   });
   const byNode = new Map();
   for (const sighting of picture.vehicles) {
@@ -40,11 +41,13 @@ function vehicle(node, sightings, known, colour) {
 }
 
 /// Why a place has its label, in words: who read what.
-export function reasons({ label, readings, vacancy }) {
-  if (!readings?.length) return null;
+export function reasons({ label, readings, vacancy, contributors }) {
+  const isSign = label !== null && label === vacancy;
+  if (!readings?.length) return isSign && contributors?.length ? `${list(contributors)} read the sign of the empty place` : null;
   const all = new Set(readings.flatMap(({ nodes }) => nodes)).size;
   const agreeing = readings.find((reading) => reading.label === label)?.nodes.length ?? 0;
   const others = readings.filter((reading) => reading.label !== label);
   const words = others.map((reading) => `${list(reading.nodes)} read ${reading.label === vacancy ? "the sign behind it" : reading.label}`);
-  return [`${agreeing} of ${all} saw ${label ?? "nothing"}`, ...words].join("; ");
+  const seen = isSign ? "read the sign of the empty place" : `saw ${label ?? "nothing"}`;
+  return [`${agreeing} of ${all} ${seen}`, ...words].join("; ");
 }
