@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check deb deb-arm64 package-check package-check-arm64 clean
+.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check deb deb-arm64 package-check package-check-arm64 clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -29,7 +29,12 @@ setup: ## install the system packages that are missing
 
 demo: setup ## run a whole cell as separate processes on this machine and print what it saw
 	cargo build --release --locked --bin ecod-node --bin ecod-lab
-	$(BUILD)/release/ecod-lab demo --scenes examples/testbed/pace_setup1.json --seconds $(SECONDS_PER_SCENE) --out target/demo
+	$(BUILD)/release/ecod-lab demo --seconds $(SECONDS_PER_SCENE) --out target/demo
+
+demo-picture: setup ## the animation in README.md: the street of the demo, run live
+	cargo build --profile $(PROFILE) --locked --bin ecod-node --bin ecod-lab
+	$(PROGRAMS)/ecod-lab demo --scene street --seconds 25 --out target/demo
+	cp target/demo/street.svg docs/street.svg
 
 testbed: setup ## accuracy on the recorded parking lots, rendered and detected, and on the recorded intersection
 	cargo build --profile $(PROFILE) --locked --bin ecod-lab

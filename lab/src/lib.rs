@@ -4,9 +4,10 @@
 //! traffic   generated towns: reports and truth
 //! eval      accuracy of maps, verdicts and objects by what is true
 //! testbed   recorded scenes: geometry, renderer, virtual-time trials   (uses eval)
+//! street    a street that moves: truth, network cameras, animation        (uses eval, testbed)
 //! report    the page about a log, judged                              (uses eval)
 //! bench     load on a live cell                                       (starts ecod-node)
-//! demo      a whole cell on this machine                              (uses testbed, starts ecod-node)
+//! demo      a whole cell on this machine                              (uses testbed and street, starts ecod-node)
 //! cli       the program ecod-lab
 //! ```
 
@@ -19,5 +20,6 @@ pub mod demo;
 pub mod eval;
 pub mod node_process;
 pub mod report;
+pub mod street;
 pub mod testbed;
 pub mod traffic;

@@ -107,3 +107,30 @@ fn a_demo_that_is_killed_leaves_no_nodes_behind() {
     demo.wait().unwrap();
     until("all nodes have ended", || working_in(directory.path()).is_empty());
 }
+
+#[test]
+fn in_the_street_the_cell_knows_more_than_any_camera_and_survives_its_edge() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut demo = ecod_lab();
+    demo.args(["demo", "--scene", "street", "--seconds", "10", "--out"]).arg(directory.path());
+    let output = demo.output().unwrap();
+    let told = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{}{told}", stderr(&output));
+    let result: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(directory.path().join("result.json")).unwrap()).unwrap();
+    let street = &result["street"];
+    let known = |how: &str| {
+        let nodes = street[how].as_object().unwrap().values().map(|share| share["known"].as_f64().unwrap());
+        nodes.collect::<Vec<_>>()
+    };
+    let (alone, with_cell) = (known("alone"), known("with_cell"));
+    assert_eq!((alone.len(), with_cell.len()), (4, 4), "{told}");
+    let best_alone = alone.into_iter().fold(0.0, f64::max);
+    assert!(with_cell.iter().all(|known| *known > best_alone + 1.0), "{told}");
+    assert!(street["took_over"].as_str().is_some_and(|leader| leader != "edge"), "nobody took over: {told}");
+    assert!(street["failover_gap_ms"].as_u64().is_none_or(|gap_ms| gap_ms < 5000), "{told}");
+    assert!(street["seen_only_by"]["galileo"].as_u64() > Some(0), "{told}");
+    let film = std::fs::read_to_string(directory.path().join("street.svg")).unwrap();
+    assert!(film.len() < 2_000_000 && film.contains("seen only by galileo") && film.contains("edge is killed"));
+    roxmltree::Document::parse(&film).unwrap();
+}

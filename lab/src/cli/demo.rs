@@ -9,26 +9,33 @@ use clap::Args;
 use ecod::model::time::Timestamp;
 use ecod_actors::cli::{Failure, print};
 use nalgebra::Point2;
+use serde::Serialize;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::testbed::{Results, check_writable, read, select};
+use super::testbed::{check_writable, read, select};
 use super::write_json;
-use crate::demo::{Demo, DemoResult, JudgedTerm, News};
+use crate::demo::street_demo::{KnownShare, StreetDemo, StreetResult};
+use crate::demo::{Demo, DemoResult, JudgedTerm, News, Progress};
 use crate::node_process::{free_address, node_program};
+use crate::street::Street;
+use crate::testbed::Testbed;
 use crate::testbed::birdseye::birdseye;
+use crate::testbed::score::SceneResult;
 use crate::testbed::table::table;
-use crate::testbed::{Scene, Testbed};
 
 /// The recorded parking lots that are shown if no others are given.
 const RECORDED: &str = include_str!("../../../examples/testbed/pace_setup1.json");
 
+/// Name of the street among the scenes.
+const STREET: &str = "street";
+
 /// Flags of `demo`.
 #[derive(Debug, Args)]
 pub(super) struct DemoArguments {
-    /// Scene file [default: the parking lots of the paper's first setup]
+    /// Scene file of parking lots [default: those of the paper's first setup, and the street]
     #[arg(long, value_name = "FILE")]
     scenes: Option<PathBuf>,
-    /// Run this scene only
+    /// Run this scene only; `street` is the street
     #[arg(long, value_name = "NAME")]
     scene: Option<String>,
     /// Time for which each scene is judged
@@ -45,36 +52,32 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
         None => Testbed::from_json(RECORDED).context("the scenes of this program"),
     };
     let testbed = testbed.map_err(Failure::usage)?;
-    let scenes = select(&testbed, arguments.scene.as_deref()).map_err(Failure::usage)?;
+    let is_street = |name: &str| arguments.scenes.is_none() && name == STREET;
+    let wanted = arguments.scene.as_deref();
+    let scenes = match wanted {
+        Some(name) if is_street(name) => Vec::new(),
+        _ => select(&testbed, wanted).map_err(Failure::usage)?,
+    };
+    let with_street = arguments.scenes.is_none() && wanted.is_none_or(is_street);
     let program = node_program()?;
     let runtime = tokio::runtime::Runtime::new().context("no threads for the demo")?;
     let results_file = arguments.out.join("result.json");
     fs::create_dir_all(&arguments.out).with_context(|| format!("cannot make {}", arguments.out.display()))?;
     check_writable(&results_file)?;
-    print(&format!("a cell on this machine: 1 edge, killed half-way, {}\n\n", vehicles(&scenes)))?;
-    let dashboard = free_address()?;
+    let count = scenes.len() + usize::from(with_street);
+    let in_street = with_street.then(|| Street::default().cameras.len());
+    let most = scenes.iter().map(|scene| scene.cavs.len()).chain(in_street).max().unwrap_or(0);
+    print(&format!(
+        "a cell on this machine: 1 edge, killed half-way, {most} nodes that see, report and may lead, {count} scenes\n\n"
+    ))?;
+    let (dashboard, duration) = (free_address()?, Duration::from_secs(arguments.seconds));
     print(&format!("watch it at http://{dashboard}/\n\n"))?;
     let mut results = Vec::with_capacity(scenes.len());
-    let count = scenes.len();
     for (index, scene) in scenes.into_iter().enumerate() {
         let directory = arguments.out.join(file_name(&scene.name));
-        let demo = Demo {
-            program: &program,
-            testbed: &testbed,
-            scene,
-            duration: Duration::from_secs(arguments.seconds),
-            directory: &directory,
-            dashboard,
-        };
+        let demo = Demo { program: &program, testbed: &testbed, scene, duration, directory: &directory, dashboard };
         print(&format!("[{}/{count}] {}: starting {} processes\n", index + 1, scene.name, scene.cavs.len() + 1))?;
-        let outcome = runtime.block_on(until_signalled(demo.run(|progress| {
-            let news = match progress.news {
-                News::Reports(reports) => format!("{reports} reports"),
-                News::EdgeKilled => "the edge is killed".to_owned(),
-                News::EdgeStarted => "the edge is started again".to_owned(),
-            };
-            print(&format!("        {:4.1} s, {news}\n", progress.elapsed.as_secs_f64()))
-        })));
+        let outcome = runtime.block_on(until_signalled(demo.run(tell)));
         let outcome = outcome.with_context(|| format!("scene {}", scene.name))?;
         print(&format!(
             "        {} maps, of which vehicles missed {} in all, {:.1} ms from the cameras to a vehicle's map (median)\n",
@@ -82,21 +85,56 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
             outcome.missed,
             outcome.median_age.as_secs_f64() * 1e3,
         ))?;
-        print(&leaders(&outcome))?;
+        print(&leaders(&outcome.terms, outcome.from, "spots"))?;
         let picture = arguments.out.join(format!("{}.svg", file_name(&scene.name)));
         let svg = birdseye(&testbed, scene, &detections(&outcome), outcome.last_map.as_ref()).context("picture")?;
         fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
         results.push(outcome.result);
     }
-    print(&format!("\n{}\n", table(&results)))?;
-    write_json(&results_file, &Results { scenes: &results })?;
-    Ok(print(&format!("pictures, results, configurations and logs: {}\n", arguments.out.display()))?)
+    let street = if let Some(cameras) = in_street {
+        let processes = cameras + 1;
+        print(&format!("[{count}/{count}] {STREET}: starting {processes} processes and {cameras} network cameras\n"))?;
+        let directory = arguments.out.join(STREET);
+        let demo = StreetDemo { program: &program, duration, directory: &directory, dashboard };
+        let outcome = runtime.block_on(until_signalled(demo.run(tell))).context("the street")?;
+        print(&leaders(&outcome.terms, outcome.from, "objects"))?;
+        let film = arguments.out.join(format!("{STREET}.svg"));
+        fs::write(&film, &outcome.film).with_context(|| format!("cannot write {}", film.display()))?;
+        Some(outcome.result)
+    } else {
+        None
+    };
+    if !results.is_empty() {
+        print(&format!("\n{}", table(&results)))?;
+    }
+    if let Some(street) = &street {
+        print(&format!("\n{}", street_table(street)))?;
+    }
+    write_json(&results_file, &DemoResults { scenes: &results, street })?;
+    Ok(print(&format!("\npictures, results, configurations and logs: {}\n", arguments.out.display()))?)
+}
+
+/// The file of results.
+#[derive(Serialize)]
+struct DemoResults<'a> {
+    scenes: &'a [SceneResult],
+    #[serde(skip_serializing_if = "Option::is_none")]
+    street: Option<StreetResult>,
+}
+
+fn tell(progress: Progress) -> anyhow::Result<()> {
+    let news = match progress.news {
+        News::Reports(reports) => format!("{reports} reports"),
+        News::EdgeKilled => "the edge is killed".to_owned(),
+        News::EdgeStarted => "the edge is started again".to_owned(),
+    };
+    print(&format!("        {:4.1} s, {news}\n", progress.elapsed.as_secs_f64()))
 }
 
 /// Terms of all leaders: times, accuracy, and gap for the vehicles.
-fn leaders(outcome: &DemoResult) -> String {
+fn leaders(terms: &[JudgedTerm], start: Timestamp, judged: &str) -> String {
     let line = |term: &JudgedTerm| {
-        let since = |time: Timestamp| time.since(outcome.from).as_secs_f64();
+        let since = |time: Timestamp| time.since(start).as_secs_f64();
         let (leader, from, until) = (&term.epoch.leader, since(term.from), since(term.until));
         let gap = term.gap.map_or_else(String::new, |gap| {
             format!(
@@ -105,15 +143,44 @@ fn leaders(outcome: &DemoResult) -> String {
             )
         });
         format!(
-            "        {leader} led from {from:.1} to {until:.1} s, {:.1} % of the spots right{gap}\n",
-            term.score.accuracy_pct()
+            "        {leader} led from {from:.1} to {until:.1} s, {:.1} % of the {judged} right{gap}\n",
+            term.right_pct
         )
     };
-    outcome.terms.iter().map(line).collect()
+    terms.iter().map(line).collect()
+}
+
+/// What each node knows of the street, alone and with the cell.
+fn street_table(street: &StreetResult) -> String {
+    let columns =
+        |known: &KnownShare| format!("{:5.1} {:8.1} % {:7.1} %", known.known, known.precision_pct, known.recall_pct);
+    let rows = street.alone.iter().zip(street.with_cell.values());
+    let rows = rows.map(|((node, alone), cell)| format!("{node:<8}{}   {}\n", columns(alone), columns(cell)));
+    let hidden = street
+        .seen_only_by
+        .iter()
+        .map(|(node, people)| format!("people who were seen only by {node} for a while: {people}\n"));
+    let failover = match (&street.took_over, street.failover_gap_ms) {
+        (Some(leader), Some(gap)) => format!("{leader} led after it, first map {gap} ms after the last one before"),
+        (Some(leader), None) => format!("{leader} led already"),
+        (None, _) => "nobody led after it".to_owned(),
+    };
+    format!(
+        "street: {} cars and people, known within 2 m\n{:<8}{:^26}   {:^26}\n{:<8}{}   {}\n{}the edge was killed: {failover}\n{}",
+        street.objects,
+        "",
+        "alone",
+        "with the cell",
+        "",
+        "known  precision    recall",
+        "known  precision    recall",
+        rows.collect::<String>(),
+        hidden.collect::<String>(),
+    )
 }
 
 /// Runs a scene; SIGINT and SIGTERM end it and, with it, its processes.
-async fn until_signalled(scene: impl Future<Output = anyhow::Result<DemoResult>>) -> anyhow::Result<DemoResult> {
+async fn until_signalled<T>(scene: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
     tokio::select! {
         outcome = scene => outcome,
@@ -126,11 +193,6 @@ async fn until_signalled(scene: impl Future<Output = anyhow::Result<DemoResult>>
 fn file_name(scene: &str) -> String {
     let allowed = |c: char| if c.is_alphanumeric() || c == '-' { c } else { '_' };
     scene.chars().map(allowed).collect()
-}
-
-fn vehicles(scenes: &[&Scene]) -> String {
-    let most = scenes.iter().map(|scene| scene.cavs.len()).max().unwrap_or(0);
-    format!("{most} vehicles that see, report and may lead, {} scenes", scenes.len())
 }
 
 /// Where every vehicle placed what it detected.

@@ -8,9 +8,6 @@ use ecod::model::time::Timestamp;
 use ecod::wire::GlobalMap;
 use ecod_actors::messages::newest::ReceivedMap;
 
-use crate::testbed::score::SpotScore;
-use crate::testbed::{Scene, Testbed};
-
 /// A leadership as the vehicles saw it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JudgedTerm {
@@ -23,15 +20,14 @@ pub struct JudgedTerm {
     /// Longest time that a vehicle waited from the last map of another leader to the first of this one; none when there
     /// was no other.
     pub gap: Option<Duration>,
-    /// Accuracy of the maps.
-    pub score: SpotScore,
+    /// Share of what is true that the maps have, in percent.
+    pub right_pct: f64,
 }
 
-/// All leaderships in the order of their terms, from what each vehicle took in its order.
+/// All leaderships in the order of their terms, from what each vehicle took in its order; `right_pct` judges the maps of one.
 pub(super) fn judged_terms<'a>(
-    testbed: &Testbed,
-    scene: &Scene,
     vehicles: impl IntoIterator<Item = &'a [ReceivedMap]>,
+    right_pct: impl Fn(&[&GlobalMap]) -> f64,
 ) -> Vec<JudgedTerm> {
     let mut terms: BTreeMap<Epoch, (JudgedTerm, BTreeMap<u64, &GlobalMap>)> = BTreeMap::new();
     for maps in vehicles {
@@ -41,10 +37,7 @@ pub(super) fn judged_terms<'a>(
             let waited = before.filter(|(last, _)| *last != epoch).map(|(_, at)| received_at.since(at));
             let (term, rounds) = terms.entry(epoch.clone()).or_insert_with(|| {
                 let (from, until) = (*received_at, *received_at);
-                (
-                    JudgedTerm { epoch: epoch.clone(), from, until, gap: None, score: SpotScore::default() },
-                    BTreeMap::new(),
-                )
+                (JudgedTerm { epoch: epoch.clone(), from, until, gap: None, right_pct: 0.0 }, BTreeMap::new())
             });
             term.from = term.from.min(*received_at);
             term.until = term.until.max(*received_at);
@@ -54,7 +47,7 @@ pub(super) fn judged_terms<'a>(
         }
     }
     let judged = |(mut term, rounds): (JudgedTerm, BTreeMap<u64, &GlobalMap>)| {
-        rounds.values().for_each(|map| term.score.judge(testbed, scene, map));
+        term.right_pct = right_pct(&rounds.into_values().collect::<Vec<_>>());
         term
     };
     terms.into_values().map(judged).collect()
@@ -68,8 +61,6 @@ mod tests {
     use ecod::wire::SCHEMA_VERSION;
 
     use super::*;
-
-    const SCENES: &str = include_str!("../../../examples/testbed/pace_setup1.json");
 
     fn taken(leader: &str, epoch: u64, round: u64, at_ms: u64) -> ReceivedMap {
         let map = GlobalMap {
@@ -88,18 +79,17 @@ mod tests {
 
     #[test]
     fn the_gap_of_a_term_is_that_of_the_vehicle_that_waited_longest() {
-        let testbed = Testbed::from_json(SCENES).unwrap();
         let quick = [taken("edge", 1, 1, 0), taken("edge", 1, 2, 100), taken("euclid", 2, 3, 210)];
         let slow = [taken("edge", 1, 1, 5), taken("euclid", 2, 4, 320), taken("edge", 3, 5, 400)];
-        let terms = judged_terms(&testbed, &testbed.scenes[0], [&quick[..], &slow[..]]);
+        let terms = judged_terms([&quick[..], &slow[..]], |maps| maps.len() as f64);
         let told = |term: &JudgedTerm| {
             let (from, until) = (term.from.micros() / 1000, term.until.micros() / 1000);
-            (term.epoch.to_string(), from, until, term.gap.map(|gap| gap.as_millis()))
+            (term.epoch.to_string(), from, until, term.gap.map(|gap| gap.as_millis()), term.right_pct)
         };
         let expected = [
-            ("edge@1".to_owned(), 0, 100, None),
-            ("euclid@2".to_owned(), 210, 320, Some(315)),
-            ("edge@3".to_owned(), 400, 400, Some(80)),
+            ("edge@1".to_owned(), 0, 100, None, 2.0),
+            ("euclid@2".to_owned(), 210, 320, Some(315), 2.0),
+            ("edge@3".to_owned(), 400, 400, Some(80), 1.0),
         ];
         assert_eq!(terms.iter().map(told).collect::<Vec<_>>(), expected);
     }

@@ -37,12 +37,12 @@ struct Seen {
 }
 
 impl ReportCollector {
-    pub(super) async fn start(brokers: Vec<BrokerAddress>, name: NodeName) -> anyhow::Result<Self> {
+    pub(super) async fn start(cell: NodeName, brokers: Vec<BrokerAddress>, name: NodeName) -> anyhow::Result<Self> {
         let seen: Arc<Mutex<Seen>> = Arc::default();
         let kept = Arc::clone(&seen);
         let status = NodeStatus::starting(name, Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
-            cell: NodeName::from_static("testbed"),
+            cell,
             role: SubscriptionRole::Candidate,
             status,
             mqtt: MqttConfig { retry_max_ms: 200, ..MqttConfig::default() },

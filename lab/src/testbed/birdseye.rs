@@ -115,10 +115,10 @@ impl MarkKind {
 }
 
 /// Fill of each vehicle in turn: the colours of Okabe and Ito that are not kin to those of a [`MarkKind`].
-const VEHICLE_COLORS: [&str; 5] = ["#0072b2", "#e69f00", "#cc79a7", "#56b4e9", "#000000"];
+pub(crate) const VEHICLE_COLORS: [&str; 5] = ["#0072b2", "#e69f00", "#cc79a7", "#56b4e9", "#000000"];
 const INK: &str = "#222222";
 const FAINT: &str = "#8a8a8a";
-const FONT: &str = "DejaVu Sans, Verdana, Helvetica, Arial, sans-serif";
+pub(crate) const FONT: &str = "DejaVu Sans, Verdana, Helvetica, Arial, sans-serif";
 /// Height of a line of text in pixels.
 const LINE_PX: f64 = 18.0;
 /// Longest text in characters; the rest is cut.

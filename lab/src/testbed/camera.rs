@@ -5,7 +5,7 @@
 //! as far below the upper end of its card as from its sides, cards stand on the floor, and vehicles hide nothing.
 
 mod render;
-mod sensor;
+pub(crate) mod sensor;
 #[cfg(test)]
 mod tests;
 

@@ -30,7 +30,7 @@ const NOISE_BANK: usize = 1 << 19;
 
 /// The disturbances of one camera.
 #[derive(Debug)]
-pub(super) struct Sensor {
+pub(crate) struct Sensor {
     seed: u64,
     /// Direction and strength of the uneven light, right and downwards.
     gradient: [f64; 2],
@@ -39,7 +39,7 @@ pub(super) struct Sensor {
 }
 
 impl Sensor {
-    pub(super) fn new(still: &Mat, seed: u64) -> Self {
+    pub(crate) fn new(still: &Mat, seed: u64) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let gradient = [0; 2].map(|_| rng.random_range(-GRADIENT..=GRADIENT));
         let row_values = 3 * still.cols().unsigned_abs() as usize;
@@ -48,7 +48,7 @@ impl Sensor {
     }
 
     /// The view as the camera takes it at frame `index`.
-    pub(super) fn expose(&self, still: &Mat, index: u64) -> Result<Mat, RenderError> {
+    pub(crate) fn expose(&self, still: &Mat, index: u64) -> Result<Mat, RenderError> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         rng.set_stream(index.wrapping_add(1));
         let shaken = shake(still, &mut rng)?;
