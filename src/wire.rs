@@ -99,6 +99,10 @@ pub struct ObjectReport {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(9), with = "Single", has_nil)]
     pub frame_yaw_rate_radps: Option<f64>,
+    /// False if the reporter is a fixed camera, which is no object of the map; absent for a vehicle.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(10)]
+    pub moving: Option<bool>,
 }
 
 impl ObjectReport {
@@ -115,6 +119,7 @@ impl ObjectReport {
             view: None,
             clock_error_us: None,
             frame_yaw_rate_radps: None,
+            moving: None,
         }
     }
 }

@@ -122,6 +122,20 @@ fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
 }
 
 #[test]
+fn a_fixed_camera_is_no_object() {
+    let mut tracker = Tracker::new(TracksConfig::default(), ReputationConfig::default());
+    let mut round = TracksRound::default();
+    for frame in 0..20 {
+        let pose = Some(WirePose { x_m: 0.0, y_m: 0.0, heading_rad: 0.0 });
+        let seen = ObjectReport { pose, moving: Some(false), ..report("mast", frame, vec![car(10.0, 0.2)]) };
+        tracker.observe(seen, at(frame));
+        round = tracker.close(at(frame));
+    }
+    let [object] = &round.objects[..] else { panic!("{:?}", round.objects) };
+    assert!(near(object, 10.0, 0.0, 1.0) && object.vehicle.is_none());
+}
+
+#[test]
 fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
     let mut tracker = tracker();
     let mut ids = BTreeSet::new();

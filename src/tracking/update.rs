@@ -126,7 +126,7 @@ impl<'a> ReportUpdate<'a> {
 
     /// Updates or spawns the track of the vehicle itself from its pose; no other report may do so.
     fn update_own_track(&mut self) {
-        let Some(pose) = self.report.pose else { return };
+        let Some(pose) = self.report.pose.filter(|_| self.report.moving != Some(false)) else { return };
         let sigma_m = (self.config.vehicle_radius_m / 2.0).max(self.config.noise_floor_m);
         let measurement = Measurement {
             position: self.sensor.registration.corrector()(&Vector2::new(pose.x_m, pose.y_m)),

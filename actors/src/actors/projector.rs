@@ -45,6 +45,8 @@ pub struct ProjectorArguments {
     pub origin: Option<GeographicOrigin>,
     /// True for a moving vehicle, whose poses are received.
     pub is_moving: bool,
+    /// True for a fixed camera.
+    pub is_fixed: bool,
     /// UDP address for these poses, with the projectors of the other cameras; for one of the cameras.
     pub poses: Option<(SocketAddr, Vec<ActorSlot<ProjectorMessage>>)>,
     /// Algorithms to report for.
@@ -70,6 +72,7 @@ pub struct ProjectorState {
     perception: Perception,
     standing: Option<Pose>,
     origin: Option<GeographicOrigin>,
+    is_fixed: bool,
     /// Recent poses of a moving vehicle.
     poses: Option<PoseHistory>,
     /// True once the log has said why a pose is not used.
@@ -99,6 +102,7 @@ impl Actor for Projector {
             standing,
             origin,
             is_moving,
+            is_fixed,
             poses,
             algorithms,
             clock,
@@ -115,6 +119,7 @@ impl Actor for Projector {
             perception,
             standing,
             origin,
+            is_fixed,
             poses: is_moving.then(PoseHistory::default),
             is_pose_problem_logged: false,
             algorithms,
@@ -200,6 +205,7 @@ impl ProjectorState {
         }
         let ClockReading { offset_us, error_us } = self.clock.reading();
         (report.captured_at_us, report.clock_error_us) = (captured_at.shifted(offset_us), error_us);
+        report.moving = self.is_fixed.then_some(false);
         self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
         if let Some(cause) = self.perception.without_size() {
             self.troubles.note(TroubleKind::NoSize, &cause);

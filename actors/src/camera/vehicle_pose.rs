@@ -36,6 +36,9 @@ pub struct PoseConfig {
     /// a pose near its time is not reported. Default none: the vehicle stands still.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub listen: Option<SocketAddr>,
+    /// False for a camera at the road, which is no object of the map. Default true, a vehicle, even while it stands.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub moving: Option<bool>,
 }
 
 impl PoseConfig {
@@ -44,6 +47,9 @@ impl PoseConfig {
     /// # Errors
     /// [`ConfigError`] naming the first key that is out of range, missing or of the other kind.
     pub fn validate(&self) -> Result<(), ConfigError> {
+        if self.is_fixed() && self.listen.is_some() {
+            return Err(ConfigError::new("moving", false, "true, or absent, beside `listen`: what stands receives no poses"));
+        }
         check_range("x_m", self.x_m, -1e8, 1e8)?;
         check_range("y_m", self.y_m, -1e8, 1e8)?;
         check_range("heading_deg", self.heading_deg, -360.0, 360.0)?;
@@ -74,6 +80,11 @@ impl PoseConfig {
             }
             _ => Ok(()),
         }
+    }
+
+    /// True for a camera at the road.
+    pub fn is_fixed(&self) -> bool {
+        self.moving == Some(false)
     }
 
     /// The constant pose.

@@ -40,7 +40,7 @@ use super::stage::{Played, Progress, Stage};
 use crate::eval::tracks::{MATCH_DISTANCE_M, SaidObject, ScoredFrame, score};
 use crate::street::film::{Film, KnownMap};
 use crate::street::network_camera::{FRAMES_PER_S, NetworkCamera};
-use crate::street::{Street, StreetCamera};
+use crate::street::{Carrier, Street, StreetCamera};
 
 /// The street to be run live.
 #[derive(Debug, Clone, Copy)]
@@ -220,6 +220,7 @@ fn node(street: &Street, camera: &StreetCamera, url: String, poses: Option<Socke
             y_m: pose.position.y,
             heading_deg: pose.heading_rad.to_degrees(),
             listen: poses,
+            moving: matches!(camera.carrier, Carrier::Mast(_)).then_some(false),
             ..PoseConfig::default()
         },
         camera: Some(config),

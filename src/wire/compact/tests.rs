@@ -43,6 +43,7 @@ fn every_field_of_every_payload_survives() {
     survives(&ObjectReport {
         view: Some(FieldOfView { range_m: 60.0, angle_rad: 6.25 }),
         frame_yaw_rate_radps: Some(-0.375),
+        moving: Some(false),
         ..report_without_rounding()
     });
     let fused_at_us = Timestamp(1_732_154_400_123_456);

@@ -25,6 +25,7 @@ impl NodeBuilder {
             standing: self.standing_pose(),
             origin: self.config.origin,
             is_moving: self.config.pose.listen.is_some(),
+            is_fixed: self.config.pose.is_fixed(),
             poses: self.config.pose.listen.filter(|_| place == 0).map(|address| (address, others)),
             algorithms: camera::algorithms(&self.config, camera),
             clock: self.clock.clone(),

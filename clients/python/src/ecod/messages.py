@@ -129,6 +129,7 @@ class ObjectReport:
     clock_error_us: Optional[Count] = None
     # Of a frame that turns, counter-clockwise, as one that is fixed to a vehicle does.
     frame_yaw_rate_radps: Optional[YawRate] = None
+    moving: Optional[bool] = None
 
 
 @dataclass(frozen=True)
