@@ -180,7 +180,7 @@ impl FilmScene<'_> {
             Some(restarted_at) if at >= restarted_at => format!("{} is started again", film.edge),
             _ => format!("{} is killed", film.edge),
         };
-        let middle = round(width / 2.0);
+        let middle = round(width * 0.45);
         Group::new()
             .add(
                 self.switched(leader)
