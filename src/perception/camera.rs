@@ -7,6 +7,7 @@
 use nalgebra::{Matrix3, Point2, Point3, Vector3};
 
 use crate::model::geometry::Pose;
+use crate::wire::WirePose;
 
 /// Focal lengths and principal point of an image, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -101,6 +102,14 @@ impl Mount {
         }
     }
 
+    /// The pose of the camera as reports state it, with what is known of its height and tilt. Without a height, an axis
+    /// that is level in the configuration says nothing.
+    pub fn stated_pose(&self, camera: &Pose) -> WirePose {
+        let known = |angle_rad| (self.height_m.is_some() || self.is_tilted()).then_some(angle_rad);
+        let (pitch_rad, roll_rad) = (known(self.pitch_rad), known(self.roll_rad));
+        WirePose { height_m: self.height_m, pitch_rad, roll_rad, ..(*camera).into() }
+    }
+
     /// True if the axis is not level, or the camera leans.
     pub fn is_tilted(&self) -> bool {
         self.pitch_rad != 0.0 || self.roll_rad != 0.0
@@ -147,5 +156,18 @@ mod tests {
         let rolled = Mount { roll_rad: 0.3, ..Mount::default() }.to_level() * right;
         assert!((rolled - Vector3::new(0.0, -(0.3f64.cos()), -(0.3f64.sin()))).norm() < 1e-12);
         assert_eq!(Mount::default().to_level() * Vector3::new(1.0, 2.0, 3.0), Vector3::new(3.0, -1.0, -2.0));
+    }
+
+    #[test]
+    fn a_report_states_of_a_mount_what_is_known() {
+        let camera = Pose::new(1.0, 2.0, 0.5);
+        let tilt = |pitch_rad, height_m| {
+            let stated = Mount { pitch_rad, height_m, ..Mount::default() }.stated_pose(&camera);
+            assert_eq!((stated.x_m, stated.y_m, stated.heading_rad), (1.0, 2.0, 0.5));
+            (stated.height_m, stated.pitch_rad, stated.roll_rad)
+        };
+        assert_eq!(tilt(0.0, None), (None, None, None));
+        assert_eq!(tilt(0.0, Some(1.3)), (Some(1.3), Some(0.0), Some(0.0)));
+        assert_eq!(tilt(0.1, None), (None, Some(0.1), Some(0.0)));
     }
 }
