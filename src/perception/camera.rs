@@ -115,6 +115,18 @@ impl Mount {
         self.pitch_rad != 0.0 || self.roll_rad != 0.0
     }
 
+    /// Distances in metres of the ground at the lower and the upper edge of the image's middle column; the upper one is
+    /// infinite at the horizon. `None` without a height, or without ground in view.
+    pub fn ground_in_view(&self, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
+        let height_m = self.height_m?;
+        let distance_m = |row_px: f64| {
+            let ray = self.to_level() * intrinsics.ray(&Point2::new(intrinsics.cx, row_px));
+            if ray.z < 0.0 { height_m * ray.x.hypot(ray.y) / -ray.z } else { f64::INFINITY }
+        };
+        let [near_m, far_m] = [f64::from(intrinsics.height), 0.0].map(distance_m);
+        near_m.is_finite().then_some([near_m, far_m])
+    }
+
     /// The rotation from the camera frame to the level frame.
     pub fn to_level(&self) -> Matrix3<f64> {
         let ((sin_pitch, cos_pitch), (sin_roll, cos_roll)) = (self.pitch_rad.sin_cos(), self.roll_rad.sin_cos());
@@ -156,6 +168,19 @@ mod tests {
         let rolled = Mount { roll_rad: 0.3, ..Mount::default() }.to_level() * right;
         assert!((rolled - Vector3::new(0.0, -(0.3f64.cos()), -(0.3f64.sin()))).norm() < 1e-12);
         assert_eq!(Mount::default().to_level() * Vector3::new(1.0, 2.0, 3.0), Vector3::new(3.0, -1.0, -2.0));
+    }
+
+    #[test]
+    fn a_tilted_camera_sees_the_ground_from_a_near_edge_to_a_far_one_or_the_horizon() {
+        let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 40f64.to_radians());
+        let view = |height_m, pitch_deg: f64| {
+            Mount { height_m, pitch_rad: pitch_deg.to_radians(), ..Mount::default() }.ground_in_view(&camera)
+        };
+        let [near_m, far_m] = view(Some(2.0), 30.0).unwrap();
+        let expected = [50f64, 10.0].map(|below_deg| 2.0 / below_deg.to_radians().tan());
+        assert!((near_m - expected[0]).abs() < 1e-9 && (far_m - expected[1]).abs() < 1e-9, "{near_m} {far_m}");
+        assert_eq!(view(Some(2.0), 10.0).map(|[_, far_m]| far_m), Some(f64::INFINITY));
+        assert_eq!((view(Some(2.0), -30.0), view(None, 30.0)), (None, None));
     }
 
     #[test]

@@ -156,7 +156,9 @@ mod tests {
         assert_eq!(compact, cbor);
         let finite = report.objects.iter().all(|o| o.x_m.is_finite() && o.confidence.is_finite());
         // JSON has no word for a number that is none.
-        if finite && report.pose.is_none_or(|pose| pose.heading_rad.is_finite() && pose.pitch_rad.is_none_or(f64::is_finite)) {
+        if finite
+            && report.pose.is_none_or(|pose| pose.heading_rad.is_finite() && pose.pitch_rad.is_none_or(f64::is_finite))
+        {
             let json = decode_report(&encode(report, Encoding::Json), &node(), &Limits::default()).err();
             assert_eq!(json, cbor);
         }
