@@ -76,6 +76,7 @@ async fn main() -> anyhow::Result<()> {
     let edge = edge.await?;
 
     let camera = CameraConfig {
+        name: None,
         source: SourceConfig::Images { path: frames, fps: 10.0, looping: true },
         capture: Default::default(),
         optics: OpticsConfig::default(),

@@ -54,6 +54,7 @@ pub fn cav(testbed: &Testbed, scene: &Scene, cav: &Cav, source: SourceConfig) ->
     let (placard, intrinsics) = (&testbed.placard, &testbed.camera.intrinsics);
     let half_angle = |pixels: u32, focal: f64| (f64::from(pixels) / 2.0 / focal).atan();
     let camera = CameraConfig {
+        name: None,
         source,
         capture: CaptureConfig::default(),
         optics: OpticsConfig {
