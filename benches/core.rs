@@ -193,7 +193,7 @@ fn report(vehicle: usize, objects: usize, landmarks: usize, side: usize) -> Obje
         }
     };
     ObjectReport {
-        pose: Some(WirePose { x_m: 0.6096, y_m: 0.4572, heading_rad: 2.8798 }),
+        pose: Some(WirePose::new(0.6096, 0.4572, 2.8798)),
         objects: (0..objects).map(object).collect(),
         seen: Some((0..objects).map(|n| format!("l{}", (first + n) % landmarks).into()).collect()),
         ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).expect("a valid name"), 1, NOON)

@@ -78,7 +78,7 @@ fn recording(topic: &str) -> Vec<String> {
                 }
             };
             let report = ObjectReport {
-                pose: (topic == "detections").then_some(WirePose { x_m: 0.6096, y_m: 0.4572, heading_rad: 2.8798 }),
+                pose: (topic == "detections").then_some(WirePose::new(0.6096, 0.4572, 2.8798)),
                 objects: (0..OBJECTS).map(object).collect(),
                 ..ObjectReport::new(
                     NodeName::new(format!("v{vehicle}")).expect("a valid name"),

@@ -73,7 +73,7 @@ fn report(observer: u32, observers: u32, frame: u64, now: Timestamp) -> ObjectRe
         PerceivedObject::new("car", 0.5 + (n % 50) as f64 / 100.0, x_m, y_m)
     };
     let middle = across as f64 / 2.0 + 0.5;
-    let pose = WirePose { x_m: (column + middle) * SPACING_M, y_m: (row + middle) * SPACING_M, heading_rad: 0.0 };
+    let pose = WirePose::new((column + middle) * SPACING_M, (row + middle) * SPACING_M, 0.0);
     let node = NodeName::new(format!("v{observer}")).expect("a valid name");
     ObjectReport {
         pose: Some(pose),

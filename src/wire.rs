@@ -136,6 +136,25 @@ pub struct WirePose {
     /// Direction of the camera's axis in radians, counter-clockwise from east.
     #[cbor(n(2), with = "Single")]
     pub heading_rad: f64,
+    /// Height of the camera above the ground in metres; absent when it is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(3), with = "Millimetres", has_nil)]
+    pub height_m: Option<f64>,
+    /// Angle of the camera's axis below the horizon in radians; absent when it is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(4), with = "Single", has_nil)]
+    pub pitch_rad: Option<f64>,
+    /// Angle in radians by which the camera leans to its right; absent when it is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cbor(n(5), with = "Single", has_nil)]
+    pub roll_rad: Option<f64>,
+}
+
+impl WirePose {
+    /// A pose in the plane, in metres and radians; nothing else is known.
+    pub fn new(x_m: f64, y_m: f64, heading_rad: f64) -> Self {
+        Self { x_m, y_m, heading_rad, height_m: None, pitch_rad: None, roll_rad: None }
+    }
 }
 
 impl From<WirePose> for Pose {
@@ -146,7 +165,7 @@ impl From<WirePose> for Pose {
 
 impl From<Pose> for WirePose {
     fn from(pose: Pose) -> Self {
-        Self { x_m: pose.position.x, y_m: pose.position.y, heading_rad: pose.heading_rad }
+        Self::new(pose.position.x, pose.position.y, pose.heading_rad)
     }
 }
 

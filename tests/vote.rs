@@ -62,7 +62,7 @@ fn silence_and_votes_without_weight_leave_no_verdict() {
     assert!(vote.close(START).verdicts.is_empty());
     vote.observe(&report("a", 1, START, &[("x", "cup", 0.0)]), START).unwrap();
     let mut far = report("b", 1, START, &[("x", "cup", 0.9)]);
-    far.pose = Some(WirePose { x_m: 60.0, y_m: 0.0, heading_rad: 0.0 });
+    far.pose = Some(WirePose::new(60.0, 0.0, 0.0));
     vote.observe(&far, START).unwrap();
     assert_eq!(vote.ignored(), 2);
     assert!(vote.close(START).verdicts.is_empty());

@@ -35,7 +35,7 @@ fn reports(seq: u64, at: Timestamp, statements: &[Statement], scale: f64) -> Vec
     }
     let report = |(vehicle, (distance, objects)): (usize, (f64, Vec<PerceivedObject>))| ObjectReport {
         objects,
-        pose: Some(WirePose { x_m: -distance, y_m: 0.0, heading_rad: 0.0 }),
+        pose: Some(WirePose::new(-distance, 0.0, 0.0)),
         ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).unwrap(), seq, at)
     };
     objects.into_iter().map(report).collect()

@@ -86,7 +86,7 @@ fn wire((vehicle, (x_m, y_m, heading_rad), detections): &Report, seq: u64) -> Ob
         ..PerceivedObject::new(LABELS[label], confidence, PLACES[place].0, PLACES[place].1)
     };
     ObjectReport {
-        pose: Some(WirePose { x_m: *x_m, y_m: *y_m, heading_rad: *heading_rad }),
+        pose: Some(WirePose::new(*x_m, *y_m, *heading_rad)),
         objects: detections.iter().map(object).collect(),
         ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).unwrap(), seq, START + Duration::from_millis(seq))
     }

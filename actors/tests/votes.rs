@@ -334,7 +334,7 @@ async fn votes_that_cannot_count_are_counted() {
     };
     let unsure = || spoilt(|r| r.objects[0].confidence = -0.5);
     until("confidence", || send(&unsure()), || rejects(RejectReason::ConfidenceOutOfRange) > 0).await;
-    let far = || spoilt(|r| r.pose = Some(ecod::wire::WirePose { x_m: 900.0, y_m: 0.0, heading_rad: 0.0 }));
+    let far = || spoilt(|r| r.pose = Some(ecod::wire::WirePose::new(900.0, 0.0, 0.0)));
     let before = events(Event::VoteIgnored);
     until("beyond range", || send(&far()), || events(Event::VoteIgnored) > before).await;
     let right = || verdict(&euclid).is_some_and(|v| v.label.as_deref() == Some("cup"));

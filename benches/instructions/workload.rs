@@ -145,7 +145,7 @@ fn reports(round: usize, captured_at: Timestamp) -> Vec<ObjectReport> {
         }
     };
     let report = |vehicle: usize| ObjectReport {
-        pose: Some(WirePose { x_m: 0.6, y_m: 0.5, heading_rad: 0.8 }),
+        pose: Some(WirePose::new(0.6, 0.5, 0.8)),
         objects: (0..OBJECTS).map(|n| object(vehicle, n)).collect(),
         ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).expect("a valid name"), round as u64 + 1, captured_at)
     };

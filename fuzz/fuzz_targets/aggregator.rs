@@ -75,11 +75,7 @@ fuzz_target!(|cell: Cell| {
         match step {
             Step::Report { votes, vehicle, age_ms, pose, view, objects, seen } => {
                 let report = ObjectReport {
-                    pose: pose.map(|[x, y, heading]| WirePose {
-                        x_m: x.into(),
-                        y_m: y.into(),
-                        heading_rad: f64::from(heading) / 100.0,
-                    }),
+                    pose: pose.map(|[x, y, heading]| WirePose::new(x.into(), y.into(), f64::from(heading) / 100.0)),
                     view: view.map(|(range, angle)| FieldOfView {
                         range_m: range.into(),
                         angle_rad: f64::from(angle) / 40.0,

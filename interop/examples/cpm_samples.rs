@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             ..PerceivedObject::new(*label, 0.93, 12.34 * step, -3.1 - step)
         }
     });
-    let pose = Some(WirePose { x_m: 10.0, y_m: 20.0, heading_rad: 0.0 });
+    let pose = Some(WirePose::new(10.0, 20.0, 0.0));
     let objects: Vec<_> = objects.collect();
     let report = ObjectReport { objects, pose, ..ObjectReport::new(NodeName::from_static("euclid"), 5, at) };
     print(&encode_report(&report, &origin, 1234)?);

@@ -40,7 +40,7 @@ fn log(directory: &Path) -> Vec<u8> {
     for map in vehicle.maps() {
         with_car += usize::from(map.unwrap().objects.iter().any(|object| object.label == "car"));
         let car = PerceivedObject { heading_rad: Some(1.5), ..PerceivedObject::new("car", 0.93, 12.5, -3.0) };
-        let pose = Some(WirePose { x_m: 1.0, y_m: 6.0, heading_rad: -1.57 });
+        let pose = Some(WirePose::new(1.0, 6.0, -1.57));
         vehicle.report(Frame { pose, ..Frame::new(vec![car]) }).unwrap();
         assert!(began.elapsed() < Duration::from_secs(30));
         if with_car >= 10 {

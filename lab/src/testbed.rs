@@ -27,6 +27,7 @@ use nalgebra::Point2;
 
 pub use file::TestbedError;
 pub use recording::{IntersectionRecording, KnownObject};
+use sight::NEAR_M;
 pub use sight::{Hit, Sighting};
 
 /// Scenes that share one kind of camera and one kind of placard.

@@ -7,6 +7,7 @@
 use nalgebra::{Matrix3, Point2, Point3, Vector3};
 
 use crate::model::geometry::Pose;
+use crate::wire::WirePose;
 
 /// Focal lengths and principal point of an image, in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -101,9 +102,29 @@ impl Mount {
         }
     }
 
+    /// The pose of the camera as reports state it, with what is known of its height and tilt. Without a height, an axis
+    /// that is level in the configuration says nothing.
+    pub fn stated_pose(&self, camera: &Pose) -> WirePose {
+        let known = |angle_rad| (self.height_m.is_some() || self.is_tilted()).then_some(angle_rad);
+        let (pitch_rad, roll_rad) = (known(self.pitch_rad), known(self.roll_rad));
+        WirePose { height_m: self.height_m, pitch_rad, roll_rad, ..(*camera).into() }
+    }
+
     /// True if the axis is not level, or the camera leans.
     pub fn is_tilted(&self) -> bool {
         self.pitch_rad != 0.0 || self.roll_rad != 0.0
+    }
+
+    /// Distances in metres of the ground at the lower and the upper edge of the image's middle column; the upper one is
+    /// infinite at the horizon. `None` without a height, or without ground in view.
+    pub fn ground_in_view(&self, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
+        let height_m = self.height_m?;
+        let distance_m = |row_px: f64| {
+            let ray = self.to_level() * intrinsics.ray(&Point2::new(intrinsics.cx, row_px));
+            if ray.z < 0.0 { height_m * ray.x.hypot(ray.y) / -ray.z } else { f64::INFINITY }
+        };
+        let [near_m, far_m] = [f64::from(intrinsics.height), 0.0].map(distance_m);
+        near_m.is_finite().then_some([near_m, far_m])
     }
 
     /// The rotation from the camera frame to the level frame.
@@ -147,5 +168,31 @@ mod tests {
         let rolled = Mount { roll_rad: 0.3, ..Mount::default() }.to_level() * right;
         assert!((rolled - Vector3::new(0.0, -(0.3f64.cos()), -(0.3f64.sin()))).norm() < 1e-12);
         assert_eq!(Mount::default().to_level() * Vector3::new(1.0, 2.0, 3.0), Vector3::new(3.0, -1.0, -2.0));
+    }
+
+    #[test]
+    fn a_tilted_camera_sees_the_ground_from_a_near_edge_to_a_far_one_or_the_horizon() {
+        let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 40f64.to_radians());
+        let view = |height_m, pitch_deg: f64| {
+            Mount { height_m, pitch_rad: pitch_deg.to_radians(), ..Mount::default() }.ground_in_view(&camera)
+        };
+        let [near_m, far_m] = view(Some(2.0), 30.0).unwrap();
+        let expected = [50f64, 10.0].map(|below_deg| 2.0 / below_deg.to_radians().tan());
+        assert!((near_m - expected[0]).abs() < 1e-9 && (far_m - expected[1]).abs() < 1e-9, "{near_m} {far_m}");
+        assert_eq!(view(Some(2.0), 10.0).map(|[_, far_m]| far_m), Some(f64::INFINITY));
+        assert_eq!((view(Some(2.0), -30.0), view(None, 30.0)), (None, None));
+    }
+
+    #[test]
+    fn a_report_states_of_a_mount_what_is_known() {
+        let camera = Pose::new(1.0, 2.0, 0.5);
+        let tilt = |pitch_rad, height_m| {
+            let stated = Mount { pitch_rad, height_m, ..Mount::default() }.stated_pose(&camera);
+            assert_eq!((stated.x_m, stated.y_m, stated.heading_rad), (1.0, 2.0, 0.5));
+            (stated.height_m, stated.pitch_rad, stated.roll_rad)
+        };
+        assert_eq!(tilt(0.0, None), (None, None, None));
+        assert_eq!(tilt(0.0, Some(1.3)), (Some(1.3), Some(0.0), Some(0.0)));
+        assert_eq!(tilt(0.1, None), (None, Some(0.1), Some(0.0)));
     }
 }

@@ -16,12 +16,14 @@ mod corners;
 mod estimate;
 mod ground;
 mod level_sight;
+mod mount_fit;
 mod paper;
 
 use nalgebra::{Matrix3, Point3};
 
 pub use config::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ground::HalfDepth;
+pub use mount_fit::{MIN_BOXES, MountEstimate, MountFitError, fit_mount};
 
 use crate::model::detection::Detection;
 use crate::model::geometry::{Covariance, Pose};

@@ -75,7 +75,7 @@ impl PosedCamera {
     }
 
     /// The pixel of a point on the ground, or as high as the camera if its height is not known; `None` behind the camera.
-    fn pixel(&self, point: &Point2<f64>) -> Option<Point2<f64>> {
+    pub fn pixel(&self, point: &Point2<f64>) -> Option<Point2<f64>> {
         let (range_m, bearing_rad) = self.pose.range_bearing(point);
         let up_m = -self.height_m.unwrap_or(0.0);
         let level = Vector3::new(range_m * bearing_rad.cos(), range_m * bearing_rad.sin(), up_m);

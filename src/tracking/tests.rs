@@ -110,7 +110,7 @@ fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
         let x_m = frame as f64 * 0.5;
         for (node, x_m, sees) in [("euclid", x_m, x_m + 0.4), ("gauss", 30.0, x_m - 0.5)] {
             // euclid detects its own bonnet, gauss detects euclid.
-            let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+            let pose = Some(WirePose::new(x_m, 0.0, 0.0));
             tracker.observe(ObjectReport { pose, ..report(node, frame, vec![car(sees, 0.2)]) }, at(frame));
         }
         round = tracker.close(at(frame));
@@ -126,7 +126,7 @@ fn a_fixed_camera_is_no_object() {
     let mut tracker = Tracker::new(TracksConfig::default(), ReputationConfig::default());
     let mut round = TracksRound::default();
     for frame in 0..20 {
-        let pose = Some(WirePose { x_m: 0.0, y_m: 0.0, heading_rad: 0.0 });
+        let pose = Some(WirePose::new(0.0, 0.0, 0.0));
         let seen = ObjectReport { pose, moving: Some(false), ..report("mast", frame, vec![car(10.0, 0.2)]) };
         tracker.observe(seen, at(frame));
         round = tracker.close(at(frame));
@@ -141,7 +141,7 @@ fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
     let mut ids = BTreeSet::new();
     for frame in 0..40 {
         let x_m = if frame < 20 { 0.0 } else { 500.0 };
-        let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+        let pose = Some(WirePose::new(x_m, 0.0, 0.0));
         tracker.observe(ObjectReport { pose, ..report("euclid", frame, vec![]) }, at(frame));
         let round = tracker.close(at(frame));
         let [vehicle] = &*round.objects else { panic!("{:?}", round.objects) };
@@ -158,7 +158,7 @@ fn nobody_overlooks_a_vehicle_where_it_no_longer_is() {
         let mut tracker = tracker();
         let mut round = TracksRound::default();
         for frame in 0..=20 {
-            let pose = |x_m| Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+            let pose = |x_m| Some(WirePose::new(x_m, 0.0, 0.0));
             let place = pose(if frame < 20 { 0.0 } else { 500.0 });
             tracker.observe(ObjectReport { pose: place, ..report("euclid", frame, vec![]) }, at(frame));
             let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
@@ -180,7 +180,7 @@ fn nobody_overlooks_a_vehicle_where_it_no_longer_is() {
 fn the_pose_that_spawns_a_track_is_not_counted_twice() {
     let mut tracker = tracker();
     for frame in 0..2 {
-        let pose = Some(WirePose { x_m: frame as f64, y_m: 0.0, heading_rad: 0.0 });
+        let pose = Some(WirePose::new(frame as f64, 0.0, 0.0));
         tracker.observe(ObjectReport { pose, ..report("euclid", 0, vec![]) }, at(0));
         let round = tracker.close(at(0));
         let variance = round.objects[0].covariance_m2[0];
@@ -272,7 +272,7 @@ fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
 fn a_view_has_its_stated_angle_and_no_more_than_all_around() {
     let sees = |angle_rad: f64, bearing_rad: f64| {
         let mut coverage = Coverage::default();
-        let pose = Some(WirePose { x_m: 10.0, y_m: -5.0, heading_rad: 2.0 });
+        let pose = Some(WirePose::new(10.0, -5.0, 2.0));
         let stated = Some(FieldOfView { range_m: 50.0, angle_rad });
         coverage.observe(&ObjectReport { pose, view: stated, ..report("euclid", 0, vec![]) });
         coverage
@@ -440,7 +440,7 @@ proptest! {
         let mut tracker = tracker();
         for (frame, reports) in rounds.into_iter().enumerate() {
             for (seq, (node, lag, objects, pose)) in reports.into_iter().enumerate() {
-                let pose = pose.map(|(x_m, heading_rad)| WirePose { x_m, y_m: 0.0, heading_rad });
+                let pose = pose.map(|(x_m, heading_rad)| WirePose::new(x_m, 0.0, heading_rad));
                 let seq = (frame * 10 + seq) as u64;
                 let report = ObjectReport { pose, seq, ..report(&format!("v{node}"), frame as u64, objects) };
                 tracker.observe(report, at(frame as u64 + 10 - lag));

@@ -138,7 +138,7 @@ mod tests {
 
     fn report() -> ObjectReport {
         ObjectReport {
-            pose: Some(WirePose { x_m: 0.61, y_m: 0.46, heading_rad: 2.88 }),
+            pose: Some(WirePose::new(0.61, 0.46, 2.88)),
             objects: vec![PerceivedObject {
                 covariance_m2: Some([0.0004, 0.0, 0.0001]),
                 landmark: Some("slot-0".into()),
@@ -156,7 +156,9 @@ mod tests {
         assert_eq!(compact, cbor);
         let finite = report.objects.iter().all(|o| o.x_m.is_finite() && o.confidence.is_finite());
         // JSON has no word for a number that is none.
-        if finite && report.pose.is_none_or(|pose| pose.heading_rad.is_finite()) {
+        if finite
+            && report.pose.is_none_or(|pose| pose.heading_rad.is_finite() && pose.pitch_rad.is_none_or(f64::is_finite))
+        {
             let json = decode_report(&encode(report, Encoding::Json), &node(), &Limits::default()).err();
             assert_eq!(json, cbor);
         }
@@ -166,7 +168,7 @@ mod tests {
     #[test]
     fn each_flaw_of_a_report_has_its_reason() {
         type Flaw = (fn(&mut ObjectReport), RejectReason);
-        let flaws: [Flaw; 24] = [
+        let flaws: [Flaw; 27] = [
             (|r| r.schema = 2, RejectReason::UnknownSchema),
             (|r| r.schema = 0, RejectReason::UnknownSchema),
             (|r| r.node = NodeName::new("gauss").unwrap(), RejectReason::NodeMismatch),
@@ -175,7 +177,10 @@ mod tests {
             (|r| r.objects[0].x_m = f64::NAN, RejectReason::NotFinite),
             (|r| r.objects[0].x_m = f64::INFINITY, RejectReason::NotFinite),
             (|r| r.objects[0].x_m = 1e9, RejectReason::NotFinite),
-            (|r| r.pose = Some(WirePose { x_m: 0.0, y_m: 0.0, heading_rad: f64::NAN }), RejectReason::NotFinite),
+            (|r| r.pose = Some(WirePose::new(0.0, 0.0, f64::NAN)), RejectReason::NotFinite),
+            (|r| r.pose.as_mut().unwrap().height_m = Some(-0.1), RejectReason::OutOfRange),
+            (|r| r.pose.as_mut().unwrap().pitch_rad = Some(f64::NAN), RejectReason::NotFinite),
+            (|r| r.pose.as_mut().unwrap().roll_rad = Some(1e9), RejectReason::OutOfRange),
             (|r| r.objects[0].covariance_m2 = Some([-1.0, 0.0, 1.0]), RejectReason::NotFinite),
             (|r| r.objects[0].covariance_m2 = Some([1.0, 2.0, 1.0]), RejectReason::NotFinite),
             (|r| r.objects[0].confidence = 2.0, RejectReason::ConfidenceOutOfRange),
@@ -284,7 +289,7 @@ mod tests {
             objects in collection::vec(object(), 0..20),
             seen in option::of(collection::vec("[a-z]{1,8}", 0..5)),
         ) -> ObjectReport {
-            ObjectReport { pose: pose.map(|(x_m, y_m, heading_rad)| WirePose { x_m, y_m, heading_rad }), objects, seen: seen.map(|ids| ids.into_iter().map(Into::into).collect()), ..ObjectReport::new(node(), seq, Timestamp(captured_at)) }
+            ObjectReport { pose: pose.map(|(x_m, y_m, heading_rad)| WirePose::new(x_m, y_m, heading_rad)), objects, seen: seen.map(|ids| ids.into_iter().map(Into::into).collect()), ..ObjectReport::new(node(), seq, Timestamp(captured_at)) }
         }
     }
 

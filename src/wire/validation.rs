@@ -154,6 +154,10 @@ impl ObjectReport {
             check_coordinate(pose.x_m).map_err(of("pose.x_m"))?;
             check_coordinate(pose.y_m).map_err(of("pose.y_m"))?;
             check_between(pose.heading_rad, f64::MIN, f64::MAX).map_err(of("pose.heading_rad"))?;
+            let check = |value: Option<f64>, low, high| value.map_or(Ok(()), |value| check_between(value, low, high));
+            check(pose.height_m, 0.0, SIZE_BOUND_M).map_err(of("pose.height_m"))?;
+            check(pose.pitch_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.pitch_rad"))?;
+            check(pose.roll_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.roll_rad"))?;
         }
         self.view.map_or(Ok(()), check_view).map_err(of("view"))?;
         let check_yaw_rate = |rate| check_between(rate, -YAW_RATE_BOUND_RADPS, YAW_RATE_BOUND_RADPS);

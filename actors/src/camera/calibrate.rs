@@ -1,5 +1,8 @@
 //! Camera calibration from photographs of a chessboard, and the calibration file.
 
+pub mod board;
+pub mod mount;
+
 use std::path::{Path, PathBuf};
 
 use ecod::perception::camera::Intrinsics;
@@ -117,6 +120,15 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
     Ok(photographs)
 }
 
+/// A photograph as 8-bit gray.
+///
+/// # Errors
+/// [`CalibrationError::UnreadableImage`].
+pub fn read_gray(path: &Path) -> Result<Mat, CalibrationError> {
+    let image = imgcodecs::imread(path, imgcodecs::IMREAD_GRAYSCALE).ok().filter(|image| !image.empty());
+    image.ok_or_else(|| CalibrationError::UnreadableImage(path.to_owned()))
+}
+
 /// Calibrates a camera (Zhang 2000). The photographs should show the board at different angles and all over the image.
 ///
 /// # Errors
@@ -130,10 +142,7 @@ pub fn calibrate(images: &[PathBuf], board: &Chessboard) -> Result<CalibrationRe
     let mut views = Vector::<Vector<Point2f>>::new();
     let mut size = None;
     for path in images {
-        let image = imgcodecs::imread(path, imgcodecs::IMREAD_GRAYSCALE)
-            .ok()
-            .filter(|image| !image.empty())
-            .ok_or_else(|| CalibrationError::UnreadableImage(path.clone()))?;
+        let image = read_gray(path)?;
         let found = ImageSize::of(&image);
         let expected = *size.get_or_insert(found);
         if found != expected {

@@ -183,6 +183,28 @@ impl MountConfig {
     }
 }
 
+impl MountConfig {
+    /// A mount in the file's units, rounded to what anyone can measure.
+    pub(crate) fn rounded(mount: &Mount) -> Self {
+        let metres = |metres: f64| (metres * 1e3).round() / 1e3;
+        let degrees = |angle_rad: f64| (angle_rad.to_degrees() * 1e2).round() / 1e2;
+        Self {
+            forward_m: metres(mount.forward_m),
+            left_m: metres(mount.left_m),
+            pan_deg: degrees(mount.pan_rad),
+            height_m: mount.height_m.map(metres),
+            pitch_deg: degrees(mount.pitch_rad),
+            roll_deg: degrees(mount.roll_rad),
+        }
+    }
+
+    /// The height and tilt of `other` at this place on the vehicle.
+    pub(crate) fn placed(&self, other: &Mount) -> Mount {
+        let here = Mount::from(*self);
+        Mount { forward_m: here.forward_m, left_m: here.left_m, pan_rad: here.pan_rad, ..*other }
+    }
+}
+
 impl From<MountConfig> for Mount {
     fn from(mount: MountConfig) -> Self {
         Self {

@@ -48,29 +48,38 @@ impl Lens {
     /// # Errors
     /// OpenCV's.
     pub fn undistort(&self, detections: &mut [Detection]) -> opencv::Result<()> {
-        let Some(distortion) = self.distortion else { return Ok(()) };
-        let mut points = Vector::<Point2d>::new();
+        if self.distortion.is_none() {
+            return Ok(());
+        }
+        let mut points = Vec::new();
         for Detection { bounding_box: b, corners, .. } in detections.iter() {
             let middle = b.center();
             let edges = [(b.x_min, middle.y), (b.x_max, middle.y), (middle.x, b.y_min), (middle.x, b.y_max)];
-            points.extend(edges.map(|(x, y)| Point2d::new(x, y)));
-            points.extend(corners.iter().flatten().map(|corner| Point2d::new(corner.x, corner.y)));
+            points.extend(edges.map(|(x, y)| Point2::new(x, y)));
+            points.extend(corners.iter().flatten());
         }
-        if points.is_empty() {
-            return Ok(());
-        }
-        let camera = camera_matrix(&self.intrinsics);
-        let mut straight = Vector::<Point2d>::new();
-        let distortion = Vector::<f64>::from_slice(&distortion);
-        calib3d::undistort_points(&points, &mut straight, &camera, &distortion, &Mat::default(), &camera)?;
-        let mut straight = straight.iter();
-        let mut next = || straight.next().map_or(Point2::origin(), |p| Point2::new(p.x, p.y));
+        let mut straight = self.undistorted(&points)?.into_iter();
+        let mut next = || straight.next().unwrap_or_default();
         for detection in detections {
             let [left, right, upper, lower] = std::array::from_fn(|_| next());
             detection.bounding_box = BoundingBox { x_min: left.x, y_min: upper.y, x_max: right.x, y_max: lower.y };
             detection.corners.iter_mut().flatten().for_each(|corner| *corner = next());
         }
         Ok(())
+    }
+
+    /// Undistorts points.
+    ///
+    /// # Errors
+    /// OpenCV's.
+    pub fn undistorted(&self, points: &[Point2<f64>]) -> opencv::Result<Vec<Point2<f64>>> {
+        let Some(distortion) = self.distortion.filter(|_| !points.is_empty()) else { return Ok(points.to_vec()) };
+        let points: Vector<Point2d> = points.iter().map(|point| Point2d::new(point.x, point.y)).collect();
+        let camera = camera_matrix(&self.intrinsics);
+        let mut straight = Vector::<Point2d>::new();
+        let distortion = Vector::<f64>::from_slice(&distortion);
+        calib3d::undistort_points(&points, &mut straight, &camera, &distortion, &Mat::default(), &camera)?;
+        Ok(straight.iter().map(|point| Point2::new(point.x, point.y)).collect())
     }
 }
 

@@ -143,7 +143,7 @@ impl Perception {
         let seen = landmarks_in_view(landmarks.landmarks(), &camera, &objects, sizes, &self.view);
         self.seq += 1;
         ObjectReport {
-            pose: Some(self.camera.into()),
+            pose: Some(mount.stated_pose(&self.camera)),
             objects,
             seen: Some(seen),
             ..ObjectReport::new(self.vehicle_camera.node.clone(), self.seq, captured_at)

@@ -48,7 +48,11 @@ impl PoseConfig {
     /// [`ConfigError`] naming the first key that is out of range, missing or of the other kind.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.is_fixed() && self.listen.is_some() {
-            return Err(ConfigError::new("moving", false, "true, or absent, beside `listen`: what stands receives no poses"));
+            return Err(ConfigError::new(
+                "moving",
+                false,
+                "true, or absent, beside `listen`: what stands receives no poses",
+            ));
         }
         check_range("x_m", self.x_m, -1e8, 1e8)?;
         check_range("y_m", self.y_m, -1e8, 1e8)?;

@@ -1,25 +1,23 @@
-//! `ecod-node calibrate`: a calibration file from photographs of a chessboard.
+//! `ecod-node calibrate`: a calibration file from photographs of a chessboard, and the mount of a camera.
+
+mod mount;
 
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clap::Args;
+use clap::{Args, Subcommand};
 
 use super::{Failure, print};
 use crate::camera::calibrate::{Chessboard, calibrate, photographs};
 
 /// Flags of `calibrate`.
 #[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub(super) struct CalibrateArguments {
-    /// Inner corners along a row of the board: squares minus one
-    #[arg(long, default_value_t = 9)]
-    columns: u16,
-    /// Inner corners along a column of the board: squares minus one
-    #[arg(long, default_value_t = 6)]
-    rows: u16,
-    /// Side of a square in millimetres
-    #[arg(long, value_name = "MM")]
-    square_mm: f64,
+    #[command(subcommand)]
+    part: Option<CalibrateCommand>,
+    #[command(flatten)]
+    board: BoardArguments,
     /// Calibration file to write
     #[arg(long, value_name = "FILE", default_value = "calibration.toml")]
     out: PathBuf,
@@ -28,9 +26,34 @@ pub(super) struct CalibrateArguments {
     images: Vec<PathBuf>,
 }
 
+#[derive(Debug, Subcommand)]
+enum CalibrateCommand {
+    /// Find height and tilt of a camera: from points on the ground, a board that lies there, or people who walk
+    #[command(subcommand)]
+    Mount(mount::MountCommand),
+}
+
+/// Flags of a printed chessboard.
+#[derive(Debug, Args)]
+struct BoardArguments {
+    /// Inner corners along a row of the board: squares minus one
+    #[arg(long, default_value_t = 9)]
+    columns: u16,
+    /// Inner corners along a column of the board: squares minus one
+    #[arg(long, default_value_t = 6)]
+    rows: u16,
+    /// Side of a square in millimetres
+    #[arg(long, value_name = "MM", required = true)]
+    square_mm: Option<f64>,
+}
+
 pub(super) fn run(arguments: &CalibrateArguments) -> Result<(), Failure> {
-    let CalibrateArguments { columns, rows, square_mm, out, images } = arguments;
-    let board = Chessboard { columns: *columns, rows: *rows, square_mm: *square_mm };
+    let CalibrateArguments { part, board, out, images } = arguments;
+    if let Some(CalibrateCommand::Mount(command)) = part {
+        return mount::run(command);
+    }
+    let square_mm = board.square_mm.context("--square-mm is missing").map_err(Failure::usage)?;
+    let board = Chessboard { columns: board.columns, rows: board.rows, square_mm };
     let images = photographs(images).map_err(Failure::usage)?;
     let report = calibrate(&images, &board).context("cannot calibrate")?;
     for image in &report.without_board {

@@ -126,7 +126,7 @@ impl Stray {
         self.seq += 1;
         let node = NodeName::from_static("stray");
         let report = ObjectReport {
-            pose: Some(WirePose { x_m: at_m, y_m: 0.0, heading_rad: 0.0 }),
+            pose: Some(WirePose::new(at_m, 0.0, 0.0)),
             objects,
             ..ObjectReport::new(node, self.seq, clock::now())
         };
@@ -168,7 +168,7 @@ fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, Object
     let from_west = vehicle.is_multiple_of(2);
     let (x_m, y_m) = if from_west { (way_m - 3.0, -0.9) } else { (length - way_m, 0.9) };
     let heading_rad = if from_west { 0.1 } else { PI + 0.1 };
-    let pose = WirePose { x_m, y_m, heading_rad };
+    let pose = WirePose::new(x_m, y_m, heading_rad);
     let in_view = |x: f64, y: f64| {
         let bearing = (y - y_m).atan2(x - x_m) - heading_rad;
         let bearing = (bearing + PI).rem_euclid(TAU) - PI;

@@ -44,7 +44,7 @@ fn watch(broker: std::net::SocketAddr) -> JoinSet<()> {
                 if name == "galileo" {
                     objects.extend([object("dog", 3.0 + walked_m, -1.0, 0.1), object("boat", 600.0, 200.0, 20.0)]);
                 }
-                let pose = Some(WirePose { x_m, y_m: 0.0, heading_rad: 0.0 });
+                let pose = Some(WirePose::new(x_m, 0.0, 0.0));
                 let node = NodeName::from_static(name);
                 let report = ObjectReport { pose, objects, ..ObjectReport::new(node, seq, clock::now()) };
                 let topic = format!("ecod/v1/lot/detections/{name}");

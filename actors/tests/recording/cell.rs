@@ -186,7 +186,7 @@ fn report(node: &str, seq: u64, vehicle: usize) -> ObjectReport {
         ..PerceivedObject::new("", 0.0, 0.0, 0.0)
     };
     ObjectReport {
-        pose: Some(WirePose { x_m: 0.1 * vehicle as f64, y_m: off, heading_rad: 0.3 }),
+        pose: Some(WirePose::new(0.1 * vehicle as f64, off, 0.3)),
         objects: vec![object("slot-0", 2.0), object("slot-1", 4.0)],
         ..ObjectReport::new(name(node), seq, clock::now())
     }

@@ -102,7 +102,7 @@ def test_a_report_is_of_its_schema(schemas: dict[str, Any]) -> None:
     }  # fmt: skip
     assert full.keys() == {field.name for field in fields(ecod.PerceivedObject)}
     report = ecod.ObjectReport(
-        1, "euclid", 1, 2, [ecod.PerceivedObject(**full)], messages.Pose(0, 0, 0), ["a"], ecod.FieldOfView(60, 6.2)  # type: ignore[arg-type]
+        1, "euclid", 1, 2, [ecod.PerceivedObject(**full)], messages.Pose(0, 0, 0, 2.5, 0.3, 0.0), ["a"], ecod.FieldOfView(60, 6.2)  # type: ignore[arg-type]
     )
     for one in (report, REPORT):
         jsonschema.validate(json.loads(codec.encode(one)), schemas["ObjectReport"])

@@ -24,7 +24,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let [x_m, y_m, heading_deg, speed_mps] = numbers[..] else {
         return Err("usage: brake_planner X_M Y_M HEADING_DEG SPEED_MPS".into());
     };
-    let pose = WirePose { x_m, y_m, heading_rad: heading_deg.to_radians() };
+    let pose = WirePose::new(x_m, y_m, heading_deg.to_radians());
     let stopping_m = speed_mps * REACTION_S + speed_mps.powi(2) / (2.0 * DECELERATION_MPS2);
     let cell = Cell::connect(Settings { part: "planner".into(), ..Settings::default() })?;
     let mut said = "";

@@ -12,7 +12,7 @@ fn main() -> Result<(), ecod_client::Error> {
         let captured_at = SystemTime::now();
         let car =
             PerceivedObject { covariance_m2: Some([0.04, 0.0, 0.04]), ..PerceivedObject::new("car", 0.93, 12.4, -3.1) };
-        let pose = Some(WirePose { x_m: 1.0, y_m: 6.0, heading_rad: -1.57 });
+        let pose = Some(WirePose::new(1.0, 6.0, -1.57));
         cell.report(Frame { captured_at, pose, ..Frame::new(vec![car]) })?;
         sleep(Duration::from_millis(100));
     }

@@ -91,7 +91,7 @@ fn car() -> PerceivedObject {
 }
 
 fn frame() -> Frame {
-    let pose = Some(ecod_client::WirePose { x_m: 1.0, y_m: 6.0, heading_rad: -1.57 });
+    let pose = Some(ecod_client::WirePose::new(1.0, 6.0, -1.57));
     Frame { pose, seen: Some(vec!["slot-0".into(), "slot-1".into()]), ..Frame::new(vec![car()]) }
 }
 

@@ -65,7 +65,7 @@ proptest! {
         rotation_deg in -180.0..180.0,
         station in any::<u32>(),
     ) {
-        let pose = pose.map(|(x_m, y_m, heading_rad)| WirePose { x_m, y_m, heading_rad });
+        let pose = pose.map(|(x_m, y_m, heading_rad)| WirePose::new(x_m, y_m, heading_rad));
         let sent = ObjectReport { pose, ..report(objects) };
         let message = encode_report(&sent, &origin(rotation_deg), station).unwrap();
         prop_assert_eq!(message.left_out, 0);

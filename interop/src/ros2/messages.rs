@@ -2,6 +2,7 @@
 
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, WirePose};
+use nalgebra::UnitQuaternion;
 use serde::Serialize;
 
 use crate::object::CellObject;
@@ -81,9 +82,10 @@ struct RosQuaternion {
 }
 
 impl RosQuaternion {
-    fn about_z(angle_rad: f64) -> Self {
-        let (sin, cos) = (angle_rad / 2.0).sin_cos();
-        Self { x: 0.0, y: 0.0, z: sin, w: cos }
+    /// A turn by the heading, then by pitch and roll about the axes so turned.
+    fn of(roll_rad: f64, pitch_rad: f64, heading_rad: f64) -> Self {
+        let turn = UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, heading_rad);
+        Self { x: turn.i, y: turn.j, z: turn.k, w: turn.w }
     }
 }
 
@@ -127,7 +129,7 @@ struct Detection3D {
 
 fn pose(object: &CellObject<'_>) -> RosPose {
     let [x, y] = object.position_m;
-    let orientation = RosQuaternion::about_z(object.heading_rad.unwrap_or(0.0));
+    let orientation = RosQuaternion::of(0.0, 0.0, object.heading_rad.unwrap_or(0.0));
     RosPose { position: RosVector { x, y, z: HEIGHT_M / 2.0 }, orientation }
 }
 
@@ -225,8 +227,9 @@ impl TFMessage {
     /// A camera's pose, and the direction of its optical frame.
     pub(super) fn of_pose(header: Header, camera: String, pose: WirePose) -> Self {
         let within = Header { frame_id: camera.clone(), ..header.clone() };
-        let translation = RosVector { x: pose.x_m, y: pose.y_m, z: 0.0 };
-        let transform = Transform { translation, rotation: RosQuaternion::about_z(pose.heading_rad) };
+        let translation = RosVector { x: pose.x_m, y: pose.y_m, z: pose.height_m.unwrap_or(0.0) };
+        let (roll_rad, pitch_rad) = (pose.roll_rad.unwrap_or(0.0), pose.pitch_rad.unwrap_or(0.0));
+        let transform = Transform { translation, rotation: RosQuaternion::of(roll_rad, pitch_rad, pose.heading_rad) };
         let rotation = RosQuaternion { x: -0.5, y: 0.5, z: -0.5, w: 0.5 };
         let to_optical = Transform { translation: RosVector::default(), rotation };
         let optical = format!("{camera}_optical");
@@ -318,7 +321,7 @@ pub(super) struct MarkerArray {
 impl MarkerArray {
     /// Boxes and labels of all objects, in place of those before.
     pub(super) fn of_map(map: &GlobalMap) -> Self {
-        let none = RosPose { position: RosVector::default(), orientation: RosQuaternion::about_z(0.0) };
+        let none = RosPose { position: RosVector::default(), orientation: RosQuaternion::of(0.0, 0.0, 0.0) };
         let marker = |ns: &str, id: i32| Marker {
             header: Header::in_map(map.fused_at_us),
             ns: ns.to_owned(),

@@ -1,8 +1,9 @@
 //! The recorded parking lots brought back to sight: no images were recorded, so that each vehicle's view is rendered
 //! from the geometry and then disturbed as a small camera disturbs it.
 //!
-//! Assumed, as it was not recorded: the axis of a camera is level and as high as the middle of the codes, a code sits
-//! as far below the upper end of its card as from its sides, cards stand on the floor, and vehicles hide nothing.
+//! Assumed, as it was not recorded: the axis of a camera is level and as high as the middle of the codes, unless a mount
+//! is given; a code sits as far below the upper end of its card as from its sides, cards stand on the floor, and vehicles
+//! hide nothing.
 
 mod render;
 pub(crate) mod sensor;
@@ -10,6 +11,7 @@ pub(crate) mod sensor;
 mod tests;
 
 use ecod::model::names::Label;
+use ecod::perception::camera::Mount;
 use opencv::core::Mat;
 
 use crate::testbed::{Cav, Scene, Testbed};
@@ -30,7 +32,15 @@ impl TestbedCamera {
     /// # Errors
     /// [`RenderError`] when a placard's text does not fit into a code or OpenCV fails.
     pub fn new(testbed: &Testbed, scene: &Scene, cav: &Cav, seed: u64) -> Result<Self, RenderError> {
-        let still = render::still(testbed, &testbed.cards(scene), &cav.pose)?;
+        Self::mounted(testbed, scene, cav, &Mount::default(), seed)
+    }
+
+    /// Renders what a camera has before it whose height and tilt are those of `mount`; the vehicle's pose is that of its camera.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn mounted(testbed: &Testbed, scene: &Scene, cav: &Cav, mount: &Mount, seed: u64) -> Result<Self, RenderError> {
+        let still = render::still(testbed, &testbed.cards(scene), &cav.pose, mount)?;
         let sensor = Sensor::new(&still, stream_seed(seed, &[&scene.name, cav.name.as_str()]));
         Ok(Self { still, sensor })
     }

@@ -7,7 +7,7 @@ use nalgebra::Vector2;
 use super::{Card, Testbed};
 
 /// Nearest depth in metres at which a card is drawn or counts.
-const NEAR_M: f64 = 1e-3;
+pub(super) const NEAR_M: f64 = 1e-3;
 /// Columns by which the shown part of a code is measured.
 const PROBES: u32 = 41;
 /// Least width of a code in the image at which it may be read: a bit more than a pixel for each of the 21 modules of

@@ -20,7 +20,7 @@ pub(super) struct HalfDepth {
 
 impl HalfDepth {
     /// That of a rectangular footprint of length l and width w at an unknown yaw φ: (l |cos φ| + w |sin φ|) / 2.
-    fn of_size(size: &ObjectSize) -> Self {
+    pub(super) fn of_size(size: &ObjectSize) -> Self {
         use std::f64::consts::PI;
         let (width, length) = (size.width_m, size.length_m.unwrap_or(size.width_m));
         let mean_m = (length + width) / PI;

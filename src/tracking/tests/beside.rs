@@ -29,7 +29,7 @@ fn two_people_side_by_side_stay_two_though_one_is_overlooked_at_times() {
 fn a_person_at_the_door_of_a_vehicle_is_not_taken_for_it() {
     let mut tracker = tracker();
     for frame in 0..40 {
-        let pose = Some(WirePose { x_m: 0.0, y_m: 0.0, heading_rad: 0.0 });
+        let pose = Some(WirePose::new(0.0, 0.0, 0.0));
         let objects = if frame % 4 == 3 { vec![] } else { vec![person(0.0, 1.6)] };
         tracker.observe(ObjectReport { pose, ..report("euclid", frame, objects) }, at(frame));
         let round = tracker.close(at(frame));
@@ -49,7 +49,7 @@ fn a_vehicle_that_comes_up_beside_a_person_does_not_carry_it_away() {
     for frame in 0..40 {
         tracker.observe(report("gauss", frame, vec![person(0.0, 2.0)]), at(frame));
         if frame >= 20 {
-            let pose = Some(WirePose { x_m: 0.8 * (frame - 20) as f64, y_m: 0.0, heading_rad: 0.0 });
+            let pose = Some(WirePose::new(0.8 * (frame - 20) as f64, 0.0, 0.0));
             tracker.observe(ObjectReport { pose, ..report("euclid", frame, vec![]) }, at(frame));
         }
         let round = tracker.close(at(frame));
@@ -69,7 +69,7 @@ fn nobody_is_blamed_for_what_is_hidden_behind_what_it_sees() {
         let all: Vec<_> = trucks.iter().cloned().chain(people).collect();
         let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
         for (node, y_m, objects) in [("hidden", 0.0, trucks), ("left", 15.0, all.clone()), ("right", 16.0, all)] {
-            let pose = Some(WirePose { x_m: if y_m > 0.0 { 50.0 } else { 0.0 }, y_m, heading_rad: 0.0 });
+            let pose = Some(WirePose::new(if y_m > 0.0 { 50.0 } else { 0.0 }, y_m, 0.0));
             tracker.observe(ObjectReport { pose, view, ..report(node, frame, objects) }, at(frame));
         }
         let evidence = tracker.close(at(frame)).evidence;

@@ -23,7 +23,7 @@ fn highway(stamped_late_us: u64) -> Vector2<f64> {
                 }));
             }
             let captured = at(frame) + std::time::Duration::from_micros(n as u64 * stamped_late_us);
-            let pose = Some(WirePose { x_m, y_m: -2.0, heading_rad: 0.0 });
+            let pose = Some(WirePose::new(x_m, -2.0, 0.0));
             tracker.observe(ObjectReport { pose, ..report(node, frame, objects) }, captured);
         }
         let round = tracker.close(at(frame));

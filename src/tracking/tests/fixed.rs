@@ -34,7 +34,7 @@ impl Camera {
                 objects.push(PerceivedObject::new("person", 0.8, x_m, y_m));
             }
         }
-        let pose = WirePose { x_m: self.place.x, y_m: self.place.y, heading_rad: 0.0 };
+        let pose = WirePose::new(self.place.x, self.place.y, 0.0);
         ObjectReport { pose: self.is_posed.then_some(pose), ..report(&self.node, frame, objects) }
     }
 }

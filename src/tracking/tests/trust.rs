@@ -58,7 +58,7 @@ fn one_sure_vehicle_does_not_outweigh_all_that_see_nothing() {
     for frame in 0..30 {
         let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
         for (n, node) in ["a", "b", "c", "d", "liar"].into_iter().enumerate() {
-            let pose = Some(WirePose { x_m: n as f64 * 6.0, y_m: 0.0, heading_rad: 0.0 });
+            let pose = Some(WirePose::new(n as f64 * 6.0, 0.0, 0.0));
             let mut objects: Vec<_> = (0..5).map(|n| car(f64::from(n) * 8.0 - 4.0, -15.0)).collect();
             if node == "liar" {
                 objects.push(PerceivedObject::new("car", 0.99, 12.0, 25.0));
@@ -127,7 +127,7 @@ fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
     let mut counts: BTreeMap<NodeName, (u32, u32)> = BTreeMap::new();
     for frame in 0..150 {
         for (n, node) in ["a", "b", "c", "d", "hider", "liar"].into_iter().enumerate() {
-            let pose = Some(WirePose { x_m: n as f64 * 6.0, y_m: 0.0, heading_rad: 0.0 });
+            let pose = Some(WirePose::new(n as f64 * 6.0, 0.0, 0.0));
             let places = (0..10).map(|n| (n as f64 * 4.0 - 4.0, if n % 2 == 0 { 12.0 } else { -12.0 }));
             let mut objects: Vec<_> = places.map(|(x, y)| car(x + noise(&mut rng, 0.2), y)).collect();
             match node {

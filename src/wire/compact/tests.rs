@@ -7,7 +7,7 @@ use crate::wire::{
 
 fn report() -> ObjectReport {
     ObjectReport {
-        pose: Some(WirePose { x_m: 0.61, y_m: 0.46, heading_rad: 2.88 }),
+        pose: Some(WirePose::new(0.61, 0.46, 2.88)),
         objects: vec![PerceivedObject {
             covariance_m2: Some([0.0004, 0.0, 0.0001]),
             landmark: Some("slot-0".into()),
@@ -41,6 +41,12 @@ fn survives<T: Payload + PartialEq + std::fmt::Debug>(payload: &T) {
 fn every_field_of_every_payload_survives() {
     let node = NodeName::from_static;
     survives(&ObjectReport {
+        pose: Some(WirePose {
+            height_m: Some(2.5),
+            pitch_rad: Some(0.25),
+            roll_rad: Some(-0.125),
+            ..WirePose::new(0.61, 0.46, 2.875)
+        }),
         view: Some(FieldOfView { range_m: 60.0, angle_rad: 6.25 }),
         frame_yaw_rate_radps: Some(-0.375),
         moving: Some(false),

@@ -210,7 +210,7 @@ fn a_vehicle_whose_objects_are_nowhere_is_named() {
             take(&mut fuser, report, at, None);
         }
         let mut gauss = ObjectReport::new(NodeName::from_static("gauss"), n, at);
-        gauss.pose = Some(WirePose { x_m: 0.0, y_m: 0.0, heading_rad: 0.0 });
+        gauss.pose = Some(WirePose::new(0.0, 0.0, 0.0));
         gauss.objects = vec![PerceivedObject::new("car", 0.9, 3.0, 0.0), PerceivedObject::new("car", 0.9, 800.0, 0.0)];
         take(&mut fuser, gauss, at, None);
         told = troubles(&fuser);

@@ -90,7 +90,14 @@ impl PlacardDetector {
 
 impl Detect for PlacardDetector {
     fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
-        let mut gray = gray(frame)?;
+        let codes = self.codes(&mut gray(frame)?)?;
+        Ok(codes.into_iter().filter_map(Code::into_detection).collect())
+    }
+}
+
+impl PlacardDetector {
+    /// The codes in a continuous gray image, which are painted over.
+    pub(crate) fn codes(&self, gray: &mut Mat) -> Result<Vec<Code>, DetectError> {
         let reader = zxingcpp::read()
             .formats(BarcodeFormat::QRCode)
             .max_number_of_symbols(self.config.max_codes)
@@ -100,9 +107,9 @@ impl Detect for PlacardDetector {
             .try_downscale(false);
         let mut codes: Vec<Code> = Vec::new();
         for &pass in &self.config.passes {
-            let found = read(&reader, &gray, pass)?;
+            let found = read(&reader, gray, pass)?;
             for code in &found {
-                paint_over(&mut gray, code)
+                paint_over(gray, code)
                     .map_err(|source| DetectError::OpenCv { step: "painting over a code", source })?;
             }
             codes.extend(found);
@@ -111,7 +118,7 @@ impl Detect for PlacardDetector {
             }
         }
         codes.truncate(self.config.max_codes.into());
-        Ok(codes.into_iter().filter_map(Code::into_detection).collect())
+        Ok(codes)
     }
 }
 
@@ -127,11 +134,12 @@ fn read(reader: &BarcodeReader, image: &Mat, pass: Pass) -> Result<Vec<Code>, De
 }
 
 /// One decoded code.
-struct Code {
+pub(crate) struct Code {
     text: Vec<u8>,
     /// Modules along a side.
-    modules: f64,
-    corners: [Point2<f64>; 4],
+    pub(crate) modules: f64,
+    /// Corners in pixels, clockwise from the upper left as printed.
+    pub(crate) corners: [Point2<f64>; 4],
 }
 
 impl Code {

@@ -8,6 +8,7 @@ use std::borrow::Cow;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, ObjectReport, WirePose};
+use nalgebra::UnitQuaternion;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::Serialize;
 
@@ -216,7 +217,7 @@ impl SceneUpdate {
     pub(crate) fn of_report(report: &ObjectReport) -> Self {
         let at = report.captured_at_us;
         let vehicle = report.pose.map(|pose| {
-            let pose = plane_pose(pose.x_m, pose.y_m, pose.heading_rad);
+            let pose = camera_pose(&pose);
             let entity = SceneEntity::new(at, format!("vehicle/{}", report.node));
             entity.arrow(pose, VEHICLE_M, VEHICLE).text(pose, report.node.to_string())
         });
@@ -232,8 +233,7 @@ impl SceneUpdate {
 impl FrameTransform {
     /// A vehicle's pose.
     pub(crate) fn of(node: &NodeName, pose: WirePose, at: Timestamp) -> Self {
-        let FoxglovePose { position: translation, orientation: rotation } =
-            plane_pose(pose.x_m, pose.y_m, pose.heading_rad);
+        let FoxglovePose { position: translation, orientation: rotation } = camera_pose(&pose);
         Self { timestamp: at.into(), parent_frame_id: MAP, child_frame_id: node.clone(), translation, rotation }
     }
 }
@@ -274,9 +274,18 @@ impl SceneEntity {
 }
 
 /// Pose in the plane: east and north in metres, heading in radians counter-clockwise from east.
-fn plane_pose(x: f64, y: f64, heading_rad: f64) -> FoxglovePose {
-    let (z, w) = (heading_rad / 2.0).sin_cos();
-    FoxglovePose { position: Vector3 { x, y, z: 0.0 }, orientation: Quaternion { x: 0.0, y: 0.0, z, w } }
+fn plane_pose(x_m: f64, y_m: f64, heading_rad: f64) -> FoxglovePose {
+    camera_pose(&WirePose::new(x_m, y_m, heading_rad))
+}
+
+/// Pose of a camera, on the ground and level as far as nothing else is stated.
+fn camera_pose(pose: &WirePose) -> FoxglovePose {
+    let (roll_rad, pitch_rad) = (pose.roll_rad.unwrap_or(0.0), pose.pitch_rad.unwrap_or(0.0));
+    let turn = UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, pose.heading_rad);
+    FoxglovePose {
+        position: Vector3 { x: pose.x_m, y: pose.y_m, z: pose.height_m.unwrap_or(0.0) },
+        orientation: Quaternion { x: turn.i, y: turn.j, z: turn.k, w: turn.w },
+    }
 }
 
 fn listed(nodes: &[NodeName]) -> String {

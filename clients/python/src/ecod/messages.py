@@ -66,6 +66,7 @@ Hash = Annotated[str, Rule(lambda text: re.fullmatch("[0-9a-f]{64}", text) is no
 Fraction = Annotated[float, _between(0, 1)]
 Metres = Annotated[float, _between(-1e8, 1e8), MILLIMETRES]
 Size = Annotated[float, _between(0, 1e5)]
+Height = Annotated[float, _between(0, 1e5), MILLIMETRES]
 Speed = Annotated[float, _between(-1e4, 1e4)]
 Angle = Annotated[float, _between(-1e6, 1e6)]
 YawRate = Annotated[float, _between(-100, 100)]
@@ -87,6 +88,12 @@ class Pose:
     x_m: Metres
     y_m: Metres
     heading_rad: Angle
+    height_m: Optional[Height] = None
+    """Above the ground."""
+    pitch_rad: Optional[Angle] = None
+    """Below the horizon."""
+    roll_rad: Optional[Angle] = None
+    """Leaning to the right."""
 
 
 @dataclass(frozen=True)

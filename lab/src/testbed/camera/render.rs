@@ -1,21 +1,22 @@
-//! The undisturbed view: one ray per sample, four by four samples per pixel.
-//!
-//! Cards stand upright and the axis of the camera is level, so that a column of samples meets each card at one depth:
-//! cards are sorted once per column and looked up per row.
+//! The undisturbed view: one ray per sample, four by four samples per pixel. Cards stand upright on the floor.
+
+use std::ops::Range;
 
 use ecod::model::geometry::Pose;
-use nalgebra::{Point2, Vector2};
+use ecod::perception::camera::{Intrinsics, Mount};
+use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
 use opencv::core::{CV_8UC3, Mat, Scalar, Vec3b};
 use opencv::prelude::*;
 use qrcode::{Color, EcLevel, QrCode};
 
 use super::RenderError;
-use crate::testbed::{Card, Placard, Testbed};
+use crate::testbed::{Card, NEAR_M, Placard, Testbed};
 
 /// Samples per pixel in each direction.
 const SAMPLES: usize = 4;
-/// Depth of the wall behind everything, in metres.
+/// Least depth of the wall behind everything, in metres, and its depth in heights of the camera.
 const WALL_M: f64 = 2.5;
+const WALL_HEIGHTS: f64 = 20.0;
 
 /// Blue, green and red light, 0 to 255.
 type Light = [f32; 3];
@@ -26,19 +27,22 @@ const CARDBOARD: Light = [92.0, 132.0, 168.0];
 const FLOOR: Light = [104.0, 110.0, 114.0];
 const WALL: Light = [150.0, 158.0, 160.0];
 
-/// View of the camera at `pose`, as 8-bit BGR.
-pub(super) fn still(testbed: &Testbed, cards: &[Card], pose: &Pose) -> Result<Mat, RenderError> {
+/// View of the camera at `pose`, mounted as told, as 8-bit BGR.
+pub(super) fn still(testbed: &Testbed, cards: &[Card], pose: &Pose, mount: &Mount) -> Result<Mat, RenderError> {
     let camera = &testbed.camera.intrinsics;
-    let faces = cards.iter().map(Face::new).collect::<Result<Vec<_>, _>>()?;
+    let view = RenderView::new(camera, pose, mount, &testbed.placard);
+    let faces = cards.iter().map(|card| Face::new(card, &view)).collect::<Result<Vec<_>, _>>()?;
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut light = vec![[0f32; 3]; width * height];
-    for sample in 0..width * SAMPLES {
-        let slope = (camera.cx - centre(sample)) / camera.fx;
-        let column = Column::new(&faces, pose, slope, &testbed.placard);
-        for row in 0..height * SAMPLES {
-            let rise = (camera.cy - centre(row)) / camera.fy;
-            let pixel = &mut light[row / SAMPLES * width + sample / SAMPLES];
-            for (sum, light) in pixel.iter_mut().zip(column.light(rise)) {
+    for row in 0..height * SAMPLES {
+        let middle = view.to_level * camera.ray(&Point2::new(camera.cx, centre(row)));
+        let right = Vector3::from(view.to_level.column(0));
+        let on_row: Vec<&Face> = faces.iter().filter(|face| face.rows.contains(&(row / SAMPLES))).collect();
+        for column in 0..width * SAMPLES {
+            let x = column / SAMPLES;
+            let ray = middle + right * ((centre(column) - camera.cx) / camera.fx);
+            let light_here = view.light(&ray, on_row.iter().copied().filter(|face| face.columns.contains(&x)));
+            for (sum, light) in light[row / SAMPLES * width + x].iter_mut().zip(light_here) {
                 *sum += light;
             }
         }
@@ -59,19 +63,25 @@ fn centre(sample: usize) -> f64 {
     (sample as f64 + 0.5) / SAMPLES as f64
 }
 
-/// A card with its printed code.
+/// A card with its printed code, before a camera.
 struct Face<'a> {
     card: &'a Card,
     modules: Vec<Color>,
     /// Modules along one side.
     side: usize,
+    facing: Vector2<f64>,
+    /// Pixels beyond which it is not seen.
+    columns: Range<usize>,
+    rows: Range<usize>,
 }
 
 impl<'a> Face<'a> {
-    fn new(card: &'a Card) -> Result<Self, RenderError> {
+    fn new(card: &'a Card, view: &RenderView) -> Result<Self, RenderError> {
         let code = QrCode::with_error_correction_level(card.text.as_bytes(), EcLevel::M)
             .map_err(|source| RenderError::Text { text: card.text.clone(), source })?;
-        Ok(Self { card, side: code.width(), modules: code.into_colors() })
+        let [columns, rows] = view.bounds(card);
+        let facing = Vector2::new(card.facing_rad.cos(), card.facing_rad.sin());
+        Ok(Self { card, side: code.width(), modules: code.into_colors(), facing, columns, rows })
     }
 
     /// True if ink is printed at a point, in metres to the right of and above the middle of the code.
@@ -88,72 +98,99 @@ impl<'a> Face<'a> {
     }
 }
 
-/// One column of samples: the cards it meets, nearest first.
-struct Column<'a> {
+/// A camera among the cards.
+struct RenderView<'a> {
+    intrinsics: &'a Intrinsics,
     placard: &'a Placard,
-    /// Top and bottom of all cards, in metres above the axis of the camera.
+    pose: &'a Pose,
+    to_level: Matrix3<f64>,
+    /// Top and bottom of all cards, in metres above the camera.
     top_m: f64,
     bottom_m: f64,
-    origin: Point2<f64>,
-    sight: Vector2<f64>,
-    met: Vec<Meeting<'a>>,
 }
 
+/// Where a ray meets a card.
 struct Meeting<'a> {
     face: &'a Face<'a>,
     depth_m: f64,
     right_m: f64,
+    up_m: f64,
     front: bool,
-    /// Share of the light that falls on this side.
-    lit: f32,
 }
 
-impl<'a> Column<'a> {
-    fn new(faces: &'a [Face<'a>], pose: &Pose, slope: f64, placard: &'a Placard) -> Self {
-        let top_m = placard.card_width_m / 2.0;
-        let meeting = |face: &'a Face<'a>| {
-            let hit = face.card.hit(pose, slope)?;
-            (hit.right_m.abs() <= placard.card_width_m / 2.0).then(|| Meeting {
-                face,
-                depth_m: hit.depth_m,
-                right_m: hit.right_m,
-                front: hit.front,
-                lit: 0.9 + 0.1 * (face.card.facing_rad - 0.6).cos() as f32 * if hit.front { 1.0 } else { -1.0 },
-            })
+impl<'a> RenderView<'a> {
+    /// A camera without a height is as high as the middle of the codes.
+    fn new(intrinsics: &'a Intrinsics, pose: &'a Pose, mount: &Mount, placard: &'a Placard) -> Self {
+        let top_m = mount.height_m.map_or(placard.card_width_m / 2.0, |height_m| placard.card_height_m - height_m);
+        let bottom_m = top_m - placard.card_height_m;
+        Self { intrinsics, placard, pose, to_level: mount.to_level(), top_m, bottom_m }
+    }
+
+    /// Columns and rows that a card may be in; all if a corner of it is behind the camera.
+    fn bounds(&self, card: &Card) -> [Range<usize>; 2] {
+        let along = Vector2::new(-card.facing_rad.sin(), card.facing_rad.cos()) * (self.placard.card_width_m / 2.0);
+        let ends = [card.position + along, card.position - along];
+        let corners = ends.iter().flat_map(|end| [(end, self.top_m), (end, self.bottom_m)]);
+        let pixel = |(end, up_m): (&Point2<f64>, f64)| {
+            let (range_m, bearing_rad) = self.pose.range_bearing(end);
+            let level = Vector3::new(range_m * bearing_rad.cos(), range_m * bearing_rad.sin(), up_m);
+            self.intrinsics.project(&Point3::from(self.to_level.transpose() * level))
         };
-        // Of two cards at one place, the later hides the earlier: a plate its sign.
-        let mut met: Vec<_> = faces.iter().rev().filter_map(meeting).collect();
-        met.sort_by(|a, b| a.depth_m.total_cmp(&b.depth_m));
-        let (sin, cos) = pose.heading_rad.sin_cos();
-        let sight = Vector2::new(cos - sin * slope, sin + cos * slope);
-        Self { placard, top_m, bottom_m: top_m - placard.card_height_m, origin: pose.position, sight, met }
+        let size = [self.intrinsics.width as usize, self.intrinsics.height as usize];
+        let Some(corners) = corners.map(pixel).collect::<Option<Vec<_>>>() else { return size.map(|size| 0..size) };
+        let range = |axis: usize| {
+            let values = corners.iter().map(|corner| corner[axis]);
+            let (low, high) = values.fold((f64::INFINITY, 0f64), |(low, high), at| (low.min(at), high.max(at)));
+            (low - 1.0).max(0.0) as usize..((high + 2.0) as usize).min(size[axis])
+        };
+        [range(0), range(1)]
     }
 
-    /// The light from one row; `rise` is the tangent of its elevation along the axis.
-    fn light(&self, rise: f64) -> Light {
-        let hit = self.met.iter().find(|met| (self.bottom_m..=self.top_m).contains(&(met.depth_m * rise)));
-        match hit {
-            Some(met) => {
-                let ink = met.front && met.face.is_ink(met.right_m, met.depth_m * rise, self.placard);
-                let colour = match (ink, met.front) {
-                    (true, _) => INK,
-                    (false, true) => PAPER,
-                    (false, false) => CARDBOARD,
-                };
-                colour.map(|light| light * met.lit)
-            }
-            None => self.surroundings(rise),
+    /// The light along a ray of the level frame that may meet `faces`.
+    fn light<'f>(&self, ray: &Vector3<f64>, faces: impl Iterator<Item = &'f Face<'f>>) -> Light {
+        let (sin, cos) = self.pose.heading_rad.sin_cos();
+        let sight = Vector2::new(cos * ray.x - sin * ray.y, sin * ray.x + cos * ray.y);
+        let mut nearest: Option<Meeting> = None;
+        for face in faces {
+            // Of two cards at one place, the later hides the earlier: a plate its sign.
+            nearest = self
+                .meet(face, &sight, ray.z)
+                .filter(|met| nearest.as_ref().is_none_or(|nearest| met.depth_m <= nearest.depth_m))
+                .or(nearest);
         }
+        let Some(met) = nearest else { return self.surroundings(ray, &sight) };
+        let code_m = self.top_m - self.placard.card_width_m / 2.0;
+        let ink = met.front && met.face.is_ink(met.right_m, met.up_m - code_m, self.placard);
+        let colour = match (ink, met.front) {
+            (true, _) => INK,
+            (false, true) => PAPER,
+            (false, false) => CARDBOARD,
+        };
+        let towards = if met.front { 1.0 } else { -1.0 };
+        let lit = 0.9 + 0.1 * (met.face.card.facing_rad - 0.6).cos() as f32 * towards;
+        colour.map(|light| light * lit)
     }
 
-    fn surroundings(&self, rise: f64) -> Light {
-        let floor_m = self.bottom_m / rise;
-        if rise < 0.0 && floor_m < WALL_M {
-            let at = self.origin + self.sight * floor_m;
+    fn meet<'f>(&self, face: &'f Face<'f>, sight: &Vector2<f64>, rise: f64) -> Option<Meeting<'f>> {
+        let approach = sight.dot(&face.facing);
+        let depth_m = (face.card.position - self.pose.position).dot(&face.facing) / approach;
+        let at = self.pose.position + sight * depth_m - face.card.position;
+        let (right_m, up_m) = (face.facing.x * at.y - face.facing.y * at.x, depth_m * rise);
+        let is_met = depth_m >= NEAR_M
+            && right_m.abs() <= self.placard.card_width_m / 2.0
+            && (self.bottom_m..=self.top_m).contains(&up_m);
+        is_met.then_some(Meeting { face, depth_m, right_m, up_m, front: approach < 0.0 })
+    }
+
+    fn surroundings(&self, ray: &Vector3<f64>, sight: &Vector2<f64>) -> Light {
+        let wall_m = WALL_M.max(-WALL_HEIGHTS * self.bottom_m);
+        let floor_m = self.bottom_m / ray.z;
+        if ray.z < 0.0 && floor_m * ray.x < wall_m {
+            let at = self.pose.position + sight * floor_m;
             let grain = 7.0 * grain(at / 0.004) + 9.0 * grain(at / 0.05);
             FLOOR.map(|light| light + grain as f32)
         } else {
-            let up_m = WALL_M * rise;
+            let up_m = WALL_M * ray.z;
             let shade = 1.0 + 0.12 * up_m.clamp(-1.0, 1.0);
             WALL.map(|light| light * shade as f32)
         }
