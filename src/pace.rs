@@ -159,7 +159,7 @@ impl Pace {
         object.landmark.is_some() || landmarks.within(&point, gate_m).next().is_some()
     }
 
-    /// True if an object is among the known locations, or at most [`MAX_AWAY_M`] and their extent away from them.
+    /// True if an object is among the known locations, or at most 200 m and their extent away from them.
     pub fn is_near_landmarks(&self, object: &PerceivedObject) -> bool {
         let positions = || self.landmarks().landmarks().iter().map(|landmark| landmark.position);
         let is_near = |value: f64, of: fn(&Point2<f64>) -> f64| {
