@@ -33,6 +33,12 @@ pub enum MountFitError {
     /// Too few boxes.
     #[error("{0} whole boxes, need {MIN_BOXES}: watch for longer, or where more people walk")]
     TooFewBoxes(usize),
+    /// The people are at one distance.
+    #[error(
+        "all people look equally high, {0:.2} times at most: let them walk from near the camera to far from it, with their feet \
+         in view"
+    )]
+    OneDistance(f64),
     /// The boxes fit many mounts.
     #[error(
         "the boxes leave the pitch open by ±{0:.1}°: let people walk from near the camera to far from it, with their feet \
@@ -43,6 +49,8 @@ pub enum MountFitError {
 
 /// Minimum number of boxes.
 pub const MIN_BOXES: usize = 40;
+/// Least ratio of large boxes to small ones, of which a tenth each are beyond. Errors of the edges alone make small ones.
+const MIN_HEIGHT_RATIO: f64 = 1.15;
 /// Boxes beyond are thinned out evenly.
 const MAX_BOXES: usize = 3000;
 /// Overlap from which a box in the next frame is taken to be of the same person.
@@ -81,6 +89,12 @@ pub fn fit_mount(
     let (boxes, people) = linked(frames);
     if boxes.len() < MIN_BOXES {
         return Err(MountFitError::TooFewBoxes(boxes.len()));
+    }
+    let mut heights: Vec<f64> = boxes.iter().map(|person| person.bounding_box.height()).collect();
+    heights.sort_by(f64::total_cmp);
+    let ratio = heights[heights.len() * 9 / 10] / heights[heights.len() / 10];
+    if ratio < MIN_HEIGHT_RATIO {
+        return Err(MountFitError::OneDistance(ratio));
     }
     let boxes = boxes.iter().step_by(boxes.len().div_ceil(MAX_BOXES)).copied().collect();
     let config = ProjectionConfig { pixel_sigma_px, ..ProjectionConfig::default() };

@@ -152,7 +152,7 @@ fn people_who_stay_at_one_distance_do_not_tell_the_pitch() {
         fit_mount(frames, size.of("person").unwrap(), 3.0, &camera(), &Mount::default())
     };
     let open = fit(&frames);
-    assert!(matches!(open, Err(MountFitError::Undetermined(sigma_deg)) if sigma_deg > 3.0), "{open:?}");
+    assert!(matches!(open, Err(MountFitError::OneDistance(ratio)) if ratio > 1.0), "{open:?}");
     frames.truncate(30);
     assert_eq!(fit(&frames), Err(MountFitError::TooFewBoxes(30)));
 }
