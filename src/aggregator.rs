@@ -15,6 +15,7 @@ pub mod round;
 mod answer;
 mod command;
 mod config;
+mod report_doubt;
 #[cfg(test)]
 mod tests;
 
@@ -24,6 +25,10 @@ use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
+pub use report_doubt::ReportDoubt;
+
+use nalgebra::Point2;
+use report_doubt::{MAX_AWAY_M, MIN_MISPLACED};
 
 use crate::admission::report_window::{Admitted, ReportWindow};
 use crate::admission::timeliness::Timeliness;
@@ -37,8 +42,8 @@ use crate::reputation::{Evidence, ReputationLedger};
 use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
-    FusedObject, GlobalMap, LandmarkState, ObjectReport, RejectReason, ReportKind, Reputation, SCHEMA_VERSION, Verdict,
-    Verdicts,
+    FusedObject, GlobalMap, LandmarkState, ObjectReport, PerceivedObject, RejectReason, ReportKind, Reputation,
+    SCHEMA_VERSION, Verdict, Verdicts,
 };
 
 /// A closed round.
@@ -58,6 +63,15 @@ pub struct Fused {
     pub reputations: Option<BTreeMap<NodeName, Reputation>>,
 }
 
+/// Numbers of reports of detections that a cell with known locations used.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Placements {
+    /// With an object at a location or, where objects are tracked, near one.
+    pub placed: u64,
+    /// With objects, and none of them there.
+    pub misplaced: u64,
+}
+
 /// Admits reports, fuses them and numbers the rounds.
 #[derive(Debug, Clone)]
 pub struct Aggregator {
@@ -73,7 +87,7 @@ pub struct Aggregator {
     tracks_open_cell: bool,
     /// Reports that only tracking used, because a later one of their vehicle came before.
     overtaken: u64,
-    placed_and_misplaced: [u64; 2],
+    placements: Placements,
     vote: Option<Vote>,
     by_packets: bool,
     /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
@@ -101,7 +115,7 @@ impl Aggregator {
             tracks,
             tracks_open_cell,
             overtaken: 0,
-            placed_and_misplaced: [0; 2],
+            placements: Placements::default(),
             vote,
             by_packets,
             voted: false,
@@ -185,11 +199,14 @@ impl Aggregator {
                 let admitted = window.admit(report, now)?;
                 if !pace.landmarks().landmarks().is_empty() && !report.objects.is_empty() {
                     let is_tracking = self.tracks.is_some();
-                    let is_placed =
-                        |object| pace.is_at_landmark(object) || is_tracking && pace.is_near_landmarks(object);
+                    let is_near = |object: &PerceivedObject| {
+                        pace.landmarks().is_around(&Point2::new(object.x_m, object.y_m), MAX_AWAY_M)
+                    };
+                    let is_placed = |object| pace.is_at_landmark(object) || is_tracking && is_near(object);
                     let is_placed = report.objects.iter().any(is_placed);
                     window.note_place(&report.node, is_placed, now);
-                    self.placed_and_misplaced[usize::from(!is_placed)] += 1;
+                    let Placements { placed, misplaced } = &mut self.placements;
+                    *if is_placed { placed } else { misplaced } += 1;
                 }
                 let report = &of_vehicle(report);
                 let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
@@ -239,21 +256,17 @@ impl Aggregator {
         self.windows[kind as usize].untimely_for(name, now)
     }
 
-    /// Time for which no detection of a vehicle or part has been at a known location or, where others are tracked, near
-    /// the known locations.
-    pub fn misplaced_for(&self, name: &NodeName, now: Timestamp) -> Duration {
-        self.windows[ReportKind::Detections as usize].misplaced_for(name, now)
+    /// Doubts about a report that was used, the range of its objects before their place.
+    pub fn doubts(&self, kind: ReportKind, report: &ObjectReport, now: Timestamp) -> impl Iterator<Item = ReportDoubt> {
+        let sender = self.windows[kind as usize].sender(&report.node, now);
+        let is_nowhere = sender.misplaced >= MIN_MISPLACED;
+        let place = ReportDoubt::of_ranges(report).or(is_nowhere.then_some(ReportDoubt::NoObjectAtLocation));
+        place.into_iter().chain(sender.is_shared.then_some(ReportDoubt::SharedName))
     }
 
-    /// True if two senders report under a name, as their numbers tell.
-    pub fn is_name_shared(&self, kind: ReportKind, name: &NodeName) -> bool {
-        self.windows[kind as usize].is_shared(name)
-    }
-
-    /// Numbers of reports of detections so far with an object where it has an effect, and with none there, of a cell with
-    /// known locations.
-    pub fn placed_and_misplaced(&self) -> [u64; 2] {
-        self.placed_and_misplaced
+    /// Numbers of reports of detections so far by the places of their objects.
+    pub fn placements(&self) -> Placements {
+        self.placements
     }
 
     /// True if a location of this id is known; `None` if none is known at all.

@@ -76,9 +76,6 @@ config_section! {
     }
 }
 
-/// Distance in metres from the known locations beyond which the objects of a cell are not.
-const MAX_AWAY_M: f64 = 200.0;
-
 impl PaceConfig {
     /// The reported covariance; without one, its default reaches the gate in metres and in sigmas alike.
     fn covariance(&self, object: &PerceivedObject) -> Covariance {
@@ -157,18 +154,6 @@ impl Pace {
         let (landmarks, gate_m) = self.places();
         let point = Point2::new(object.x_m, object.y_m);
         object.landmark.is_some() || landmarks.within(&point, gate_m).next().is_some()
-    }
-
-    /// True if an object is among the known locations, or at most 200 m and their extent away from them.
-    pub fn is_near_landmarks(&self, object: &PerceivedObject) -> bool {
-        let positions = || self.landmarks().landmarks().iter().map(|landmark| landmark.position);
-        let is_near = |value: f64, of: fn(&Point2<f64>) -> f64| {
-            let (low, high) = positions()
-                .fold((f64::MAX, f64::MIN), |(low, high), position| (low.min(of(&position)), high.max(of(&position))));
-            let margin = MAX_AWAY_M + (high - low);
-            (low - margin..=high + margin).contains(&value)
-        };
-        is_near(object.x_m, |position| position.x) && is_near(object.y_m, |position| position.y)
     }
 
     /// Takes one admitted report, captured at `captured_at` on the aggregator's clock.

@@ -25,7 +25,7 @@ pub use clock::TimeUnit;
 pub use journal::{JournalEntry, JournalEvent, JournalReplay, JournalSummary};
 pub use records::FusedLine;
 
-use crate::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
+use crate::aggregator::{Aggregator, Algorithms, Fused, FusionConfig, Placements};
 use crate::model::names::{LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::perception::landmark::{Landmark, LandmarkConfig};
@@ -102,10 +102,8 @@ pub struct Summary {
     pub votes: u64,
     /// Those of them that did not vote or whose votes were forgotten; see [`crate::vote`].
     pub ignored_votes: u64,
-    /// Used lines of a cell with known locations of which no object is at one or, where objects are tracked, near them.
-    pub misplaced: u64,
-    /// The other used lines of detections of such a cell.
-    pub placed: u64,
+    /// Lines of detections by the places of their objects.
+    pub placements: Placements,
     /// Lines that only tracking used, because a later one of their vehicle came before.
     pub overtaken: u64,
     /// Reports and objects that tracking did not use.
@@ -243,7 +241,7 @@ impl Replay {
             output.extend(last.map(FusedLine::Verdicts));
             self.summary.ignored_votes = cell.ignored_votes();
             self.summary.overtaken = cell.overtaken();
-            [self.summary.placed, self.summary.misplaced] = cell.placed_and_misplaced();
+            self.summary.placements = cell.placements();
             self.summary.tracks = cell.tracks_losses();
         }
         (output, self.summary)

@@ -110,38 +110,31 @@ fn votes_by_name_are_used_without_positions_and_detections_are_told_what_they_la
     assert!(said(&detections).contains("line 1: objects[0]: missing field `x_m`"), "{}", said(&detections));
 }
 
-/// Votes for locations that the configuration does not have, and votes in centimetres, are readable and change nothing.
+/// Votes for locations that the configuration does not have, and positions in centimetres, are readable and change nothing.
 #[test]
-fn votes_of_which_none_counts_fail() {
+fn reports_of_which_none_has_an_effect_fail() {
     let folder = TempDir::new().unwrap();
     let cell = folder.path().join("cell.toml");
     fs::write(&cell, "[[landmarks]]\nid = \"table\"\nx_m = 3\ny_m = 0\n").unwrap();
-    for (landmark, x_m, code) in [("table", 0, 0), ("tabel", 0, 3), ("table", 300, 3)] {
+    let vote = |landmark: &str, vehicle_m: u32| {
+        let pose = format!(r#""pose":{{"x_m":{vehicle_m},"y_m":0,"heading_rad":0}}"#);
         let object = format!(r#"{{"label":"cup","confidence":0.9,"x_m":3,"y_m":0,"landmark":"{landmark}"}}"#);
-        let pose = format!(r#""pose":{{"x_m":{x_m},"y_m":0,"heading_rad":0}}"#);
-        let line = format!(
-            r#"{{"schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,{pose},"objects":[{object}],"topic":"vote_detections"}}"#
-        );
+        format!(r#"{pose},"topic":"vote_detections","objects":[{object}]"#)
+    };
+    let detection = |x_m: u32| format!(r#""objects":[{{"label":"cup","confidence":0.9,"x_m":{x_m},"y_m":0}}]"#);
+    let (no_vote, no_object) = ("1 of 1 votes do not count", "no report has an object at a known location");
+    for (report, problem) in [
+        (vote("table", 0), None),
+        (vote("tabel", 0), Some(no_vote)),
+        (vote("table", 300), Some(no_vote)),
+        (detection(3), None),
+        (detection(300), Some(no_object)),
+    ] {
+        let line = format!(r#"{{"schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,{report}}}"#);
         let arguments = ["replay", "--config", text(&cell), "--input", "-", "--output", "-"];
         let run = ecod_with_input(&arguments, line.as_bytes());
-        assert_eq!(run.status.code(), Some(code), "{landmark}, {x_m}: {}", said(&run));
-        assert_eq!(said(&run).contains("1 of 1 votes do not count"), code == 3, "{}", said(&run));
-    }
-}
-
-#[test]
-fn detections_that_are_nowhere_near_a_location_fail() {
-    let folder = TempDir::new().unwrap();
-    let cell = folder.path().join("cell.toml");
-    fs::write(&cell, "[[landmarks]]\nid = \"table\"\nx_m = 3\ny_m = 0\n").unwrap();
-    for (x_m, code) in [(3, 0), (300, 3)] {
-        let object = format!(r#"{{"label":"cup","confidence":0.9,"x_m":{x_m},"y_m":0}}"#);
-        let line =
-            format!(r#"{{"schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,"objects":[{object}]}}"#);
-        let arguments = ["replay", "--config", text(&cell), "--input", "-", "--output", "-"];
-        let run = ecod_with_input(&arguments, line.as_bytes());
-        assert_eq!(run.status.code(), Some(code), "{x_m}: {}", said(&run));
-        assert_eq!(said(&run).contains("no report has an object at a known location"), code == 3, "{}", said(&run));
+        assert_eq!(run.status.code(), Some(if problem.is_some() { 3 } else { 0 }), "{report}: {}", said(&run));
+        assert!(problem.is_none_or(|problem| said(&run).contains(problem)), "{report}: {}", said(&run));
     }
 }
 

@@ -4,7 +4,8 @@
 //! traffic   generated towns: reports and truth
 //! eval      accuracy of maps, verdicts and objects by what is true
 //! testbed   recorded scenes: geometry, renderer, virtual-time trials   (uses eval)
-//! street    a street that moves: truth, network cameras, animation        (uses eval, testbed)
+//! street    a street that moves: truth, network cameras, animation    (uses eval, testbed)
+//! drawing   page and font of drawings
 //! report    the page about a log, judged                              (uses eval)
 //! bench     load on a live cell                                       (starts ecod-node)
 //! demo      a whole cell on this machine                              (uses testbed and street, starts ecod-node)
@@ -17,6 +18,7 @@
 pub mod bench;
 pub mod cli;
 pub mod demo;
+mod drawing;
 pub mod eval;
 pub mod node_process;
 pub mod report;

@@ -1,9 +1,10 @@
 //! A node as a process of its own.
 
 use std::fs::{self, File};
-use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context, bail, ensure};
@@ -144,13 +145,25 @@ pub fn node_beside(program: &Path) -> anyhow::Result<PathBuf> {
     Ok(node)
 }
 
-/// A TCP address on which nothing listens now.
+/// First and last port that is given to a node: below those of outgoing connections, one of which could take it before the
+/// node does.
+const PORTS: [usize; 2] = [18_000, 31_999];
+
+/// An address on which nothing listens now, for TCP or UDP; another one each time.
 ///
 /// # Errors
 /// When loopback has no free port.
 pub fn free_address() -> anyhow::Result<SocketAddr> {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).context("no free port on loopback")?;
-    Ok(listener.local_addr()?)
+    static GIVEN: AtomicUsize = AtomicUsize::new(0);
+    let [first, last] = PORTS;
+    // Processes start apart.
+    let start = std::process::id() as usize * 97;
+    let mut ports = (first..=last).map(|_| {
+        let port = first + (start + GIVEN.fetch_add(1, Ordering::Relaxed)) % (last - first + 1);
+        SocketAddr::from((Ipv4Addr::LOCALHOST, port as u16))
+    });
+    let is_free = |address: &SocketAddr| TcpListener::bind(address).is_ok() && UdpSocket::bind(address).is_ok();
+    ports.find(is_free).context("no free port on loopback")
 }
 
 fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {

@@ -50,6 +50,15 @@ pub enum Admitted {
     OutOfOrder(Timestamp),
 }
 
+/// Faults of a sender whose reports are admitted.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct SenderState {
+    /// Time for which none of its objects has been where it has an effect.
+    pub(crate) misplaced: Duration,
+    /// True if another sender uses its name.
+    pub(crate) is_shared: bool,
+}
+
 /// The state of admission.
 #[derive(Debug, Clone)]
 pub struct ReportWindow {
@@ -119,9 +128,11 @@ impl ReportWindow {
         since.map_or(Duration::ZERO, |since| now.since(since))
     }
 
-    /// True if two senders report under a name.
-    pub(crate) fn is_shared(&self, name: &NodeName) -> bool {
-        self.vehicles.get(name).is_some_and(VehicleClock::is_shared)
+    /// The state of a sender; without faults if it is not known.
+    pub(crate) fn sender(&self, name: &NodeName, now: Timestamp) -> SenderState {
+        let Some(vehicle) = self.vehicles.get(name) else { return SenderState::default() };
+        let misplaced = vehicle.misplaced_since.map_or(Duration::ZERO, |since| now.since(since));
+        SenderState { misplaced, is_shared: vehicle.is_shared() }
     }
 
     /// Notes if any object of a known sender's report has an effect where it is.
@@ -129,12 +140,6 @@ impl ReportWindow {
         if let Some(vehicle) = self.vehicles.get_mut(name) {
             vehicle.misplaced_since = (!is_placed).then(|| vehicle.misplaced_since.unwrap_or(at));
         }
-    }
-
-    /// Time for which no object of a sender has been where it has an effect.
-    pub(crate) fn misplaced_for(&self, name: &NodeName, now: Timestamp) -> Duration {
-        let since = self.vehicles.get(name).and_then(|vehicle| vehicle.misplaced_since);
-        since.map_or(Duration::ZERO, |since| now.since(since))
     }
 
     /// The share of the vehicles heard lately whose reports are admitted.

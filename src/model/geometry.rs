@@ -25,6 +25,13 @@ impl Pose {
         self.position + Vector2::new(cos * forward_m - sin * left_m, sin * forward_m + cos * left_m)
     }
 
+    /// Metres ahead and to the left of this pose of a world point: the inverse of [`Self::transform`].
+    pub fn ahead_left(&self, point: &Point2<f64>) -> Vector2<f64> {
+        let (sin, cos) = self.heading_rad.sin_cos();
+        let offset = point - self.position;
+        Vector2::new(cos * offset.x + sin * offset.y, cos * offset.y - sin * offset.x)
+    }
+
     /// Range in metres and bearing in radians, wrapped to (-π, π] and relative to the heading, of a world point.
     pub fn range_bearing(&self, point: &Point2<f64>) -> (f64, f64) {
         let offset = point - self.position;
@@ -141,6 +148,12 @@ mod tests {
         assert!(Covariance { xx: 0.0, xy: 0.0, yy: 1.0 }.is_valid());
         assert!(!Covariance { xx: 0.0, xy: 1e-9, yy: 1.0 }.is_valid());
         assert!(!Covariance { xx: 1.0, xy: f64::NAN, yy: 1.0 }.is_valid());
+    }
+
+    #[test]
+    fn ahead_and_left_are_as_the_pose_has_them() {
+        let pose = Pose::new(3.0, -1.0, 2.0);
+        assert!((pose.ahead_left(&pose.transform(4.0, -0.5)) - Vector2::new(4.0, -0.5)).norm() < 1e-12);
     }
 
     #[test]

@@ -4,7 +4,7 @@
 //! image, x to the right, y downwards. Lens distortion is removed where images are handled; pixels here are
 //! undistorted. Level frame: the camera as origin, forward along the heading of its axis, left, up, metres.
 
-use nalgebra::{Matrix3, Point2, Point3, Vector3};
+use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
 
 use crate::model::geometry::Pose;
 use crate::wire::WirePose;
@@ -118,13 +118,20 @@ impl Mount {
     /// Distances in metres of the ground at the lower and the upper edge of the image's middle column; the upper one is
     /// infinite at the horizon. `None` without a height, or without ground in view.
     pub fn ground_in_view(&self, intrinsics: &Intrinsics) -> Option<[f64; 2]> {
-        let height_m = self.height_m?;
         let distance_m = |row_px: f64| {
-            let ray = self.to_level() * intrinsics.ray(&Point2::new(intrinsics.cx, row_px));
-            if ray.z < 0.0 { height_m * ray.x.hypot(ray.y) / -ray.z } else { f64::INFINITY }
+            let ground = self.ground_at(&Point2::new(intrinsics.cx, row_px), intrinsics);
+            ground.map_or(f64::INFINITY, |ground| ground.norm())
         };
         let [near_m, far_m] = [f64::from(intrinsics.height), 0.0].map(distance_m);
         near_m.is_finite().then_some([near_m, far_m])
+    }
+
+    /// Metres ahead and to the left of the camera at which a pixel shows the ground; `None` without a height, and from the
+    /// horizon on.
+    pub fn ground_at(&self, pixel: &Point2<f64>, intrinsics: &Intrinsics) -> Option<Vector2<f64>> {
+        let ray = self.to_level() * intrinsics.ray(pixel);
+        let distance = self.height_m? / -ray.z;
+        (ray.z < 0.0).then(|| ray.xy() * distance)
     }
 
     /// The rotation from the camera frame to the level frame.

@@ -4,7 +4,7 @@
 //! A report lists them as `seen`, so that a location in view without a detection is known to be empty. A false claim does
 //! more harm than a missing one: a location must meet every condition.
 
-use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
+use nalgebra::{Matrix3, Point2, Point3, Vector2};
 
 use crate::config::{check_optional, config_section};
 use crate::model::geometry::{Pose, wrap_angle};
@@ -76,9 +76,7 @@ impl PosedCamera {
 
     /// The pixel of a point on the ground, or as high as the camera if its height is not known; `None` behind the camera.
     pub fn pixel(&self, point: &Point2<f64>) -> Option<Point2<f64>> {
-        let (range_m, bearing_rad) = self.pose.range_bearing(point);
-        let up_m = -self.height_m.unwrap_or(0.0);
-        let level = Vector3::new(range_m * bearing_rad.cos(), range_m * bearing_rad.sin(), up_m);
+        let level = self.pose.ahead_left(point).push(-self.height_m.unwrap_or(0.0));
         self.intrinsics.project(&Point3::from(self.from_level * level))
     }
 }

@@ -18,17 +18,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::aggregator::round::FirstRound;
-use ecod::aggregator::{Aggregator, Command, Fused};
+use ecod::aggregator::{Aggregator, Command, Fused, ReportDoubt};
 use ecod::diagnostics::TroubleKind;
 use ecod::leadership::timers::MAX_ADOPTED_MAP_AGE;
 use ecod::model::epoch::Epoch;
-use ecod::model::geometry::Pose;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::replay::{JournalEvent, TimeUnit};
 use ecod::tracking::TracksLosses;
 use ecod::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind};
-use nalgebra::Point2;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
@@ -156,11 +154,9 @@ const MIN_UNTIMELY: Duration = Duration::from_millis(500);
 /// take on their way.
 const MAX_UNNOTED_LEAD_US: i64 = 1_500_000;
 
-/// Time for which no object of a vehicle is at a known location until it is a trouble: it may see something else.
-const MIN_MISPLACED: Duration = Duration::from_secs(10);
-
-/// Greatest range in metres at which a camera tells what an object is.
-const MAX_SEEN_RANGE_M: f64 = 300.0;
+/// Remedy where times seem to be in another unit.
+const OTHER_UNIT_REMEDY: &str =
+    "correct the program that sends them, or set its clock: `captured_at_us` counts microseconds since 1970";
 
 /// The lead of a report's time in words.
 fn lead_in_words(report: &ObjectReport, lead_us: i64) -> String {
@@ -222,8 +218,7 @@ impl FuserState {
         match taken {
             Ok(fused) => {
                 self.note_clock(report, delivery.received_at);
-                self.note_place(*kind, report, delivery.received_at);
-                self.note_name(*kind, report);
+                self.note_doubts(*kind, report, delivery.received_at);
                 if self.aggregator.leads().is_some() {
                     self.spans.note(report, delivery.received_at, &mut self.reports);
                 }
@@ -250,12 +245,8 @@ impl FuserState {
                 if self.aggregator.untimely_for(kind, &report.node, received_at) >= MIN_UNTIMELY {
                     let cause = format!("refused, {}", lead_in_words(report, self.lead_us(report, received_at)));
                     self.counters.troubles().settle(TroubleKind::ClockOff, Some(node));
-                    let remedy = match TimeUnit::of(report.captured_at_us) {
-                        Some(_) => {
-                            "correct the program that sends them, or set its clock: `captured_at_us` counts microseconds since 1970"
-                        }
-                        None => TroubleKind::Untimely.remedy(),
-                    };
+                    let is_in_microseconds = TimeUnit::of(report.captured_at_us).is_none();
+                    let remedy = if is_in_microseconds { TroubleKind::Untimely.remedy() } else { OTHER_UNIT_REMEDY };
                     self.counters.troubles().note_with_remedy(Some(node), TroubleKind::Untimely, &cause, remedy);
                 }
             }
@@ -277,28 +268,14 @@ impl FuserState {
         }
     }
 
-    /// Notes a name that two senders use.
-    fn note_name(&self, kind: ReportKind, report: &ObjectReport) {
-        if self.aggregator.is_name_shared(kind, &report.node) {
-            let cause = "two programs report under this name: the numbers `seq` of its reports go back and forth";
-            self.counters.troubles().note_about(report.node.as_str(), TroubleKind::NameTaken, cause);
-        }
-    }
-
-    /// Notes detections that are used nowhere, or too far from their camera for any: their unit or frame is another.
-    fn note_place(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
-        let note = |cause: &str| {
-            self.counters.troubles().note_about(report.node.as_str(), TroubleKind::Misplaced, cause);
-        };
-        if let Some(pose) = report.pose.map(Pose::from) {
-            let ranges = report.objects.iter().map(|object| pose.range_bearing(&Point2::new(object.x_m, object.y_m)).0);
-            let farthest_m = ranges.fold(0.0, f64::max);
-            if farthest_m > MAX_SEEN_RANGE_M {
-                return note(&format!("an object of its report is {farthest_m:.0} m from its pose"));
-            }
-        }
-        if kind == ReportKind::Detections && self.aggregator.misplaced_for(&report.node, received_at) >= MIN_MISPLACED {
-            note("none of its objects is at a known location, or near one");
+    /// Notes doubts about a report that was used.
+    fn note_doubts(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
+        for doubt in self.aggregator.doubts(kind, report, received_at) {
+            let trouble = match doubt {
+                ReportDoubt::FarObject { .. } | ReportDoubt::NoObjectAtLocation => TroubleKind::Misplaced,
+                ReportDoubt::SharedName => TroubleKind::NameTaken,
+            };
+            self.counters.troubles().note_about(report.node.as_str(), trouble, &doubt.to_string());
         }
     }
 

@@ -47,7 +47,7 @@ pub struct ProjectorArguments {
     pub is_moving: bool,
     /// True for a fixed camera.
     pub is_fixed: bool,
-    /// UDP address for these poses, with the projectors of the other cameras; for one of the cameras.
+    /// UDP address for these poses, with the projectors of all cameras; for one of the cameras.
     pub poses: Option<(SocketAddr, Vec<ActorSlot<ProjectorMessage>>)>,
     /// Algorithms to report for.
     pub algorithms: Algorithms,
@@ -94,7 +94,7 @@ impl Actor for Projector {
 
     async fn pre_start(
         &self,
-        myself: ActorRef<Self::Msg>,
+        _myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         let ProjectorArguments {
@@ -112,8 +112,8 @@ impl Actor for Projector {
             counters,
         } = arguments;
         let mut feed = JoinSet::new();
-        if let Some((address, others)) = poses {
-            feed.spawn(pose_feed::listen(address, (myself, others), Arc::clone(&counters)));
+        if let Some(poses) = poses {
+            feed.spawn(pose_feed::listen(poses, Arc::clone(&counters)));
         }
         Ok(ProjectorState {
             perception,

@@ -181,9 +181,7 @@ impl MountConfig {
         check_range("pitch_deg", self.pitch_deg, -90.0, 90.0)?;
         check_range("roll_deg", self.roll_deg, -180.0, 180.0)
     }
-}
 
-impl MountConfig {
     /// A mount in the file's units, rounded to what anyone can measure.
     pub(crate) fn rounded(mount: &Mount) -> Self {
         let metres = |metres: f64| (metres * 1e3).round() / 1e3;

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
+use ecod::aggregator::Placements;
 use ecod::replay::{FusedLine, Rejections, Replay, ReplayConfig, Summary};
 use ecod::wire::Limits;
 
@@ -113,7 +114,7 @@ struct Usable {
 
 impl Usable {
     fn of(summary: &Summary, may_repeat: bool) -> Self {
-        let Summary { lines, votes, ignored_votes, placed, misplaced, .. } = *summary;
+        let Summary { lines, votes, ignored_votes, placements: Placements { placed, misplaced }, .. } = *summary;
         let (used, faulty) = (summary.used(), summary.faulty(may_repeat));
         Self { reports: lines, used, faulty, votes, ignored_votes, placed, misplaced }
     }
@@ -210,19 +211,7 @@ impl RoundWriter {
 }
 
 fn print_summary(summary: &Summary) {
-    let Summary {
-        lines,
-        rejected,
-        unit,
-        late,
-        votes: _,
-        ignored_votes,
-        misplaced,
-        placed: _,
-        overtaken,
-        tracks,
-        written,
-    } = summary;
+    let Summary { lines, rejected, unit, late, ignored_votes, placements, overtaken, tracks, written, .. } = summary;
     eprintln!("{lines} lines, {} used, {written} written", summary.used());
     for (reason, Rejections { lines, examples }) in rejected {
         eprintln!("rejected {reason} {lines}");
@@ -236,7 +225,7 @@ fn print_summary(summary: &Summary) {
     for (what, number) in [
         ("reports used although older than an earlier line", *late),
         ("votes ignored: no usable location, or too many labels", *ignored_votes),
-        ("reports of which no object is at a known location, or near one", *misplaced),
+        ("reports of which no object is at a known location, or near one", placements.misplaced),
         ("reports used for tracking only, since a later one of the vehicle came first", *overtaken),
         ("reports too late for tracking", tracks.late),
         ("new objects not tracked: too many", tracks.refused),

@@ -428,16 +428,7 @@ impl NodeBuilder {
     }
 }
 
-/// The same for one of the cameras.
-#[cfg(feature = "camera")]
-fn camera_slot<M: Message>(
-    slots: &[ActorSlot<M>],
-    camera: usize,
-    spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
-) -> Result<ActorId, ActorProcessingErr> {
-    slot(slots.get(camera).ok_or("there is no such camera")?, spawned)
-}
-
+/// Slots a part that was started.
 fn slot<M: Message>(
     slot: &ActorSlot<M>,
     spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
@@ -446,6 +437,16 @@ fn slot<M: Message>(
     let id = actor.get_id();
     slot.set(actor);
     Ok(id)
+}
+
+/// The same for one of the cameras.
+#[cfg(feature = "camera")]
+fn camera_slot<M: Message>(
+    slots: &[ActorSlot<M>],
+    camera: usize,
+    spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
+) -> Result<ActorId, ActorProcessingErr> {
+    slot(slots.get(camera).ok_or("there is no such camera")?, spawned)
 }
 
 /// The rule of the node's own broker: who may publish for all.

@@ -150,7 +150,7 @@ fn leaders(terms: &[JudgedTerm], start: Timestamp, judged: &str) -> String {
     terms.iter().map(line).collect()
 }
 
-/// What each node knows of the street, alone and with the cell.
+/// Table of what each node knows of the street, alone and with the cell.
 fn street_table(street: &StreetResult) -> String {
     let columns =
         |known: &KnownShare| format!("{:5.1} {:8.1} % {:7.1} %", known.known, known.precision_pct, known.recall_pct);

@@ -1,7 +1,7 @@
 //! The processes of a demo: started, watched, the edge killed half-way and started again, and stopped.
 
 use std::fs;
-use std::net::{Ipv4Addr, SocketAddr, TcpListener, UdpSocket};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -16,7 +16,7 @@ use ecod_actors::platform::clock;
 use ecod_actors::transport::gossip::MembershipConfig;
 
 use super::report_collector::{ObservedReport, ReportCollector};
-use crate::node_process::NodeProcess;
+use crate::node_process::{NodeProcess, free_address};
 
 /// Progress of a running demo.
 #[derive(Debug, Clone, Copy)]
@@ -38,7 +38,7 @@ pub enum News {
     EdgeStarted,
 }
 
-/// What was seen of a cell that ran.
+/// Reports and times of a cell that ran.
 #[derive(Debug)]
 pub(super) struct Played {
     pub(super) reports: Vec<ObservedReport>,
@@ -81,7 +81,9 @@ impl<'a> Stage<'a> {
         if state.exists() {
             fs::remove_dir_all(&state).with_context(|| format!("cannot remove {}", state.display()))?;
         }
-        Ok(Self { program, directory, addresses: free_addresses(nodes)? })
+        let free = |_| Ok(NodeAddresses { broker: free_address()?, gossip: free_address()?, poses: free_address()? });
+        let addresses = (0..nodes).map(free).collect::<anyhow::Result<_>>()?;
+        Ok(Self { program, directory, addresses })
     }
 
     /// Where a node may receive its poses; the edge is number 0.
@@ -197,19 +199,6 @@ async fn watch(
     }
     played.until = clock::now();
     Ok(played)
-}
-
-/// Addresses on which nothing listens now, no two the same.
-fn free_addresses(count: usize) -> anyhow::Result<Vec<NodeAddresses>> {
-    let loopback = (Ipv4Addr::LOCALHOST, 0);
-    // All at once, so that none is given away twice.
-    let sockets: std::io::Result<Vec<_>> = (0..count)
-        .map(|_| Ok((TcpListener::bind(loopback)?, UdpSocket::bind(loopback)?, UdpSocket::bind(loopback)?)))
-        .collect();
-    let node = |(broker, gossip, poses): &(TcpListener, UdpSocket, UdpSocket)| {
-        Ok(NodeAddresses { broker: broker.local_addr()?, gossip: gossip.local_addr()?, poses: poses.local_addr()? })
-    };
-    sockets.and_then(|sockets| sockets.iter().map(node).collect()).context("no free port on loopback")
 }
 
 fn check(nodes: &mut [NodeProcess]) -> anyhow::Result<()> {

@@ -37,8 +37,8 @@ use serde::Serialize;
 use super::judged_term::{JudgedTerm, judged_terms};
 use super::report_collector::ObservedReport;
 use super::stage::{Played, Progress, Stage};
-use crate::eval::tracks::{MATCH_DISTANCE_M, SaidObject, ScoredFrame, score};
-use crate::street::film::{Film, KnownMap};
+use crate::eval::tracks::{DEFAULT_THRESHOLD, MATCH_DISTANCE_M, SaidObject, ScoredFrame, score};
+use crate::street::film::{FORGOTTEN, Film, KnownMap};
 use crate::street::network_camera::{FRAMES_PER_S, NetworkCamera};
 use crate::street::{Carrier, Street, StreetCamera};
 
@@ -55,7 +55,7 @@ pub struct StreetDemo<'a> {
     pub dashboard: SocketAddr,
 }
 
-/// What came of the street.
+/// Result of a run.
 #[derive(Debug)]
 pub struct StreetOutcome {
     /// Figures.
@@ -87,7 +87,7 @@ pub struct StreetResult {
     pub seen_only_by: BTreeMap<NodeName, usize>,
 }
 
-/// What a node knows of the street, every tenth of a second. An object counts as known within 2 m.
+/// Knowledge of a node about the street, judged every tenth of a second. An object counts as known within 2 m.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct KnownShare {
     /// Objects that it knows at a time, the mean.
@@ -101,14 +101,8 @@ pub struct KnownShare {
 /// Time between two moments that are judged.
 const STEP: Duration = Duration::from_millis(100);
 
-/// Age of a map from which on a node knows nothing.
-const FORGOTTEN: Duration = Duration::from_secs(1);
-
 /// Time between two poses of a vehicle that drives.
 const POSE_PERIOD: Duration = Duration::from_millis(50);
-
-/// Confidence from which an object of a map counts.
-const CONFIDENCE: f64 = 0.5;
 
 impl StreetDemo<'_> {
     /// Runs the street; `progress` is told once a second.
@@ -122,7 +116,6 @@ impl StreetDemo<'_> {
         for number in 0..street.cameras.len() {
             cameras.push(NetworkCamera::start(&street, number, start).await?);
         }
-        // Once the cameras have their ports.
         let stage = Stage::new(self.program, self.directory, street.cameras.len() + 1)?;
         let mut configs = vec![NodeConfig { name: Some(edge_name()), role: Role::Edge, ..cell() }];
         let mut driving = Vec::new();
@@ -277,7 +270,7 @@ impl Judge<'_> {
         let mut seen_only_by: BTreeMap<NodeName, std::collections::BTreeSet<u32>> = BTreeMap::new();
         for ReceivedMap { map, .. } in logs.iter().flat_map(|(_, log)| log).filter(|line| self.is_judged(&line.map)) {
             let truth = self.street.truth(map.fused_at_us.since(self.start).as_secs_f64());
-            for object in map.objects.iter().filter(|object| object.confidence >= CONFIDENCE) {
+            for object in map.objects.iter().filter(|object| object.confidence >= DEFAULT_THRESHOLD) {
                 let place = Point2::new(object.x_m, object.y_m);
                 let near = truth.iter().filter(|known| known.label == object.label && known.label.as_str() == "person");
                 let near = near.map(|known| (nalgebra::distance(&known.position, &place), known.id));
@@ -335,7 +328,7 @@ impl Judge<'_> {
         })
     }
 
-    /// What somebody knows who got these maps.
+    /// Knowledge of a node that got these maps.
     fn share(&self, maps: &[ReceivedMap]) -> KnownShare {
         let (mut frames, mut at, mut next, mut ids) = (Vec::new(), self.from, 0, HashMap::new());
         while at <= self.until {
@@ -349,20 +342,8 @@ impl Judge<'_> {
     }
 
     fn frame(&self, at: Timestamp, map: Option<&GlobalMap>, ids: &mut HashMap<uuid::Uuid, u32>) -> ScoredFrame {
-        let said = map.into_iter().flat_map(|map| &map.objects).map(|object| {
-            let next = ids.len() as u32;
-            SaidObject {
-                id: *ids.entry(object.id).or_insert(next),
-                label: object.label.clone(),
-                score: object.confidence,
-                existence: object.existence,
-                position: Point2::new(object.x_m, object.y_m),
-            }
-        });
-        ScoredFrame {
-            said: said.filter(|said| said.score >= CONFIDENCE).collect(),
-            truth: self.street.truth(at.since(self.start).as_secs_f64()),
-        }
+        let said = map.into_iter().flat_map(|map| &map.objects).map(|object| SaidObject::of(object, ids));
+        ScoredFrame { said: said.collect(), truth: self.street.truth(at.since(self.start).as_secs_f64()) }
     }
 }
 

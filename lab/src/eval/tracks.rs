@@ -21,7 +21,7 @@ use std::collections::BTreeMap;
 
 use ecod::model::names::Label;
 use ecod::model::time::Timestamp;
-use ecod::wire::GlobalMap;
+use ecod::wire::{FusedObject, GlobalMap};
 use hashbrown::HashMap;
 use nalgebra::Point2;
 use serde::Serialize;
@@ -83,6 +83,20 @@ pub struct SaidObject {
     pub existence: Option<f64>,
     /// Its centre in metres.
     pub position: Point2<f64>,
+}
+
+impl SaidObject {
+    /// An object of a map; `ids` are the numbers given so far.
+    pub fn of(object: &FusedObject, ids: &mut HashMap<Uuid, u32>) -> Self {
+        let next = ids.len() as u32;
+        Self {
+            id: *ids.entry(object.id).or_insert(next),
+            label: object.label.clone(),
+            score: object.confidence,
+            existence: object.existence,
+            position: Point2::new(object.x_m, object.y_m),
+        }
+    }
 }
 
 /// Result of an evaluation. Shares are percentages; `None` where nothing could be judged.
@@ -229,16 +243,7 @@ impl TrackEvaluation {
     /// Takes the next map.
     pub fn map(&mut self, map: &GlobalMap) {
         let ids = &mut self.ids;
-        let said = map.objects.iter().map(|object| {
-            let fresh = ids.len() as u32;
-            SaidObject {
-                id: *ids.entry(object.id).or_insert(fresh),
-                label: object.label.clone(),
-                score: object.confidence,
-                existence: object.existence,
-                position: Point2::new(object.x_m, object.y_m),
-            }
-        });
+        let said = map.objects.iter().map(|object| SaidObject::of(object, ids));
         let said: Vec<SaidObject> = said.collect();
         self.said(map.fused_at_us, &said);
     }

@@ -19,8 +19,9 @@ use svg::node::element::{
 use super::network_camera::{KEPT_PX, KeptPicture};
 use super::view::StreetSight;
 use super::{CODE_MODULES, QUIET_MODULES, Solid, Street, StreetBody, StreetCamera};
-use crate::eval::tracks::{MATCH_DISTANCE_M, TrueObject};
-use crate::testbed::birdseye::{FONT, VEHICLE_COLORS};
+use crate::drawing::{INK, page, round};
+use crate::eval::tracks::{DEFAULT_THRESHOLD, MATCH_DISTANCE_M, TrueObject};
+use crate::testbed::birdseye::VEHICLE_COLORS;
 
 /// A map and when a vehicle had it.
 #[derive(Debug, Clone, Copy)]
@@ -31,7 +32,7 @@ pub struct KnownMap<'a> {
     pub map: &'a GlobalMap,
 }
 
-/// What the animation shows.
+/// Run of a street to be animated.
 pub struct Film<'a> {
     /// The street.
     pub street: &'a Street,
@@ -61,11 +62,8 @@ const AFTER: Duration = Duration::from_secs(6);
 /// Time between two moments of the drawing, and between two pictures.
 const STEP: Duration = Duration::from_millis(200);
 const PICTURE_STEP: Duration = Duration::from_millis(400);
-/// Age of a map from which on it is not shown.
-const FORGOTTEN: Duration = Duration::from_secs(1);
-/// Confidence from which an object is shown.
-const CONFIDENCE: f64 = 0.5;
-
+/// Age of a map from which on a node knows nothing.
+pub const FORGOTTEN: Duration = Duration::from_secs(1);
 const PX_PER_M: f64 = 22.0;
 /// Half of what is shown of the street, in metres.
 const HALF_M: [f64; 2] = [20.5, 10.0];
@@ -73,7 +71,6 @@ const TOP_PX: f64 = 56.0;
 const MARGIN_PX: f64 = 18.0;
 /// Range up to which the view of a camera is shown, in metres.
 const CONE_M: f64 = 9.0;
-const INK: &str = "#222222";
 const FAINT: &str = "#767676";
 const SHARED: &str = "#007a5a";
 const ALARM: &str = "#d1420f";
@@ -107,14 +104,7 @@ impl FilmScene<'_> {
         let (width, street_px) = (2.0 * (MARGIN_PX + HALF_M[0] * PX_PER_M), 2.0 * HALF_M[1] * PX_PER_M);
         let pictures_top = TOP_PX + street_px + 34.0;
         let height = pictures_top + self.picture_px()[1] + MARGIN_PX;
-        let mut document = Document::new()
-            .set("viewBox", (0, 0, round(width), round(height)))
-            .set("width", round(width))
-            .set("height", round(height))
-            .set("font-family", FONT)
-            .set("font-size", 14)
-            .set("fill", INK)
-            .add(Rectangle::new().set("width", "100%").set("height", "100%").set("fill", "white"))
+        let mut document = page(width, height, 14)
             .add(self.title(width))
             .add(Definitions::new().add(ClipPath::new().set("id", "street").add(frame("white"))));
         let mut below = Group::new().set("clip-path", "url(#street)").add(ground());
@@ -152,7 +142,7 @@ impl FilmScene<'_> {
         format!("{}s", round(STEP.as_secs_f64() * (self.times.len() - 1) as f64))
     }
 
-    /// Who leads, what happens to the edge, and how much is known.
+    /// The leader, the fate of the edge, and the number of known objects.
     fn title(&self, width: f64) -> Group {
         let film = self.film;
         let who = film.street.cameras.first().map_or("a vehicle", |camera| camera.name.as_str());
@@ -424,7 +414,7 @@ impl Street {
 
 /// The objects of a map that are shown.
 fn shown(map: &GlobalMap) -> impl Iterator<Item = &FusedObject> {
-    map.objects.iter().filter(|object| object.confidence >= CONFIDENCE)
+    map.objects.iter().filter(|object| object.confidence >= DEFAULT_THRESHOLD)
 }
 
 /// The node that alone told of an object.
@@ -457,8 +447,4 @@ fn ground() -> Group {
 /// Where a place is in the picture.
 fn px(place: &Point2<f64>) -> (f64, f64) {
     (MARGIN_PX + (place.x + HALF_M[0]) * PX_PER_M, TOP_PX + (HALF_M[1] - place.y) * PX_PER_M)
-}
-
-fn round(value: f64) -> f64 {
-    (value * 10.0).round() / 10.0
 }

@@ -111,7 +111,7 @@ impl NetworkCamera {
     }
 }
 
-/// What the thread of a camera needs.
+/// State of the thread that takes the pictures of a camera.
 struct Shooting {
     street: Arc<Street>,
     number: usize,

@@ -9,11 +9,12 @@ use ecod::model::names::{Label, LandmarkId, NodeName};
 use ecod::wire::{GlobalMap, LandmarkState};
 use nalgebra::Point2;
 use svg::Document;
-use svg::node::element::{Circle, ClipPath, Definitions, Group, Line, Path, Rectangle, Text};
+use svg::node::element::{Circle, ClipPath, Definitions, Group, Line, Path, Text};
 
 use super::score::is_right;
+use crate::drawing::{INK, page, round};
 use crate::testbed::{Cav, Scene, Spot, Testbed};
-use sheet::{METRES_PER_INCH, Sheet, round};
+use sheet::{METRES_PER_INCH, Sheet};
 
 /// Draws a scene as a self-contained SVG, in inches.
 ///
@@ -116,9 +117,7 @@ impl MarkKind {
 
 /// Fill of each vehicle in turn: the colours of Okabe and Ito that are not kin to those of a [`MarkKind`].
 pub(crate) const VEHICLE_COLORS: [&str; 5] = ["#0072b2", "#e69f00", "#cc79a7", "#56b4e9", "#000000"];
-const INK: &str = "#222222";
 const FAINT: &str = "#8a8a8a";
-pub(crate) const FONT: &str = "DejaVu Sans, Verdana, Helvetica, Arial, sans-serif";
 /// Height of a line of text in pixels.
 const LINE_PX: f64 = 18.0;
 /// Longest text in characters; the rest is cut.
@@ -144,15 +143,8 @@ impl BirdseyePicture<'_> {
             .add(self.dots(detections))
             .add(self.marks());
         let beyond = detections.iter().filter(|(_, place)| !sheet.holds(place)).count();
-        Document::new()
-            .set("viewBox", (0, 0, round(width), round(height)))
-            .set("width", round(width))
-            .set("height", round(height))
-            .set("font-family", FONT)
-            .set("font-size", 13)
-            .set("fill", INK)
+        page(width, height, 13)
             .add(Definitions::new().add(clip))
-            .add(Rectangle::new().set("width", "100%").set("height", "100%").set("fill", "white"))
             .add(self.title())
             .add(sheet.axes())
             .add(inside)

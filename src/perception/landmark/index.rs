@@ -19,6 +19,8 @@ pub struct LandmarkIndex {
     by_id: HashMap<LandmarkId, usize>,
     objects: Grid,
     vacancy_signs: Grid,
+    /// Corners of the box around all positions, west-south and east-north; without landmarks, the wrong way around.
+    corners: [Point2<f64>; 2],
 }
 
 /// A landmark that a detection may belong to.
@@ -54,7 +56,12 @@ impl LandmarkIndex {
         };
         let objects = landmarks.iter().map(|l| l.position).enumerate().map(point);
         let signs = landmarks.iter().enumerate().filter_map(|(index, l)| Some((index, l.vacancy.as_ref()?.position)));
+        let (mut low, mut high) = (Point2::from([f64::MAX; 2]), Point2::from([f64::MIN; 2]));
+        for Landmark { position, .. } in &landmarks {
+            (low, high) = (low.inf(position), high.sup(position));
+        }
         Self {
+            corners: [low, high],
             ids: landmarks.iter().map(|l| l.id.clone()).collect(),
             by_id: landmarks.iter().enumerate().map(|(index, l)| (l.id.clone(), index)).collect(),
             objects: Grid::new(objects, 4.0 * radius_m),
@@ -86,6 +93,13 @@ impl LandmarkIndex {
     /// Landmarks whose object position is within `radius_m` of a point in metres, in no particular order.
     pub fn within(&self, point: &Point2<f64>, radius_m: f64) -> impl Iterator<Item = usize> {
         self.objects.within(*point, radius_m).map(|(near, _)| near.landmark as usize)
+    }
+
+    /// True if a point in metres is at most `margin_m` and their extent away from the landmarks, along each axis.
+    pub fn is_around(&self, point: &Point2<f64>, margin_m: f64) -> bool {
+        let [low, high] = self.corners;
+        let margin = (high - low).add_scalar(margin_m);
+        low - margin <= *point && *point <= high + margin
     }
 
     /// The landmark within the gate at the smallest Mahalanobis distance from a detection.

@@ -101,7 +101,7 @@ pub fn fit_mount(
     let fit = HeightFit { boxes, people, size: *size, config, intrinsics: *intrinsics, mount: *mount };
     let (start, grown, _) =
         fit.improved((fit.start(), vec![1.0; fit.people]), |off| (FREEDOM + 1.0) / (FREEDOM + off * off));
-    // What is beyond a few of the errors' median counts no more.
+    // Errors beyond a few medians count no more.
     let mut off: Vec<f64> =
         fit.errors(&start, &grown).iter().flatten().map(|e| e.in_sigmas(e.own_sigma).abs()).collect();
     off.sort_by(f64::total_cmp);

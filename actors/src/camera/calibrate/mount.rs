@@ -75,9 +75,9 @@ const RANSAC_CONFIDENCE: f64 = 0.999;
 /// Largest standard deviation in degrees of a pitch that is worth to be told.
 const MAX_PITCH_SIGMA_DEG: f64 = 5.0;
 
-/// Fits a camera to points: P3P within RANSAC (Fischler, Bolles 1981), then the pose of a plane (Collins, Bartoli
-/// 2014) from the inliers, refined by Levenberg and Marquardt. The places are in
-/// any frame on the ground, x to y counter-clockwise from above.
+/// Fits a camera to points: P3P within RANSAC (Fischler, Bolles 1981), then the pose of a plane (Collins, Bartoli 2014)
+/// from the inliers, refined by Levenberg and Marquardt. Places are in any frame on the ground, x to y counter-clockwise
+/// from above.
 ///
 /// # Errors
 /// [`GroundFitError`] when no camera fits, or several do.
@@ -94,7 +94,9 @@ pub fn fit_ground_points(points: &[GroundPoint], intrinsics: &Intrinsics) -> Res
     let camera = PosedCamera::new(pose, &mount, *intrinsics);
     let fit = |(index, point): (usize, &GroundPoint)| PointFit {
         error_px: camera.pixel(&point.place).map_or(f64::INFINITY, |pixel| (pixel - point.pixel).norm()),
-        error_m: on_ground(&point.pixel, &pose, &mount, intrinsics).map(|place| (place - point.place).norm()),
+        error_m: mount
+            .ground_at(&point.pixel, intrinsics)
+            .map(|ground| (pose.transform(ground.x, ground.y) - point.place).norm()),
         is_outlier: !inliers.contains(&index),
     };
     let fits: Vec<PointFit> = points.iter().enumerate().map(fit).collect();
@@ -152,8 +154,8 @@ fn solve(
     calib3d::rodrigues_def(&rotation, &mut matrix)?;
     let from_ground = Matrix3::from_row_slice(&matrix.val);
     let translation = Vector3::from_column_slice(translation.data_typed::<f64>()?);
-    Ok(Some((from_extrinsics(&from_ground, &translation), inliers))
-        .map(|((pose, mount), inliers)| (pose, mount, inliers)))
+    let (pose, mount) = from_extrinsics(&from_ground, &translation);
+    Ok(Some((pose, mount, inliers)))
 }
 
 /// Pose and mount from the rotation from the ground to the camera and the ground's origin in the camera.
@@ -170,13 +172,6 @@ fn from_extrinsics(from_ground: &Matrix3<f64>, origin: &Vector3<f64>) -> (Pose, 
     };
     let heading_rad = to_ground[(1, 2)].atan2(to_ground[(0, 2)]);
     (Pose::new(position.x, position.y, heading_rad), mount)
-}
-
-/// Where a pixel's line of sight meets the ground.
-fn on_ground(pixel: &Point2<f64>, pose: &Pose, mount: &Mount, intrinsics: &Intrinsics) -> Option<Point2<f64>> {
-    let ray = mount.to_level() * intrinsics.ray(pixel);
-    let distance = mount.height_m? / -ray.z;
-    (ray.z < 0.0).then(|| pose.transform(ray.x * distance, ray.y * distance))
 }
 
 /// Of height, pitch, roll, heading and position.

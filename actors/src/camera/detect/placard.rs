@@ -86,16 +86,7 @@ impl PlacardDetector {
     pub fn new(config: PlacardConfig) -> Self {
         Self { config }
     }
-}
 
-impl Detect for PlacardDetector {
-    fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
-        let codes = self.codes(&mut gray(frame)?)?;
-        Ok(codes.into_iter().filter_map(Code::into_detection).collect())
-    }
-}
-
-impl PlacardDetector {
     /// The codes in a continuous gray image, which are painted over.
     pub(crate) fn codes(&self, gray: &mut Mat) -> Result<Vec<Code>, DetectError> {
         let reader = zxingcpp::read()
@@ -119,6 +110,13 @@ impl PlacardDetector {
         }
         codes.truncate(self.config.max_codes.into());
         Ok(codes)
+    }
+}
+
+impl Detect for PlacardDetector {
+    fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
+        let codes = self.codes(&mut gray(frame)?)?;
+        Ok(codes.into_iter().filter_map(Code::into_detection).collect())
     }
 }
 

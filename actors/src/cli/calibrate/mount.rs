@@ -27,6 +27,7 @@ use crate::camera::frame_source::SourceConfig;
 use crate::camera::frame_source::capture::Capture;
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
+use crate::node;
 use crate::node::config::NodeConfig;
 
 #[derive(Debug, Subcommand)]
@@ -149,7 +150,7 @@ impl MountArguments {
             Some(name) => anyhow!("{:?} has no camera {name:?}: see `name` in its [[cameras]]", self.config),
         };
         let camera = camera.cloned().ok_or_else(no_camera).map_err(Failure::usage)?;
-        let lens = camera.optics.lens().map_err(Failure::usage)?;
+        let lens = node::camera::lens(&camera).map_err(Failure::usage)?;
         Ok((config, camera, lens))
     }
 
@@ -219,15 +220,11 @@ impl PointsArguments {
         let pixels: Vec<_> = stated.iter().map(|[column, row, ..]| Point2::new(column * scale, row * scale)).collect();
         let pixels = lens.undistorted(&pixels).context("cannot remove the distortion")?;
         let vehicle = self.vehicle(&config)?;
-        let place = |&[_, _, x_m, y_m]: &StatedPoint| {
-            let (range_m, bearing_rad) = vehicle.range_bearing(&Point2::new(x_m, y_m));
-            Point2::new(range_m * bearing_rad.cos(), range_m * bearing_rad.sin())
+        let point = |(pixel, [_, _, x_m, y_m]): (&Point2<f64>, &StatedPoint)| GroundPoint {
+            pixel: *pixel,
+            place: vehicle.ahead_left(&Point2::new(*x_m, *y_m)).into(),
         };
-        let points: Vec<_> = pixels
-            .iter()
-            .zip(&stated)
-            .map(|(pixel, point)| GroundPoint { pixel: *pixel, place: place(point) })
-            .collect();
+        let points: Vec<_> = pixels.iter().zip(&stated).map(point).collect();
         let fit = fit_ground_points(&points, &lens.intrinsics).context("the points give no mount")?;
         for (PointFit { error_px, error_m, is_outlier }, [column, row, ..]) in fit.points.iter().zip(&stated) {
             let on_ground = error_m.map_or_else(|| "above the horizon".to_owned(), |metres| format!("{metres:.3} m"));
@@ -310,11 +307,11 @@ impl PeopleArguments {
         self.node.tell(&estimate, &watched.lens)
     }
 
-    /// What the node's detector finds until the time is up, or the source ends.
+    /// Detections of the node's detector until the time is up, or the source ends.
     fn watch(&self, camera: &CameraConfig, lens: Lens) -> Result<Watched, Failure> {
         let mut detector = camera.detector.build().map_err(Failure::usage)?;
         let (source, capture) = (camera.source.clone(), camera.capture.clone());
-        let timeout = Duration::from_secs_f64(capture.stall_timeout_s);
+        let timeout = node::camera::open_timeout(camera);
         source.open(timeout).map(drop).map_err(Failure::usage)?;
         let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().context("cannot start")?;
         let for_s = Duration::try_from_secs_f64(self.for_s).map_err(Failure::usage)?;
@@ -330,7 +327,7 @@ impl PeopleArguments {
     }
 }
 
-/// What was found in a camera's frames.
+/// Findings in a camera's frames.
 struct Watched {
     /// Whole boxes of people by frame, without distortion.
     people: Vec<Vec<BoundingBox>>,

@@ -1,4 +1,4 @@
-//! What the actors of the cameras are made of.
+//! Arguments and settings of the actors of the cameras.
 
 use std::sync::Arc;
 
@@ -19,14 +19,13 @@ impl NodeBuilder {
     /// vehicle for all.
     pub(super) fn projector_arguments(&self, place: usize) -> anyhow::Result<ProjectorArguments> {
         let camera = self.camera(place)?;
-        let others = self.slots.projectors.iter().skip(1).cloned().collect();
         Ok(ProjectorArguments {
             perception: camera::perception(&self.config, camera)?,
             standing: self.standing_pose(),
             origin: self.config.origin,
             is_moving: self.config.pose.listen.is_some(),
             is_fixed: self.config.pose.is_fixed(),
-            poses: self.config.pose.listen.filter(|_| place == 0).map(|address| (address, others)),
+            poses: self.config.pose.listen.filter(|_| place == 0).zip(Some(self.slots.projectors.clone())),
             algorithms: camera::algorithms(&self.config, camera),
             clock: self.clock.clone(),
             gateway: self.slots.gateway.clone(),

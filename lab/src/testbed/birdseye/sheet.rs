@@ -4,6 +4,7 @@ use nalgebra::{Point2, Vector2};
 use svg::node::element::{Group, Rectangle};
 
 use super::{FAINT, line, text};
+use crate::drawing::round;
 use crate::testbed::Scene;
 
 /// Scene files and axes are in inches.
@@ -125,9 +126,4 @@ impl Sheet {
 fn ticks(low_m: f64, high_m: f64, step: f64) -> impl Iterator<Item = f64> {
     let (first, last) = ((low_m / METRES_PER_INCH / step).ceil(), (high_m / METRES_PER_INCH / step).floor());
     (first as i64..=last as i64).map(move |index| index as f64 * step)
-}
-
-/// Tenths of a pixel are enough and keep the file small.
-pub(super) fn round(pixels: f64) -> f64 {
-    (pixels * 10.0).round() / 10.0
 }

@@ -17,7 +17,7 @@ export function ellipse([xx, xy, yy]) {
   return { a: SIGMAS_95 * Math.sqrt(mean + half), b: SIGMAS_95 * Math.sqrt(Math.max(mean - half, 0)), turn: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 
-/// Who sees an object, in words.
+/// Nodes that see an object, in words.
 export const sightings = ({ contributors, vehicle }) => witnesses(contributors.map((name) => (name === vehicle ? "itself" : name)));
 
 const witnesses = (names) => (names.length === 0 ? "nobody at present" : names.length === 1 ? `only by ${names[0]}` : `by ${[...names].sort().join(", ")}`);

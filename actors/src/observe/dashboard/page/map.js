@@ -29,12 +29,12 @@ export class BirdsEye {
   #fullAt = 0;
   #zoom = 1;
   #shift = [0, 0];
-  /// Whether far things count for the fit, too.
+  /// True if far things count for the fit, too.
   #all = false;
   #kept = null;
   #trails = new Trails();
   #at = null;
-  /// Whether the present press dragged the map.
+  /// True if the present press dragged the map.
   #dragged = false;
   #onPick = null;
   #known = [];

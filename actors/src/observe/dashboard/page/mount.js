@@ -4,7 +4,7 @@ import { byId, counted, keyed, set, text } from "./dom.js";
 
 /// Minimum number of points from which a mount follows.
 const MIN_POINTS = 4;
-/// What a point consists of: [key, name, decimals].
+/// Parts of a point: [key, name, decimals].
 const COLUMNS = [["column", "Column, px", 0], ["row", "Row, px", 0], ["x_m", "East, m", 2], ["y_m", "North, m", 2]];
 
 export class MountPoints {

@@ -76,19 +76,19 @@ impl Sessions {
             }
             Handshake::Proof { echo, cookie, introduction } => {
                 self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
-                if introduction.id.name == arrival.own.name && !self.prove_certificates() {
-                    let taken =
-                        Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim: NameClaim::Taken };
-                    let accept = Handshake::Accept { echo: cookie, introduction: taken };
-                    let answer = Some(self.handshake(&head.sender, &accept));
-                    return Ok(FrameContent::Namesake { id: introduction.id, answer });
-                }
                 if !self.prove_certificates() {
+                    let is_namesake = introduction.id.name == arrival.own.name;
                     let admission = Admission { proven: None, keys: None, is_proof: true };
-                    let claim = self.admit(head, &introduction.id, admission, arrival)?;
+                    let claim = match is_namesake {
+                        true => NameClaim::Taken,
+                        false => self.admit(head, &introduction.id, admission, arrival)?,
+                    };
                     let answer = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
                     let accept = Handshake::Accept { echo: cookie, introduction: answer };
                     let answer = Some(self.handshake(&head.sender, &accept));
+                    if is_namesake {
+                        return Ok(FrameContent::Namesake { id: introduction.id, answer });
+                    }
                     return Ok(FrameContent::Met { introduction, answer, speaks: claim != NameClaim::Taken });
                 }
                 let attestation = decode(attestation)?;

@@ -1,0 +1,55 @@
+//! Doubts about reports that are used all the same.
+
+use std::fmt;
+use std::time::Duration;
+
+use nalgebra::Point2;
+
+use crate::model::geometry::Pose;
+use crate::wire::ObjectReport;
+
+/// Time for which no object of a vehicle has an effect where it is until that is a doubt: it may see something else.
+pub(super) const MIN_MISPLACED: Duration = Duration::from_secs(10);
+
+/// Distance in metres from the known locations, beside their extent, beyond which a cell tracks no objects.
+pub(super) const MAX_AWAY_M: f64 = 200.0;
+
+/// Greatest range in metres at which a camera tells what an object is.
+const MAX_SEEN_RANGE_M: f64 = 300.0;
+
+/// A doubt about the reports of a vehicle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ReportDoubt {
+    /// An object is farther from the camera than any can be seen: positions are in another unit.
+    FarObject {
+        /// Its range in metres.
+        range_m: f64,
+    },
+    /// For ten seconds no object has been at a known location or, where objects are tracked, near one: positions are in
+    /// another unit or frame.
+    NoObjectAtLocation,
+    /// Two senders report under the name: their numbers go back and forth.
+    SharedName,
+}
+
+impl ReportDoubt {
+    /// The doubt about the range of the objects of a report, if there is one.
+    pub(super) fn of_ranges(report: &ObjectReport) -> Option<Self> {
+        let camera = Pose::from(report.pose?).position;
+        let range_m = |x_m, y_m| nalgebra::distance(&camera, &Point2::new(x_m, y_m));
+        let range_m = report.objects.iter().map(|object| range_m(object.x_m, object.y_m)).fold(0.0, f64::max);
+        (range_m > MAX_SEEN_RANGE_M).then_some(Self::FarObject { range_m })
+    }
+}
+
+impl fmt::Display for ReportDoubt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::FarObject { range_m } => write!(f, "an object of its report is {range_m:.0} m from its pose"),
+            Self::NoObjectAtLocation => f.write_str("none of its objects is at a known location, or near one"),
+            Self::SharedName => {
+                f.write_str("two programs report under this name: the numbers `seq` of its reports go back and forth")
+            }
+        }
+    }
+}
