@@ -48,19 +48,25 @@ impl Drop for Trial {
     }
 }
 
-/// Labels and distances from the first vehicle of the objects on the map that the page shows.
-fn objects(page: &str) -> Option<Vec<(String, f64)>> {
+/// The objects on the map that the page shows.
+fn map(page: &str) -> Option<Vec<Value>> {
     let mut stream = TcpStream::connect(page).ok()?;
     write!(stream, "GET /api/picture HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n").ok()?;
     let mut answer = String::new();
     stream.read_to_string(&mut answer).ok()?;
     let body = &answer[answer.find('{')?..=answer.rfind('}')?];
     let picture: Value = serde_json::from_str(body).ok()?;
-    let object = |object: &Value| {
-        let (x_m, y_m) = (object["x_m"].as_f64().unwrap(), object["y_m"].as_f64().unwrap());
-        (object["label"].as_str().unwrap().to_owned(), x_m.hypot(y_m))
-    };
-    Some(picture["map"]["message"]["objects"].as_array()?.iter().map(object).collect())
+    Some(picture["map"]["message"]["objects"].as_array()?.clone())
+}
+
+fn label(object: &Value) -> String {
+    object["label"].as_str().unwrap().to_owned()
+}
+
+/// Labels and distances from the first vehicle of the objects on the map that the page shows.
+fn objects(page: &str) -> Option<Vec<(String, f64)>> {
+    let distance_m = |object: &Value| object["x_m"].as_f64().unwrap().hypot(object["y_m"].as_f64().unwrap());
+    Some(map(page)?.iter().map(|object| (label(object), distance_m(object))).collect())
 }
 
 /// Labels of the boxes in the next picture on a page.
@@ -119,11 +125,38 @@ fn photographs_of_two_cameras_become_objects_on_one_map() {
 }
 
 #[test]
+fn without_a_source_a_street_is_shown_by_two_cameras() {
+    let mut command = ecod_node();
+    command.args(["try", "--dashboard", "127.0.0.1:0"]).current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
+    let mut trial = Trial(command.stderr(Stdio::piped()).spawn().unwrap());
+    let mut lines = BufReader::new(trial.0.stderr.take().unwrap()).lines().map_while(Result::ok);
+    let page = lines.find_map(|line| Some(line.strip_prefix("page: http://")?.split('/').next()?.to_owned())).unwrap();
+    std::thread::spawn(move || lines.for_each(drop));
+    let deadline = Instant::now() + PATIENCE;
+    let seen_by = |object: &Value, names: &[&str]| {
+        let seen = object["contributors"].as_array().unwrap();
+        seen.iter().map(|name| name.as_str().unwrap()).eq(names.iter().copied())
+    };
+    // A car that nobody but the camera on the mast sees, and a person whom both see.
+    let wanted = [("car", vec!["kepler"]), ("person", vec!["galileo", "kepler"])];
+    let mut missing = wanted.to_vec();
+    while !missing.is_empty() {
+        let objects = map(&page).unwrap_or_default();
+        missing
+            .retain(|(wanted, names)| !objects.iter().any(|object| label(object) == *wanted && seen_by(object, names)));
+        assert!(Instant::now() < deadline, "never on the map: {missing:?}; at last {objects:?}");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    kill(Pid::from_raw(trial.0.id().cast_signed()), Signal::SIGINT).unwrap();
+    assert!(trial.0.wait().unwrap().success());
+}
+
+#[test]
 fn what_cannot_be_shown_is_told_in_one_line_with_a_remedy() {
     let directory = tempfile::tempdir().unwrap();
     let nothing = directory.path().to_str().unwrap();
     for (arguments, parts) in [
-        (vec!["try"], vec!["--video FILE", "--images DIR", "--camera 0"]),
+        (vec!["try"], vec!["examples/street", "package", "--video FILE", "--images DIR", "--camera 0"]),
         (vec!["try", "--video", "no-such.mp4"], vec!["no-such.mp4"]),
         (vec!["try", "--images", nothing], vec![nothing, "no images found"]),
         (vec!["try", "--url", "192.168.1.20"], vec!["rtsp://"]),

@@ -5,6 +5,7 @@ mod columns;
 mod demo;
 mod eval;
 mod report;
+mod street;
 mod testbed;
 
 use std::fs;
@@ -30,6 +31,8 @@ struct Cli {
 enum Command {
     /// Run a whole cell on this machine, as separate processes, and print what it saw
     Demo(demo::DemoArguments),
+    /// Write the street that `ecod-node try` shows: a video and a configuration for each camera that stays where it is
+    Street(street::StreetArguments),
     /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
     Testbed(testbed::TestbedArguments),
     /// Measure a live cell under simulated vehicles: latency beside the bare broker, capacity, costs
@@ -46,6 +49,7 @@ pub fn main() -> ExitCode {
     start_log(cli.log.log_format, false, "warn");
     let outcome = match cli.command {
         Command::Demo(arguments) => demo::run(&arguments),
+        Command::Street(arguments) => street::run(&arguments),
         Command::Testbed(arguments) => testbed::run(&arguments),
         Command::Bench(arguments) => bench::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),

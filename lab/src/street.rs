@@ -9,6 +9,7 @@ pub mod film;
 pub mod network_camera;
 mod route;
 mod staging;
+pub(crate) mod video;
 pub(crate) mod view;
 
 use ecod::model::geometry::Pose;

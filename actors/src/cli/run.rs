@@ -108,7 +108,7 @@ pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
 /// arguments, so that no library of OpenCV is loaded. Returns where there is none.
 #[cfg(feature = "camera")]
 fn continue_without_opencv() {
-    if let Some(program) = installed::file("lib/ecod-node/ecod-node") {
+    if let Some(program) = installed::path("lib/ecod-node/ecod-node") {
         let error = Command::new(&program).args(std::env::args_os().skip(1)).exec();
         tracing::warn!(?program, %error, "cannot run the program without OpenCV; this one goes on, with more memory");
     }

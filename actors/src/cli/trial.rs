@@ -1,11 +1,11 @@
-//! `ecod-node try`: a cell from one's own pictures, without a configuration.
+//! `ecod-node try`: a cell from one's own pictures, without a configuration, or from those of a street.
 
 use std::io::{IsTerminal, Write};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, ensure};
 use clap::Args;
 use ecod::aggregator::FusionConfig;
 use ecod::model::names::{Label, NodeName};
@@ -25,8 +25,8 @@ use crate::camera::frame_source::capture::CaptureConfig;
 use crate::node::config::NodeConfig;
 use crate::node::{self, NodeHandle};
 use crate::observe::dashboard::DEFAULT_ADDRESS;
+use crate::platform::installed;
 use crate::telemetry::counters::Event;
-use crate::transport::gossip::{MembershipConfig, MulticastConfig};
 
 /// Flags of `try`.
 #[derive(Debug, Args)]
@@ -57,6 +57,10 @@ pub(super) struct TryArguments {
 /// Distance in metres between vehicles: nothing is known of where they stand, and none must take another's objects for
 /// its own.
 const SPACING_M: f64 = 50.0;
+
+/// The street, below the prefix of an installed program and in the sources.
+const STREET_INSTALLED: &str = "share/ecod-node/street";
+const STREET_IN_SOURCES: &str = "examples/street";
 
 /// Guessed height of the camera in metres, between that on a dashboard and that in a hand.
 const CAMERA_HEIGHT_M: f64 = 1.5;
@@ -95,10 +99,6 @@ impl TryArguments {
     /// The configurations of the vehicles. The others are told of the first once it runs.
     fn configs(&self) -> Result<Vec<NodeConfig>, Failure> {
         let sources = self.sources();
-        if sources.is_empty() {
-            let usage = anyhow!("give what to look at: --video FILE, --images DIR, --camera 0 or --url rtsp://...");
-            return Err(Failure::usage(usage));
-        }
         let mut configs = Vec::new();
         for (index, (name, source)) in sources.into_iter().enumerate() {
             if let SourceConfig::Video { .. } | SourceConfig::Images { .. } = source {
@@ -106,12 +106,53 @@ impl TryArguments {
             }
             let mut config = vehicle(NodeName::new(name).map_err(Failure::usage)?, source);
             config.pose.y_m = -SPACING_M * index as f64;
+            configs.push(config);
+        }
+        if configs.is_empty() {
+            configs = street().map_err(Failure::usage)?;
+        }
+        for (index, config) in configs.iter_mut().enumerate() {
+            apart(config);
             config.dashboard.listen = self.dashboard.filter(|_| index == 0);
             config.validate().map_err(Failure::usage)?;
-            configs.push(config);
         }
         Ok(configs)
     }
+}
+
+/// The nodes of the street that comes with the program: two cameras that stay where they are, on one clock.
+fn street() -> anyhow::Result<Vec<NodeConfig>> {
+    let directory = installed::path(STREET_INSTALLED).unwrap_or_else(|| STREET_IN_SOURCES.into());
+    let missing = || {
+        format!(
+            "no street in {}: run this in the sources of ecod, install the package ecod-node, or give what to look at: --video \
+             FILE, --images DIR, --camera 0 or --url rtsp://...",
+            directory.display()
+        )
+    };
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(&directory).with_context(missing)? {
+        files.push(entry?.path());
+    }
+    files.retain(|file| file.extension().is_some_and(|extension| extension == "toml"));
+    files.sort();
+    ensure!(!files.is_empty(), missing());
+    let node = |file: &PathBuf| {
+        let mut config = NodeConfig::load_cell(file)?;
+        if let Some(CameraConfig { source: SourceConfig::Video { path, .. }, .. }) = &mut config.camera {
+            *path = directory.join(&path);
+        }
+        Ok(config)
+    };
+    files.iter().map(node).collect()
+}
+
+/// Makes a node of this process part of its own cell only, at addresses that nobody else has.
+fn apart(config: &mut NodeConfig) {
+    config.cell = NodeName::from_static("try");
+    config.listen = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
+    config.membership.bind = config.listen;
+    config.membership.multicast.enabled = false;
 }
 
 /// A vehicle that stands at the origin, with guesses for all that nobody said. The errors of the guesses count in the
@@ -136,16 +177,8 @@ fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
     // A camera in a hand is no car, and things may be close to it.
     let tracks =
         TracksConfig { vehicle_radius_m: 0.1, vehicle_label: Label::new_static("camera"), ..TracksConfig::default() };
-    let loopback = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
     NodeConfig {
         name: Some(name),
-        cell: NodeName::from_static("try"),
-        listen: loopback,
-        membership: MembershipConfig {
-            bind: loopback,
-            multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
-            ..MembershipConfig::default()
-        },
         fusion: FusionConfig { tracks, ..FusionConfig::default() },
         camera: Some(camera),
         ..NodeConfig::default()

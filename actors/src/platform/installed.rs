@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-/// File below the prefix under which the program is installed: of `/usr/bin/ecod-node` that is `/usr`. None where
-/// there is no such file, as beside a program that was built by hand.
-pub(crate) fn file(below_prefix: &str) -> Option<PathBuf> {
+/// File or directory below the prefix under which the program is installed: of `/usr/bin/ecod-node` that is `/usr`. None
+/// where there is none, as beside a program that was built by hand.
+pub(crate) fn path(below_prefix: &str) -> Option<PathBuf> {
     let program = std::env::current_exe().ok()?;
-    Some(program.parent()?.parent()?.join(below_prefix)).filter(|path| path.is_file())
+    Some(program.parent()?.parent()?.join(below_prefix)).filter(|path| path.exists())
 }

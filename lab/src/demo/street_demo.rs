@@ -122,7 +122,8 @@ impl StreetDemo<'_> {
         for (number, (camera, served)) in street.cameras.iter().zip(&cameras).enumerate() {
             let poses = street.drives(camera).then(|| stage.pose_address(number + 1));
             driving.extend(poses.map(|address| (number, address)));
-            configs.push(node(&street, camera, served.url(), poses));
+            let source = SourceConfig::Url { url: served.url() };
+            configs.push(camera_node(&street, camera, source, poses));
         }
         let localisation = tokio::spawn(send_poses(Arc::clone(&street), driving, start));
         let observer = NodeName::from_static("observer");
@@ -181,14 +182,20 @@ fn fusion() -> FusionConfig {
     FusionConfig { algorithms: Algorithms::Pace, round, ..FusionConfig::default() }
 }
 
-fn node(street: &Street, camera: &StreetCamera, url: String, poses: Option<SocketAddr>) -> NodeConfig {
+/// Configuration of the node of a camera that shows `source`; `poses` is where one that drives hears where it is.
+pub(crate) fn camera_node(
+    street: &Street,
+    camera: &StreetCamera,
+    source: SourceConfig,
+    poses: Option<SocketAddr>,
+) -> NodeConfig {
     let optics = Street::optics();
     let Mount { height_m, pitch_rad, .. } = camera.mount;
     let pose = street.pose(camera, 0.0);
     let pass = |stretch| Pass { stretch_x: stretch, stretch_y: stretch };
     let config = CameraConfig {
         name: None,
-        source: SourceConfig::Url { url },
+        source,
         capture: CaptureConfig::default(),
         optics: OpticsConfig {
             width_px: Some(optics.width),

@@ -110,7 +110,7 @@ impl CocoDetector {
     /// # Errors
     /// [`ModelError`] naming the file.
     pub fn new(config: CocoConfig) -> Result<Self, ModelError> {
-        let packaged = || installed::file(PACKAGED).filter(|_| BUILT_IN.is_none());
+        let packaged = || installed::path(PACKAGED).filter(|_| BUILT_IN.is_none());
         let file = config.model.clone().or_else(packaged);
         let name = file.as_ref().map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
         let unusable = |reason: String| ModelError::Unusable { path: name.clone(), reason };
