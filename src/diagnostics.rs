@@ -67,6 +67,8 @@ trouble_kinds! {
     NoPose = "no_pose", SHORT, "send poses to `pose.listen`, or set `pose`; `origin` if they are on Earth";
     /// Detections of a label that has no size.
     NoSize = "no_size", SHORT, "set the label's size in `camera.projection.sizes.labels`, or `camera.projection.sizes.default`";
+    /// A camera that looks elsewhere than its mount says.
+    MountMismatch = "mount_mismatch", SHORT, "measure `camera.mount` again, as by `ecod-node calibrate mount`, or correct the sizes of the objects that it sees";
     /// A size in another unit than metres.
     ImplausibleSize = "implausible_size", UNTIL_SETTLED, "sizes are in metres: correct `camera.projection.sizes`";
     /// Another value that looks as if it were in another unit.

@@ -16,6 +16,7 @@ mod corners;
 mod estimate;
 mod ground;
 mod level_sight;
+mod mount_check;
 mod mount_fit;
 mod paper;
 
@@ -23,6 +24,7 @@ use nalgebra::{Matrix3, Point3};
 
 pub use config::{ObjectSize, ObjectSizes, ProjectionConfig, Ranging};
 use ground::HalfDepth;
+pub use mount_check::MountCheck;
 pub use mount_fit::{MIN_BOXES, MountEstimate, MountFitError, fit_mount};
 
 use crate::model::detection::Detection;

@@ -9,6 +9,7 @@
 //! The pump takes the latest frame only when the detector is done with the previous one, so frames never queue.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::diagnostics::TroubleKind;
 use ecod::model::detection::Detection;
@@ -17,7 +18,7 @@ use tokio::sync::Semaphore;
 use tokio::task::{JoinHandle, spawn_blocking};
 
 use crate::camera::detect::Detect;
-use crate::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus, Opener};
+use crate::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus, Opener, Readers};
 use crate::camera::image_size::{ImageSize, SizeMismatch};
 use crate::camera::lens::Lens;
 use crate::messages::actor_slot::ActorSlot;
@@ -72,7 +73,11 @@ pub struct DetectorState {
     troubles: CameraTroubles,
     counters: Arc<Counters>,
     pump: JoinHandle<()>,
+    readers: Readers,
 }
+
+/// Maximum time for the camera to end.
+const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl Actor for Detector {
     type Msg = DetectorMessage;
@@ -97,6 +102,7 @@ impl Actor for Detector {
             spans,
         } = arguments;
         let capture = Capture::start(open, capture)?;
+        let readers = capture.readers();
         let pump = tokio::spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans));
         let detect = Some(detect);
         Ok(DetectorState {
@@ -110,7 +116,15 @@ impl Actor for Detector {
             troubles,
             counters,
             pump,
+            readers,
         })
+    }
+
+    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+        state.pump.abort();
+        // OpenCV must not be in use while the process ends.
+        std::mem::take(&mut state.readers).ended(STOP_TIMEOUT).await;
+        Ok(())
     }
 
     async fn handle(

@@ -10,7 +10,7 @@ use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::perception::camera::Mount;
 use ecod::perception::landmark::{LandmarkGate, LandmarkIndex};
-use ecod::perception::projection::{Cut, Projection, ProjectionConfig, ProjectionError};
+use ecod::perception::projection::{Cut, MountCheck, Projection, ProjectionConfig, ProjectionError};
 use ecod::perception::view::{PosedCamera, ViewConfig, landmarks_in_view};
 use ecod::wire::{ObjectReport, PerceivedObject};
 use nalgebra::Point2;
@@ -45,6 +45,7 @@ pub struct Perception {
     /// Indices of the detections behind the objects of the last report.
     reported: Vec<usize>,
     discarded: DiscardCounts,
+    mount_check: MountCheck,
 }
 
 /// Number of discarded detections.
@@ -103,6 +104,7 @@ impl Perception {
             seq: 0,
             reported: Vec::new(),
             discarded: DiscardCounts::default(),
+            mount_check: MountCheck::default(),
         }
     }
 
@@ -134,6 +136,8 @@ impl Perception {
         if let Err(error) = self.vehicle_camera.lens.undistort(&mut detections) {
             tracing::warn!(%error, "cannot remove distortion");
         }
+        let boxes = detections.iter().zip(cuts.iter().copied());
+        self.mount_check.take(boxes, captured_at, &self.projection);
         let all = detections.iter().zip(cuts).enumerate();
         let placed = all.filter_map(|(index, (detection, cut))| Some((index, self.place(detection, cut)?)));
         let (reported, objects): (Vec<_>, Vec<_>) = placed.unzip();
@@ -165,6 +169,16 @@ impl Perception {
         let labels = self.discarded.without_size.iter().map(|(label, times)| format!("{times} of {label}"));
         let labels = labels.collect::<Vec<_>>().join(", ");
         self.discarded.is_size_missing.then(|| format!("detections have no size and are not reported: {labels}"))
+    }
+
+    /// The angle between mount and reality in words, if it is too large.
+    pub fn mount_mismatch(&self) -> Option<String> {
+        let off_deg = self.mount_check.off_rad()?.to_degrees();
+        let side = if off_deg > 0.0 { "higher" } else { "lower" };
+        Some(format!(
+            "the camera looks {:.0}° {side} than its mount says, judged by objects on the ground",
+            off_deg.abs()
+        ))
     }
 
     fn place(&mut self, detection: &Detection, cut: Cut) -> Option<PerceivedObject> {

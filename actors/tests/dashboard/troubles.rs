@@ -188,6 +188,33 @@ async fn what_a_camera_lacks_is_named() {
     stop([blind, lost, seeing]).await;
 }
 
+/// A camera that looks 6° higher than its mount says, at people who stand 4 to 15 m away.
+#[cfg(feature = "camera")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_camera_that_has_turned_is_named_with_its_angle() {
+    let directory = tempfile::tempdir().unwrap();
+    let (frames, detections) = (directory.path().join("frames"), directory.path().join("detections.jsonl"));
+    std::fs::create_dir(&frames).unwrap();
+    std::fs::write(frames.join("0.ppm"), [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat()).unwrap();
+    let (focal_px, camera_m, person_m, turned) = (530.0, 1.5, 1.7, 6f64.to_radians());
+    let row_px = |slope: f64| 240.0 + focal_px * (slope.atan() + turned).tan();
+    let people = (4..16).map(|distance| {
+        let (distance_m, x_px) = (f64::from(distance), 40.0 * f64::from(distance) - 130.0);
+        let [y_min, y_max] = [camera_m - person_m, camera_m].map(|below_m| row_px(below_m / distance_m));
+        let bounding_box = serde_json::json!({"x_min": x_px, "x_max": x_px + 20.0, "y_min": y_min, "y_max": y_max});
+        serde_json::json!({"label": "person", "confidence": 0.9, "bounding_box": bounding_box})
+    });
+    std::fs::write(&detections, serde_json::Value::from_iter(people).to_string()).unwrap();
+    let camera = format!(
+        "source = {{ kind = \"images\", path = {frames:?}, looping = true }}\nmount = {{ height_m = {camera_m} }}\n\
+         detector = {{ kind = \"recorded\", path = {detections:?}, looping = true }}"
+    );
+    let camera = Some(toml::from_str(&camera).unwrap());
+    let (node, page) = start(NodeConfig { camera, ..config("euclid", Role::Cav, 1) }).await;
+    until_told(page, ["euclid", "", "mount_mismatch"], "the camera looks 6° higher").await;
+    node.stop().await;
+}
+
 /// An observer that stops properly is not listed as a node that was lost.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_observer_that_has_stopped_is_not_there() {

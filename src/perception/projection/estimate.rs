@@ -29,7 +29,7 @@ pub(super) struct Estimate {
 }
 
 /// Difference of two estimates in standard deviations above which one of them rests on a false assumption.
-const CONFLICT_SIGMAS: f64 = 3.0;
+pub(super) const CONFLICT_SIGMAS: f64 = 3.0;
 
 impl Estimate {
     /// The estimate as far as it lies before the camera.

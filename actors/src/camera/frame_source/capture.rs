@@ -89,6 +89,7 @@ pub struct Capture {
     events: SyncSender<CaptureEvent>,
     unusable: Arc<AtomicU64>,
     failures: Arc<AtomicU64>,
+    readers: Readers,
 }
 
 impl Capture {
@@ -112,10 +113,12 @@ impl Capture {
             captured: 0,
             unusable: Arc::default(),
             failures: Arc::default(),
+            readers: Readers::default(),
         };
+        let readers = capture.readers.clone();
         let (unusable, failures) = (Arc::clone(&capture.unusable), Arc::clone(&capture.failures));
         thread::Builder::new().name("capture".into()).spawn(move || capture.run())?;
-        Ok(Self { slot, status, events, unusable, failures })
+        Ok(Self { slot, status, events, unusable, failures, readers })
     }
 
     /// Waits for the latest frame; `None` once the source ended. Numbers continue when the source is reopened.
@@ -138,6 +141,11 @@ impl Capture {
         self.failures.load(Ordering::Relaxed)
     }
 
+    /// The readers of this capture.
+    pub fn readers(&self) -> Readers {
+        self.readers.clone()
+    }
+
     /// State of the source as it changes.
     pub fn status(&self) -> watch::Receiver<CaptureStatus> {
         self.status.clone()
@@ -154,13 +162,29 @@ impl Drop for Capture {
 /// Number of readers in this process that may be inside OpenCV.
 static READERS: AtomicUsize = AtomicUsize::new(0);
 
+/// The running readers of a capture, each of which holds a clone of what is inside.
+#[derive(Debug, Clone, Default)]
+pub struct Readers(Arc<()>);
+
+impl Readers {
+    /// Waits at most `timeout` until those of a stopped capture have ended.
+    pub async fn ended(self, timeout: Duration) {
+        let running = Arc::downgrade(&self.0);
+        drop(self);
+        let until = Instant::now() + timeout;
+        while running.strong_count() > 0 && Instant::now() < until {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    }
+}
+
 /// Counts a reader while it runs.
-struct ReaderGuard;
+struct ReaderGuard(#[expect(dead_code, reason = "held")] Readers);
 
 impl ReaderGuard {
-    fn new() -> Self {
+    fn new(readers: Readers) -> Self {
         READERS.fetch_add(1, Ordering::SeqCst);
-        Self
+        Self(readers)
     }
 }
 
@@ -206,6 +230,7 @@ struct CaptureLoop {
     captured: u64,
     unusable: Arc<AtomicU64>,
     failures: Arc<AtomicU64>,
+    readers: Readers,
 }
 
 impl CaptureLoop {
@@ -247,7 +272,7 @@ impl CaptureLoop {
         let opening = self.opening.load(Ordering::SeqCst);
         let reader = Reader { opening, current: Arc::clone(&self.opening), events: self.events.clone() };
         let open = Arc::clone(&self.open);
-        let running = ReaderGuard::new();
+        let running = ReaderGuard::new(self.readers.clone());
         let read = move || {
             let _running = running;
             reader.run(&open);

@@ -1,12 +1,14 @@
 //! Boxes around objects on the ground, projected exactly, as cameras of any height and pitch see them.
 
 use std::f64::consts::PI;
+use std::time::Duration;
 
 use nalgebra::{Rotation2, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::model::time::Timestamp;
 
 const HEIGHTS_M: [f64; 4] = [0.2, 1.2, 2.5, 6.0];
 const PITCHES_DEG: [f64; 6] = [0.0, 10.0, 20.0, 30.0, 40.0, 45.0];
@@ -294,4 +296,55 @@ fn a_tilted_camera_of_unknown_height_ranges_upright_objects_and_corners_alike() 
     let corners = projection(Ranging::Corners, tilted, &ProjectionConfig::default());
     let placed = corners.place(&detection, Cut::default(), Some(&target), &Pose::new(0.0, 0.0, 0.0)).unwrap();
     assert!(offset_m(&placed, at) < 1e-9);
+}
+
+/// A check that has seen a minute of the street, a box each half second, through a camera that is mounted otherwise than said.
+fn checked(mounted: &Mount, said: Mount, max_range: f64) -> MountCheck {
+    let mut street = Street::new(said.height_m.unwrap());
+    let projection =
+        projection(Ranging::Auto, said, &ProjectionConfig { pixel_sigma_px: 2.0, ..ProjectionConfig::default() });
+    let mut check = MountCheck::default();
+    for half_seconds in 0..120 {
+        let (mut detection, _) = street.next(mounted, 1.0, max_range);
+        detection.bounding_box.y_max += 2.0 * street.normal();
+        let boxes = [(&detection, projection.cut(&detection))];
+        check.take(boxes, Timestamp::default() + Duration::from_millis(500 * half_seconds), &projection);
+    }
+    check
+}
+
+#[test]
+fn a_camera_that_has_turned_is_told_by_its_angle_and_one_within_its_errors_is_not() {
+    for (height_m, pitch_deg) in [(1.2, 0.0), (1.2, 10.0), (2.5, 10.0), (6.0, 20.0)] {
+        let said = mount(height_m, pitch_deg, 0.0);
+        for turned_deg in [-8.0, -5.0, 5.0, 8.0] {
+            let off_rad = checked(&mount(height_m, pitch_deg - turned_deg, 0.0), said, 10.0).off_rad();
+            let off_deg = off_rad.map(f64::to_degrees);
+            assert!(
+                off_deg.is_some_and(|off_deg| (off_deg - turned_deg).abs() < 1.0),
+                "{height_m} m, {pitch_deg}° turned by {turned_deg}°: {off_deg:?}"
+            );
+        }
+        for turned_deg in [-1.5, 0.0, 1.5] {
+            let off_rad = checked(&mount(height_m, pitch_deg - turned_deg, 1.5), said, 10.0).off_rad();
+            assert_eq!(off_rad, None, "{height_m} m, {pitch_deg}° turned by {turned_deg}°");
+        }
+    }
+}
+
+#[test]
+fn things_above_the_ground_at_one_distance_are_no_sign_of_a_camera_that_has_turned() {
+    let projection = projection(Ranging::Auto, mount(1.2, 0.0, 0.0), &ProjectionConfig::default());
+    let mut check = MountCheck::default();
+    let hanging =
+        Detection { bounding_box: moved(&person_ahead(8.0, &mount(1.2, 0.0, 0.0)), -80.0), ..detection_of("person") };
+    for seconds in 0..60 {
+        check.take([(&hanging, Cut::default())], Timestamp::default() + Duration::from_secs(seconds), &projection);
+    }
+    assert_eq!(check.off_rad(), None);
+}
+
+fn moved(detection: &Detection, down_px: f64) -> BoundingBox {
+    let BoundingBox { x_min, y_min, x_max, y_max } = detection.bounding_box;
+    BoundingBox { x_min, y_min: y_min + down_px, x_max, y_max: y_max + down_px }
 }

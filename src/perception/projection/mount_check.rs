@@ -1,0 +1,109 @@
+//! Agreement of a camera's mount with what it sees: a camera that turns moves the horizon.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use super::estimate::{CONFLICT_SIGMAS, Source};
+use super::ground::HalfDepth;
+use super::{Cut, Projection, Ranging, box_height};
+use crate::model::detection::Detection;
+use crate::model::time::Timestamp;
+
+/// Time for which a box counts.
+const WINDOW: Duration = Duration::from_secs(60);
+/// Time between two frames that count: the same objects are in the frames between.
+const SAMPLE_PERIOD: Duration = Duration::from_millis(500);
+/// Least and largest number of boxes that are compared.
+const MIN_BOXES: usize = 30;
+const MAX_BOXES: usize = 200;
+/// Least ratio of near feet's slopes to far ones', of which a tenth each are beyond. At one distance, a camera that has turned
+/// looks like objects that do not stand on the ground.
+const MIN_SLOPE_RATIO: f64 = 1.25;
+/// Least share of the boxes that agree about the angle within two standard deviations.
+const MIN_AGREEMENT: f64 = 2.0 / 3.0;
+
+/// The angle between where the foot of an object is and where the mount expects it.
+#[derive(Debug, Clone, Copy)]
+struct FootOffset {
+    captured_at: Timestamp,
+    /// Tangent of the angle below the horizon that the object's size makes one expect.
+    expected_slope: f64,
+    /// Positive below the expected line of sight.
+    angle_rad: f64,
+    sigma_rad: f64,
+}
+
+/// Recent boxes of upright objects of known size on the ground.
+#[derive(Debug, Clone, Default)]
+pub struct MountCheck {
+    offsets: VecDeque<FootOffset>,
+}
+
+impl MountCheck {
+    /// Takes the boxes of a frame, without distortion, with the edges that cut them.
+    pub fn take<'a>(
+        &mut self,
+        boxes: impl IntoIterator<Item = (&'a Detection, Cut)>,
+        captured_at: Timestamp,
+        projection: &Projection,
+    ) {
+        self.offsets.retain(|offset| captured_at.since(offset.captured_at) < WINDOW);
+        if self.offsets.back().is_some_and(|last| captured_at.since(last.captured_at) < SAMPLE_PERIOD) {
+            return;
+        }
+        let offsets =
+            boxes.into_iter().filter_map(|(detection, cut)| projection.foot_offset(detection, cut, captured_at));
+        self.offsets.extend(offsets);
+        self.offsets.drain(..self.offsets.len().saturating_sub(MAX_BOXES));
+    }
+
+    /// The angle in radians by which the camera looks higher than its mount says, if that is more than the stated errors
+    /// explain and objects at several distances agree.
+    pub fn off_rad(&self) -> Option<f64> {
+        let sorted = |value: fn(&FootOffset) -> f64| {
+            let mut values: Vec<f64> = self.offsets.iter().map(value).collect();
+            values.sort_by(f64::total_cmp);
+            values
+        };
+        let slopes = sorted(|offset| offset.expected_slope);
+        let (count, tenth) = (slopes.len(), slopes.len() / 10);
+        if count < MIN_BOXES || slopes[count - 1 - tenth] < MIN_SLOPE_RATIO * slopes[tenth] {
+            return None;
+        }
+        let sigmas = sorted(|offset| offset.angle_rad / offset.sigma_rad)[count / 2];
+        let angle_rad = sorted(|offset| offset.angle_rad)[count / 2];
+        let agrees = |offset: &&FootOffset| (offset.angle_rad - angle_rad).abs() < 2.0 * offset.sigma_rad;
+        let agreeing = self.offsets.iter().filter(agrees).count();
+        (sigmas.abs() > CONFLICT_SIGMAS && agreeing as f64 >= MIN_AGREEMENT * count as f64).then_some(angle_rad)
+    }
+}
+
+impl Projection {
+    /// None where foot and height of a box cannot be compared: the image cuts it, it is of a target, its size or the camera's
+    /// height is not known, or it is not ranged by the ground.
+    fn foot_offset(&self, detection: &Detection, cut: Cut, captured_at: Timestamp) -> Option<FootOffset> {
+        let bounds = &detection.bounding_box;
+        let is_grounded = matches!(self.config.ranging, Ranging::Auto | Ranging::Ground) && detection.corners.is_none();
+        if !is_grounded || !bounds.is_valid() || cut.upper || cut.lower {
+            return None;
+        }
+        let (camera_m, size) = (self.mount.height_m?, self.config.sizes.of(&detection.label)?);
+        let (foot, head) = box_height::foot_and_head(bounds, self);
+        let half = HalfDepth::of_size(size);
+        let upright = box_height::upright(&foot, &head, size, half)?;
+        let near_m = upright.distance_m - half.mean_m * foot.depth_factor;
+        if near_m <= 0.0 {
+            return None;
+        }
+        let expected_slope = camera_m / near_m;
+        let mut errors = foot.errors + upright.errors * (expected_slope / near_m);
+        errors[Source::Depth as usize] -= half.sigma_m * foot.depth_factor * expected_slope / near_m;
+        errors[Source::CameraHeight as usize] -= self.config.height_sigma_m / near_m;
+        Some(FootOffset {
+            captured_at,
+            expected_slope,
+            angle_rad: foot.slope.atan() - expected_slope.atan(),
+            sigma_rad: errors.norm() / (1.0 + foot.slope * foot.slope),
+        })
+    }
+}
