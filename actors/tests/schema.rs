@@ -51,7 +51,9 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
         Topic::Ledger(node.clone()),
         Topic::Nodes(node.clone()),
     ];
-    let spoken: BTreeSet<_> = kinds.iter().map(|topic| topics.path(topic)).chain([topics.clients(&node)]).collect();
+    let spoken = kinds.iter().map(|topic| topics.path(topic)).chain([topics.clients(&node)]);
+    let spoken: BTreeSet<_> =
+        spoken.chain(["map", "vehicles/node", "received/{receiver}"].map(|level| topics.cpm(level))).collect();
     let addresses = values(&document, "address: ", '\n');
     let documented: BTreeSet<_> =
         addresses.iter().map(|address| address.replace("{cell}", "cell").replace("{node}", "node")).collect();

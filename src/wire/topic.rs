@@ -76,6 +76,11 @@ impl Topics {
         format!("{}/nodes/{node}/clients", self.root)
     }
 
+    /// A topic of ETSI's collective perception messages (CPM), such as `ecod/v1/lot-1/cpm/map`.
+    pub fn cpm(&self, level: &str) -> String {
+        format!("{}/cpm/{level}", self.root)
+    }
+
     /// A subscription filter for one kind of topic, such as `ecod/v1/lot-1/detections/+`.
     pub fn filter(&self, level: &str) -> String {
         format!("{}/{level}", self.root)

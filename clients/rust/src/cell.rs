@@ -203,7 +203,7 @@ impl Cell {
     /// # Errors
     /// [`Error::Refused`] when the broker refused the login or an earlier message there.
     pub fn publish_cpm(&self, level: &str, payload: Vec<u8>) -> Result<bool, Error> {
-        self.publish(&self.topics.filter(&format!("cpm/{level}")), payload)
+        self.publish(&self.topics.cpm(level), payload)
     }
 
     /// The settings that all nodes of the cell share, as they are now; version 0 if there are none.

@@ -165,7 +165,7 @@ impl DoorState {
         match self.setup.topics.parse(topic) {
             Some(Topic::Nodes(name)) if name.vehicle() == *node && name != *node && self.is_own(principal) => Ok(()),
             None if principal.identity.is_none() => Ok(()),
-            None if self.is_own(principal) && topic.starts_with(&self.setup.topics.filter("cpm/")) => Ok(()),
+            None if self.is_own(principal) && topic.starts_with(&self.setup.topics.cpm("")) => Ok(()),
             _ => Err(DoorRefusal::not_permitted(format!(
                 "programs do not publish {topic}; reports go to detections/{node}--<part> and vote_detections/{node}--<part>"
             ))),
