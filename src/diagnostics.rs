@@ -66,7 +66,9 @@ trouble_kinds! {
     /// The pose of the camera is not known, so that its frames have no place.
     NoPose = "no_pose", SHORT, "send poses to `pose.listen`, or set `pose`; `origin` if they are on Earth";
     /// Detections of a label that has no size.
-    NoSize = "no_size", SHORT, "set the label's size in `camera.projection.sizes.labels`, or `camera.projection.sizes.default`";
+    NoSize = "no_size", SHORT, "set the label's size in `camera.projection.sizes.labels`, or `camera.mount.height_m` to range it by the ground";
+    /// None of the detections has a place.
+    NotPlaced = "not_placed", SHORT, "let the camera see whole objects, or correct `camera.mount` and `camera.projection`";
     /// A camera that looks elsewhere than its mount says.
     MountMismatch = "mount_mismatch", SHORT, "measure `camera.mount` again, as by `ecod-node calibrate mount`, or correct the sizes of the objects that it sees";
     /// A size in another unit than metres.

@@ -15,7 +15,7 @@ use ecod::diagnostics::TroubleKind;
 use ecod::model::detection::Detection;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::Semaphore;
-use tokio::task::{JoinHandle, spawn_blocking};
+use tokio::task::{JoinSet, spawn_blocking};
 
 use crate::camera::detect::Detect;
 use crate::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus, Opener, Readers};
@@ -72,7 +72,7 @@ pub struct DetectorState {
     camera_feed: Option<Arc<CameraFeed>>,
     troubles: CameraTroubles,
     counters: Arc<Counters>,
-    pump: JoinHandle<()>,
+    pump: JoinSet<()>,
     readers: Readers,
 }
 
@@ -103,7 +103,8 @@ impl Actor for Detector {
         } = arguments;
         let capture = Capture::start(open, capture)?;
         let readers = capture.readers();
-        let pump = tokio::spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans));
+        let mut pumping = JoinSet::new();
+        pumping.spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans));
         let detect = Some(detect);
         Ok(DetectorState {
             detect,
@@ -115,15 +116,15 @@ impl Actor for Detector {
             camera_feed,
             troubles,
             counters,
-            pump,
+            pump: pumping,
             readers,
         })
     }
 
     async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
-        state.pump.abort();
-        // OpenCV must not be in use while the process ends.
-        std::mem::take(&mut state.readers).ended(STOP_TIMEOUT).await;
+        state.pump.abort_all();
+        let readers = state.readers.clone();
+        spawn_blocking(move || readers.wait_for_end(STOP_TIMEOUT)).await?;
         Ok(())
     }
 
@@ -175,10 +176,7 @@ impl Actor for Detector {
 impl DetectorState {
     /// The detections' lens, with them scaled to its image size; none for a frame of a shape that the lens does not take.
     fn scale(&mut self, frame: ImageSize, detections: &mut [Detection]) -> Option<Lens> {
-        let scaled = self.lens.of_frames(frame).and_then(|lens| {
-            ImageSize::from(&lens.intrinsics).fit(frame, detections)?;
-            Ok(lens)
-        });
+        let scaled = self.lens.fitted(frame, detections);
         let mismatch = scaled.as_ref().err().copied();
         match &mismatch {
             Some(error) => self.troubles.note(TroubleKind::Camera, &error.to_string()),
@@ -187,12 +185,6 @@ impl DetectorState {
         }
         self.mismatch = mismatch;
         scaled.ok()
-    }
-}
-
-impl Drop for DetectorState {
-    fn drop(&mut self) {
-        self.pump.abort();
     }
 }
 
@@ -231,7 +223,10 @@ async fn pump(
             }
         };
         let Some(frame) = frame else {
-            troubles.note(TroubleKind::Camera, "the camera's frames have ended");
+            troubles.note(
+                TroubleKind::Camera,
+                "the camera's frames have ended: set `looping` of its source, or another source",
+            );
             return;
         };
         let span = spans.frame(frame.captured_at);

@@ -210,6 +210,9 @@ impl ProjectorState {
         if let Some(cause) = self.perception.without_size() {
             self.troubles.note(TroubleKind::NoSize, &cause);
         }
+        if let Some(cause) = self.perception.nothing_placed() {
+            self.troubles.note(TroubleKind::NotPlaced, &cause);
+        }
         if let Some(cause) = self.perception.mount_mismatch() {
             self.troubles.note(TroubleKind::MountMismatch, &cause);
         }

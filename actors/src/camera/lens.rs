@@ -43,6 +43,16 @@ impl Lens {
         }
     }
 
+    /// The lens of frames of this size, with their detections scaled to its image size.
+    ///
+    /// # Errors
+    /// [`SizeMismatch`] for frames of another shape, unless the lens takes any.
+    pub fn fitted(&self, frame: ImageSize, detections: &mut [Detection]) -> Result<Self, SizeMismatch> {
+        let lens = self.of_frames(frame)?;
+        ImageSize::from(&lens.intrinsics).fit(frame, detections)?;
+        Ok(lens)
+    }
+
     /// Undistorts boxes and corners. A box is undistorted at the midpoints of its edges.
     ///
     /// # Errors

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ecod::model::detection::Detection;
 use ecod::model::geometry::Pose;
@@ -45,6 +46,8 @@ pub struct Perception {
     /// Indices of the detections behind the objects of the last report.
     reported: Vec<usize>,
     discarded: DiscardCounts,
+    /// First and last frame with detections since one had a place.
+    unplaced: Option<[Timestamp; 2]>,
     mount_check: MountCheck,
 }
 
@@ -56,7 +59,12 @@ struct DiscardCounts {
     without_size: BTreeMap<Label, u64>,
     /// True if the last report had one without a size.
     is_size_missing: bool,
+    /// The last reason in the last report, in words.
+    last_reason: Option<String>,
 }
+
+/// Time for which no detection must have had a place before that is told.
+const UNPLACED_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Maximum labels without a size that are counted: a detector of texts knows any number.
 const MAX_UNSIZED: usize = 8;
@@ -66,6 +74,7 @@ impl DiscardCounts {
     fn count(&mut self, reason: &'static str, error: &dyn Display) {
         let times = self.by_reason.entry(reason).or_default();
         *times += 1;
+        self.last_reason = Some(error.to_string());
         match *times {
             1 => tracing::info!(%error, "detection discarded, first for this reason"),
             _ => tracing::debug!(%error, "detection discarded"),
@@ -104,6 +113,7 @@ impl Perception {
             seq: 0,
             reported: Vec::new(),
             discarded: DiscardCounts::default(),
+            unplaced: None,
             mount_check: MountCheck::default(),
         }
     }
@@ -126,12 +136,13 @@ impl Perception {
             self.vehicle_camera.lens = *lens;
             let (config, mount) = (self.projection.config().clone(), self.vehicle_camera.mount);
             self.projection = Projection::new(config, lens.intrinsics, mount);
+            self.mount_check = MountCheck::default();
         }
     }
 
     /// The report of one frame. Detections without a position are discarded and counted.
     pub fn report(&mut self, mut detections: Vec<Detection>, captured_at: Timestamp) -> ObjectReport {
-        self.discarded.is_size_missing = false;
+        (self.discarded.is_size_missing, self.discarded.last_reason) = (false, None);
         let cuts: Vec<Cut> = detections.iter().map(|detection| self.projection.cut(detection)).collect();
         if let Err(error) = self.vehicle_camera.lens.undistort(&mut detections) {
             tracing::warn!(%error, "cannot remove distortion");
@@ -142,6 +153,11 @@ impl Perception {
         let placed = all.filter_map(|(index, (detection, cut))| Some((index, self.place(detection, cut)?)));
         let (reported, objects): (Vec<_>, Vec<_>) = placed.unzip();
         self.reported = reported;
+        if !objects.is_empty() {
+            self.unplaced = None;
+        } else if self.discarded.last_reason.is_some() {
+            self.unplaced = Some([self.unplaced.map_or(captured_at, |[since, _]| since), captured_at]);
+        }
         let VehicleCamera { landmarks, mount, lens, .. } = &self.vehicle_camera;
         let (camera, sizes) = (PosedCamera::new(self.camera, mount, lens.intrinsics), &self.projection.config().sizes);
         let seen = landmarks_in_view(landmarks.landmarks(), &camera, &objects, sizes, &self.view);
@@ -169,6 +185,18 @@ impl Perception {
         let labels = self.discarded.without_size.iter().map(|(label, times)| format!("{times} of {label}"));
         let labels = labels.collect::<Vec<_>>().join(", ");
         self.discarded.is_size_missing.then(|| format!("detections have no size and are not reported: {labels}"))
+    }
+
+    /// The reason, in words, why the last discarded detection of the last report has no place.
+    pub fn last_discard(&self) -> Option<&str> {
+        self.discarded.last_reason.as_deref()
+    }
+
+    /// The reason in words, if no detection of the last frame has a place and none had one for seconds.
+    pub fn nothing_placed(&self) -> Option<String> {
+        let ([since, last], reason) = (self.unplaced?, self.last_discard()?);
+        let time = last.since(since);
+        (time >= UNPLACED_PATIENCE).then(|| format!("no detection has had a place for {} s: {reason}", time.as_secs()))
     }
 
     /// The angle between mount and reality in words, if it is too large.

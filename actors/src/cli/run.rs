@@ -18,6 +18,8 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::oneshot;
 
 use super::{Failure, print};
+#[cfg(feature = "camera")]
+use crate::camera::frame_source::capture::Readers;
 use crate::node::config::NodeConfig;
 use crate::node::service::ServiceManager;
 use crate::node::{self, NodeError};
@@ -126,7 +128,7 @@ pub(super) fn run_to_end(serve: impl Future<Output = anyhow::Result<()>>) -> Res
     // A detector may block for good; a restart of the node must not wait for it.
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     #[cfg(feature = "camera")]
-    crate::camera::frame_source::capture::wait_for_readers(SHUTDOWN_TIMEOUT);
+    Readers::of_process().wait_for_end(SHUTDOWN_TIMEOUT);
     served.map_err(|error| match error.downcast_ref() {
         Some(NodeError::NameTaken { .. }) => Failure::name_taken(error),
         _ => error.into(),

@@ -120,13 +120,13 @@ impl TryArguments {
     }
 }
 
-/// The nodes of the street that comes with the program: two cameras that stay where they are, on one clock.
+/// The nodes of the street that comes with the program: two cameras that stay where they are.
 fn street() -> anyhow::Result<Vec<NodeConfig>> {
     let directory = installed::path(STREET_INSTALLED).unwrap_or_else(|| STREET_IN_SOURCES.into());
     let missing = || {
         format!(
-            "no street in {}: run this in the sources of ecod, install the package ecod-node, or give what to look at: --video \
-             FILE, --images DIR, --camera 0 or --url rtsp://...",
+            "no street in {}: run this in ecod's sources, or install the package ecod-node; or give --video FILE, --images DIR, \
+             --camera 0 or --url rtsp://...",
             directory.display()
         )
     };

@@ -2,10 +2,17 @@
 
 use std::time::Duration;
 
+use ecod::model::detection::Detection;
+use ecod::model::time::Timestamp;
+
 use super::Finding;
 use crate::camera::config::CameraConfig;
+use crate::camera::frame::CameraFrame;
 use crate::camera::frame_source::SourceConfig;
 use crate::camera::image_size::ImageSize;
+use crate::camera::lens::Lens;
+use crate::camera::perception::Perception;
+use crate::node;
 use crate::node::config::NodeConfig;
 
 /// Maximum time until the first frame; network cameras take seconds.
@@ -15,7 +22,9 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     let mut findings = Vec::new();
     for camera in config.all_cameras() {
-        let mut of_camera = [frame(camera).await, calibration(camera), detector(camera).await];
+        let (first, frame) = frame(camera).await;
+        let mut of_camera = vec![first, calibration(camera)];
+        of_camera.extend(detections(config, camera, frame).await);
         if let Some(name) = &camera.name {
             of_camera.iter_mut().for_each(|finding| finding.seen = format!("{name}: {}", finding.seen));
         }
@@ -24,7 +33,7 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     findings
 }
 
-async fn frame(camera: &CameraConfig) -> Finding {
+async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
     let check = "camera";
     let fix = match &camera.source {
         SourceConfig::V4l2 { .. } => "plug it in, add the user to the group `video`, set `camera.source.device`",
@@ -36,22 +45,22 @@ async fn frame(camera: &CameraConfig) -> Finding {
     // A camera that blocks forever keeps its thread, but the program ends all the same.
     let (sender, answer) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
-        let size =
-            source.open(TIMEOUT).and_then(|mut source| source.next_frame()).map(|frame| ImageSize::of(&frame.image));
         // The receiver is gone after the timeout.
-        let _ = sender.send(size);
+        let _ = sender.send(source.open(TIMEOUT).and_then(|mut source| source.next_frame()));
     });
     let lens = camera.optics.lens().ok();
     match tokio::time::timeout(TIMEOUT, answer).await {
-        Ok(Ok(Ok(size))) => match lens.map(|lens| lens.of_frames(size)) {
-            Some(Err(mismatch)) => {
+        Ok(Ok(Ok(frame))) => {
+            let size = ImageSize::of(&frame.image);
+            if let Some(Err(mismatch)) = lens.map(|lens| lens.of_frames(size)) {
                 let seen = format!("frames of {size}, but optics of {}", mismatch.optics);
-                Finding::broken(check, seen, "set `camera.optics` to the size of the frames, or calibrate")
+                let fix = "set `camera.optics` to the size of the frames, or calibrate";
+                return (Finding::broken(check, seen, fix), None);
             }
-            _ => Finding::fine(check, format!("frames of {size}")),
-        },
-        Ok(Ok(Err(error))) => Finding::broken(check, error.to_string(), fix),
-        Ok(Err(_)) | Err(_) => Finding::broken(check, format!("no frame within {TIMEOUT:?}"), fix),
+            (Finding::fine(check, format!("frames of {size}")), Some(frame))
+        }
+        Ok(Ok(Err(error))) => (Finding::broken(check, error.to_string(), fix), None),
+        Ok(Err(_)) | Err(_) => (Finding::broken(check, format!("no frame within {TIMEOUT:?}"), fix), None),
     }
 }
 
@@ -70,12 +79,40 @@ fn calibration(camera: &CameraConfig) -> Finding {
     }
 }
 
-async fn detector(camera: &CameraConfig) -> Finding {
+/// Loads the detector, runs it on a frame, and places what it finds.
+async fn detections(config: &NodeConfig, camera: &CameraConfig, frame: Option<CameraFrame>) -> Vec<Finding> {
     let check = "detector";
-    let detector = camera.detector.clone();
-    match tokio::task::spawn_blocking(move || detector.build().map(drop)).await {
-        Ok(Ok(())) => Finding::fine(check, "loaded"),
-        Ok(Err(error)) => Finding::broken(check, format!("{error:#}"), "correct `camera.detector` or its files"),
-        Err(error) => Finding::broken(check, error.to_string(), "use another model"),
+    let (detector, lens) = (camera.detector.clone(), camera.optics.lens().ok());
+    let perception = node::camera::perception(config, camera).ok();
+    let detected = tokio::task::spawn_blocking(move || {
+        let mut detector = detector.build()?;
+        frame.map(|frame| anyhow::Ok((ImageSize::of(&frame.image), detector.detect(&frame)?))).transpose()
+    });
+    match detected.await {
+        Ok(Ok(None)) => vec![Finding::fine(check, "loaded")],
+        Ok(Ok(Some((size, found)))) => {
+            let loaded = Finding::fine(check, format!("loaded, finds {} objects in a frame", found.len()));
+            let placed = perception.zip(lens).and_then(|(perception, lens)| placed(perception, &lens, size, found));
+            std::iter::once(loaded).chain(placed).collect()
+        }
+        Ok(Err(error)) => {
+            vec![Finding::broken(check, format!("{error:#}"), "correct `camera.detector` or its files")]
+        }
+        Err(error) => vec![Finding::broken(check, error.to_string(), "use another model")],
+    }
+}
+
+/// Places the detections of a frame, if there are any.
+fn placed(mut perception: Perception, lens: &Lens, size: ImageSize, mut found: Vec<Detection>) -> Option<Finding> {
+    let (check, count) = ("places", found.len());
+    perception.set_lens(&lens.fitted(size, &mut found).ok()?);
+    let placed = perception.report(found, Timestamp::default()).objects.len();
+    let seen = format!("{placed} of {count} objects have a place");
+    match perception.last_discard() {
+        Some(reason) => {
+            let fix = "correct `camera.mount` or `camera.projection`, unless the object does not matter";
+            Some(Finding::doubtful(check, format!("{seen}: {reason}"), fix))
+        }
+        None => (count > 0).then(|| Finding::fine(check, seen)),
     }
 }

@@ -188,6 +188,26 @@ async fn what_a_camera_lacks_is_named() {
     stop([blind, lost, seeing]).await;
 }
 
+/// A camera so near that the image's edge cuts whatever it sees.
+#[cfg(feature = "camera")]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_camera_none_of_whose_detections_has_a_place_is_named_with_the_reason() {
+    let directory = tempfile::tempdir().unwrap();
+    let (frames, detections) = (directory.path().join("frames"), directory.path().join("detections.jsonl"));
+    std::fs::create_dir(&frames).unwrap();
+    std::fs::write(frames.join("0.ppm"), [b"P6 64 48 255\n".as_slice(), &[128; 64 * 48 * 3]].concat()).unwrap();
+    let seen = r#"[{"label":"person","confidence":0.9,"bounding_box":{"x_min":0,"y_min":0,"x_max":64,"y_max":48}}]"#;
+    std::fs::write(&detections, seen).unwrap();
+    let camera = format!(
+        "source = {{ kind = \"images\", path = {frames:?}, looping = true }}\nmount = {{ height_m = 1.5 }}\n\
+         detector = {{ kind = \"recorded\", path = {detections:?}, looping = true }}"
+    );
+    let camera = Some(toml::from_str(&camera).unwrap());
+    let (node, page) = start(NodeConfig { camera, ..config("euclid", Role::Cav, 1) }).await;
+    until_told(page, ["euclid", "", "not_placed"], "the image's edge cuts the box").await;
+    node.stop().await;
+}
+
 /// A camera that looks 6° higher than its mount says, at people who stand 4 to 15 m away.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

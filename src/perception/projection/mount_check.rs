@@ -16,6 +16,10 @@ const SAMPLE_PERIOD: Duration = Duration::from_millis(500);
 /// Least and largest number of boxes that are compared.
 const MIN_BOXES: usize = 30;
 const MAX_BOXES: usize = 200;
+/// Least time between the first and the last of them.
+const MIN_TIME: Duration = Duration::from_secs(10);
+/// Labels of COCO that stand on the ground. Those with a listed size count as well; others may hang or lie on something.
+const STANDING: [&str; 6] = ["person", "bicycle", "car", "motorcycle", "bus", "truck"];
 /// Least ratio of near feet's slopes to far ones', of which a tenth each are beyond. At one distance, a camera that has turned
 /// looks like objects that do not stand on the ground.
 const MIN_SLOPE_RATIO: f64 = 1.25;
@@ -67,7 +71,8 @@ impl MountCheck {
         };
         let slopes = sorted(|offset| offset.expected_slope);
         let (count, tenth) = (slopes.len(), slopes.len() / 10);
-        if count < MIN_BOXES || slopes[count - 1 - tenth] < MIN_SLOPE_RATIO * slopes[tenth] {
+        let time = self.offsets.back()?.captured_at.since(self.offsets.front()?.captured_at);
+        if count < MIN_BOXES || time < MIN_TIME || slopes[count - 1 - tenth] < MIN_SLOPE_RATIO * slopes[tenth] {
             return None;
         }
         let sigmas = sorted(|offset| offset.angle_rad / offset.sigma_rad)[count / 2];
@@ -79,12 +84,15 @@ impl MountCheck {
 }
 
 impl Projection {
-    /// None where foot and height of a box cannot be compared: the image cuts it, it is of a target, its size or the camera's
-    /// height is not known, or it is not ranged by the ground.
+    /// The angle between the foot of a box and where its height makes one expect it. None where they cannot be compared: the
+    /// image cuts the box, it is of a target, or the ground plays no part. Nor without the camera's height and an object that
+    /// stands.
     fn foot_offset(&self, detection: &Detection, cut: Cut, captured_at: Timestamp) -> Option<FootOffset> {
         let bounds = &detection.bounding_box;
+        let label = detection.label.as_str();
+        let stands = STANDING.contains(&label) || self.config.sizes.labels.contains_key(label);
         let is_grounded = matches!(self.config.ranging, Ranging::Auto | Ranging::Ground) && detection.corners.is_none();
-        if !is_grounded || !bounds.is_valid() || cut.upper || cut.lower {
+        if !stands || !is_grounded || !bounds.is_valid() || cut.upper || cut.lower {
             return None;
         }
         let (camera_m, size) = (self.mount.height_m?, self.config.sizes.of(&detection.label)?);

@@ -7,9 +7,9 @@
 //! OpenCV may block forever. The capture thread then abandons the reader, which ends when OpenCV returns, and reopens
 //! the source on a new one.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender};
+use std::sync::{Arc, LazyLock};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -159,46 +159,43 @@ impl Drop for Capture {
     }
 }
 
-/// Number of readers in this process that may be inside OpenCV.
-static READERS: AtomicUsize = AtomicUsize::new(0);
-
-/// The running readers of a capture, each of which holds a clone of what is inside.
+/// Number of running readers. They may be inside OpenCV, which must not be in use while the process ends.
 #[derive(Debug, Clone, Default)]
-pub struct Readers(Arc<()>);
+pub struct Readers(Arc<AtomicUsize>);
 
 impl Readers {
-    /// Waits at most `timeout` until those of a stopped capture have ended.
-    pub async fn ended(self, timeout: Duration) {
-        let running = Arc::downgrade(&self.0);
-        drop(self);
+    /// Those of all captures in this process.
+    pub fn of_process() -> &'static Self {
+        static ALL: LazyLock<Readers> = LazyLock::new(Readers::default);
+        &ALL
+    }
+
+    /// Waits at most `timeout` until none runs.
+    pub fn wait_for_end(&self, timeout: Duration) {
         let until = Instant::now() + timeout;
-        while running.strong_count() > 0 && Instant::now() < until {
-            tokio::time::sleep(Duration::from_millis(2)).await;
+        while self.0.load(Ordering::SeqCst) > 0 && Instant::now() < until {
+            thread::sleep(Duration::from_millis(2));
         }
     }
 }
 
-/// Counts a reader while it runs.
-struct ReaderGuard(#[expect(dead_code, reason = "held")] Readers);
+/// Counts a reader of a capture while it runs.
+struct ReaderGuard(Readers);
 
 impl ReaderGuard {
     fn new(readers: Readers) -> Self {
-        READERS.fetch_add(1, Ordering::SeqCst);
+        for count in [&readers, Readers::of_process()] {
+            count.0.fetch_add(1, Ordering::SeqCst);
+        }
         Self(readers)
     }
 }
 
 impl Drop for ReaderGuard {
     fn drop(&mut self) {
-        READERS.fetch_sub(1, Ordering::SeqCst);
-    }
-}
-
-/// Waits at most `timeout` until no reader runs, because OpenCV must not be in use while the process ends.
-pub fn wait_for_readers(timeout: Duration) {
-    let until = Instant::now() + timeout;
-    while READERS.load(Ordering::SeqCst) > 0 && Instant::now() < until {
-        thread::sleep(Duration::from_millis(2));
+        for count in [&self.0, Readers::of_process()] {
+            count.0.fetch_sub(1, Ordering::SeqCst);
+        }
     }
 }
 

@@ -120,6 +120,9 @@ type StatedPoint = [f64; 4];
 /// Relative standard deviation of the height of one known person.
 const KNOWN_HEIGHT_SIGMA: f64 = 0.02;
 
+/// Maximum time for the camera to end.
+const STOP_TIMEOUT: Duration = Duration::from_secs(1);
+
 fn four_numbers(text: &str) -> Result<StatedPoint, String> {
     let words =
         text.split(|c: char| c == ',' || c == '=' || c == ';' || c.is_whitespace()).filter(|word| !word.is_empty());
@@ -323,6 +326,9 @@ impl PeopleArguments {
             let detections = detector.detect(&frame).context("the detector failed")?;
             watched.add(detections, &frame, &self.label, camera).map_err(Failure::usage)?;
         }
+        let readers = capture.readers();
+        drop(capture);
+        readers.wait_for_end(STOP_TIMEOUT);
         Ok(watched)
     }
 }

@@ -299,13 +299,13 @@ fn a_tilted_camera_of_unknown_height_ranges_upright_objects_and_corners_alike() 
 }
 
 /// A check that has seen a minute of the street, a box each half second, through a camera that is mounted otherwise than said.
-fn checked(mounted: &Mount, said: Mount, max_range: f64) -> MountCheck {
+fn checked(mounted: &Mount, said: Mount) -> MountCheck {
     let mut street = Street::new(said.height_m.unwrap());
     let projection =
         projection(Ranging::Auto, said, &ProjectionConfig { pixel_sigma_px: 2.0, ..ProjectionConfig::default() });
     let mut check = MountCheck::default();
     for half_seconds in 0..120 {
-        let (mut detection, _) = street.next(mounted, 1.0, max_range);
+        let (mut detection, _) = street.next(mounted, 1.0, 10.0);
         detection.bounding_box.y_max += 2.0 * street.normal();
         let boxes = [(&detection, projection.cut(&detection))];
         check.take(boxes, Timestamp::default() + Duration::from_millis(500 * half_seconds), &projection);
@@ -318,7 +318,7 @@ fn a_camera_that_has_turned_is_told_by_its_angle_and_one_within_its_errors_is_no
     for (height_m, pitch_deg) in [(1.2, 0.0), (1.2, 10.0), (2.5, 10.0), (6.0, 20.0)] {
         let said = mount(height_m, pitch_deg, 0.0);
         for turned_deg in [-8.0, -5.0, 5.0, 8.0] {
-            let off_rad = checked(&mount(height_m, pitch_deg - turned_deg, 0.0), said, 10.0).off_rad();
+            let off_rad = checked(&mount(height_m, pitch_deg - turned_deg, 0.0), said).off_rad();
             let off_deg = off_rad.map(f64::to_degrees);
             assert!(
                 off_deg.is_some_and(|off_deg| (off_deg - turned_deg).abs() < 1.0),
@@ -326,10 +326,28 @@ fn a_camera_that_has_turned_is_told_by_its_angle_and_one_within_its_errors_is_no
             );
         }
         for turned_deg in [-1.5, 0.0, 1.5] {
-            let off_rad = checked(&mount(height_m, pitch_deg - turned_deg, 1.5), said, 10.0).off_rad();
+            let off_rad = checked(&mount(height_m, pitch_deg - turned_deg, 1.5), said).off_rad();
             assert_eq!(off_rad, None, "{height_m} m, {pitch_deg}° turned by {turned_deg}°");
         }
     }
+}
+
+#[test]
+fn what_hangs_is_no_sign_of_a_camera_that_has_turned() {
+    let projection = projection(Ranging::Auto, mount(1.5, 0.0, 0.0), &ProjectionConfig::default());
+    let lamp = ObjectSizes::default().of("traffic light").copied().unwrap();
+    let above = Mount { height_m: Some(1.5 - 4.0), ..Mount::default() };
+    let mut check = MountCheck::default();
+    for seconds in 0..60 {
+        let at = Point2::new(16.0 + f64::from(seconds % 8), 1.0);
+        let hanging = seen("traffic light", &lamp, at, 0.0, &above).unwrap();
+        check.take(
+            [(&hanging, Cut::default())],
+            Timestamp::default() + Duration::from_secs(seconds.into()),
+            &projection,
+        );
+    }
+    assert_eq!(check.off_rad(), None);
 }
 
 #[test]
