@@ -338,7 +338,7 @@ fn what_hangs_is_no_sign_of_a_camera_that_has_turned() {
     let lamp = ObjectSizes::default().of("traffic light").copied().unwrap();
     let above = Mount { height_m: Some(1.5 - 4.0), ..Mount::default() };
     let mut check = MountCheck::default();
-    for seconds in 0..60 {
+    for seconds in 0..60u32 {
         let at = Point2::new(16.0 + f64::from(seconds % 8), 1.0);
         let hanging = seen("traffic light", &lamp, at, 0.0, &above).unwrap();
         check.take(
@@ -356,8 +356,12 @@ fn things_above_the_ground_at_one_distance_are_no_sign_of_a_camera_that_has_turn
     let mut check = MountCheck::default();
     let hanging =
         Detection { bounding_box: moved(&person_ahead(8.0, &mount(1.2, 0.0, 0.0)), -80.0), ..detection_of("person") };
-    for seconds in 0..60 {
-        check.take([(&hanging, Cut::default())], Timestamp::default() + Duration::from_secs(seconds), &projection);
+    for seconds in 0..60u32 {
+        check.take(
+            [(&hanging, Cut::default())],
+            Timestamp::default() + Duration::from_secs(seconds.into()),
+            &projection,
+        );
     }
     assert_eq!(check.off_rad(), None);
 }
