@@ -3,7 +3,7 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::TcpStream;
+use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -160,11 +160,19 @@ fn without_a_source_a_street_is_shown_by_two_cameras() {
 fn what_cannot_be_shown_is_told_in_one_line_with_a_remedy() {
     let directory = tempfile::tempdir().unwrap();
     let nothing = directory.path().to_str().unwrap();
+    let shown = format!("{}/tests/data/photos", env!("CARGO_MANIFEST_DIR"));
+    let there = format!("{}/Cargo.toml", env!("CARGO_MANIFEST_DIR"));
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let taken = listener.local_addr().unwrap().to_string();
     for (arguments, parts) in [
         (vec!["try"], vec!["examples/street", "package", "--video FILE", "--images DIR", "--camera 0"]),
         (vec!["try", "--video", "no-such.mp4"], vec!["no-such.mp4"]),
         (vec!["try", "--images", nothing], vec![nothing, "no images found"]),
         (vec!["try", "--url", "192.168.1.20"], vec!["rtsp://"]),
+        (vec!["try", "--video", nothing], vec![nothing, "a directory", "--images"]),
+        (vec!["try", "--images", &shown, "--save", &there], vec![&there, "another name"]),
+        (vec!["try", "--images", &shown, "--save", "none/node.toml"], vec!["none/node.toml", "make the directory"]),
+        (vec!["try", "--images", &shown, "--dashboard", &taken], vec![&taken, "another address"]),
     ] {
         let Output { status, stderr, .. } = ecod_node().args(&arguments).output().unwrap();
         let error = String::from_utf8(stderr).unwrap();

@@ -8,6 +8,7 @@
 //!
 //! The pump takes the latest frame only when the detector is done with the previous one, so frames never queue.
 
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,6 +17,7 @@ use ecod::model::detection::Detection;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::Semaphore;
 use tokio::task::{JoinSet, spawn_blocking};
+use tokio::time::timeout;
 
 use crate::camera::detect::Detect;
 use crate::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus, Opener, Readers};
@@ -75,6 +77,11 @@ pub struct DetectorState {
     pump: JoinSet<()>,
     readers: Readers,
 }
+
+/// Time after which a detector is told to be slow.
+const SLOW_AFTER: Duration = Duration::from_secs(5);
+const SLOW_DETECTOR: &str =
+    "the detector has been busy with one frame for more than 5 s: use smaller frames or another model";
 
 /// Maximum time for the camera to end.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
@@ -198,7 +205,22 @@ async fn pump(
     let permits = Arc::new(Semaphore::new(1));
     let mut status = capture.status();
     let (mut skipped, mut unusable, mut failures) = (0, 0, 0);
-    while let Ok(permit) = Arc::clone(&permits).acquire_owned().await {
+    loop {
+        let mut ready = pin!(Arc::clone(&permits).acquire_owned());
+        let mut is_slow = false;
+        let permit = loop {
+            match timeout(SLOW_AFTER, &mut ready).await {
+                Ok(Ok(permit)) => break permit,
+                Ok(Err(_)) => return,
+                Err(_) => {
+                    is_slow = true;
+                    troubles.note(TroubleKind::Camera, SLOW_DETECTOR);
+                }
+            }
+        };
+        if is_slow {
+            troubles.settle(TroubleKind::Camera);
+        }
         let frame = loop {
             let frame = tokio::select! {
                 frame = capture.next_frame() => Some(frame),
@@ -233,5 +255,60 @@ async fn pump(
         if span.in_scope(|| detector.cast(DetectorMessage::Detect { frame, permit })).is_err() {
             return;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::{Receiver, channel};
+
+    use ecod::model::names::NodeName;
+    use ecod::perception::camera::Intrinsics;
+
+    use super::*;
+    use crate::camera::detect::DetectError;
+    use crate::camera::frame::CameraFrame;
+    use crate::camera::frame_source::SourceConfig;
+
+    /// A model that is too large for its machine: each frame takes until the test says.
+    struct Slow(Receiver<()>);
+
+    impl Detect for Slow {
+        fn detect(&mut self, _: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
+            self.0.recv().ok();
+            Ok(Vec::new())
+        }
+    }
+
+    #[tokio::test]
+    async fn a_detector_that_does_not_finish_a_frame_is_a_trouble_until_it_does() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos").into();
+        let source = SourceConfig::Images { path, fps: 10.0, looping: true };
+        let (done, waits) = channel();
+        let counters = Arc::<Counters>::default();
+        let arguments = DetectorArguments {
+            open: Arc::new(move || source.open(Duration::from_secs(5))),
+            capture: CaptureConfig::default(),
+            detect: Box::new(Slow(waits)),
+            lens: Lens { is_any_shape: true, ..Lens::ideal(Intrinsics::with_square_pixels(640, 480, 1.0)) },
+            projector: ActorSlot::default(),
+            images: None,
+            camera_feed: None,
+            troubles: CameraTroubles::new(Arc::clone(&counters), None),
+            counters: Arc::clone(&counters),
+            spans: Spans::new(NodeName::from_static("cell"), NodeName::from_static("euclid")),
+        };
+        let (detector, ended) = Actor::spawn(None, Detector, arguments).await.unwrap();
+        let until = async |is_slow: bool| {
+            let is_told = || counters.troubles().present().iter().any(|trouble| trouble.cause == SLOW_DETECTOR);
+            while is_told() != is_slow {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        timeout(Duration::from_secs(60), until(true)).await.expect("it is told");
+        drop(done);
+        timeout(Duration::from_secs(60), until(false)).await.expect("it is over");
+        detector.stop(None);
+        ended.await.unwrap();
     }
 }

@@ -1,7 +1,7 @@
 //! `ecod-node try`: a cell from one's own pictures, without a configuration, or from those of a street.
 
 use std::io::{IsTerminal, Write};
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -77,12 +77,13 @@ impl TryArguments {
     /// The frame sources with the names of their vehicles.
     fn sources(&self) -> Vec<(String, SourceConfig)> {
         let numbered = |kind: &str, index: usize| format!("{kind}-{}", index + 1);
-        let videos =
-            self.video.iter().enumerate().map(|(index, path)| {
-                (numbered("video", index), SourceConfig::Video { path: path.clone(), looping: true })
-            });
+        // A saved configuration is to be of use in every directory.
+        let absolute = |path: &PathBuf| std::path::absolute(path).unwrap_or_else(|_| path.clone());
+        let videos = self.video.iter().enumerate().map(|(index, path)| {
+            (numbered("video", index), SourceConfig::Video { path: absolute(path), looping: true })
+        });
         let images = self.images.iter().enumerate().map(|(index, path)| {
-            (numbered("images", index), SourceConfig::Images { path: path.clone(), fps: 5.0, looping: true })
+            (numbered("images", index), SourceConfig::Images { path: absolute(path), fps: 5.0, looping: true })
         });
         let cameras = self.camera.iter().map(|number| {
             let device = PathBuf::from(format!("/dev/video{number}"));
@@ -105,19 +106,35 @@ impl TryArguments {
                 source.open(PROGRESS_PERIOD).map(drop).map_err(Failure::usage)?;
             }
             let mut config = vehicle(NodeName::new(name).map_err(Failure::usage)?, source);
-            config.pose.y_m = -SPACING_M * index as f64;
+            config.pose.y_m -= SPACING_M * index as f64;
             configs.push(config);
+        }
+        if let Some(page) = self.dashboard {
+            let bound = TcpListener::bind(page).map(drop);
+            let free = "give --dashboard another address, or leave it out for a free port";
+            bound.with_context(|| format!("no page at {page}: {free}")).map_err(Failure::usage)?;
         }
         if configs.is_empty() {
             configs = street().map_err(Failure::usage)?;
         }
         for (index, config) in configs.iter_mut().enumerate() {
+            if let Some(path) = &self.save {
+                check_absent(&numbered(path, index)).map_err(Failure::usage)?;
+            }
             apart(config);
             config.dashboard.listen = self.dashboard.filter(|_| index == 0);
             config.validate().map_err(Failure::usage)?;
         }
         Ok(configs)
     }
+}
+
+/// Checks that a file can be made.
+fn check_absent(path: &Path) -> anyhow::Result<()> {
+    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    ensure!(directory.is_dir(), "cannot write {}: make the directory first", path.display());
+    ensure!(!path.exists(), "cannot write {}: it exists, choose another name for --save", path.display());
+    Ok(())
 }
 
 /// The nodes of the street that comes with the program: two cameras that stay where they are.
@@ -231,9 +248,9 @@ async fn start_and_watch(
         nodes.push(node);
         if let Some(path) = save {
             let path = numbered(path, index);
-            let text = config.to_toml().context("the configuration cannot be written as TOML")?;
+            let text = config.to_toml_changed().context("the configuration cannot be written as TOML")?;
             let written = std::fs::File::create_new(&path).and_then(|mut file| file.write_all(text.as_bytes()));
-            written.with_context(|| format!("cannot write {}, which must not exist yet", path.display()))?;
+            written.with_context(|| format!("cannot write {}", path.display()))?;
         }
     }
     watch(nodes).await

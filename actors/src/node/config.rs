@@ -250,7 +250,6 @@ impl NodeConfig {
         self.reputations.validate().map_err(|error| error.within("reputations"))?;
         self.dashboard.validate().map_err(|error| error.within("dashboard"))?;
         #[cfg(feature = "camera")]
-        #[cfg(feature = "camera")]
         self.validate_cameras()?;
         if let Some(record) = &self.record {
             record.validate().map_err(|error| error.within("record"))?;

@@ -72,7 +72,9 @@ pub enum ModelError {
     )]
     NoWeights,
     /// OpenCV cannot run the file, or its inputs and outputs differ.
-    #[error("model {path} is not an ssdlite network that opencv can run: {reason}")]
+    #[error(
+        "model {path} is not an ssdlite network that opencv can run; for other models set `kind = \"onnx\"`: {reason}"
+    )]
     Unusable {
         /// The file, or `built-in`.
         path: String,
@@ -113,7 +115,9 @@ impl CocoDetector {
         let packaged = || installed::path(PACKAGED).filter(|_| BUILT_IN.is_none());
         let file = config.model.clone().or_else(packaged);
         let name = file.as_ref().map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
-        let unusable = |reason: String| ModelError::Unusable { path: name.clone(), reason };
+        // OpenCV tells more in further lines.
+        let first_line = |reason: String| reason.lines().next().unwrap_or_default().to_owned();
+        let unusable = |reason: String| ModelError::Unusable { path: name.clone(), reason: first_line(reason) };
         let weights = match file {
             Some(path) => match std::fs::read(&path) {
                 Ok(bytes) => Vector::from_slice(&bytes),

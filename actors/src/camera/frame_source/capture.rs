@@ -279,18 +279,25 @@ impl CaptureLoop {
             Err(e) => return Outcome::Failed(FrameError::Open { origin: "a thread".into(), reason: e.to_string() }),
         }
         let mut deadline = Instant::now() + stall_timeout;
+        let mut last_unusable = None;
         loop {
             match self.inbox.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
                 Ok(CaptureEvent::Stop) | Err(RecvTimeoutError::Disconnected) => return Outcome::Stopped,
-                Err(RecvTimeoutError::Timeout) => return Outcome::Failed(FrameError::Stalled(stall_timeout)),
+                Err(RecvTimeoutError::Timeout) => {
+                    return Outcome::Failed(last_unusable.unwrap_or(FrameError::Stalled(stall_timeout)));
+                }
                 Ok(CaptureEvent::Read(from, _)) if from != opening => {}
                 Ok(CaptureEvent::Read(_, Err(error @ FrameError::Unusable { .. }))) => {
-                    tracing::warn!(%error, "frame skipped");
+                    if last_unusable.is_none() {
+                        tracing::warn!(%error, "frame skipped; others until the next whole one are only counted");
+                    }
+                    last_unusable = Some(error);
                     self.unusable.fetch_add(1, Ordering::Relaxed);
                 }
                 Ok(CaptureEvent::Read(_, Err(error))) => return Outcome::Failed(error),
                 Ok(CaptureEvent::Read(_, Ok(frame))) => {
                     deadline = Instant::now() + stall_timeout;
+                    last_unusable = None;
                     if matches!(*self.status.borrow(), CaptureStatus::Failed { .. }) {
                         tracing::info!("frame source runs again");
                     }

@@ -94,7 +94,7 @@ impl Video {
         let failed = |reason: String| FrameError::Open { origin: origin.clone(), reason };
         let capture = open().map_err(|e| failed(e.message))?;
         if !capture.is_opened().map_err(|e| failed(e.message))? {
-            return Err(failed("opencv finds no video".into()));
+            return Err(failed("opencv finds no video there: see whether a player shows it".into()));
         }
         Ok(Self { origin, capture, playback: None, seq: 0 })
     }
@@ -162,7 +162,11 @@ fn is_missing(element: &str) -> bool {
 /// The operating system's error for a missing or forbidden file, since OpenCV reports none.
 fn readable(path: &Path, origin: &str) -> Result<(), FrameError> {
     let failed = |e: std::io::Error| FrameError::Open { origin: origin.to_owned(), reason: e.to_string() };
-    File::open(path).map(drop).map_err(failed)
+    let file = File::open(path).map_err(failed)?;
+    if file.metadata().map_err(failed)?.is_dir() {
+        return Err(failed(std::io::Error::other("it is a directory: for images use kind `images`, or `--images`")));
+    }
+    Ok(())
 }
 
 #[cfg(test)]

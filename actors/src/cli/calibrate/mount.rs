@@ -322,6 +322,7 @@ impl PeopleArguments {
             Capture::start(Arc::new(move || source.open(timeout)), capture).context("cannot start the camera")?;
         let mut watched = Watched { people: Vec::new(), others: BTreeSet::new(), lens };
         let end = Instant::now() + for_s;
+        eprintln!("watches for {} s, or until the frames end", self.for_s);
         while let Ok(Some(frame)) = runtime.block_on(async { timeout_at(end, capture.next_frame()).await }) {
             let detections = detector.detect(&frame).context("the detector failed")?;
             watched.add(detections, &frame, &self.label, camera).map_err(Failure::usage)?;
