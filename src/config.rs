@@ -75,7 +75,8 @@ pub fn check_range(key: &str, value: f64, low: f64, high: f64) -> Result<(), Con
     if (low..=high).contains(&value) {
         Ok(())
     } else {
-        Err(ConfigError::new(key, value, format!("a number from {low} to {high}")))
+        let shown = if value.abs() < 1e9 { value.to_string() } else { format!("{value:e}") };
+        Err(ConfigError::new(key, shown, format!("a number from {low} to {high}")))
     }
 }
 
