@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check deb deb-arm64 package-check package-check-arm64 clean
+.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -108,7 +108,7 @@ attack: setup ## attackers of all kinds against real cells, and a table; ROWS=te
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
-	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets -- -D warnings
+	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets --features ecod-interop/dds -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items
 
 doc: setup ## API documentation in target/doc
@@ -137,6 +137,10 @@ recording-check: setup ## prove that the Python reader of MCAP reads what nodes 
 
 live-check: setup ## record with the feature foxglove, and look on as Foxglove does
 	cargo test --locked -p ecod-actors --no-default-features --features foxglove --test recording
+
+foxglove-check: PACKAGES += $(if $(shell command -v npm),,npm)
+foxglove-check: setup ## a camera's log against Foxglove's published schemas, and the layout against the log; installs npm where there is none
+	packaging/check-foxglove
 
 tracing-check: setup ## follow a detection through two nodes, with the feature otel
 	cargo test --locked -p ecod-actors --features otel --test tracing
@@ -173,6 +177,10 @@ ros2-check: setup ## a node's log for ROS 2, read by mcap-ros2-support and writt
 	python3 -m venv $(BUILD)/ros2-venv
 	$(BUILD)/ros2-venv/bin/pip install --quiet mcap-ros2-support rosbags
 	ROS2_PYTHON=$(abspath $(BUILD))/ros2-venv/bin/python3 cargo test --locked -p ecod-interop --test ros2 -- --include-ignored --nocapture
+
+dds-check: PACKAGES := build-essential ca-certificates iproute2 python3-venv
+dds-check: setup ## live topics of ROS 2 and a detector's, in a network of their own, against Cyclone DDS for Python; needs root
+	packaging/check-dds
 
 deb: setup ## Debian packages of a node, with camera and without, and of the COCO weights, in target/debian
 	packaging/deb

@@ -1,4 +1,4 @@
-"""Reads a log of profile ros2 by mcap-ros2-support, and has rosbags write each message again to the same bytes."""
+"""Reads logs of profile ros2 by mcap-ros2-support, and has rosbags write each message again to the same bytes."""
 
 import collections
 import sys
@@ -8,10 +8,10 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 
-def main():
-    counts, seen = collections.Counter(), set()
+def read(path, counts):
+    seen = set()
     store = get_typestore(Stores.EMPTY)
-    with open(sys.argv[1], "rb") as file:
+    with open(path, "rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
         for schema, channel, message, decoded in reader.iter_decoded_messages():
@@ -34,7 +34,17 @@ def main():
                 # An optical frame's z axis is the camera's x axis (REP 103).
                 q = optical.transform.rotation
                 assert 2 * (q.x * q.z + q.w * q.y) == 1 and optical.header.frame_id == transform.child_frame_id
-    assert len(counts) == 4, counts
+            if channel.topic == "/ecod/camera/camera_info":
+                assert (decoded.width, decoded.height, decoded.distortion_model) == (640, 480, "plumb_bob")
+                assert decoded.header.frame_id == "cam_1_camera_optical" and list(decoded.d)[:2] == [-0.3, 0.1]
+                assert decoded.k[0] == decoded.p[0] == 554.25 and decoded.k[5] == decoded.p[6] == 240.0
+
+
+def main():
+    counts = collections.Counter()
+    for path in sys.argv[1:]:
+        read(path, counts)
+    assert len(counts) == 6, counts
     print(*(f"{topic} {count}" for topic, count in sorted(counts.items())), sep="\n")
 
 

@@ -6,6 +6,12 @@ use std::process::ExitCode;
 use clap::{Args, Parser, Subcommand};
 use ecod_client::{Settings, Tls};
 use ecod_interop::bridge::CpmBridge;
+#[cfg(feature = "dds")]
+use {
+    ecod::model::geometry::Pose,
+    ecod::perception::camera::Mount,
+    ecod_interop::dds::{DetectorTopics, RosBridge, RosCamera, RosSettings},
+};
 
 /// Bridges between a cell and the messages of other stations. Runs beside a node, as any program does.
 #[derive(Parser)]
@@ -28,6 +34,84 @@ enum Command {
         /// File to be written.
         output: PathBuf,
     },
+    /// The cell as live topics of ROS 2, by DDS, and the detections of a topic as reports.
+    #[cfg(feature = "dds")]
+    Ros2Live(Box<RosOptions>),
+}
+
+/// Domain of DDS, and a detector whose detections are to be reported.
+#[cfg(feature = "dds")]
+#[derive(Args)]
+struct RosOptions {
+    #[command(flatten)]
+    connection: Connection,
+    /// Domain of DDS.
+    #[arg(long, env = "ROS_DOMAIN_ID", default_value_t = 0)]
+    domain: u16,
+    /// Address of this machine in a network to take part in; may be given several times. Default: in all.
+    #[arg(long, value_name = "ADDRESS")]
+    network: Vec<std::net::IpAddr>,
+    /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in that of a camera with a --pose.
+    #[arg(long, value_name = "TOPIC", conflicts_with = "detections_2d")]
+    detections_3d: Option<String>,
+    /// Topic of vision_msgs/Detection2DArray: boxes in pictures without distortion.
+    #[arg(long, value_name = "TOPIC", requires_all = ["camera_info", "pose"])]
+    detections_2d: Option<String>,
+    /// Topic of sensor_msgs/CameraInfo: the optics of these pictures.
+    #[arg(long, value_name = "TOPIC")]
+    camera_info: Option<String>,
+    /// Pose of the camera: metres east and north, degrees counter-clockwise from east.
+    #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose)]
+    pose: Option<Pose>,
+    /// Height of the camera above the ground in metres; boxes are then also ranged by the ground.
+    #[arg(long)]
+    height_m: Option<f64>,
+    /// Angle of the camera's axis below the horizon in degrees.
+    #[arg(long, default_value_t = 0.0, allow_hyphen_values = true)]
+    pitch_deg: f64,
+    /// File with the keys of `camera.projection` (TOML). Default: sizes of COCO's labels, and `pixel_sigma_px = 3`.
+    #[arg(long, value_name = "FILE")]
+    projection: Option<PathBuf>,
+    /// Label of a class of the detector, such as 0=person; may be given several times.
+    #[arg(long, value_name = "CLASS=LABEL", value_parser = class_label)]
+    label: Vec<(String, String)>,
+}
+
+#[cfg(feature = "dds")]
+impl RosOptions {
+    fn settings(self) -> Result<(Settings, RosSettings), String> {
+        let mut camera = RosCamera {
+            pose: self.pose,
+            mount: Mount { height_m: self.height_m, pitch_rad: self.pitch_deg.to_radians(), ..Mount::default() },
+            labels: self.label.into_iter().collect(),
+            ..RosCamera::default()
+        };
+        if let Some(file) = &self.projection {
+            let text = std::fs::read_to_string(file).map_err(|error| format!("{}: {error}", file.display()))?;
+            camera.projection = toml::from_str(&text).map_err(|error| format!("{}: {error}", file.display()))?;
+            camera.projection.validate().map_err(|error| format!("{}: {error}", file.display()))?;
+        }
+        let in_pictures = self.detections_2d.zip(self.camera_info);
+        let in_pictures = in_pictures.map(|(topic, optics)| DetectorTopics::InPictures(topic, optics));
+        let input = self.detections_3d.map(DetectorTopics::InSpace).or(in_pictures);
+        let ros = RosSettings { domain: self.domain, networks: self.network, input, camera };
+        Ok((self.connection.settings(), ros))
+    }
+}
+
+#[cfg(feature = "dds")]
+fn pose(text: &str) -> Result<Pose, String> {
+    let numbers: Vec<f64> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
+    let [x_m, y_m, heading_deg] = numbers[..] else {
+        return Err("must be three numbers, such as 1.5,-2,90".to_owned());
+    };
+    Ok(Pose::new(x_m, y_m, heading_deg.to_radians()))
+}
+
+#[cfg(feature = "dds")]
+fn class_label(text: &str) -> Result<(String, String), String> {
+    let (class, label) = text.split_once('=').ok_or("must be CLASS=LABEL, such as 0=person")?;
+    Ok((class.to_owned(), label.to_owned()))
 }
 
 /// Where the node is, and its name. All can be set by the environment, as for nodes.
@@ -75,6 +159,10 @@ fn main() -> ExitCode {
         }
         #[cfg(feature = "ros2")]
         Command::Ros2 { log, output } => convert(&log, &output),
+        #[cfg(feature = "dds")]
+        Command::Ros2Live(options) => options.settings().and_then(|(settings, ros)| {
+            RosBridge::connect(settings, ros).and_then(|bridge| bridge.run()).map_err(|error| error.to_string())
+        }),
     };
     match ended {
         Ok(()) => ExitCode::SUCCESS,

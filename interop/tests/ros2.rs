@@ -79,29 +79,45 @@ fn a_log_has_detections_markers_and_poses_for_ros() {
     assert!(cut.is_cut && cut.written < done.written && cut.unusable == 0, "{cut:?} {done:?}");
 }
 
-#[test]
-fn a_picture_of_the_camera_is_the_same_picture() {
+/// A log with the optics of a camera, a picture, and one that is none.
+fn camera_log() -> Vec<u8> {
     let mut log = Vec::new();
     let mut writer = mcap::Writer::new(Cursor::new(&mut log)).unwrap();
-    let channel_id = writer.add_channel(0, "camera", "json", &BTreeMap::new()).unwrap();
     let at = 1_795_239_882_123_000_000;
-    let header = mcap::records::MessageHeader { channel_id, sequence: 0, log_time: at, publish_time: at };
-    for image in [
-        r#"{"frame_id":"camera","data":"/9j/","format":"jpeg"}"#,
-        r#"{"frame_id":"camera","data":"?","format":"jpeg"}"#,
+    let optics = r#"{"timestamp":{"sec":1795239882,"nsec":123000000},"frame_id":"cam-1/optical","width":640,"height":480,
+        "distortion_model":"plumb_bob","D":[-0.3,0.1,0.001,-0.002,0.0],"K":[554.25,0.0,320.0,0.0,554.25,240.0,0.0,0.0,1.0],
+        "R":[1.0,0.0,0.0,0.0,1.0,0.0,0.0,0.0,1.0],"P":[554.25,0.0,320.0,0.0,0.0,554.25,240.0,0.0,0.0,0.0,1.0,0.0]}"#;
+    for (topic, message) in [
+        ("camera_calibration", optics),
+        ("camera", r#"{"frame_id":"cam-1/optical","data":"/9j/","format":"jpeg"}"#),
+        ("camera", r#"{"frame_id":"cam-1","data":"?","format":"jpeg"}"#),
     ] {
-        writer.write_to_known_channel(&header, image.as_bytes()).unwrap();
+        let channel_id = writer.add_channel(0, topic, "json", &BTreeMap::new()).unwrap();
+        let header = mcap::records::MessageHeader { channel_id, sequence: 0, log_time: at, publish_time: at };
+        writer.write_to_known_channel(&header, message.as_bytes()).unwrap();
     }
     writer.finish().unwrap();
     drop(writer);
+    log
+}
+
+#[test]
+fn a_picture_of_the_camera_is_the_same_picture_and_has_its_optics() {
     let mut bytes = Vec::new();
-    let done = convert(&log, Cursor::new(&mut bytes)).unwrap();
-    assert_eq!((done.written, done.unusable), (1, 1));
-    let message = mcap::MessageStream::new(&bytes).unwrap().next().unwrap().unwrap();
-    assert_eq!(message.channel.schema.as_ref().unwrap().name, "sensor_msgs/msg/CompressedImage");
+    let done = convert(&camera_log(), Cursor::new(&mut bytes)).unwrap();
+    assert_eq!((done.written, done.unusable), (2, 1));
+    let messages: Vec<_> = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap).collect();
+    let [info, picture] = &messages[..] else { panic!("{messages:?}") };
+    assert_eq!(picture.channel.schema.as_ref().unwrap().name, "sensor_msgs/msg/CompressedImage");
     // Header, seconds, nanoseconds; two texts with their lengths; three bytes.
-    assert_eq!(message.data[4..8], 1_795_239_882_i32.to_le_bytes());
-    assert!(message.data.ends_with(&[3, 0, 0, 0, 0xff, 0xd8, 0xff]), "{:?}", message.data);
+    assert_eq!(picture.data[4..8], 1_795_239_882_i32.to_le_bytes());
+    assert!(picture.data.ends_with(&[3, 0, 0, 0, 0xff, 0xd8, 0xff]), "{:?}", picture.data);
+    assert_eq!(info.channel.topic, "/ecod/camera/camera_info");
+    assert_eq!(info.channel.schema.as_ref().unwrap().name, "sensor_msgs/msg/CameraInfo");
+    let frame = b"cam_1_camera_optical\0";
+    for message in [info, picture] {
+        assert!(message.data.windows(frame.len()).any(|part| part == frame), "both are in one frame");
+    }
 }
 
 #[test]
@@ -109,10 +125,12 @@ fn a_picture_of_the_camera_is_the_same_picture() {
 fn readers_of_ros_read_it_and_write_the_same_bytes() {
     let python = std::env::var("ROS2_PYTHON").unwrap();
     let directory = tempfile::tempdir().unwrap();
-    let output = directory.path().join("ros2.mcap");
-    convert(&log(directory.path()), std::fs::File::create(&output).unwrap()).unwrap();
+    let outputs = ["node.mcap", "camera.mcap"].map(|name| directory.path().join(name));
+    for (log, output) in [log(directory.path()), camera_log()].iter().zip(&outputs) {
+        convert(log, std::fs::File::create(output).unwrap()).unwrap();
+    }
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../packaging/check-ros2.py");
-    let run = Command::new(python).arg(script).arg(&output).output().unwrap();
+    let run = Command::new(python).arg(script).args(&outputs).output().unwrap();
     assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
     print!("{}", String::from_utf8_lossy(&run.stdout));
 }

@@ -144,13 +144,13 @@ impl Actor for Detector {
         let DetectorMessage::Detect { frame, permit } = message;
         let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
-        let mut images = state.images.take();
+        let (mut images, lens) = (state.images.take(), state.lens);
         let span = tracing::info_span!("detect");
         let (detect, images, frame, outcome) = spawn_blocking(move || {
             let outcome = span.in_scope(|| detect.detect(&frame));
             drop(span);
             if let Some(images) = &mut images {
-                images.offer(&frame);
+                images.offer(&frame, &lens, outcome.as_deref().unwrap_or_default());
             }
             (detect, images, frame, outcome)
         })

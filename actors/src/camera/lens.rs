@@ -53,6 +53,18 @@ impl Lens {
         Ok(lens)
     }
 
+    /// The lens for pixels of frames of this size.
+    ///
+    /// # Errors
+    /// As [`Self::of_frames`].
+    pub fn in_pixels_of(&self, frame: ImageSize) -> Result<Self, SizeMismatch> {
+        let lens = self.of_frames(frame)?;
+        let Intrinsics { width, height, fx, fy, cx, cy } = lens.intrinsics;
+        let (x, y) = (f64::from(frame.width) / f64::from(width), f64::from(frame.height) / f64::from(height));
+        let (width, height) = (frame.width, frame.height);
+        Ok(Self { intrinsics: Intrinsics { width, height, fx: fx * x, fy: fy * y, cx: cx * x, cy: cy * y }, ..lens })
+    }
+
     /// Undistorts boxes and corners. A box is undistorted at the midpoints of its edges.
     ///
     /// # Errors

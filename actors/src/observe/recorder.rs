@@ -22,5 +22,5 @@ pub use disk::{EXTENSION, files, free_bytes};
 #[cfg(feature = "camera")]
 pub use image_recorder::ImageRecorder;
 pub use log_identity::{LogIdentity, LogIdentityError};
-pub use log_sender::{LogItem, LogSender};
+pub use log_sender::{CapturedPicture, LogItem, LogSender};
 pub use reader::{LogError, LogEvent, LogMessage, LogReader};

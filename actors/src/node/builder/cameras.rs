@@ -46,7 +46,7 @@ impl NodeBuilder {
             detect: camera.detector.build().context("key `camera.detector`")?,
             lens: camera::lens(camera)?,
             projector: self.slots.projectors.get(place).cloned().unwrap_or_default(),
-            images: ImageRecorder::new(self.config.record.as_ref(), camera.name.as_deref(), self.recording.clone()),
+            images: ImageRecorder::new(self.config.record.as_ref(), &self.name, camera, self.recording.clone()),
             camera_feed: self.camera_feed(place),
             troubles: self.camera_troubles(camera),
             counters: self.counters(),

@@ -2,7 +2,7 @@
 //!
 //! `ecod.*` are payloads of the cell and facts about the recording node; `foxglove.*` are drawings for viewers. Topics
 //! are those of the cell without its root, such as `detections/euclid`. Messages without a topic in the cell are on
-//! `node/…`, `scene/…`, `tf`, `log` and `camera`.
+//! `node/…`, `scene/…`, `tf`, `log`, `camera`, `camera_calibration` and `camera_boxes`.
 
 use std::collections::BTreeMap;
 
@@ -68,13 +68,17 @@ schemas! {
     /// An input of the recording node's aggregator.
     JournalEntry(JournalEntry) = "ecod.JournalEntry",
     /// A drawing of map or report.
-    SceneUpdate(foxglove::SceneUpdate) = "foxglove.SceneUpdate",
+    SceneUpdate(foxglove::scene::SceneUpdate) = "foxglove.SceneUpdate",
     /// A vehicle's pose.
     FrameTransform(foxglove::FrameTransform) = "foxglove.FrameTransform",
     /// A log line.
     Log(foxglove::Log) = "foxglove.Log",
     /// A camera image.
-    CompressedImage(foxglove::CompressedImage) = "foxglove.CompressedImage",
+    CompressedImage(foxglove::picture::CompressedImage) = "foxglove.CompressedImage",
+    /// The optics of a camera's images.
+    CameraCalibration(foxglove::picture::CameraCalibration) = "foxglove.CameraCalibration",
+    /// Boxes of what was detected in a camera image.
+    ImageAnnotations(foxglove::picture::ImageAnnotations) = "foxglove.ImageAnnotations",
 }
 
 impl SchemaName {
@@ -160,6 +164,11 @@ mod tests {
             ),
             (SchemaName::Log, &["timestamp", "level", "message", "name", "file", "line"][..]),
             (SchemaName::CompressedImage, &["timestamp", "frame_id", "data", "format"][..]),
+            (
+                SchemaName::CameraCalibration,
+                &["timestamp", "frame_id", "width", "height", "distortion_model", "D", "K", "R", "P"][..],
+            ),
+            (SchemaName::ImageAnnotations, &["circles", "points", "texts"][..]),
         ] {
             let json = serde_json::to_value(schema.json_schema()).unwrap();
             let properties = json["properties"].as_object().unwrap();

@@ -3,17 +3,20 @@
 use std::collections::BTreeMap;
 use std::fmt::Display;
 
-use base64::prelude::{BASE64_STANDARD, Engine};
+use ecod::aggregator::Command;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
+use ecod::perception::landmark::LandmarkConfig;
 use ecod::replay::{JournalEntry, JournalEvent};
 use ecod::wire::{ReportKind, Topic};
 use mcap::McapResult;
 use serde::Serialize;
 
 use super::channels::{CounterReading, LeadershipChange, SchemaName};
-use super::foxglove::{CompressedImage, FrameTransform, Level, Log, SceneUpdate};
-use super::log_sender::{LogEntry, LogItem};
+use super::foxglove::picture::{CameraCalibration, CompressedImage, ImageAnnotations};
+use super::foxglove::scene::SceneStyle;
+use super::foxglove::{FrameTransform, Level, Log};
+use super::log_sender::{CapturedPicture, LogEntry, LogItem};
 use crate::transport::mqtt::LinkState;
 
 /// A message of a channel, as JSON.
@@ -41,6 +44,7 @@ pub(crate) trait MessageSink {
 pub(crate) struct EntryEncoder {
     node: NodeName,
     drawable: bool,
+    style: SceneStyle,
     /// Latest frame of each vehicle that was drawn, and whether the vehicle reports for PACE.
     drawn: BTreeMap<NodeName, (Timestamp, bool)>,
     /// Buffer reused for every message.
@@ -48,9 +52,9 @@ pub(crate) struct EntryEncoder {
 }
 
 impl EntryEncoder {
-    /// An encoder that also draws entries if they are to be `drawable`.
-    pub(crate) fn new(node: NodeName, drawable: bool) -> Self {
-        Self { node, drawable, drawn: BTreeMap::new(), json: Vec::new() }
+    /// An encoder that also draws entries of a cell with these known locations if they are to be `drawable`.
+    pub(crate) fn new(node: NodeName, landmarks: &[LandmarkConfig], drawable: bool) -> Self {
+        Self { node, drawable, style: SceneStyle::of(landmarks), drawn: BTreeMap::new(), json: Vec::new() }
     }
 
     /// Writes the messages of an entry.
@@ -64,17 +68,24 @@ impl EntryEncoder {
                 if !output.encoder.is_to_be_drawn(*kind, vehicle, captured_at) {
                     return Ok(());
                 }
-                let scene = || SceneUpdate::of_report(report);
-                output.draw(SchemaName::SceneUpdate, format_args!("scene/{vehicle}"), captured_at, scene)?;
+                let topic = format_args!("scene/{vehicle}");
+                output.draw(SchemaName::SceneUpdate, topic, captured_at, |style| style.report(report))?;
                 let Some(pose) = report.pose else { return Ok(()) };
-                let transform = || FrameTransform::of(vehicle, pose, captured_at);
+                let scene = |style: &SceneStyle| style.vehicle(vehicle, &pose, report);
+                output.draw(SchemaName::SceneUpdate, "scene/vehicles", captured_at, scene)?;
+                let transform = |_: &SceneStyle| FrameTransform::of(vehicle, pose, captured_at);
                 output.draw(SchemaName::FrameTransform, "tf", captured_at, transform)
             }
-            LogItem::Journal(event) => output.journal(event),
+            LogItem::Journal(event) => {
+                if let JournalEvent::Command(Command::Configure { landmarks, .. }) = event {
+                    output.encoder.style = SceneStyle::of(landmarks);
+                }
+                output.journal(event)
+            }
             LogItem::Round(_) => Ok(()),
             LogItem::Map(map) => {
                 output.put(SchemaName::GlobalMap, Topic::GlobalDetections, map.fused_at_us, map)?;
-                output.draw(SchemaName::SceneUpdate, "scene/map", map.fused_at_us, || SceneUpdate::of_map(map))
+                output.draw(SchemaName::SceneUpdate, "scene/map", map.fused_at_us, |style| style.map(map))
             }
             LogItem::Verdicts(verdicts) => {
                 output.put(SchemaName::Verdicts, Topic::GlobalVerdicts, verdicts.fused_at_us, verdicts)
@@ -101,11 +112,7 @@ impl EntryEncoder {
                 let reading = CounterReading { node, at_us: at, events, rejects, shed };
                 output.put(SchemaName::Counters, "node/counters", at, &reading)
             }
-            LogItem::Image(topic, jpeg) => {
-                let data = BASE64_STANDARD.encode(jpeg);
-                let image = CompressedImage { timestamp: at.into(), frame_id: node, data, format: "jpeg" };
-                output.put(SchemaName::CompressedImage, topic, at, &image)
-            }
+            LogItem::Picture(picture) => output.picture(picture),
         }
     }
 
@@ -151,9 +158,25 @@ impl<S: MessageSink> Output<'_, S> {
         self.put(SchemaName::JournalEntry, "node/journal", self.at, &entry)
     }
 
+    /// A picture with the optics and the boxes of its time.
+    fn picture(&mut self, picture: &CapturedPicture) -> McapResult<()> {
+        let at = self.at;
+        let topic =
+            |root: &str| picture.camera.as_ref().map_or_else(|| root.to_owned(), |name| format!("{root}/{name}"));
+        if let Some(calibration) = CameraCalibration::of(picture, at) {
+            self.put(SchemaName::CameraCalibration, topic("camera_calibration"), at, &calibration)?;
+        }
+        let boxes = |_: &SceneStyle| ImageAnnotations::of(picture, at);
+        self.draw(SchemaName::ImageAnnotations, topic("camera_boxes"), at, boxes)?;
+        let optical = |_: &SceneStyle| FrameTransform::optical(&picture.reporter, at);
+        self.draw(SchemaName::FrameTransform, "tf", at, optical)?;
+        // Viewers draw over a picture what they have when it comes.
+        self.put(SchemaName::CompressedImage, topic("camera"), at, &CompressedImage::of(picture, at))
+    }
+
     fn log(&mut self, level: Level, message: impl FnOnce() -> String) -> McapResult<()> {
         let (timestamp, name) = (self.at.into(), self.encoder.node.to_string());
-        let log = || Log { timestamp, level, message: message(), name, file: String::new(), line: 0 };
+        let log = |_: &SceneStyle| Log { timestamp, level, message: message(), name, file: String::new(), line: 0 };
         self.draw(SchemaName::Log, "log", self.at, log)
     }
 
@@ -162,9 +185,13 @@ impl<S: MessageSink> Output<'_, S> {
         schema: SchemaName,
         topic: impl Display,
         made_at: Timestamp,
-        drawing: impl FnOnce() -> T,
+        drawing: impl FnOnce(&SceneStyle) -> T,
     ) -> McapResult<()> {
-        if self.encoder.drawable { self.put(schema, topic, made_at, &drawing()) } else { Ok(()) }
+        if !self.encoder.drawable {
+            return Ok(());
+        }
+        let drawing = drawing(&self.encoder.style);
+        self.put(schema, topic, made_at, &drawing)
     }
 
     fn put(
@@ -201,7 +228,7 @@ mod tests {
 
     #[test]
     fn a_frame_is_drawn_once_however_many_reports_it_makes() {
-        let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), true);
+        let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), &[], true);
         let mut topics = Topics(Vec::new());
         let mut write = |kind, node: &str, at: u64| {
             let pose = Some(Pose::new(0.0, 0.0, 0.0).into());

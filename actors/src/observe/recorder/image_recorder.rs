@@ -2,39 +2,61 @@
 
 use std::time::Duration;
 
+use ecod::model::detection::Detection;
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use opencv::core::Vector;
 use opencv::imgcodecs;
 
-use super::{LogItem, LogSender, RecordConfig};
+use super::{CapturedPicture, LogItem, LogSender, RecordConfig};
+use crate::camera::config::CameraConfig;
 use crate::camera::frame::CameraFrame;
+use crate::camera::image_size::ImageSize;
+use crate::camera::lens::Lens;
 
 /// Records frames as JPEG at a fixed rate.
 #[derive(Debug, Clone)]
 pub struct ImageRecorder {
     log: LogSender,
-    topic: String,
+    camera: Option<String>,
+    reporter: NodeName,
     period: Duration,
     due: Timestamp,
 }
 
 impl ImageRecorder {
-    /// As configured, for a camera by its name; `None` without a log, or without images in it.
-    pub fn new(config: Option<&RecordConfig>, camera: Option<&str>, log: LogSender) -> Option<Self> {
+    /// As configured, for a camera of a vehicle; `None` without a log, or without images in it.
+    pub fn new(
+        config: Option<&RecordConfig>,
+        vehicle: &NodeName,
+        camera: &CameraConfig,
+        log: LogSender,
+    ) -> Option<Self> {
         let hz = config.map(|record| record.camera_hz).filter(|hz| *hz > 0.0)?;
-        let topic = camera.map_or_else(|| "camera".to_owned(), |name| format!("camera/{name}"));
-        Some(Self { log, topic, period: Duration::from_secs_f64(1.0 / hz), due: Timestamp::default() })
+        let (camera, reporter) = (camera.name.clone(), camera.reporter(vehicle));
+        Some(Self { log, camera, reporter, period: Duration::from_secs_f64(1.0 / hz), due: Timestamp::default() })
     }
 
-    /// Records the frame if one is due, which takes some milliseconds.
-    pub fn offer(&mut self, frame: &CameraFrame) {
+    /// Records the frame with its detections if one is due, which takes some milliseconds.
+    pub fn offer(&mut self, frame: &CameraFrame, lens: &Lens, detections: &[Detection]) {
         if frame.captured_at < self.due {
             return;
         }
         self.due = frame.captured_at + self.period;
         let mut jpeg = Vector::<u8>::new();
         match imgcodecs::imencode_def(".jpg", &frame.image, &mut jpeg) {
-            Ok(true) => self.log.send(frame.captured_at, LogItem::Image(self.topic.clone(), jpeg.into())),
+            Ok(true) => {
+                let size = ImageSize::of(&frame.image);
+                let picture = CapturedPicture {
+                    camera: self.camera.clone(),
+                    reporter: self.reporter.clone(),
+                    jpeg: jpeg.into(),
+                    height: size.height,
+                    optics: lens.in_pixels_of(size).ok().map(|lens| (lens.intrinsics, lens.distortion)),
+                    detections: detections.to_vec(),
+                };
+                self.log.send(frame.captured_at, LogItem::Picture(Box::new(picture)));
+            }
             encoded => tracing::debug!(?encoded, "cannot encode frame as JPEG"),
         }
     }

@@ -6,7 +6,6 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ecod::model::names::NodeName;
 use foxglove::{
     ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, Schema, WebSocketServer, WebSocketServerHandle,
 };
@@ -42,8 +41,8 @@ struct Channels {
 }
 
 impl LiveServer {
-    pub(crate) fn new(port: u16, node: NodeName) -> Self {
-        Self { port, encoder: EntryEncoder::new(node, true), state: State::Down { retry_at: None } }
+    pub(crate) fn new(port: u16, encoder: EntryEncoder) -> Self {
+        Self { port, encoder, state: State::Down { retry_at: None } }
     }
 
     /// Sends an entry to all viewers. A busy port is tried again.

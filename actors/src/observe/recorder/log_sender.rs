@@ -6,8 +6,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 
 use ecod::aggregator::Command;
 use ecod::leadership::Leadership;
+use ecod::model::detection::Detection;
 use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
+use ecod::perception::camera::Intrinsics;
 use ecod::replay::JournalEvent;
 use ecod::wire::{GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts};
 
@@ -46,8 +49,25 @@ pub enum LogItem {
     Link(BrokerAddress, LinkState),
     /// The node's counters.
     Counters(CounterSnapshot),
-    /// A camera image as JPEG, with its topic.
-    Image(String, Vec<u8>),
+    /// A picture of a camera.
+    Picture(Box<CapturedPicture>),
+}
+
+/// A camera's picture, with what was detected in it.
+#[derive(Debug, Clone)]
+pub struct CapturedPicture {
+    /// Name of the camera, if it has one.
+    pub camera: Option<String>,
+    /// Name under which the camera reports.
+    pub reporter: NodeName,
+    /// The picture as JPEG.
+    pub jpeg: Vec<u8>,
+    /// Height of the picture in pixels.
+    pub height: u32,
+    /// Optics for pixels of the picture, and OpenCV's k1, k2, p1, p2, k3; absent where they are for another shape.
+    pub optics: Option<(Intrinsics, Option<[f64; 5]>)>,
+    /// Detections in pixels of the picture, before distortion is removed.
+    pub detections: Vec<Detection>,
 }
 
 impl LogItem {

@@ -51,9 +51,10 @@ struct Pending {
 impl LogWriter {
     pub(crate) fn new(config: RecordConfig, identity: LogIdentity, recording: LogSender) -> Self {
         let flush_due = Instant::now() + FLUSH_PERIOD;
-        let encoder = EntryEncoder::new(identity.node.clone(), config.drawable);
+        let encoder = |drawable| EntryEncoder::new(identity.node.clone(), &identity.landmarks, drawable);
         #[cfg(feature = "foxglove")]
-        let live = config.live_port.map(|port| LiveServer::new(port, identity.node.clone()));
+        let live = config.live_port.map(|port| LiveServer::new(port, encoder(true)));
+        let encoder = encoder(config.drawable);
         Self {
             config,
             identity,

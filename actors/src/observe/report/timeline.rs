@@ -8,7 +8,8 @@ use std::time::Duration;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts};
-use serde::{Deserialize, Serialize};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize};
 
 use super::LeaderRounds;
 use crate::messages::newest::Received;
@@ -37,9 +38,15 @@ pub(super) struct LogTimeline {
 pub(super) struct RecordedPicture {
     #[serde(default)]
     at_us: Timestamp,
-    #[serde(alias = "frame_id")]
+    #[serde(alias = "frame_id", deserialize_with = "reporter")]
     node: NodeName,
     data: String,
+}
+
+/// Name under which a camera reports, of the frame of its pictures; earlier versions wrote the name alone.
+fn reporter<'de, D: Deserializer<'de>>(frame: D) -> Result<NodeName, D::Error> {
+    let frame = String::deserialize(frame)?;
+    NodeName::new(frame.strip_suffix("/optical").unwrap_or(&frame)).map_err(D::Error::custom)
 }
 
 /// The part of maps and verdicts that has the cell's time.

@@ -1,0 +1,305 @@
+//! Live topics of ROS 2, by DDS: a cell's messages for ROS, and a detector's messages from ROS as reports.
+//!
+//! ```text
+//! global_detections -> /ecod/map/detections, /ecod/map/markers
+//! detections/<node> -> /ecod/<node>/detections, /tf
+//! a detector's topic -> detections/<node>--ros2
+//! ```
+
+mod detections;
+
+use std::collections::BTreeMap;
+use std::net::IpAddr;
+use std::sync::{Mutex, PoisonError};
+use std::thread;
+
+use ecod_client::{Cell, Error, GlobalMap, ObjectReport, Settings};
+use futures::channel::oneshot;
+use futures::executor::block_on_stream;
+use futures::stream::{BoxStream, select_all};
+use futures::{FutureExt, StreamExt};
+use rustdds::bytes::Bytes;
+use rustdds::no_key::{DataReader, DataWriter, SerializerAdapter};
+use rustdds::policy::{History, Reliability};
+use rustdds::{
+    DomainParticipant, DomainParticipantBuilder, QosPolicies, QosPolicyBuilder, RepresentationIdentifier, Topic,
+    TopicKind,
+};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::ros2::{CameraInfo, Definition, Detection2DArray, Detection3DArray, RosSink, encode, put_map, put_report};
+use detections::place_in_pictures;
+pub use detections::{InputRefusal, RosCamera};
+
+/// Part of the node's name in which detections are reported.
+const PART: &str = "ros2";
+
+/// Samples of a topic that are kept for slow readers, as ROS does unless told otherwise.
+const DEPTH: i32 = 10;
+
+/// Domain, network and input of a bridge.
+#[derive(Debug, Clone, Default)]
+pub struct RosSettings {
+    /// Number of the domain, `ROS_DOMAIN_ID`.
+    pub domain: u16,
+    /// Addresses of this machine's networks; empty for all.
+    pub networks: Vec<IpAddr>,
+    /// Topics of a detector, if its detections are to be reported.
+    pub input: Option<DetectorTopics>,
+    /// The detector's camera.
+    pub camera: RosCamera,
+}
+
+/// Topics of a detector, such as `/detections`.
+#[derive(Debug, Clone)]
+pub enum DetectorTopics {
+    /// `vision_msgs/Detection3DArray`.
+    InSpace(String),
+    /// `vision_msgs/Detection2DArray`, and the `sensor_msgs/CameraInfo` of its pictures.
+    InPictures(String, String),
+}
+
+/// A bridge that cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum RosBridgeError {
+    /// No part in the DDS domain, or a topic that is not possible there.
+    #[error("DDS: {0}; is the domain right, and the network up?")]
+    Dds(String),
+    /// No part in the cell.
+    #[error(transparent)]
+    Cell(#[from] Error),
+}
+
+impl RosBridgeError {
+    fn dds(error: impl std::fmt::Display) -> Self {
+        Self::Dds(error.to_string())
+    }
+}
+
+/// A bridge beside a node.
+pub struct RosBridge {
+    cell: Cell,
+    camera: RosCamera,
+    input: Option<DetectorTopics>,
+    participant: DomainParticipant,
+    /// Ends the loop over the detector's messages when dropped.
+    closing: Mutex<Option<oneshot::Sender<()>>>,
+    closed: Mutex<Option<oneshot::Receiver<()>>>,
+    refusals: Mutex<BTreeMap<InputRefusal, u64>>,
+}
+
+/// A message of a detector.
+enum Taken {
+    InSpace(Detection3DArray),
+    InPicture(Detection2DArray),
+    Optics(Box<CameraInfo>),
+    Closed,
+}
+
+impl RosBridge {
+    /// Connects to a cell and joins a domain.
+    ///
+    /// # Errors
+    /// [`RosBridgeError`] if either is not possible.
+    pub fn connect(settings: Settings, ros: RosSettings) -> Result<Self, RosBridgeError> {
+        let cell = Cell::connect(Settings { part: PART.to_owned(), ..settings })?;
+        let mut participant = DomainParticipantBuilder::new(ros.domain);
+        if !ros.networks.is_empty() {
+            participant = participant.with_only_networks(ros.networks);
+        }
+        let participant = participant.build().map_err(RosBridgeError::dds)?;
+        let (closing, closed) = oneshot::channel();
+        Ok(Self {
+            cell,
+            camera: ros.camera,
+            input: ros.input,
+            participant,
+            closing: Mutex::new(Some(closing)),
+            closed: Mutex::new(Some(closed)),
+            refusals: Mutex::default(),
+        })
+    }
+
+    /// Carries messages until the bridge is closed.
+    ///
+    /// # Errors
+    /// [`RosBridgeError`] when the node's broker refuses the bridge, or DDS a topic.
+    pub fn run(&self) -> Result<(), RosBridgeError> {
+        thread::scope(|scope| {
+            let maps = scope.spawn(|| self.until_closed(|| self.send_maps()));
+            let reports = scope.spawn(|| self.until_closed(|| self.send_reports()));
+            let taken = self.input.is_some().then(|| scope.spawn(|| self.until_closed(|| self.take_detections())));
+            let ended = [maps.join(), reports.join()].into_iter().chain(taken.map(thread::ScopedJoinHandle::join));
+            ended.flatten().fold(Ok(()), Result::and)
+        })
+    }
+
+    /// Ends the connections, and with them [`RosBridge::run`].
+    pub fn close(&self) {
+        self.cell.close();
+        self.closing.lock().unwrap_or_else(PoisonError::into_inner).take();
+    }
+
+    /// Messages and objects of the detector that were not reported, by reason.
+    pub fn refusals(&self) -> BTreeMap<InputRefusal, u64> {
+        self.refusals.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn until_closed(&self, carry: impl Fn() -> Result<(), RosBridgeError>) -> Result<(), RosBridgeError> {
+        let ended = carry();
+        self.close();
+        ended
+    }
+
+    fn send_maps(&self) -> Result<(), RosBridgeError> {
+        let mut topics = LiveTopics { participant: &self.participant, writers: BTreeMap::new() };
+        for map in self.cell.maps() {
+            let map: &GlobalMap = &*map?;
+            put_map(map, &mut topics)?;
+        }
+        Ok(())
+    }
+
+    fn send_reports(&self) -> Result<(), RosBridgeError> {
+        let mut topics = LiveTopics { participant: &self.participant, writers: BTreeMap::new() };
+        for report in self.cell.reports() {
+            let report: &ObjectReport = &*report?;
+            put_report(report, &mut topics)?;
+        }
+        Ok(())
+    }
+
+    fn take_detections(&self) -> Result<(), RosBridgeError> {
+        let closed = self.closed.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let Some(closed) = closed else { return Ok(()) };
+        let mut streams = vec![closed.map(|_| Taken::Closed).into_stream().boxed()];
+        match &self.input {
+            Some(DetectorTopics::InSpace(topic)) => streams.push(self.read(topic, Taken::InSpace)?),
+            Some(DetectorTopics::InPictures(topic, optics)) => {
+                streams.push(self.read(topic, Taken::InPicture)?);
+                streams.push(self.read(optics, |info| Taken::Optics(Box::new(info)))?);
+            }
+            None => {}
+        }
+        let mut optics = None;
+        for taken in block_on_stream(select_all(streams)) {
+            let placed = match taken {
+                Taken::InSpace(detections) => self.camera.place(&detections),
+                Taken::InPicture(detections) => place_in_pictures(&self.camera, &detections, optics.as_deref()),
+                Taken::Optics(info) => {
+                    optics = Some(info);
+                    continue;
+                }
+                Taken::Closed => break,
+            };
+            let (frame, unplaced) = match placed {
+                Ok(placed) => placed,
+                Err(refusal) => {
+                    self.note(refusal);
+                    continue;
+                }
+            };
+            unplaced.into_iter().for_each(|refusal| self.note(refusal));
+            match self.cell.report(frame) {
+                Err(Error::Invalid(cause)) => {
+                    log::debug!("{cause}");
+                    self.note(InputRefusal::Report);
+                }
+                sent => drop(sent?),
+            }
+        }
+        Ok(())
+    }
+
+    /// Messages of a topic of ROS; those that cannot be decoded are counted.
+    fn read<M: Definition + DeserializeOwned + Send + 'static>(
+        &self,
+        name: &str,
+        taken: fn(M) -> Taken,
+    ) -> Result<BoxStream<'_, Taken>, RosBridgeError> {
+        // A reader that does not ask for more takes from reliable writers, too.
+        let qos = qos(Reliability::BestEffort);
+        let topic = ros_topic::<M>(&self.participant, name, &qos)?;
+        let subscriber = self.participant.create_subscriber(&qos).map_err(RosBridgeError::dds)?;
+        let reader: DataReader<M> =
+            subscriber.create_datareader_no_key_cdr(&topic, Some(qos)).map_err(RosBridgeError::dds)?;
+        let samples = reader.async_sample_stream().filter_map(move |sample| async move {
+            match sample {
+                Ok(sample) => Some(taken(sample.into_value())),
+                Err(error) => {
+                    log::debug!("a message that cannot be read: {error}");
+                    self.note(InputRefusal::Malformed);
+                    None
+                }
+            }
+        });
+        Ok(samples.boxed())
+    }
+
+    /// Counts something that is not reported, and tells of the first of each kind.
+    fn note(&self, refusal: InputRefusal) {
+        let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
+        let count = refusals.entry(refusal).or_default();
+        *count += 1;
+        if *count == 1 {
+            log::warn!("not reported from ROS: {refusal}; others like it are only counted");
+        }
+    }
+}
+
+fn qos(reliability: Reliability) -> QosPolicies {
+    QosPolicyBuilder::new().reliability(reliability).history(History::KeepLast { depth: DEPTH }).build()
+}
+
+/// The DDS topic of a topic of ROS, with the names that ROS gives to both topic and type.
+fn ros_topic<M: Definition>(
+    participant: &DomainParticipant,
+    name: &str,
+    qos: &QosPolicies,
+) -> Result<Topic, RosBridgeError> {
+    let kind = M::NAME.replace('/', "::").replace("::msg::", "::msg::dds_::") + "_";
+    let name = format!("rt/{}", name.trim_start_matches('/'));
+    participant.create_topic(name, kind, qos, TopicKind::NoKey).map_err(RosBridgeError::dds)
+}
+
+/// Topics of a domain that messages are put on, each announced with its first message.
+struct LiveTopics<'a> {
+    participant: &'a DomainParticipant,
+    writers: BTreeMap<String, DataWriter<Encoded, Encoded>>,
+}
+
+/// A message in CDR, little-endian.
+struct Encoded(Vec<u8>);
+
+impl SerializerAdapter<Encoded> for Encoded {
+    type Error = std::convert::Infallible;
+
+    fn output_encoding() -> RepresentationIdentifier {
+        RepresentationIdentifier::CDR_LE
+    }
+
+    fn to_bytes(message: &Encoded) -> Result<Bytes, Self::Error> {
+        Ok(Bytes::copy_from_slice(&message.0))
+    }
+}
+
+impl RosSink for LiveTopics<'_> {
+    type Error = RosBridgeError;
+
+    fn put<M: Serialize + Definition>(&mut self, name: &str, message: &M) -> Result<(), RosBridgeError> {
+        if !self.writers.contains_key(name) {
+            let qos = qos(Reliability::Reliable { max_blocking_time: rustdds::Duration::ZERO });
+            let topic = ros_topic::<M>(self.participant, name, &qos)?;
+            let publisher = self.participant.create_publisher(&qos).map_err(RosBridgeError::dds)?;
+            let writer = publisher.create_datawriter_no_key(&topic, Some(qos)).map_err(RosBridgeError::dds)?;
+            self.writers.insert(name.to_owned(), writer);
+        }
+        let Some(writer) = self.writers.get(name) else { return Ok(()) };
+        let encoded = Encoded(encode(message).map_err(RosBridgeError::dds)?);
+        if let Err(error) = writer.write(encoded, None) {
+            log::debug!("nothing sent on {name}: {error}");
+        }
+        Ok(())
+    }
+}

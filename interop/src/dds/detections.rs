@@ -1,0 +1,294 @@
+//! Detections of ROS, placed in the cell.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, SystemTime};
+
+use ecod::model::detection::{BoundingBox, Detection};
+use ecod::model::geometry::Pose;
+use ecod::perception::camera::{Intrinsics, Mount};
+use ecod::perception::projection::{Projection, ProjectionConfig, ProjectionError};
+use ecod::wire::PerceivedObject;
+use ecod_client::{Frame, Label};
+use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
+
+use crate::ros2::{
+    CameraInfo, Detection2DArray, Detection3D, Detection3DArray, Header, ObjectHypothesisWithPose, RosPose,
+};
+
+/// A detector's camera.
+#[derive(Debug, Clone)]
+pub struct RosCamera {
+    /// Pose of the camera in the cell's frame; `None` if it is not known.
+    pub pose: Option<Pose>,
+    /// Height and attitude of the camera.
+    pub mount: Mount,
+    /// Projection of boxes in pictures.
+    pub projection: ProjectionConfig,
+    /// Labels for the detector's classes; classes that are not listed are labels.
+    pub labels: BTreeMap<String, String>,
+}
+
+impl Default for RosCamera {
+    /// A camera without a pose, and the pixel noise of neural detectors.
+    fn default() -> Self {
+        let projection = ProjectionConfig { pixel_sigma_px: 3.0, ..ProjectionConfig::default() };
+        Self { pose: None, mount: Mount::default(), projection, labels: BTreeMap::new() }
+    }
+}
+
+/// The reason why a message or an object of it is not reported.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, thiserror::Error)]
+pub enum InputRefusal {
+    /// Not a message of the topic's type.
+    #[error("a message that cannot be decoded")]
+    Malformed,
+    /// Positions relative to a camera whose pose was not given.
+    #[error("a frame other than `map`, and no --pose of the camera")]
+    NoPose,
+    /// Boxes in pictures whose optics are not known.
+    #[error("boxes before a CameraInfo, or one without focal lengths")]
+    NoOptics,
+    /// A stamp before 1970.
+    #[error("a stamp before 1970")]
+    BadTime,
+    /// An object without a class.
+    #[error("an object without a hypothesis")]
+    NoClass,
+    /// A box that gives no position.
+    #[error("a box that gives no position: {0}")]
+    NoPosition(&'static str),
+    /// Values that no report may have.
+    #[error("values that no report may have")]
+    Report,
+}
+
+/// A frame to be reported, and reasons why objects are missing in it.
+type Placed = (Frame, Vec<InputRefusal>);
+
+impl RosCamera {
+    /// Places detections in space: in the frame `map`, in that of the camera, or in its optical one (REP 103).
+    pub(super) fn place(&self, detections: &Detection3DArray) -> Result<Placed, InputRefusal> {
+        let to_map = self.to_map(&detections.header)?;
+        self.frame(&detections.header, detections.detections.iter().map(|detection| self.object(detection, &to_map)))
+    }
+
+    fn object(&self, detection: &Detection3D, to_map: &ToMap) -> Result<PerceivedObject, InputRefusal> {
+        let unplaced = self.unplaced(&detection.results)?;
+        let RosPose { position, orientation } = detection.bbox.center;
+        let [x_m, y_m] = to_map.position(&Vector3::new(position.x, position.y, position.z));
+        let covariance = detection.results.first().map(|result| &result.pose.covariance);
+        let covariance_m2 = covariance.and_then(|covariance| to_map.covariance(covariance));
+        let size = detection.bbox.size;
+        // An optical frame's boxes are not upright ones, and a box that is not turned may mean that nothing is known.
+        let has_size = !to_map.is_optical && size.x > 0.0 && size.y > 0.0;
+        let turn = orientation.rotation().filter(|turn| has_size && turn.angle() > 0.0);
+        Ok(PerceivedObject {
+            x_m,
+            y_m,
+            covariance_m2,
+            size_m: has_size.then_some([size.x, size.y]),
+            heading_rad: turn.map(|turn| to_map.heading(&(turn * Vector3::x()))),
+            ..unplaced
+        })
+    }
+
+    /// Reports objects that are fit for it, at the time of the header.
+    fn frame(
+        &self,
+        header: &Header,
+        objects: impl Iterator<Item = Result<PerceivedObject, InputRefusal>>,
+    ) -> Result<Placed, InputRefusal> {
+        let micros = header.stamp.micros().ok_or(InputRefusal::BadTime)?;
+        // A stamp of zero is one that nobody set.
+        let since_epoch = (micros > 0).then(|| Duration::from_micros(micros));
+        let captured_at = since_epoch.map_or_else(SystemTime::now, |since_epoch| SystemTime::UNIX_EPOCH + since_epoch);
+        let (mut placed, mut refused) = (Vec::new(), Vec::new());
+        for object in objects {
+            match object {
+                Ok(object) if object.validate().is_ok() => placed.push(object),
+                Ok(_) => refused.push(InputRefusal::Report),
+                Err(refusal) => refused.push(refusal),
+            }
+        }
+        let pose = self.pose.map(|pose| self.mount.stated_pose(&pose));
+        Ok((Frame { captured_at, pose, ..Frame::new(placed) }, refused))
+    }
+
+    /// An object without a place: label and confidence of the best hypothesis, and those of all if there are several.
+    fn unplaced(&self, results: &[ObjectHypothesisWithPose]) -> Result<PerceivedObject, InputRefusal> {
+        let classes = results.iter().map(|result| {
+            let class = &result.hypothesis.class_id;
+            (Label::from(self.labels.get(class).unwrap_or(class).as_str()), result.hypothesis.score)
+        });
+        let (label, confidence) = classes.clone().max_by(|a, b| a.1.total_cmp(&b.1)).ok_or(InputRefusal::NoClass)?;
+        let scores = if results.len() > 1 { classes.collect() } else { BTreeMap::new() };
+        Ok(PerceivedObject { label, confidence, scores, ..PerceivedObject::default() })
+    }
+
+    fn to_map(&self, header: &Header) -> Result<ToMap, InputRefusal> {
+        if header.frame_id == "map" {
+            return Ok(ToMap { origin: Pose::new(0.0, 0.0, 0.0), turn: Matrix3::identity(), is_optical: false });
+        }
+        let origin = self.pose.ok_or(InputRefusal::NoPose)?;
+        let is_optical = ["_optical", "_optical_frame"].iter().any(|suffix| header.frame_id.ends_with(suffix));
+        // From x ahead, y left, z up to x right, y down, z ahead.
+        let body_to_optical = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
+        let to_optical = if is_optical { Matrix3::identity() } else { body_to_optical };
+        let heading = Rotation3::from_axis_angle(&Vector3::z_axis(), origin.heading_rad);
+        Ok(ToMap { origin, turn: heading * self.mount.to_level() * to_optical, is_optical })
+    }
+}
+
+/// Places boxes in pictures of which the distortion has been removed.
+pub(super) fn place_in_pictures(
+    camera: &RosCamera,
+    detections: &Detection2DArray,
+    optics: Option<&CameraInfo>,
+) -> Result<Placed, InputRefusal> {
+    let pose = camera.pose.ok_or(InputRefusal::NoPose)?;
+    let intrinsics = optics.and_then(CameraInfo::intrinsics).ok_or(InputRefusal::NoOptics)?;
+    let projection = Projection::new(camera.projection.clone(), intrinsics, camera.mount);
+    let objects = detections.detections.iter().map(|detection| {
+        let PerceivedObject { label, confidence, scores, .. } = camera.unplaced(&detection.results)?;
+        let bounds = &detection.bbox;
+        let (x, y) = (bounds.center.position.x, bounds.center.position.y);
+        let (half_width, half_height) = (bounds.size_x / 2.0, bounds.size_y / 2.0);
+        let (x_min, x_max, y_min, y_max) = (x - half_width, x + half_width, y - half_height, y + half_height);
+        let bounding_box = BoundingBox { x_min, y_min, x_max, y_max };
+        let detection = Detection { label, confidence, bounding_box, corners: None };
+        let placed = projection.place(&detection, projection.cut(&detection), None::<&Point3<f64>>, &pose);
+        let placed = placed.map_err(|error: ProjectionError| InputRefusal::NoPosition(error.as_str()))?;
+        Ok(PerceivedObject { scores, ..placed })
+    });
+    camera.frame(&detections.header, objects)
+}
+
+impl CameraInfo {
+    /// The camera of pictures without distortion; `None` without focal lengths.
+    fn intrinsics(&self) -> Option<Intrinsics> {
+        let [fx, _, cx, _, _, fy, cy, ..] = self.p;
+        let [raw_fx, _, raw_cx, _, raw_fy, raw_cy, ..] = self.k;
+        let (fx, fy, cx, cy) = if fx > 0.0 { (fx, fy, cx, cy) } else { (raw_fx, raw_fy, raw_cx, raw_cy) };
+        let is_usable = fx > 0.0 && fy > 0.0 && cx.is_finite() && cy.is_finite() && self.width > 0 && self.height > 0;
+        is_usable.then_some(Intrinsics { width: self.width, height: self.height, fx, fy, cx, cy })
+    }
+}
+
+/// The way from a message's frame to the cell's.
+struct ToMap {
+    origin: Pose,
+    turn: Matrix3<f64>,
+    is_optical: bool,
+}
+
+impl ToMap {
+    fn position(&self, point: &Vector3<f64>) -> [f64; 2] {
+        let turned = self.turn * point;
+        [self.origin.position.x + turned.x, self.origin.position.y + turned.y]
+    }
+
+    fn heading(&self, direction: &Vector3<f64>) -> f64 {
+        let turned = self.turn * direction;
+        turned.y.atan2(turned.x)
+    }
+
+    /// `[xx, xy, yy]` in m²; `None` if nothing is stated: all zeros, or a negative variance.
+    fn covariance(&self, [x, y, z, ..]: &[[f64; 6]; 6]) -> Option<[f64; 3]> {
+        let rows = [x, y, z].map(|[a, b, c, ..]| [*a, *b, *c]);
+        let stated =
+            Matrix3::from_fn(|row, column| rows.get(row).and_then(|row| row.get(column)).copied().unwrap_or(0.0));
+        let turned = self.turn * stated * self.turn.transpose();
+        let [xx, xy, yy] = [turned.m11, turned.m12, turned.m22];
+        (xx > 0.0 && yy > 0.0).then_some([xx, xy, yy])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::FRAC_PI_2;
+
+    use super::*;
+
+    /// One object in a frame, with its variances along the frame's axes.
+    fn message(frame: &str, at: [f64; 3], variances: [f64; 3], yaw_rad: f64) -> Detection3DArray {
+        let mut covariance = vec![0.0; 36];
+        variances.iter().zip([0, 7, 14]).for_each(|(variance, place)| covariance[place] = *variance);
+        let [x, y, z] = at;
+        let (sin, cos) = (yaw_rad / 2.0).sin_cos();
+        let header = r#"{"stamp": {"sec": 1000, "nanosec": 5000}, "frame_id": "FRAME"}"#.replace("FRAME", frame);
+        let pose = |x: f64, y: f64, z: f64| {
+            format!(
+                r#"{{"position": {{"x": {x}, "y": {y}, "z": {z}}}, "orientation": {{"x": 0, "y": 0, "z": {sin}, "w": {cos}}}}}"#
+            )
+        };
+        let rows: Vec<_> = covariance.chunks(6).collect();
+        let text = format!(
+            r#"{{"header": {header}, "detections": [{{"header": {header}, "id": "",
+                "results": [{{"hypothesis": {{"class_id": "2", "score": 0.9}},
+                    "pose": {{"pose": {}, "covariance": {rows:?}}}}}],
+                "bbox": {{"center": {}, "size": {{"x": 4.2, "y": 1.8, "z": 1.5}}}}}}]}}"#,
+            pose(0.0, 0.0, 0.0),
+            pose(x, y, z)
+        );
+        serde_json::from_str(&text).unwrap()
+    }
+
+    fn camera() -> RosCamera {
+        let pose = Some(Pose::new(5.0, 1.0, FRAC_PI_2));
+        RosCamera { pose, labels: [("2".to_owned(), "car".to_owned())].into(), ..RosCamera::default() }
+    }
+
+    fn only(camera: &RosCamera, message: &Detection3DArray) -> PerceivedObject {
+        let (frame, refused) = camera.place(message).unwrap();
+        assert_eq!(refused, []);
+        assert_eq!(frame.captured_at, SystemTime::UNIX_EPOCH + Duration::from_micros(1_000_000_005));
+        frame.objects.into_iter().next().unwrap()
+    }
+
+    #[test]
+    fn an_object_is_at_one_place_in_whichever_frame_it_is_stated() {
+        // 10 m ahead of a camera that looks north, 2 m to its right; least certain along the view.
+        let stated = [
+            message("map", [7.0, 11.0, 0.5], [0.1, 2.0, 0.1], FRAC_PI_2),
+            message("front", [10.0, -2.0, 0.5], [2.0, 0.1, 0.1], 0.0),
+            message("front_camera_optical_frame", [2.0, -0.5, 10.0], [0.1, 0.1, 2.0], 0.0),
+        ];
+        for message in &stated {
+            let object = only(&camera(), message);
+            assert!((object.x_m - 7.0).abs() < 1e-9 && (object.y_m - 11.0).abs() < 1e-9, "{object:?}");
+            let [xx, xy, yy] = object.covariance_m2.unwrap();
+            assert!((xx - 0.1).abs() < 1e-9 && xy.abs() < 1e-9 && (yy - 2.0).abs() < 1e-9, "{object:?}");
+            assert_eq!((object.label.as_str(), object.confidence), ("car", 0.9));
+        }
+        let [in_map, before, optical] = stated.map(|message| only(&camera(), &message));
+        assert!((in_map.heading_rad.unwrap() - FRAC_PI_2).abs() < 1e-9 && in_map.size_m == Some([4.2, 1.8]));
+        assert_eq!((before.heading_rad, before.size_m), (None, Some([4.2, 1.8])), "not turned: nothing is known");
+        assert_eq!((optical.heading_rad, optical.size_m), (None, None));
+    }
+
+    #[test]
+    fn a_camera_that_looks_down_places_what_is_before_it_nearer() {
+        let mount = Mount { height_m: Some(3.0), pitch_rad: 0.5, ..Mount::default() };
+        let tilted = RosCamera { mount, ..camera() };
+        let object = only(&tilted, &message("front_optical", [0.0, 0.0, 10.0], [0.0; 3], 0.0));
+        assert!((object.y_m - 1.0 - 10.0 * 0.5f64.cos()).abs() < 1e-9 && (object.x_m - 5.0).abs() < 1e-9, "{object:?}");
+        assert_eq!(object.covariance_m2, None, "zeros state nothing");
+    }
+
+    #[test]
+    fn what_cannot_be_placed_is_refused_by_reason() {
+        let nowhere = RosCamera { pose: None, ..camera() };
+        let refusal = |message: &Detection3DArray| nowhere.place(message).map(|(_, refused)| refused);
+        assert_eq!(refusal(&message("front", [1.0, 0.0, 0.0], [0.1; 3], 0.0)), Err(InputRefusal::NoPose));
+        assert_eq!(refusal(&message("map", [1e300, 0.0, 0.0], [0.1; 3], 0.0)), Ok(vec![InputRefusal::Report]));
+        let mut unknown = message("map", [1.0, 0.0, 0.0], [0.1; 3], 0.0);
+        unknown.detections[0].results.clear();
+        assert_eq!(refusal(&unknown), Ok(vec![InputRefusal::NoClass]));
+        let boxes = Detection2DArray { header: unknown.header, detections: Vec::new() };
+        assert_eq!(place_in_pictures(&camera(), &boxes, None).err(), Some(InputRefusal::NoOptics));
+        assert_eq!(
+            place_in_pictures(&camera(), &boxes, Some(&CameraInfo::default())).err(),
+            Some(InputRefusal::NoOptics)
+        );
+    }
+}

@@ -1,0 +1,46 @@
+//! Messages of vision_msgs 4 about detections in pictures.
+
+use serde::{Deserialize, Serialize};
+
+use super::detections::ObjectHypothesisWithPose;
+use super::messages::{Definition, HEADER, Header, POINT, POSE, QUATERNION, TIME};
+
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(crate) struct Point2D {
+    pub(crate) x: f64,
+    pub(crate) y: f64,
+}
+
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(crate) struct Pose2D {
+    pub(crate) position: Point2D,
+    theta: f64,
+}
+
+/// A box in pixels; `theta` is taken for zero.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct BoundingBox2D {
+    pub(crate) center: Pose2D,
+    pub(crate) size_x: f64,
+    pub(crate) size_y: f64,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Detection2D {
+    header: Header,
+    pub(crate) results: Vec<ObjectHypothesisWithPose>,
+    pub(crate) bbox: BoundingBox2D,
+    id: String,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Detection2DArray {
+    pub(crate) header: Header,
+    pub(crate) detections: Vec<Detection2D>,
+}
+
+impl Definition for Detection2DArray {
+    const NAME: &'static str = "vision_msgs/msg/Detection2DArray";
+    const FIELDS: &'static str = "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n";
+    const INSIDE: &'static [(&'static str, &'static str)] = &[HEADER, TIME, POSE, POINT, QUATERNION];
+}
