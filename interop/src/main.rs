@@ -152,7 +152,7 @@ impl Connection {
 }
 
 fn main() -> ExitCode {
-    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or("info")).init();
+    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or("info,rustdds=warn")).init();
     let ended = match Cli::parse().command {
         Command::Cpm(connection) => {
             CpmBridge::connect(connection.settings()).and_then(|bridge| bridge.run()).map_err(|error| error.to_string())
