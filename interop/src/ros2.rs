@@ -55,8 +55,22 @@ pub(crate) fn put_report<S: RosSink>(report: &ObjectReport, sink: &mut S) -> Res
     sink.put("/tf", &transforms)
 }
 
-/// A node's name as names in ROS allow it: letters, digits and `_`, no digit first.
+/// A node's name as names in ROS allow it: letters and digits with single `_` between them, no digit first. A `_` in front would
+/// hide the topic.
 fn ros_name(node: &NodeName) -> String {
-    let name = node.as_str().replace('-', "_");
-    if name.starts_with(|first: char| first.is_ascii_digit()) { format!("_{name}") } else { name }
+    let words: Vec<_> = node.as_str().split(['-', '_']).filter(|word| !word.is_empty()).collect();
+    let name = words.join("_");
+    if name.starts_with(|first: char| first.is_ascii_alphabetic()) { name } else { format!("node_{name}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_as_ros_allows_them() {
+        for (name, expected) in [("lot-1", "lot_1"), ("edge--ros2", "edge_ros2"), ("_x-", "x"), ("7", "node_7")] {
+            assert_eq!(ros_name(&NodeName::from_static(name)), expected);
+        }
+    }
 }
