@@ -17,5 +17,7 @@ pub mod image_size;
 #[cfg(feature = "camera")]
 pub mod lens;
 #[cfg(feature = "camera")]
+pub mod mount_calibration;
+#[cfg(feature = "camera")]
 pub mod perception;
 pub mod vehicle_pose;

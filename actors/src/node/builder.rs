@@ -45,7 +45,7 @@ use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
-use crate::observe::dashboard::{CameraFeed, FloorPlan, LiveState};
+use crate::observe::dashboard::{FloorPlan, LiveState, ShownCamera};
 use crate::observe::readiness::SharedFacts;
 use crate::observe::recorder::LogSender;
 use crate::platform::cell_clock::CellClock;
@@ -88,7 +88,8 @@ pub(super) struct NodeBuilder {
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
     live_state: Arc<LiveState>,
-    camera_feed: Option<Arc<CameraFeed>>,
+    /// The cameras, if browsers are to see their pictures.
+    shown_cameras: Vec<ShownCamera>,
     floor_plan: Option<FloorPlan>,
     dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<NodeError>>,
@@ -125,12 +126,10 @@ impl NodeBuilder {
         let counters = Arc::<Counters>::default();
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
-        let shows_camera = config.has_camera() && config.dashboard.enabled && config.dashboard.camera;
-        let camera_feed = shows_camera.then(Arc::default);
         #[cfg(feature = "camera")]
-        let slots = ActorSlots::with_cameras(&config);
+        let (slots, shown_cameras) = (ActorSlots::with_cameras(&config), cameras::shown(&config, &name));
         #[cfg(not(feature = "camera"))]
-        let slots = ActorSlots::default();
+        let (slots, shown_cameras) = (ActorSlots::default(), Vec::new());
         let mut builder = Self {
             _state_lock: directory.and_then(|directory| lock_state(directory, &config.cell, &name)),
             name,
@@ -156,7 +155,7 @@ impl NodeBuilder {
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
             live_state: Arc::default(),
-            camera_feed,
+            shown_cameras,
             floor_plan: None,
             dashboard_address: watch::Sender::new(None),
             failed,

@@ -12,6 +12,8 @@ pub(crate) mod history;
 pub(crate) mod live_state;
 pub(crate) mod map_latency;
 pub(crate) mod metrics;
+#[cfg(feature = "camera")]
+pub(crate) mod mount_answer;
 pub(crate) mod node_monitor;
 pub(crate) mod node_sources;
 pub(crate) mod process_metrics;
@@ -28,4 +30,6 @@ pub use camera_picture::{PictureBox, camera_event};
 pub use config::{DEFAULT_ADDRESS, DashboardConfig};
 pub use floor_plan::{FloorPlan, FloorPlanConfig, FloorPlanFacts, FloorPlanPoint};
 pub use live_state::{LatestReport, LiveState, MAX_SHOWN};
-pub use node_sources::{LandmarkFacts, NodeFacts, NodeSources};
+#[cfg(feature = "camera")]
+pub use mount_answer::CameraSetup;
+pub use node_sources::{LandmarkFacts, NodeFacts, NodeSources, ShownCamera};

@@ -5,7 +5,7 @@ use ecod_actors::platform::secret::Secret;
 use ecod_actors::telemetry::counters::Event;
 
 use crate::cell::{config, start};
-use crate::http::{get, get_with};
+use crate::http::{get, get_with, request};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn without_the_token_nothing_but_health_is_told() {
@@ -16,7 +16,9 @@ async fn without_the_token_nothing_but_health_is_told() {
     for path in api.into_iter().chain(["/", "/main.js", "/metrics", "/nowhere"]) {
         assert_eq!(get(page, path).await.status, 401, "{path}");
     }
-    assert_eq!(node.counters().events(Event::BrowserRefused), 10);
+    let points = request(page, "POST", "/api/camera/mount", &[("Host", "localhost")], "{}").await;
+    assert_eq!(points.status, 401);
+    assert_eq!(node.counters().events(Event::BrowserRefused), 11);
     assert_eq!(get(page, "/healthz").await.status, 200);
 
     let host = ("Host", "localhost");

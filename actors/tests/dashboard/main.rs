@@ -12,6 +12,8 @@ mod http;
 mod load;
 mod map;
 mod metrics;
+#[cfg(feature = "camera")]
+mod mount;
 mod pictures;
 mod processes;
 mod timeline;

@@ -7,6 +7,7 @@ use ecod::perception::view::PosedCamera;
 use nalgebra::{Matrix3, Point2, SMatrix, SVector, Vector3};
 use opencv::calib3d::{self, SolvePnPMethod};
 use opencv::core::{Mat, MatTraitConstManual, Matx33d, Point2d, Point3d, Vector};
+use serde::Serialize;
 
 use crate::camera::lens::camera_matrix;
 
@@ -31,13 +32,14 @@ pub struct GroundFit {
 }
 
 /// Fit of one point.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PointFit {
-    /// Distance in the image in pixels.
+    /// Distance in the image in pixels; infinite behind the camera.
     pub error_px: f64,
     /// Distance on the ground in metres; `None` where the pixel shows no ground.
     pub error_m: Option<f64>,
     /// True if the point contradicts the others and was left out.
+    #[serde(rename = "outlier")]
     pub is_outlier: bool,
 }
 
@@ -49,15 +51,19 @@ pub enum GroundFitError {
     TooFewPoints(usize),
     /// No camera fits.
     #[error(
-        "no camera sees {MIN_POINTS} of the points where they are: check the order of the numbers (column, row, metres ahead, \
-         metres to the left), the signs, and `camera.optics`"
+        "no camera sees {MIN_POINTS} of the points where they are: check the numbers, their order and signs, and \
+         `camera.optics`; of more points the wrong ones are named"
     )]
     NoCamera,
     /// The camera is below the ground.
-    #[error("the points fit a camera below the ground only: check that left is positive, and rows count downwards")]
+    #[error(
+        "the points fit a camera below the ground only: check that left and north are positive, and rows count downwards"
+    )]
     BelowGround,
     /// The points do not say enough.
-    #[error("the points leave the pitch open by ±{0:.1}°: spread them over the image, not on one line")]
+    #[error(
+        "the points leave the pitch open by ±{0:.1}°: spread them over the image, not on one line, and measure again"
+    )]
     Undetermined(f64),
     /// OpenCV failed.
     #[error("opencv cannot solve the points: spread them over the image, not on one line")]

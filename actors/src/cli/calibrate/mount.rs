@@ -11,15 +11,13 @@ use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::geometry::Pose;
 use ecod::model::names::Label;
 use ecod::model::origin::StatedPose;
-use ecod::perception::camera::Mount;
 use ecod::perception::projection::{Cut, MountEstimate, ObjectSize, Projection, fit_mount};
-use nalgebra::Point2;
 use tokio::time::{Instant, timeout_at};
 use toml_edit::{DocumentMut, Item, TableLike};
 
 use super::{Failure, print};
 use crate::camera::calibrate::board::{GroundBoard, fit_board};
-use crate::camera::calibrate::mount::{GroundFit, GroundPoint, PointFit, fit_ground_points};
+use crate::camera::calibrate::mount::PointFit;
 use crate::camera::calibrate::{Chessboard, read_gray};
 use crate::camera::config::{CameraConfig, MountConfig};
 use crate::camera::frame::CameraFrame;
@@ -27,6 +25,7 @@ use crate::camera::frame_source::SourceConfig;
 use crate::camera::frame_source::capture::Capture;
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
+use crate::camera::mount_calibration::{MeasuredPoint, fit_mount_to_points, mount_table};
 use crate::node;
 use crate::node::config::NodeConfig;
 
@@ -60,8 +59,8 @@ pub(super) struct PointsArguments {
     #[command(flatten)]
     node: MountArguments,
     /// A point: column and row in pixels, metres ahead and to the left of the vehicle's reference point
-    #[arg(long = "point", value_name = "COLUMN,ROW=AHEAD,LEFT", value_parser = four_numbers)]
-    points: Vec<StatedPoint>,
+    #[arg(long = "point", value_name = "COLUMN,ROW=AHEAD,LEFT", value_parser = measured_point)]
+    points: Vec<MeasuredPoint>,
     /// The picture in which the points were measured, whose size counts. Default the size of `camera.optics`
     #[arg(long, value_name = "IMAGE")]
     image: Option<PathBuf>,
@@ -114,22 +113,21 @@ pub(super) struct PeopleArguments {
     label: String,
 }
 
-/// Column and row in pixels, and two metres.
-type StatedPoint = [f64; 4];
-
 /// Relative standard deviation of the height of one known person.
 const KNOWN_HEIGHT_SIGMA: f64 = 0.02;
 
 /// Maximum time for the camera to end.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 
-fn four_numbers(text: &str) -> Result<StatedPoint, String> {
+fn measured_point(text: &str) -> Result<MeasuredPoint, String> {
     let words =
         text.split(|c: char| c == ',' || c == '=' || c == ';' || c.is_whitespace()).filter(|word| !word.is_empty());
     let numbers: Option<Vec<f64>> =
         words.map(|word| word.parse().ok().filter(|number: &f64| number.is_finite())).collect();
-    let numbers = numbers.and_then(|numbers| numbers.try_into().ok());
-    numbers.ok_or_else(|| format!("{text:?} is not four numbers: column and row in pixels, two distances in metres"))
+    match numbers.as_deref() {
+        Some(&[column, row, x_m, y_m]) => Ok(MeasuredPoint { pixel: [column, row], position_m: [x_m, y_m] }),
+        _ => Err(format!("{text:?} is not four numbers: column and row in pixels, two distances in metres")),
+    }
 }
 
 pub(super) fn run(command: &MountCommand) -> Result<(), Failure> {
@@ -159,21 +157,13 @@ impl MountArguments {
 
     /// Prints the mount to paste into a configuration, and writes it there if told to.
     fn tell(&self, estimate: &MountEstimate, lens: &Lens) -> Result<(), Failure> {
-        let MountEstimate { mount, pitch_sigma_rad, roll_sigma_rad, height_sigma_m } = estimate;
-        let config = MountConfig::rounded(mount);
-        let toml = toml::to_string(&config).context("the mount as TOML")?;
-        let table = if self.camera.is_some() { "cameras" } else { "camera" };
-        let [pitch_deg, roll_deg] = [pitch_sigma_rad, roll_sigma_rad].map(|sigma| sigma.to_degrees());
-        print(&format!(
-            "[{table}.mount]\n{toml}# Errors: pitch ±{pitch_deg:.2}°, roll ±{roll_deg:.2}°, height ±{height_sigma_m:.3} m.\n# \
-             camera.projection.tilt_sigma_rad and height_sigma_m must cover them, and how the vehicle sways.\n"
-        ))?;
-        if let Some([near_m, far_m]) = mount.ground_in_view(&lens.intrinsics) {
+        print(&mount_table(estimate, self.camera.is_some()).context("the mount as TOML")?)?;
+        if let Some([near_m, far_m]) = estimate.mount.ground_in_view(&lens.intrinsics) {
             let far = if far_m.is_finite() { format!("to {far_m:.1} m") } else { "to the horizon".to_owned() };
             eprintln!("the middle of the image shows the ground from {near_m:.1} m {far}");
         }
         if self.write {
-            self.write_into(&config).map_err(Failure::usage)?;
+            self.write_into(&MountConfig::rounded(&estimate.mount)).map_err(Failure::usage)?;
             eprintln!("written to {}", self.config.display());
         }
         Ok(())
@@ -215,40 +205,30 @@ impl PointsArguments {
             for (number, line) in text.map_err(Failure::usage)?.lines().enumerate() {
                 if !line.trim().is_empty() && !line.trim_start().starts_with('#') {
                     let place = |problem| anyhow!("{}, line {}: {problem}", file.display(), number + 1);
-                    stated.push(four_numbers(line).map_err(place).map_err(Failure::usage)?);
+                    stated.push(measured_point(line).map_err(place).map_err(Failure::usage)?);
                 }
             }
         }
-        let (lens, scale) = self.scaled(lens)?;
-        let pixels: Vec<_> = stated.iter().map(|[column, row, ..]| Point2::new(column * scale, row * scale)).collect();
-        let pixels = lens.undistorted(&pixels).context("cannot remove the distortion")?;
-        let vehicle = self.vehicle(&config)?;
-        let point = |(pixel, [_, _, x_m, y_m]): (&Point2<f64>, &StatedPoint)| GroundPoint {
-            pixel: *pixel,
-            place: vehicle.ahead_left(&Point2::new(*x_m, *y_m)).into(),
-        };
-        let points: Vec<_> = pixels.iter().zip(&stated).map(point).collect();
-        let fit = fit_ground_points(&points, &lens.intrinsics).context("the points give no mount")?;
-        for (PointFit { error_px, error_m, is_outlier }, [column, row, ..]) in fit.points.iter().zip(&stated) {
+        let (picture, vehicle) = (self.picture(&lens)?, self.vehicle(&config)?);
+        let fit = fit_mount_to_points(&stated, picture, &lens, &vehicle).context("the points give no mount")?;
+        for (PointFit { error_px, error_m, is_outlier }, MeasuredPoint { pixel: [column, row], .. }) in
+            fit.points.iter().zip(&stated)
+        {
             let on_ground = error_m.map_or_else(|| "above the horizon".to_owned(), |metres| format!("{metres:.3} m"));
             let outlier = if *is_outlier { "  OUTLIER, left out: measure it again" } else { "" };
-            eprintln!("point {column},{row}: off by {:.1} px, {on_ground}{outlier}", error_px / scale);
+            eprintln!("point {column},{row}: off by {error_px:.1} px, {on_ground}{outlier}");
         }
-        let GroundFit { pose, estimate, .. } = fit;
-        let place =
-            Mount { forward_m: pose.position.x, left_m: pose.position.y, pan_rad: pose.heading_rad, ..estimate.mount };
-        self.node.tell(&MountEstimate { mount: place, ..estimate }, &lens)
+        self.node.tell(&fit.estimate, &lens.of_frames(picture).map_err(Failure::usage)?)
     }
 
-    /// The lens of the picture, and the factor from its pixels to those of the lens.
-    fn scaled(&self, lens: Lens) -> Result<(Lens, f64), Failure> {
+    /// The size of the picture in which the points were measured.
+    fn picture(&self, lens: &Lens) -> Result<ImageSize, Failure> {
         let Some(path) = &self.image else {
             let unknown = anyhow!("`camera.optics` says no size of the image: give the picture with --image");
-            return if lens.is_any_shape { Err(Failure::usage(unknown)) } else { Ok((lens, 1.0)) };
+            return if lens.is_any_shape { Err(Failure::usage(unknown)) } else { Ok((&lens.intrinsics).into()) };
         };
         let size = ImageSize::of(&read_gray(path).map_err(Failure::usage)?);
-        let lens = lens.of_frames(size).map_err(Failure::usage)?;
-        Ok((lens, f64::from(lens.intrinsics.width) / f64::from(size.width)))
+        lens.of_frames(size).map(|_| size).map_err(Failure::usage)
     }
 
     /// The frame of the places: the vehicle's own, or its pose in the cell's.

@@ -312,7 +312,8 @@ impl NodeBuilder {
             name: self.name.clone(),
             cell: self.config.cell.clone(),
             role: self.config.role,
-            camera: self.camera_feed.is_some(),
+            camera: !self.shown_cameras.is_empty(),
+            cameras: self.shown_cameras.iter().map(|camera| camera.name.clone()).collect(),
             floor_plan: self.floor_plan.as_ref().map(|plan| plan.facts.clone()),
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
@@ -325,7 +326,7 @@ impl NodeBuilder {
             counters: self.counters(),
             frames: self.frames(),
             live_state: Arc::clone(&self.live_state),
-            camera: self.camera_feed.clone(),
+            cameras: self.shown_cameras.clone(),
             floor_plan: self.floor_plan.clone(),
         };
         DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }

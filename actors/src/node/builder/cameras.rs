@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use anyhow::Context;
+use ecod::model::names::NodeName;
 
 use super::NodeBuilder;
 use crate::actors::detector::DetectorArguments;
@@ -10,9 +11,28 @@ use crate::actors::projector::ProjectorArguments;
 use crate::camera::config::CameraConfig;
 use crate::messages::projector::ProjectorMessage;
 use crate::node::camera;
-use crate::observe::dashboard::CameraFeed;
+use crate::node::config::NodeConfig;
+use crate::observe::dashboard::{CameraFeed, CameraSetup, ShownCamera};
 use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::camera_troubles::CameraTroubles;
+
+/// The cameras of a node whose pictures browsers may see.
+pub(super) fn shown(config: &NodeConfig, node: &NodeName) -> Vec<ShownCamera> {
+    if !(config.dashboard.enabled && config.dashboard.camera) {
+        return Vec::new();
+    }
+    let shown = |(place, camera): (usize, &CameraConfig)| ShownCamera {
+        name: camera.name.clone(),
+        feed: Arc::default(),
+        reporter: camera.reporter(node),
+        setup: CameraSetup {
+            optics: camera.optics.clone(),
+            mount: camera.mount,
+            is_one_of_several: place > 0 || config.camera.is_none(),
+        },
+    };
+    config.all_cameras().enumerate().map(shown).collect()
+}
 
 impl NodeBuilder {
     /// Arguments of the projector of a camera, by its place. That of the first camera receives the poses of a moving
@@ -75,9 +95,8 @@ impl NodeBuilder {
         self.config.all_cameras().nth(place).context("this node has no such camera")
     }
 
-    /// The page shows the pictures of the first camera.
     fn camera_feed(&self, place: usize) -> Option<Arc<CameraFeed>> {
-        self.camera_feed.clone().filter(|_| place == 0)
+        self.shown_cameras.get(place).map(|camera| Arc::clone(&camera.feed))
     }
 
     fn camera_troubles(&self, camera: &CameraConfig) -> CameraTroubles {

@@ -1,4 +1,4 @@
-//! The node's own pictures on their way to browsers.
+//! Pictures of the node's cameras on their way to browsers.
 
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
@@ -7,7 +7,7 @@ use bytes::Bytes;
 use ecod::model::time::Timestamp;
 use tokio::sync::watch;
 
-/// Latest picture of the node's camera as a server-sent event, made only while a browser shows it.
+/// Latest picture of a camera as a server-sent event, made only while a browser shows it.
 #[derive(Debug, Default)]
 pub struct CameraFeed {
     pictures: watch::Sender<Bytes>,

@@ -10,6 +10,8 @@ use ecod::admission::report_window::MAX_PARTS;
 use ecod::diagnostics::TroubleKind;
 use ecod::model::names::{NodeName, PART_MARK};
 use ecod::model::time::Timestamp;
+#[cfg(feature = "camera")]
+use ecod::wire::WirePose;
 use ecod::wire::{NodeState, NodeStatus, ObjectReport, ReportKind, Trouble};
 use serde::Serialize;
 
@@ -123,6 +125,14 @@ impl LiveState {
         let mut latest = self.latest();
         latest.reports.retain(|_, entry| entry.received_at >= time);
         latest.reports.values().cloned().collect()
+    }
+
+    /// Latest pose that a node reported at or after a time.
+    #[cfg(feature = "camera")]
+    pub(crate) fn pose_since(&self, node: &NodeName, time: Timestamp) -> Option<WirePose> {
+        let latest = self.latest();
+        let reports = latest.reports.values().filter(|entry| entry.report.node == *node && entry.received_at >= time);
+        reports.max_by_key(|entry| entry.received_at)?.report.pose
     }
 
     /// Latest status of each node.

@@ -12,6 +12,8 @@ use tokio::sync::watch;
 use super::camera_feed::CameraFeed;
 use super::floor_plan::{FloorPlan, FloorPlanFacts};
 use super::live_state::LiveState;
+#[cfg(feature = "camera")]
+use super::mount_answer::CameraSetup;
 use crate::observe::readiness::Vitals;
 use crate::telemetry::counters::Counters;
 use crate::transport::gossip::{FrameCounters, Member};
@@ -31,10 +33,24 @@ pub struct NodeSources {
     pub frames: Arc<FrameCounters>,
     /// Latest reports and statuses.
     pub live_state: Arc<LiveState>,
-    /// Pictures of the node's camera, if they are shown.
-    pub camera: Option<Arc<CameraFeed>>,
+    /// The node's cameras, if their pictures are shown.
+    pub cameras: Vec<ShownCamera>,
     /// Image under the map.
     pub floor_plan: Option<FloorPlan>,
+}
+
+/// A camera whose pictures are shown.
+#[derive(Debug, Clone)]
+pub struct ShownCamera {
+    /// Its name, if it has one.
+    pub name: Option<String>,
+    /// Its pictures.
+    pub feed: Arc<CameraFeed>,
+    /// Name under which it reports.
+    pub reporter: NodeName,
+    /// Its settings.
+    #[cfg(feature = "camera")]
+    pub setup: CameraSetup,
 }
 
 /// Facts about a node.
@@ -46,8 +62,10 @@ pub struct NodeFacts {
     pub cell: NodeName,
     /// Its role.
     pub role: Role,
-    /// True if `/api/camera` shows the pictures of its camera.
+    /// True if `/api/camera` shows the pictures of its cameras.
     pub camera: bool,
+    /// Names of these, in their order; none for one without a name, which is the first.
+    pub cameras: Vec<Option<String>>,
     /// The image under the map, if there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub floor_plan: Option<FloorPlanFacts>,
@@ -63,6 +81,16 @@ impl NodeSources {
     /// The node as it is now.
     pub(crate) fn node_facts(&self) -> NodeFacts {
         NodeFacts { round_period_s: self.vitals.shared.borrow().round_period_s, ..self.node.clone() }
+    }
+
+    /// The camera with this name, or the first.
+    pub(crate) fn camera(&self, name: Option<&str>) -> Option<&ShownCamera> {
+        self.cameras.iter().find(|camera| name.is_none() || camera.name.as_deref() == name)
+    }
+
+    /// Number of browsers that show pictures of a camera.
+    pub(crate) fn camera_viewers(&self) -> usize {
+        self.cameras.iter().map(|camera| camera.feed.viewers()).sum()
     }
 
     /// Known locations of the cell.

@@ -6,22 +6,35 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
+#[cfg(feature = "camera")]
+use axum::extract::{DefaultBodyLimit, FromRequest};
 use axum::extract::{Request, State};
 use axum::http::{HeaderValue, StatusCode, Uri, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+#[cfg(feature = "camera")]
+use axum::routing::post;
 use axum::{Json, Router};
 use ecod::model::time::Timestamp;
 use futures_util::stream;
+#[cfg(feature = "camera")]
+use tokio::sync::Semaphore;
 use tokio::sync::watch;
+#[cfg(feature = "camera")]
+use tokio::task::spawn_blocking;
+#[cfg(feature = "camera")]
+use tokio::time::timeout;
 
 use super::access::{AccessDecision, HEADERS, PageAccess};
 use super::assets::Asset;
 use super::connection_limit::ConnectionSlot;
 use super::floor_plan;
 use super::metrics;
+#[cfg(feature = "camera")]
+use super::mount_answer::MountQuestion;
 use super::node_monitor::NodeMonitor;
+use super::node_sources::ShownCamera;
 use super::response_cache::ResponseCache;
 use super::snapshot::json;
 use crate::platform::clock;
@@ -38,6 +51,9 @@ pub(crate) struct HttpApi {
     refusals: Mutex<TokenBucket>,
     metrics: ResponseCache<Result<Bytes, fmt::Error>>,
     max_viewers: usize,
+    /// One mount is fitted at a time.
+    #[cfg(feature = "camera")]
+    mounts: Arc<Semaphore>,
 }
 
 /// Burst of requests: some tabs open together unhindered.
@@ -49,6 +65,18 @@ const REQUEST_INTERVAL: Duration = Duration::from_millis(5);
 /// Minimum age of the metrics before they are read again.
 const METRICS_MIN_AGE: Duration = Duration::from_millis(100);
 
+/// Maximum size of the points of a mount: more than anyone clicks.
+#[cfg(feature = "camera")]
+const MAX_POINTS_BYTES: usize = 16 * 1024;
+
+/// Maximum time for the points of a mount to come.
+#[cfg(feature = "camera")]
+const BODY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Maximum age of the pose from which a mount is calculated.
+#[cfg(feature = "camera")]
+const MAX_POSE_AGE: Duration = Duration::from_secs(5);
+
 impl HttpApi {
     /// At most half of the connections carry live snapshots.
     pub(crate) fn new(monitor: Arc<NodeMonitor>, access: PageAccess, max_connections: usize) -> Self {
@@ -59,6 +87,8 @@ impl HttpApi {
             refusals: throttle(),
             metrics: ResponseCache::new(METRICS_MIN_AGE),
             max_viewers: max_connections / 2,
+            #[cfg(feature = "camera")]
+            mounts: Arc::new(Semaphore::new(1)),
             monitor,
         }
     }
@@ -75,8 +105,11 @@ impl HttpApi {
             .route("/api/events", get(show_events))
             .route("/api/camera", get(show_camera))
             .route(floor_plan::PATH, get(show_floor_plan))
-            .fallback(show_asset)
-            .layer(middleware::from_fn_with_state(Arc::clone(&api), guard));
+            .fallback(show_asset);
+        #[cfg(feature = "camera")]
+        let guarded =
+            guarded.route("/api/camera/mount", post(answer_mount).layer(DefaultBodyLimit::max(MAX_POINTS_BYTES)));
+        let guarded = guarded.layer(middleware::from_fn_with_state(Arc::clone(&api), guard));
         Router::new()
             .route("/healthz", get(|| async { "ok\n" }))
             .route("/readyz", get(show_readiness))
@@ -91,8 +124,21 @@ impl HttpApi {
 
     /// True if no further connection may stay open.
     fn is_crowded(&self) -> bool {
-        let camera = self.monitor.sources.camera.as_ref();
-        self.monitor.viewers() + camera.map_or(0, |camera| camera.viewers()) >= self.max_viewers
+        self.monitor.viewers() + self.monitor.sources.camera_viewers() >= self.max_viewers
+    }
+
+    /// The camera of `?name=`, or the first; else an answer with the names.
+    fn camera(&self, uri: &Uri) -> Result<&ShownCamera, (StatusCode, String)> {
+        let (sources, name) = (&self.monitor.sources, value_in(uri, "name="));
+        sources.camera(name).ok_or_else(|| {
+            let names: Vec<_> = sources.cameras.iter().filter_map(|camera| camera.name.as_deref()).collect();
+            let reason = match name.filter(|_| !sources.cameras.is_empty()) {
+                None => "this node shows no camera\n".to_owned(),
+                Some(name) if names.is_empty() => format!("no camera {name:?}: the only one has no name\n"),
+                Some(name) => format!("no camera {name:?}: there are {}\n", names.join(", ")),
+            };
+            (StatusCode::NOT_FOUND, reason)
+        })
     }
 
     fn refuse_viewer(&self) -> Response {
@@ -176,7 +222,11 @@ async fn show_frame(State(api): Api, uri: Uri) -> Response {
 }
 
 fn time_in(uri: &Uri, key: &str) -> Option<Timestamp> {
-    uri.query()?.strip_prefix(key)?.parse().ok().map(Timestamp)
+    value_in(uri, key)?.parse().ok().map(Timestamp)
+}
+
+fn value_in<'a>(uri: &'a Uri, key: &str) -> Option<&'a str> {
+    uri.query()?.split('&').find_map(|pair| pair.strip_prefix(key))
 }
 
 async fn show_landmarks(State(api): Api) -> Response {
@@ -192,15 +242,47 @@ async fn show_events(State(api): Api) -> Response {
     stream_events(snapshots, Some(api.monitor.event()))
 }
 
-/// Pictures of the node's camera as they are taken.
-async fn show_camera(State(api): Api) -> Response {
-    let Some(camera) = &api.monitor.sources.camera else {
-        return (StatusCode::NOT_FOUND, "this node shows no camera\n").into_response();
-    };
-    if api.is_crowded() {
-        return api.refuse_viewer();
+/// Pictures of a camera of the node as they are taken.
+async fn show_camera(State(api): Api, uri: Uri) -> Response {
+    match api.camera(&uri) {
+        Ok(_) if api.is_crowded() => api.refuse_viewer(),
+        Ok(camera) => stream_events(camera.feed.pictures(), None),
+        Err(refusal) => refusal.into_response(),
     }
-    stream_events(camera.pictures(), None)
+}
+
+/// The mount of a camera, from points that were clicked. Foreign pages cannot ask: the content's type must be JSON.
+#[cfg(feature = "camera")]
+async fn answer_mount(State(api): Api, request: Request) -> Response {
+    let camera = match api.camera(request.uri()) {
+        Ok(camera) => camera.clone(),
+        Err(refusal) => return refusal.into_response(),
+    };
+    let question = match timeout(BODY_TIMEOUT, Json::<MountQuestion>::from_request(request, &())).await {
+        Ok(Ok(Json(question))) => question,
+        Ok(Err(refusal)) => return refusal.into_response(),
+        Err(_) => return (StatusCode::REQUEST_TIMEOUT, "the points did not come\n").into_response(),
+    };
+    let pose = api.monitor.sources.live_state.pose_since(&camera.reporter, clock::now() - MAX_POSE_AGE);
+    let Some(pose) = pose else {
+        let reason = format!("{} reports no pose at present: wait for it, or see its troubles\n", camera.reporter);
+        return (StatusCode::CONFLICT, reason).into_response();
+    };
+    let Ok(permit) = Arc::clone(&api.mounts).acquire_owned().await else {
+        return StatusCode::SERVICE_UNAVAILABLE.into_response();
+    };
+    let answered = spawn_blocking(move || {
+        let _permit = permit;
+        question.answer(&camera.setup, &pose.into())
+    });
+    match answered.await {
+        Ok(Ok(mount)) => typed(JSON, json(&mount)),
+        Ok(Err(reason)) => (StatusCode::UNPROCESSABLE_ENTITY, format!("{reason}\n")).into_response(),
+        Err(error) => {
+            tracing::warn!(%error, "cannot fit a mount for a browser");
+            StatusCode::INTERNAL_SERVER_ERROR.into_response()
+        }
+    }
 }
 
 /// The image under the map.

@@ -1,4 +1,4 @@
-// Picture of the node's camera with its boxes, fetched only while it is in view. A box and its object on the map light up together.
+// Picture of one of the node's cameras with its boxes, fetched only while it is in view. A box and its object on the map light up together.
 
 import { byId, keyed, set, text } from "./dom.js";
 
@@ -11,27 +11,54 @@ export class CameraView {
   #source = null;
   #visible = false;
   #shows = false;
+  /// Names of the cameras, the first of which may have none, and which of them is looked at.
+  #names = [];
+  #chosen = null;
   #boxes = [];
   #shownAt = -Infinity;
   #scene = null;
   #node = null;
 
-  /// Calls `onLight` with the name of what is pointed at, or null, and `onPicture` with each picture's facts.
-  constructor(onLight, onPicture) {
-    Object.assign(this, { onLight, onPicture });
+  /// Calls `onLight` with the name of what is pointed at, or null, `onPicture` with each picture's facts, and `onCamera` with the name of another camera.
+  constructor(onLight, onPicture, onCamera) {
+    Object.assign(this, { onLight, onPicture, onCamera });
     document.addEventListener("visibilitychange", () => this.#follow());
     new IntersectionObserver((looks) => {
       this.#visible = looks.at(-1).isIntersecting;
       this.#follow();
     }).observe(byId("camera-card"));
+    byId("camera-name").onchange = ({ target }) => this.#choose(this.#names[target.selectedIndex]);
   }
 
   /// Draws boxes for what the node sees; `lit` names what is pointed at.
   draw(node, scene, lit) {
     [this.#shows, this.#scene, this.#node] = [node.camera, scene, node.name];
     byId("camera-card").hidden = !node.camera;
+    this.#offer(node.cameras, node.name);
     this.#follow();
     this.#draw(lit);
+  }
+
+  /// Lets choose among several cameras.
+  #offer(names, vehicle) {
+    this.#names = names;
+    const chooser = byId("camera-name");
+    chooser.hidden = names.length < 2;
+    keyed(chooser, names, (name) => name, () => document.createElement("option"), (option, name) => text(option, name ?? vehicle));
+    if (names.length > 0 && !names.includes(this.#chosen)) this.#choose(names[0]);
+    // Not under the hand of who chooses.
+    if (document.activeElement !== chooser) chooser.selectedIndex = names.indexOf(this.#chosen);
+  }
+
+  #choose(name) {
+    this.#chosen = name;
+    this.#source?.close();
+    [this.#source, this.#boxes, this.#shownAt] = [null, [], -Infinity];
+    const canvas = byId("camera");
+    canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+    this.#follow();
+    this.onCamera(name);
+    this.onLight(null);
   }
 
   #draw(lit) {
@@ -65,13 +92,14 @@ export class CameraView {
       this.#source = null;
     }
     if (!wanted || this.#source) return;
-    this.#source = new EventSource("/api/camera");
-    this.#source.addEventListener("camera", (event) => this.#take(JSON.parse(event.data)));
+    const source = (this.#source = new EventSource(this.#chosen === null ? "/api/camera" : `/api/camera?name=${this.#chosen}`));
+    source.addEventListener("camera", (event) => this.#take(JSON.parse(event.data), source));
   }
 
-  async #take({ jpeg, boxes, width_px, height_px }) {
+  async #take({ jpeg, boxes, width_px, height_px }, source) {
     const bytes = Uint8Array.from(atob(jpeg), (letter) => letter.charCodeAt(0));
     const image = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
+    if (source !== this.#source) return;
     const canvas = byId("camera");
     [canvas.width, canvas.height] = [image.width, image.height];
     canvas.getContext("2d").drawImage(image, 0, 0);

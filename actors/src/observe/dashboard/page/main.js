@@ -22,7 +22,7 @@ document.addEventListener("scroll", ({ target }) => target.classList?.toggle("sc
 const live = new Live(draw, () => attempt("history", drawHistory));
 const map = new BirdsEye(draw, light);
 const mount = new MountPoints(map, draw);
-const camera = new CameraView(light, (picture) => mount.take(picture));
+const camera = new CameraView(light, (picture) => mount.take(picture), (name) => mount.choose(name));
 const timeline = new Timeline(scrub, { live: true, time: clock, moment: (at) => `${clock(at)}, ${ago((live.now - at) / 1e6)}` });
 /// The map that the timeline chose, and whether one is on its way.
 let [past, loading] = [null, false];
