@@ -156,10 +156,17 @@ asyncapi-check: setup ## validate docs/asyncapi.yaml by the parser of its standa
 	packaging/check-asyncapi
 
 models-check: PACKAGES += python3-venv
-models-check: setup ## the boxes that the detector's tests expect, found once more by ONNX Runtime and Python
+models-check: setup ## the boxes that the detector's tests expect, found once more by ONNX Runtime and Python; YOLOX=FILE also tries photographs
 	python3 -m venv $(BUILD)/models-venv
-	$(BUILD)/models-venv/bin/pip install --quiet numpy onnx onnxruntime
+	$(BUILD)/models-venv/bin/pip install --quiet numpy onnx onnxruntime $(if $(YOLOX),opencv-python-headless)
 	$(BUILD)/models-venv/bin/python3 actors/tests/data/onnx/make.py --check
+ifdef YOLOX
+	$(BUILD)/models-venv/bin/python3 actors/tests/data/onnx/photos.py $(YOLOX) > $(BUILD)/yolox-photos.json
+	YOLOX_MODEL=$(abspath $(YOLOX)) YOLOX_PHOTOS=$(abspath $(BUILD)/yolox-photos.json) \
+	    cargo test --locked -p ecod-actors --lib photographs_what_onnx_runtime -- --ignored --nocapture
+else
+	@echo "no photographs were tried: YOLOX=FILE names an export of YOLOX without --decode_in_inference, such as yolox_nano.onnx"
+endif
 
 # PYTHONS="python3.9 python3.13" tests it with these.
 python-client-check: PACKAGES += mosquitto python3-venv

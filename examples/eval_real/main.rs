@@ -1,10 +1,12 @@
-//! Accuracy on real recordings, measured on the programs: detections are replayed as reports, and judged by `eval`.
+//! Accuracy on real recordings, measured on the programs: detections are replayed as reports, and judged by `eval`. Ranging
+//! by the ground is held against annotated places.
 //!
 //! `make eval-real DIR=…`, or `cargo run --example eval_real -- --program target/release/ecod-node --data DIR [--work DIR]`
 //!
 //! DIR holds copies of public repositories, named as they are there; `docs/measurements.md` has the list. What is missing
 //! is named, and makes the program fail after all others were judged.
 
+mod foot_points;
 mod kitti;
 mod wildtrack;
 
@@ -16,6 +18,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, bail};
 use ecod::wire::ObjectReport;
 use serde_json::Value;
+use wildtrack::Wildtrack;
 
 /// Labels are judged by the example `eval_labels`, which needs these.
 const LABEL_SETS: [&str; 4] = ["CF", "CF_amt", "SP", "SP_amt"];
@@ -65,12 +68,16 @@ fn main() -> anyhow::Result<()> {
         find((path.as_str(), LABELS.1));
     }
     missing.iter().for_each(|what| eprintln!("{what}"));
+    let wildtrack = wildtrack.map(|((boxes, cameras), truth)| Wildtrack::read(&boxes, &cameras, &truth)).transpose()?;
+    if let Some(wildtrack) = &wildtrack {
+        foot_points::print(wildtrack)?;
+    }
     println!("{HEADER}");
     if let Some((detections, truth)) = kitti {
         judge(&program, &kitti::convert(&detections, &truth, &folder(&work, "kitti")?)?)?;
     }
-    if let Some(((boxes, cameras), truth)) = wildtrack {
-        judge(&program, &wildtrack::convert(&boxes, &cameras, &truth, &folder(&work, "wildtrack")?)?)?;
+    if let Some(wildtrack) = wildtrack {
+        judge(&program, &wildtrack.convert(&folder(&work, "wildtrack")?)?)?;
     }
     if missing.is_empty() { Ok(()) } else { bail!("{} of the data are missing", missing.len()) }
 }

@@ -38,56 +38,70 @@ const CONFIDENCE: f64 = 0.9;
 const FOOT_PIXELS: f64 = 5.0;
 
 /// The boxes of a frame: left, top, width, height, nothing, camera.
-type Boxes = BTreeMap<String, Vec<[f64; 6]>>;
+type Boxes = BTreeMap<u64, Vec<[f64; 6]>>;
 
-pub(super) fn convert(boxes: &Path, cameras: &Path, truth: &Path, work: &Path) -> anyhow::Result<Recording> {
-    let recording = Recording {
-        name: "WILDTRACK",
-        format: "mot",
-        frame_rate: "2",
-        truth: work.join("truth.txt"),
-        detections: work.join("detections.txt"),
-        reports: work.join("reports.jsonl"),
-    };
-    let read = |path: &Path| fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
-    let boxes: Boxes = serde_json::from_str(&read(boxes)?)?;
-    let cameras: Value = serde_json::from_str(&read(cameras)?)?;
-    let homographies: Vec<[[f64; 3]; 3]> = serde_json::from_value(cameras["sequence1"]["homography"].clone())?;
-    let to_ground: Option<Vec<Matrix3<f64>>> =
-        homographies.iter().map(|rows| Matrix3::from_fn(|row, column| rows[row][column]).try_inverse()).collect();
-    let to_ground = to_ground.context("a homography has no inverse")?;
-    let mut positions: BTreeMap<u64, Vec<[f64; 2]>> = BTreeMap::new();
-    for (number, line) in read(truth)?.lines().enumerate() {
-        let cells: Option<Vec<u64>> = line.split_ascii_whitespace().map(|cell| cell.parse().ok()).collect();
-        let cells: [u64; 3] = cells
-            .and_then(|cells| cells.try_into().ok())
-            .with_context(|| format!("{}: line {}: not three numbers", truth.display(), number + 1))?;
-        let [frame, x, y] = cells;
-        let place = [x as f64, y as f64];
-        let place = std::array::from_fn(|axis| CORNER_M[axis] + GRID_M * place[axis]);
-        positions.entry(frame / TRUTH_FRAMES).or_default().push(place);
-    }
-    let (mut truth, mut detections, mut reports) = (String::new(), String::new(), Vec::new());
-    for (number, (frame, boxes)) in (1..).zip(boxes) {
-        let frame: u64 = frame.parse()?;
-        for [x, y] in positions.get(&frame).into_iter().flatten() {
-            writeln!(truth, "{number},-1,0,0,0,0,1,{x},{y},0")?;
+/// Boxes, cameras and truth.
+pub(super) struct Wildtrack {
+    pub(super) boxes: Boxes,
+    /// From the ground in centimetres to the image without distortion, by camera.
+    pub(super) homographies: Vec<Matrix3<f64>>,
+    /// Places of people in metres by frame.
+    pub(super) positions: BTreeMap<u64, Vec<Point2<f64>>>,
+}
+
+impl Wildtrack {
+    pub(super) fn read(boxes: &Path, cameras: &Path, truth: &Path) -> anyhow::Result<Self> {
+        let read = |path: &Path| fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
+        let boxes = serde_json::from_str(&read(boxes)?)?;
+        let cameras: Value = serde_json::from_str(&read(cameras)?)?;
+        let homographies: Vec<[[f64; 3]; 3]> = serde_json::from_value(cameras["sequence1"]["homography"].clone())?;
+        let homographies = homographies.iter().map(|rows| Matrix3::from_fn(|row, column| rows[row][column])).collect();
+        let mut positions: BTreeMap<u64, Vec<Point2<f64>>> = BTreeMap::new();
+        for (number, line) in read(truth)?.lines().enumerate() {
+            let cells: Option<Vec<u64>> = line.split_ascii_whitespace().map(|cell| cell.parse().ok()).collect();
+            let cells: [u64; 3] = cells
+                .and_then(|cells| cells.try_into().ok())
+                .with_context(|| format!("{}: line {}: not three numbers", truth.display(), number + 1))?;
+            let [frame, x, y] = cells;
+            let place = [x as f64, y as f64];
+            let place: [f64; 2] = std::array::from_fn(|axis| CORNER_M[axis] + GRID_M * place[axis]);
+            positions.entry(frame / TRUTH_FRAMES).or_default().push(place.into());
         }
-        for (camera, to_ground) in to_ground.iter().enumerate() {
-            let of_camera = boxes.iter().filter(|cells| cells[5] as usize == camera);
-            let objects: Vec<PerceivedObject> = of_camera.map(|cells| object(cells, to_ground)).collect();
-            for PerceivedObject { x_m, y_m, .. } in &objects {
-                writeln!(detections, "{number},-1,0,0,0,0,{CONFIDENCE},{x_m},{y_m},0")?;
+        Ok(Self { boxes, homographies, positions })
+    }
+
+    pub(super) fn convert(&self, work: &Path) -> anyhow::Result<Recording> {
+        let recording = Recording {
+            name: "WILDTRACK",
+            format: "mot",
+            frame_rate: "2",
+            truth: work.join("truth.txt"),
+            detections: work.join("detections.txt"),
+            reports: work.join("reports.jsonl"),
+        };
+        let to_ground: Option<Vec<_>> = self.homographies.iter().map(|homography| homography.try_inverse()).collect();
+        let to_ground = to_ground.context("a homography has no inverse")?;
+        let (mut truth, mut detections, mut reports) = (String::new(), String::new(), Vec::new());
+        for (number, (frame, boxes)) in (1..).zip(&self.boxes) {
+            for place in self.positions.get(frame).into_iter().flatten() {
+                writeln!(truth, "{number},-1,0,0,0,0,1,{},{},0", place.x, place.y)?;
             }
-            let node = NodeName::new(format!("camera-{}", camera + 1))?;
-            reports
-                .push(ObjectReport { objects, ..ObjectReport::new(node, number, time_of(0, number, FRAME_RATE_HZ)) });
+            for (camera, to_ground) in to_ground.iter().enumerate() {
+                let of_camera = boxes.iter().filter(|cells| cells[5] as usize == camera);
+                let objects: Vec<PerceivedObject> = of_camera.map(|cells| object(cells, to_ground)).collect();
+                for PerceivedObject { x_m, y_m, .. } in &objects {
+                    writeln!(detections, "{number},-1,0,0,0,0,{CONFIDENCE},{x_m},{y_m},0")?;
+                }
+                let node = NodeName::new(format!("camera-{}", camera + 1))?;
+                let at = time_of(0, number, FRAME_RATE_HZ);
+                reports.push(ObjectReport { objects, ..ObjectReport::new(node, number, at) });
+            }
         }
+        fs::write(&recording.truth, truth)?;
+        fs::write(&recording.detections, detections)?;
+        write_reports(&recording.reports, reports)?;
+        Ok(recording)
     }
-    fs::write(&recording.truth, truth)?;
-    fs::write(&recording.detections, detections)?;
-    write_reports(&recording.reports, reports)?;
-    Ok(recording)
 }
 
 /// The foot of a box on the ground, with the error of its pixels.

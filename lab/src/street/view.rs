@@ -242,3 +242,6 @@ fn scalar(color: [f64; 3], lit: f64) -> Scalar {
     let [blue, green, red] = color.map(|value| value * lit);
     Scalar::new(blue, green, red, 0.0)
 }
+
+#[cfg(test)]
+mod tests;

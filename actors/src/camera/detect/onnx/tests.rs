@@ -210,3 +210,40 @@ fn frames_of_any_shape_give_boxes_inside_them() {
         }
     }
 }
+
+/// An object that `photos.py` found.
+#[derive(Debug, Deserialize)]
+struct Photographed {
+    class: usize,
+    score: f64,
+    r#box: [f64; 4],
+}
+
+#[test]
+#[ignore = "needs weights of YOLOX: make models-check YOLOX=FILE"]
+fn yolox_finds_in_photographs_what_onnx_runtime_finds_with_the_same_weights() {
+    let file = |key| PathBuf::from(std::env::var_os(key).expect(key));
+    let expected = std::fs::read_to_string(file("YOLOX_PHOTOS")).unwrap();
+    let expected: BTreeMap<String, Vec<Photographed>> = serde_json::from_str(&expected).unwrap();
+    assert!(expected.len() == 3 && expected.values().all(|objects| !objects.is_empty()), "{expected:?}");
+    let names: Vec<_> = crate::camera::detect::coco::labels::all().map(|(_, name)| name).collect();
+    let mut detector = OnnxDetector::new(OnnxConfig { threshold: 0.3, ..OnnxConfig::of(file("YOLOX_MODEL")) }).unwrap();
+    for (name, expected) in expected {
+        let photograph = path(&format!("../photos/{name}.jpg"));
+        let image = imgcodecs::imread(photograph.to_str().unwrap(), imgcodecs::IMREAD_COLOR).unwrap();
+        let found = detector.detect(&CameraFrame { image, ..frame() }).unwrap();
+        assert_eq!(found.len(), expected.len(), "{name}: {found:?}");
+        for Photographed { class, score, r#box } in expected {
+            let same = found.iter().find(|found| found.label == names[class]);
+            let Detection { confidence, bounding_box: b, .. } = same.unwrap_or_else(|| panic!("{name}: {found:?}"));
+            let edges = [b.x_min, b.y_min, b.x_max, b.y_max];
+            let off_px = edges.iter().zip(r#box).map(|(edge, expected)| (edge - expected).abs()).fold(0.0, f64::max);
+            println!(
+                "{name}: {} {confidence:.4}, off by {:.5}, box by {off_px:.3} px",
+                names[class],
+                confidence - score
+            );
+            assert!((confidence - score).abs() < 0.01 && off_px < 0.5, "{name}: {same:?} at {edges:?}");
+        }
+    }
+}
