@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 clean
+.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -196,7 +196,7 @@ deb-arm64: PACKAGES += debootstrap systemd-container
 deb-arm64: setup ## the same packages for arm64, built in a Debian of its own in target/arm64-root; needs root
 	packaging/arm64 packaging/deb
 
-package-check-arm64: PACKAGES += mosquitto-clients python3
+package-check-arm64: PACKAGES += mosquitto-clients python3 qrencode
 package-check-arm64: deb-arm64 ## install the arm64 packages in that Debian, and hold their program, under qemu, against the amd64 one
 	cargo build --release --locked --bin ecod-node
 	packaging/check-arm64 $(BUILD)/release/ecod-node
@@ -204,6 +204,18 @@ package-check-arm64: deb-arm64 ## install the arm64 packages in that Debian, and
 package-check: PACKAGES += debootstrap systemd-container
 package-check: setup ## build the package without camera, and install, run, upgrade and remove it in a Debian of its own; needs root
 	packaging/check-package
+
+footprint: deb ## hold size, memory and start of the packages' node against bars: with camera and COCO, and without
+	packaging/check-footprint
+
+release: PACKAGES += apt-utils debootstrap systemd-container
+release: setup ## packages for amd64 and arm64, SBOM, checksums and an apt repository of the commit, in target/dist; KEY=... signs it
+	packaging/release
+
+release-check: PACKAGES += debootstrap
+release-check: setup ## prove that two clean clones give the same packages (CLONED="ecod-node-edge" only that), and that apt installs target/dist
+	packaging/check-release $(CLONED)
+	packaging/check-repository
 
 edge-only: setup ## an aggregator without camera and OpenCV
 	cargo build --locked -p ecod-actors --no-default-features
@@ -214,6 +226,12 @@ bench: setup ## speed of the core, the detectors and the path through the broker
 instructions: PACKAGES := build-essential ca-certificates valgrind
 instructions: setup ## instructions of the core's hot paths against the baseline; SAVE=1 writes a new one
 	packaging/instructions $(if $(SAVE),--save)
+
+instructions-arm64: PACKAGES := build-essential ca-certificates debootstrap python3 systemd-container valgrind
+instructions-arm64: setup ## instructions of the core's work on arm64 beside amd64, and the time that Pis take by them; needs root
+	cargo build --release --locked -p ecod-instructions --bin ecod-work
+	packaging/arm64 cargo build --release --locked --target aarch64-unknown-linux-gnu -p ecod-instructions --bin ecod-work
+	packaging/count-arm64 $(BUILD)/release/ecod-work target/arm64/aarch64-unknown-linux-gnu/release/ecod-work
 
 liars: setup ## what lying vehicles achieve against VOTE, within a bound: table in docs/vote.md, drawing in target/liars.svg; SEEDS=n only checks
 	mkdir -p target
