@@ -205,15 +205,16 @@ package-check: PACKAGES += debootstrap systemd-container
 package-check: setup ## build the package without camera, and install, run, upgrade and remove it in a Debian of its own; needs root
 	packaging/check-package
 
+footprint: PACKAGES += python3
 footprint: deb ## hold size, memory and start of the packages' node against bars: with camera and COCO, and without
 	packaging/check-footprint
 
-release: PACKAGES += apt-utils debootstrap systemd-container
+release: PACKAGES += apt-utils debootstrap gnupg systemd-container
 release: setup ## packages for amd64 and arm64, SBOM, checksums and an apt repository of the commit, in target/dist; KEY=... signs it
 	packaging/release
 
-release-check: PACKAGES += debootstrap
-release-check: setup ## prove that two clean clones give the same packages (CLONED="ecod-node-edge" only that), and that apt installs target/dist
+release-check: PACKAGES += debootstrap gnupg
+release-check: setup ## after make release: prove that two clean clones give the same packages (CLONED="ecod-node-edge" only that), and that apt installs target/dist
 	packaging/check-release $(CLONED)
 	packaging/check-repository
 

@@ -28,7 +28,9 @@ use rustdds::{
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::ros2::{CameraInfo, Definition, Detection2DArray, Detection3DArray, RosSink, encode, put_map, put_report};
+use crate::ros2::{
+    CameraInfo, Definition, Detection2DArray, Detection3DArray, RosMessage, RosSink, encode, put_map, put_report,
+};
 use detections::place_in_pictures;
 pub use detections::{InputRefusal, RosCamera};
 
@@ -213,7 +215,7 @@ impl RosBridge {
     }
 
     /// Messages of a topic of ROS; those that cannot be decoded are counted.
-    fn read<M: Definition + DeserializeOwned + Send + 'static>(
+    fn read<M: RosMessage + DeserializeOwned + Send + 'static>(
         &self,
         name: &str,
         taken: fn(M) -> Taken,
@@ -253,7 +255,7 @@ fn qos(reliability: Reliability) -> QosPolicies {
 }
 
 /// The DDS topic of a topic of ROS, with the names that ROS gives to both topic and type.
-fn ros_topic<M: Definition>(
+fn ros_topic<M: RosMessage>(
     participant: &DomainParticipant,
     name: &str,
     qos: &QosPolicies,

@@ -58,16 +58,16 @@ struct RosOptions {
     #[arg(long, value_name = "TOPIC", requires_all = ["camera_info", "pose"])]
     detections_2d: Option<String>,
     /// Topic of sensor_msgs/CameraInfo: the optics of these pictures.
-    #[arg(long, value_name = "TOPIC")]
+    #[arg(long, value_name = "TOPIC", requires = "detections_2d")]
     camera_info: Option<String>,
     /// Pose of the camera: metres east and north, degrees counter-clockwise from east.
     #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose)]
     pose: Option<Pose>,
     /// Height of the camera above the ground in metres; boxes are then also ranged by the ground.
-    #[arg(long)]
+    #[arg(long, value_parser = height)]
     height_m: Option<f64>,
     /// Angle of the camera's axis below the horizon in degrees.
-    #[arg(long, default_value_t = 0.0, allow_hyphen_values = true)]
+    #[arg(long, default_value_t = 0.0, allow_hyphen_values = true, value_parser = finite)]
     pitch_deg: f64,
     /// File with the keys of `camera.projection` (TOML). Default: sizes of COCO's labels, and `pixel_sigma_px = 3`.
     #[arg(long, value_name = "FILE")]
@@ -100,9 +100,19 @@ impl RosOptions {
 }
 
 #[cfg(feature = "dds")]
+fn finite(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|number: &f64| number.is_finite()).ok_or_else(|| "must be a number".to_owned())
+}
+
+#[cfg(feature = "dds")]
+fn height(text: &str) -> Result<f64, String> {
+    finite(text).ok().filter(|height_m| *height_m > 0.0).ok_or_else(|| "must be metres above the ground".to_owned())
+}
+
+#[cfg(feature = "dds")]
 fn pose(text: &str) -> Result<Pose, String> {
-    let numbers: Vec<f64> = text.split(',').filter_map(|part| part.trim().parse().ok()).collect();
-    let [x_m, y_m, heading_deg] = numbers[..] else {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|part| finite(part.trim()).ok()).collect();
+    let Some(&[x_m, y_m, heading_deg]) = numbers.as_deref() else {
         return Err("must be three numbers, such as 1.5,-2,90".to_owned());
     };
     Ok(Pose::new(x_m, y_m, heading_deg.to_radians()))

@@ -27,7 +27,7 @@ use transforms::TFMessage;
 pub use log::{Conversion, ConversionError, convert};
 pub(crate) use messages::{Definition, Header};
 #[cfg(feature = "dds")]
-pub(crate) use messages::{RosPose, encode};
+pub(crate) use messages::{RosMessage, RosPose, encode};
 #[cfg(feature = "dds")]
 pub(crate) use pictured::Detection2DArray;
 
@@ -56,11 +56,12 @@ pub(crate) fn put_report<S: RosSink>(report: &ObjectReport, sink: &mut S) -> Res
 }
 
 /// A node's name as names in ROS allow it: letters and digits with single `_` between them, no digit first. A `_` in front would
-/// hide the topic.
+/// hide the topic, and `map` is the cell's.
 fn ros_name(node: &NodeName) -> String {
     let words: Vec<_> = node.as_str().split(['-', '_']).filter(|word| !word.is_empty()).collect();
     let name = words.join("_");
-    if name.starts_with(|first: char| first.is_ascii_alphabetic()) { name } else { format!("node_{name}") }
+    let is_free = name != "map" && name.starts_with(|first: char| first.is_ascii_alphabetic());
+    if is_free { name } else { format!("node_{name}") }
 }
 
 #[cfg(test)]
@@ -69,7 +70,9 @@ mod tests {
 
     #[test]
     fn names_are_as_ros_allows_them() {
-        for (name, expected) in [("lot-1", "lot_1"), ("edge--ros2", "edge_ros2"), ("_x-", "x"), ("7", "node_7")] {
+        for (name, expected) in
+            [("lot-1", "lot_1"), ("edge--ros2", "edge_ros2"), ("_x-", "x"), ("7", "node_7"), ("map", "node_map")]
+        {
             assert_eq!(ros_name(&NodeName::from_static(name)), expected);
         }
     }

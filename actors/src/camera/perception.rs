@@ -156,7 +156,9 @@ impl Perception {
         if !objects.is_empty() {
             self.unplaced = None;
         } else if self.discarded.last_reason.is_some() {
-            self.unplaced = Some([self.unplaced.map_or(captured_at, |[since, _]| since), captured_at]);
+            // What was seen long ago is another object.
+            let going_on = self.unplaced.filter(|[_, last]| captured_at.since(*last) < UNPLACED_PATIENCE);
+            self.unplaced = Some([going_on.map_or(captured_at, |[since, _]| since), captured_at]);
         }
         let VehicleCamera { landmarks, mount, lens, .. } = &self.vehicle_camera;
         let (camera, sizes) = (PosedCamera::new(self.camera, mount, lens.intrinsics), &self.projection.config().sizes);

@@ -139,7 +139,7 @@ fn check_absent(path: &Path) -> anyhow::Result<()> {
 
 /// The nodes of the street that comes with the program: two cameras that stay where they are.
 fn street() -> anyhow::Result<Vec<NodeConfig>> {
-    let directory = installed::path(STREET_INSTALLED).unwrap_or_else(|| STREET_IN_SOURCES.into());
+    let directory = std::path::absolute(installed::path(STREET_INSTALLED).unwrap_or_else(|| STREET_IN_SOURCES.into()))?;
     let missing = || {
         format!(
             "no street in {}: run this in ecod's sources, or install the package ecod-node; or give --video FILE, --images DIR, \

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::messages::{Definition, HEADER, Header, TIME};
+use super::messages::{Definition, HEADER, Header, RosMessage, TIME};
 
 pub(super) const IMAGE: &str = "std_msgs/Header header\nstring format\nuint8[] data\n";
 
@@ -13,8 +13,11 @@ pub(super) struct RosImage {
     pub(super) data: Vec<u8>,
 }
 
-impl Definition for RosImage {
+impl RosMessage for RosImage {
     const NAME: &'static str = "sensor_msgs/msg/CompressedImage";
+}
+
+impl Definition for RosImage {
     const FIELDS: &'static str = IMAGE;
     const INSIDE: &'static [(&'static str, &'static str)] = &[HEADER, TIME];
 }
@@ -44,8 +47,11 @@ pub(crate) struct CameraInfo {
     pub(crate) roi: RegionOfInterest,
 }
 
-impl Definition for CameraInfo {
+impl RosMessage for CameraInfo {
     const NAME: &'static str = "sensor_msgs/msg/CameraInfo";
+}
+
+impl Definition for CameraInfo {
     const FIELDS: &'static str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\n\
                                   float64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n\
                                   sensor_msgs/RegionOfInterest roi\n";

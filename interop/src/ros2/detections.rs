@@ -4,7 +4,7 @@ use ecod::wire::{GlobalMap, ObjectReport};
 use serde::{Deserialize, Serialize};
 
 use super::messages::{
-    Definition, HEADER, Header, POINT, POSE, QUATERNION, RosPose, RosQuaternion, RosVector, TIME, VECTOR,
+    Definition, HEADER, Header, POINT, POSE, QUATERNION, RosMessage, RosPose, RosQuaternion, RosVector, TIME, VECTOR,
 };
 use crate::object::CellObject;
 
@@ -101,8 +101,11 @@ impl Detection3DArray {
     }
 }
 
-impl Definition for Detection3DArray {
+impl RosMessage for Detection3DArray {
     const NAME: &'static str = "vision_msgs/msg/Detection3DArray";
+}
+
+impl Definition for Detection3DArray {
     const FIELDS: &'static str = "std_msgs/Header header\nvision_msgs/Detection3D[] detections\n";
     const INSIDE: &'static [(&'static str, &'static str)] = &[
         HEADER,

@@ -6,7 +6,8 @@ use serde::Serialize;
 use super::camera::{IMAGE, RosImage};
 use super::detections::{HEIGHT_M, pose, size};
 use super::messages::{
-    Definition, HEADER, Header, POINT, POSE, QUATERNION, RosPose, RosQuaternion, RosTime, RosVector, TIME, VECTOR,
+    Definition, HEADER, Header, POINT, POSE, QUATERNION, RosMessage, RosPose, RosQuaternion, RosTime, RosVector, TIME,
+    VECTOR,
 };
 use crate::object::CellObject;
 
@@ -97,8 +98,11 @@ impl MarkerArray {
     }
 }
 
-impl Definition for MarkerArray {
+impl RosMessage for MarkerArray {
     const NAME: &'static str = "visualization_msgs/msg/MarkerArray";
+}
+
+impl Definition for MarkerArray {
     const FIELDS: &'static str = "visualization_msgs/Marker[] markers\n";
     const INSIDE: &'static [(&'static str, &'static str)] = &[
         (

@@ -4,10 +4,14 @@ use ecod::model::time::Timestamp;
 use nalgebra::UnitQuaternion;
 use serde::{Deserialize, Serialize};
 
-/// A message with a name and a definition by which others read it.
-pub(crate) trait Definition {
+/// A message of ROS.
+pub(crate) trait RosMessage {
     /// Package, kind and name.
     const NAME: &'static str;
+}
+
+/// A message with a name and a definition by which others read it.
+pub(crate) trait Definition: RosMessage {
     /// Its own fields.
     const FIELDS: &'static str;
     /// The messages inside it.

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::detections::ObjectHypothesisWithPose;
-use super::messages::{Definition, HEADER, Header, POINT, POSE, QUATERNION, TIME};
+use super::messages::{Header, RosMessage};
 
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Point2D {
@@ -39,8 +39,6 @@ pub(crate) struct Detection2DArray {
     pub(crate) detections: Vec<Detection2D>,
 }
 
-impl Definition for Detection2DArray {
+impl RosMessage for Detection2DArray {
     const NAME: &'static str = "vision_msgs/msg/Detection2DArray";
-    const FIELDS: &'static str = "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n";
-    const INSIDE: &'static [(&'static str, &'static str)] = &[HEADER, TIME, POSE, POINT, QUATERNION];
 }

@@ -3,7 +3,7 @@
 use ecod::wire::WirePose;
 use serde::Serialize;
 
-use super::messages::{Definition, HEADER, Header, QUATERNION, RosQuaternion, RosVector, TIME, VECTOR};
+use super::messages::{Definition, HEADER, Header, QUATERNION, RosMessage, RosQuaternion, RosVector, TIME, VECTOR};
 
 #[derive(Debug, Serialize)]
 struct Transform {
@@ -42,8 +42,11 @@ impl TFMessage {
     }
 }
 
-impl Definition for TFMessage {
+impl RosMessage for TFMessage {
     const NAME: &'static str = "tf2_msgs/msg/TFMessage";
+}
+
+impl Definition for TFMessage {
     const FIELDS: &'static str = "geometry_msgs/TransformStamped[] transforms\n";
     const INSIDE: &'static [(&'static str, &'static str)] = &[
         (

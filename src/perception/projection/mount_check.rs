@@ -13,9 +13,10 @@ use crate::model::time::Timestamp;
 const WINDOW: Duration = Duration::from_secs(60);
 /// Time between two frames that count: the same objects are in the frames between.
 const SAMPLE_PERIOD: Duration = Duration::from_millis(500);
-/// Least and largest number of boxes that are compared.
+/// Largest number of boxes of a frame that count: a crowd says no more.
+const MAX_OF_FRAME: usize = 4;
+/// Least number of boxes that are compared.
 const MIN_BOXES: usize = 30;
-const MAX_BOXES: usize = 200;
 /// Least time between the first and the last of them.
 const MIN_TIME: Duration = Duration::from_secs(10);
 /// Labels of COCO that stand on the ground. Those with a listed size count as well; others may hang or lie on something.
@@ -55,14 +56,16 @@ impl MountCheck {
         if self.offsets.back().is_some_and(|last| captured_at.since(last.captured_at) < SAMPLE_PERIOD) {
             return;
         }
-        let offsets =
-            boxes.into_iter().filter_map(|(detection, cut)| projection.foot_offset(detection, cut, captured_at));
-        self.offsets.extend(offsets);
-        self.offsets.drain(..self.offsets.len().saturating_sub(MAX_BOXES));
+        let offset = |(detection, cut)| projection.foot_offset(detection, cut, captured_at);
+        let mut offsets: Vec<_> = boxes.into_iter().filter_map(offset).collect();
+        // Near ones and far ones.
+        offsets.sort_by(|a, b| a.expected_slope.total_cmp(&b.expected_slope));
+        let step = offsets.len().div_ceil(MAX_OF_FRAME).max(1);
+        self.offsets.extend(offsets.into_iter().step_by(step));
     }
 
-    /// The angle in radians by which the camera looks higher than its mount says, if that is more than the stated errors
-    /// explain and objects at several distances agree.
+    /// The angle in radians by which the camera looks higher than its mount says. None if the stated errors explain it, or
+    /// objects at several distances do not agree.
     pub fn off_rad(&self) -> Option<f64> {
         let sorted = |value: fn(&FootOffset) -> f64| {
             let mut values: Vec<f64> = self.offsets.iter().map(value).collect();

@@ -333,6 +333,20 @@ fn a_camera_that_has_turned_is_told_by_its_angle_and_one_within_its_errors_is_no
 }
 
 #[test]
+fn a_camera_that_has_turned_is_told_in_a_crowd_too() {
+    let (mounted, said) = (mount(1.5, -6.0, 0.0), mount(1.5, 0.0, 0.0));
+    let (mut street, mut check) = (Street::new(1.5), MountCheck::default());
+    let projection = projection(Ranging::Auto, said, &ProjectionConfig::default());
+    for half_seconds in 0..40 {
+        let crowd: Vec<_> = (0..20).map(|_| street.next(&mounted, 1.0, 10.0).0).collect();
+        let boxes = crowd.iter().map(|detection| (detection, projection.cut(detection)));
+        check.take(boxes, Timestamp::default() + Duration::from_millis(500 * half_seconds), &projection);
+    }
+    let off_deg = check.off_rad().map(f64::to_degrees);
+    assert!(off_deg.is_some_and(|off_deg| (off_deg - 6.0).abs() < 1.0), "{off_deg:?}");
+}
+
+#[test]
 fn what_hangs_is_no_sign_of_a_camera_that_has_turned() {
     let projection = projection(Ranging::Auto, mount(1.5, 0.0, 0.0), &ProjectionConfig::default());
     let lamp = ObjectSizes::default().of("traffic light").copied().unwrap();

@@ -185,11 +185,14 @@ async function fitted(path, body) {
   try {
     const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body });
     if (answer.ok) return await answer.json();
-    return { reason: (await answer.text()).trim() || `The node answers ${answer.status}.`, passes: answer.status !== 422 };
+    return { reason: (await answer.text()).trim() || `The node answers ${answer.status}.`, passes: PASSING.has(answer.status) || answer.status >= 500 };
   } catch {
     return { reason: "The node does not answer.", passes: true };
   }
 }
+
+/// Refusals that pass: too slow, no pose, too often.
+const PASSING = new Set([408, 409, 429]);
 
 const isWhole = (point) => COLUMNS.every(([key]) => Number.isFinite(point[key]));
 const isWaiting = (point) => point.column !== undefined && point.x_m === undefined;
