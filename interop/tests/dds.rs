@@ -18,8 +18,8 @@ use ecod_client::{Cell, Frame, NodeName, PerceivedObject, Role, Settings, WirePo
 use ecod_interop::dds::{DetectorTopics, RosBridge, RosCamera, RosSettings};
 use tokio::runtime::Runtime;
 
-/// Runs a bridge beside an edge to which a vehicle reports, until Python has published such detections and found an object
-/// of this label at this place of the map.
+/// Runs a bridge beside an edge to which a vehicle reports. It ends once Python has published such detections, and found an
+/// object of this label at this place of the map.
 fn exchange(kind: &str, input: DetectorTopics, camera: RosCamera, (label, x_m, y_m): (&str, f64, f64)) {
     let python = std::env::var("DDS_PYTHON").unwrap();
     let loopback = SocketAddr::from(([127, 0, 0, 1], 0));

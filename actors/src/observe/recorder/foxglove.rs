@@ -109,9 +109,12 @@ impl JsonSchema for Level {
     }
 }
 
+/// What the frame of a camera's pictures has after the name under which the camera reports.
+pub(crate) const OPTICAL_FRAME: &str = "/optical";
+
 /// The frame of a camera's pictures.
 pub(crate) fn optical_frame(reporter: &NodeName) -> String {
-    format!("{reporter}/optical")
+    format!("{reporter}{OPTICAL_FRAME}")
 }
 
 impl FrameTransform {

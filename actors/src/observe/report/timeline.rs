@@ -18,6 +18,7 @@ use crate::observe::dashboard::node_monitor::MAX_REPORT_AGE;
 use crate::observe::dashboard::snapshot::json;
 use crate::observe::dashboard::timeline::{EventKind, ThinnedSeries, Timeline, TimelineFrame};
 use crate::observe::dashboard::{LandmarkFacts, LiveState, assets};
+use crate::observe::recorder::foxglove::OPTICAL_FRAME;
 use crate::observe::recorder::{LogError, LogEvent, LogIdentity, LogReader, SchemaName};
 use crate::transport::mqtt::Incoming;
 
@@ -46,7 +47,7 @@ pub(super) struct RecordedPicture {
 /// Name under which a camera reports, of the frame of its pictures; earlier versions wrote the name alone.
 fn reporter<'de, D: Deserializer<'de>>(frame: D) -> Result<NodeName, D::Error> {
     let frame = String::deserialize(frame)?;
-    NodeName::new(frame.strip_suffix("/optical").unwrap_or(&frame)).map_err(D::Error::custom)
+    NodeName::new(frame.strip_suffix(OPTICAL_FRAME).unwrap_or(&frame)).map_err(D::Error::custom)
 }
 
 /// The part of maps and verdicts that has the cell's time.

@@ -67,7 +67,7 @@ fn noisy(bounds: &BoundingBox, dice: &mut ChaCha8Rng) -> BoundingBox {
     BoundingBox { x_min, y_min, x_max, y_max }
 }
 
-/// The box of the pixels in which `alone` differs from `bare`, if all of them are in view in `full` and none is at the edge.
+/// The box of the pixels in which `alone` differs from `bare`. None if `full` hides some of them, or one is at the edge.
 fn whole_box(alone: &Mat, bare: &Mat, full: &Mat) -> Option<BoundingBox> {
     let [alone_px, bare_px, full_px] = [alone, bare, full].map(|image| image.data_bytes().unwrap().chunks_exact(3));
     let mut pixels = Vec::new();
