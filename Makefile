@@ -183,7 +183,7 @@ ros2-check: PACKAGES := build-essential ca-certificates python3-venv
 ros2-check: setup ## a node's log for ROS 2, read by mcap-ros2-support and written again to the same bytes by rosbags
 	python3 -m venv $(BUILD)/ros2-venv
 	$(BUILD)/ros2-venv/bin/pip install --quiet mcap-ros2-support rosbags
-	ROS2_PYTHON=$(abspath $(BUILD))/ros2-venv/bin/python3 cargo test --locked -p ecod-interop --test ros2 -- --include-ignored --nocapture
+	ROS2_PYTHON=$(abspath $(BUILD))/ros2-venv/bin/python3 cargo test --locked --test ros2 -- --include-ignored --nocapture
 
 dds-check: PACKAGES := build-essential ca-certificates iproute2 python3-venv
 dds-check: setup ## live topics of ROS 2 and a detector's, in a network of their own, against Cyclone DDS for Python; needs root
