@@ -35,5 +35,6 @@ async fn a_page_of_the_nodes_host_shows_the_map_and_one_of_another_name_does_not
     // Chromium takes every name below localhost for this machine; the door does not know it.
     browser.open(&format!("http://elsewhere.localhost:{port}/{query}")).await;
     browser.until("/^No connection/.test(document.querySelector('#state').textContent)").await;
+    browser.quit().await;
     node.stop().await;
 }
