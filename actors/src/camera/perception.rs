@@ -49,6 +49,8 @@ pub struct Perception {
     /// First and last frame with detections since one had a place.
     unplaced: Option<[Timestamp; 2]>,
     mount_check: MountCheck,
+    /// The angle that the last frame has told, in radians.
+    mount_off_rad: Option<f64>,
 }
 
 /// Number of discarded detections.
@@ -115,6 +117,7 @@ impl Perception {
             discarded: DiscardCounts::default(),
             unplaced: None,
             mount_check: MountCheck::default(),
+            mount_off_rad: None,
         }
     }
 
@@ -148,7 +151,7 @@ impl Perception {
             tracing::warn!(%error, "cannot remove distortion");
         }
         let boxes = detections.iter().zip(cuts.iter().copied());
-        self.mount_check.take(boxes, captured_at, &self.projection);
+        self.mount_off_rad = self.mount_check.take(boxes, captured_at, &self.projection);
         let all = detections.iter().zip(cuts).enumerate();
         let placed = all.filter_map(|(index, (detection, cut))| Some((index, self.place(detection, cut)?)));
         let (reported, objects): (Vec<_>, Vec<_>) = placed.unzip();
@@ -156,7 +159,7 @@ impl Perception {
         if !objects.is_empty() {
             self.unplaced = None;
         } else if self.discarded.last_reason.is_some() {
-            // What was seen long ago is another object.
+            // An object that was seen long ago is another one.
             let going_on = self.unplaced.filter(|[_, last]| captured_at.since(*last) < UNPLACED_PATIENCE);
             self.unplaced = Some([going_on.map_or(captured_at, |[since, _]| since), captured_at]);
         }
@@ -201,9 +204,9 @@ impl Perception {
         (time >= UNPLACED_PATIENCE).then(|| format!("no detection has had a place for {} s: {reason}", time.as_secs()))
     }
 
-    /// The angle between mount and reality in words, if it is too large.
+    /// The angle between mount and reality in words, if the last frame has shown that it is too large.
     pub fn mount_mismatch(&self) -> Option<String> {
-        let off_deg = self.mount_check.off_rad()?.to_degrees();
+        let off_deg = self.mount_off_rad?.to_degrees();
         let side = if off_deg > 0.0 { "higher" } else { "lower" };
         Some(format!(
             "the camera looks {:.0}° {side} than its mount says, judged by objects on the ground",

@@ -8,6 +8,8 @@ use std::time::Duration;
 use ecod::aggregator::Algorithms;
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
+#[cfg(feature = "camera")]
+use ecod_actors::camera::frame_source::SourceConfig;
 use ecod_actors::node::NodeHandle;
 #[cfg(feature = "camera")]
 use ecod_actors::node::config::NodeConfig;
@@ -161,29 +163,38 @@ async fn a_broker_that_refuses_is_named_with_its_answer() {
     node.stop().await;
 }
 
+/// A vehicle that is shown gray frames of this size, and detects in each what is recorded; `more` are further keys of its camera.
+#[cfg(feature = "camera")]
+fn watching(name: &str, directory: &Path, [width, height]: [usize; 2], detections: &str, more: &str) -> NodeConfig {
+    let (frames, recorded) = (directory.join("frames"), directory.join("detections.jsonl"));
+    std::fs::create_dir_all(&frames).unwrap();
+    let gray = [format!("P6 {width} {height} 255\n").as_bytes(), &vec![128; width * height * 3]].concat();
+    std::fs::write(frames.join("0.ppm"), gray).unwrap();
+    std::fs::write(&recorded, detections).unwrap();
+    let camera = format!(
+        "source = {{ kind = \"images\", path = {frames:?}, looping = true }}\n{more}\n\
+         detector = {{ kind = \"recorded\", path = {recorded:?}, looping = true }}"
+    );
+    NodeConfig { camera: Some(toml::from_str(&camera).unwrap()), ..config(name, Role::Cav, 1) }
+}
+
 /// A camera that is not there, one whose pose nobody sends, and one that sees what has no size.
 #[cfg(feature = "camera")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_camera_lacks_is_named() {
     let directory = tempfile::tempdir().unwrap();
-    let (frames, detections) = (directory.path().join("frames"), directory.path().join("detections.jsonl"));
-    std::fs::create_dir(&frames).unwrap();
-    std::fs::write(frames.join("0.ppm"), [b"P6 64 48 255\n".as_slice(), &[128; 64 * 48 * 3]].concat()).unwrap();
     let seen = r#"[{"label":"dragon","confidence":0.9,"bounding_box":{"x_min":30,"y_min":20,"x_max":34,"y_max":24}}]"#;
-    std::fs::write(&detections, seen).unwrap();
-    let with_camera = |name: &str, frames: &Path| {
-        let detector = format!("{{ kind = \"recorded\", path = {detections:?}, looping = true }}");
-        let camera =
-            format!("source = {{ kind = \"images\", path = {frames:?}, looping = true }}\ndetector = {detector}");
-        NodeConfig { camera: Some(toml::from_str(&camera).unwrap()), ..config(name, Role::Cav, 1) }
-    };
-    let (seeing, page) = start(with_camera("euclid", &frames)).await;
+    let with_camera = |name: &str| watching(name, directory.path(), [64, 48], seen, "");
+    let (seeing, page) = start(with_camera("euclid")).await;
     until_told(page, ["euclid", "", "no_size"], "dragon").await;
-    let mut moving = with_camera("gauss", &frames);
+    let mut moving = with_camera("gauss");
     moving.pose.listen = Some("127.0.0.1:0".parse().unwrap());
     let (lost, page) = start(moving).await;
     until_told(page, ["gauss", "", "no_pose"], "no pose is known").await;
-    let (blind, page) = start(with_camera("hertz", &directory.path().join("none"))).await;
+    let mut gone = with_camera("hertz");
+    let path = directory.path().join("none");
+    gone.camera.as_mut().unwrap().source = SourceConfig::Images { path, fps: 10.0, looping: true };
+    let (blind, page) = start(gone).await;
     until_told(page, ["hertz", "", "camera"], "the camera gives no frames").await;
     stop([blind, lost, seeing]).await;
 }
@@ -193,17 +204,9 @@ async fn what_a_camera_lacks_is_named() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_camera_none_of_whose_detections_has_a_place_is_named_with_the_reason() {
     let directory = tempfile::tempdir().unwrap();
-    let (frames, detections) = (directory.path().join("frames"), directory.path().join("detections.jsonl"));
-    std::fs::create_dir(&frames).unwrap();
-    std::fs::write(frames.join("0.ppm"), [b"P6 64 48 255\n".as_slice(), &[128; 64 * 48 * 3]].concat()).unwrap();
     let seen = r#"[{"label":"person","confidence":0.9,"bounding_box":{"x_min":0,"y_min":0,"x_max":64,"y_max":48}}]"#;
-    std::fs::write(&detections, seen).unwrap();
-    let camera = format!(
-        "source = {{ kind = \"images\", path = {frames:?}, looping = true }}\nmount = {{ height_m = 1.5 }}\n\
-         detector = {{ kind = \"recorded\", path = {detections:?}, looping = true }}"
-    );
-    let camera = Some(toml::from_str(&camera).unwrap());
-    let (node, page) = start(NodeConfig { camera, ..config("euclid", Role::Cav, 1) }).await;
+    let near = watching("euclid", directory.path(), [64, 48], seen, "mount = { height_m = 1.5 }");
+    let (node, page) = start(near).await;
     until_told(page, ["euclid", "", "not_placed"], "the image's edge cuts the box").await;
     node.stop().await;
 }
@@ -213,9 +216,6 @@ async fn a_camera_none_of_whose_detections_has_a_place_is_named_with_the_reason(
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_camera_that_has_turned_is_named_with_its_angle() {
     let directory = tempfile::tempdir().unwrap();
-    let (frames, detections) = (directory.path().join("frames"), directory.path().join("detections.jsonl"));
-    std::fs::create_dir(&frames).unwrap();
-    std::fs::write(frames.join("0.ppm"), [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat()).unwrap();
     let (focal_px, camera_m, person_m, turned) = (530.0, 1.5, 1.7, 6f64.to_radians());
     let row_px = |slope: f64| 240.0 + focal_px * (slope.atan() + turned).tan();
     let people = (4..16).map(|distance| {
@@ -224,13 +224,9 @@ async fn a_camera_that_has_turned_is_named_with_its_angle() {
         let bounding_box = serde_json::json!({"x_min": x_px, "x_max": x_px + 20.0, "y_min": y_min, "y_max": y_max});
         serde_json::json!({"label": "person", "confidence": 0.9, "bounding_box": bounding_box})
     });
-    std::fs::write(&detections, serde_json::Value::from_iter(people).to_string()).unwrap();
-    let camera = format!(
-        "source = {{ kind = \"images\", path = {frames:?}, looping = true }}\nmount = {{ height_m = {camera_m} }}\n\
-         detector = {{ kind = \"recorded\", path = {detections:?}, looping = true }}"
-    );
-    let camera = Some(toml::from_str(&camera).unwrap());
-    let (node, page) = start(NodeConfig { camera, ..config("euclid", Role::Cav, 1) }).await;
+    let (people, mount) =
+        (serde_json::Value::from_iter(people).to_string(), format!("mount = {{ height_m = {camera_m} }}"));
+    let (node, page) = start(watching("euclid", directory.path(), [640, 480], &people, &mount)).await;
     until_told(page, ["euclid", "", "mount_mismatch"], "the camera looks 6° higher").await;
     node.stop().await;
 }

@@ -42,31 +42,35 @@ struct FootOffset {
 #[derive(Debug, Clone, Default)]
 pub struct MountCheck {
     offsets: VecDeque<FootOffset>,
+    sampled_at: Option<Timestamp>,
 }
 
 impl MountCheck {
     /// Takes the boxes of a frame, without distortion, with the edges that cut them.
+    ///
+    /// Returns the angle in radians by which the camera looks higher than its mount says, at most twice a second. None if the
+    /// stated errors explain it, or objects at several distances do not agree.
     pub fn take<'a>(
         &mut self,
         boxes: impl IntoIterator<Item = (&'a Detection, Cut)>,
         captured_at: Timestamp,
         projection: &Projection,
-    ) {
-        self.offsets.retain(|offset| captured_at.since(offset.captured_at) < WINDOW);
-        if self.offsets.back().is_some_and(|last| captured_at.since(last.captured_at) < SAMPLE_PERIOD) {
-            return;
+    ) -> Option<f64> {
+        if self.sampled_at.is_some_and(|last| captured_at.since(last) < SAMPLE_PERIOD) {
+            return None;
         }
+        self.sampled_at = Some(captured_at);
+        self.offsets.retain(|offset| captured_at.since(offset.captured_at) < WINDOW);
         let offset = |(detection, cut)| projection.foot_offset(detection, cut, captured_at);
         let mut offsets: Vec<_> = boxes.into_iter().filter_map(offset).collect();
         // Near ones and far ones.
         offsets.sort_by(|a, b| a.expected_slope.total_cmp(&b.expected_slope));
         let step = offsets.len().div_ceil(MAX_OF_FRAME).max(1);
         self.offsets.extend(offsets.into_iter().step_by(step));
+        self.off_rad()
     }
 
-    /// The angle in radians by which the camera looks higher than its mount says. None if the stated errors explain it, or
-    /// objects at several distances do not agree.
-    pub fn off_rad(&self) -> Option<f64> {
+    fn off_rad(&self) -> Option<f64> {
         let sorted = |value: fn(&FootOffset) -> f64| {
             let mut values: Vec<f64> = self.offsets.iter().map(value).collect();
             values.sort_by(f64::total_cmp);

@@ -8,7 +8,7 @@ use crate::camera::config::{MountConfig, OpticsConfig};
 use crate::camera::image_size::ImageSize;
 use crate::camera::mount_calibration::{MeasuredPoint, fit_mount_to_points, mount_table, vehicle_of};
 
-/// What a mount is fitted with, beside points.
+/// Settings of a camera that fitting its mount needs, beside points.
 #[derive(Debug, Clone)]
 pub struct CameraSetup {
     /// Configured optics.

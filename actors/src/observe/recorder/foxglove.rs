@@ -109,7 +109,7 @@ impl JsonSchema for Level {
     }
 }
 
-/// What the frame of a camera's pictures has after the name under which the camera reports.
+/// Suffix of the frame of a camera's pictures, after the name under which the camera reports.
 pub(crate) const OPTICAL_FRAME: &str = "/optical";
 
 /// The frame of a camera's pictures.
