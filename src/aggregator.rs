@@ -429,6 +429,7 @@ impl Aggregator {
             landmarks,
             objects,
             pose_corrections,
+            neighbour_objects: Vec::new(),
         });
         let verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());

@@ -5,4 +5,5 @@ pub mod epoch;
 pub mod geometry;
 pub mod names;
 pub mod origin;
+pub mod quadkey;
 pub mod time;

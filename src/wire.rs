@@ -14,10 +14,13 @@
 //! broker      -> nodes/<node>/clients     ClientRefusals retained, at that node's broker alone
 //! ```
 //!
+//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`]).
+//!
 //! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
 
 #![deny(clippy::indexing_slicing)]
 
+mod cell_map;
 mod client_refusals;
 mod codec;
 mod compact;
@@ -25,6 +28,7 @@ mod description;
 pub(crate) mod flaw;
 mod ledger;
 mod object;
+mod region_topic;
 mod reject;
 mod topic;
 mod trouble;
@@ -37,12 +41,14 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
+pub use cell_map::{CellMap, NeighbourObject};
 pub use client_refusals::{ClientRefusal, ClientRefusals};
 pub use codec::{Encoding, decode, decode_report, decode_share, encode};
 pub use description::{CellDescription, ContentHash, DescriptionStamp, DescriptionStatus, InvalidHash};
 pub use flaw::Flaw;
 pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
+pub use region_topic::{RegionTopic, RegionTopicKind};
 pub use reject::RejectReason;
 pub use topic::{ReportKind, Topic, Topics};
 pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
@@ -201,6 +207,10 @@ pub struct GlobalMap {
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[cbor(n(8), with = "skip_empty", has_nil)]
     pub pose_corrections: BTreeMap<NodeName, PoseCorrection>,
+    /// Objects of neighbouring cells, near this one. They are none of this cell's objects.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cbor(n(9), with = "skip_empty", has_nil)]
+    pub neighbour_objects: Vec<NeighbourObject>,
 }
 
 /// The agreed state of one known location.
@@ -445,6 +455,7 @@ pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
     [
         ("ObjectReport", schemars::schema_for!(ObjectReport)),
         ("GlobalMap", schemars::schema_for!(GlobalMap)),
+        ("CellMap", schemars::schema_for!(CellMap)),
         ("Verdicts", schemars::schema_for!(Verdicts)),
         ("CellDescription", schemars::schema_for!(CellDescription)),
         ("Reputations", schemars::schema_for!(Reputations)),

@@ -270,6 +270,7 @@ impl Cell {
             landmarks: Vec::new(),
             objects: Vec::new(),
             pose_corrections: Default::default(),
+            neighbour_objects: Vec::new(),
         };
         let accepted = node.filter.accept_map(&map, Origin::Claimed, node.clock, &node.leadership);
         if node.machine.is_none() || accepted.is_err() {

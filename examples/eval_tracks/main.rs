@@ -262,6 +262,7 @@ impl Files {
             landmarks: Vec::new(),
             objects: objects.collect(),
             pose_corrections: BTreeMap::new(),
+            neighbour_objects: Vec::new(),
         };
         Ok(writeln!(self.maps, "{}", serde_json::to_string(&map)?)?)
     }

@@ -42,6 +42,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         landmarks: Vec::new(),
         objects: cars.collect(),
         pose_corrections: Default::default(),
+        neighbour_objects: Vec::new(),
     };
     print(&encode_map(&map, &origin, 77, &mut ObjectIds::default())?);
     Ok(())

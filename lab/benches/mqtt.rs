@@ -151,5 +151,6 @@ fn answer_to(report: &ObjectReport) -> GlobalMap {
         landmarks: vec![],
         objects: vec![],
         pose_corrections: Default::default(),
+        neighbour_objects: Vec::new(),
     }
 }

@@ -5,7 +5,9 @@
 //! plane: 2 m at s = 5 km.
 
 use map_3d::{Ellipsoid, enu2geodetic, enu2uvw, geodetic2enu, uvw2enu};
+use minicbor::{Decode, Encode};
 use nalgebra::Point3;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::config::{ConfigError, check_range};
@@ -16,18 +18,22 @@ use crate::model::geometry::{Pose, wrap_angle};
 const MAX_DISTANCE_M: f64 = 1e5;
 
 /// Geographic origin of the east-north frame, in WGS 84.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct GeographicOrigin {
     /// Latitude in degrees, north positive.
+    #[n(0)]
     pub latitude_deg: f64,
     /// Longitude in degrees, east positive.
+    #[n(1)]
     pub longitude_deg: f64,
     /// Height above the ellipsoid in metres. Default 0.
     #[serde(default)]
+    #[n(2)]
     pub height_m: f64,
     /// Direction of the x axis in degrees, counter-clockwise from true east. Default 0.
     #[serde(default)]
+    #[n(3)]
     pub rotation_deg: f64,
 }
 

@@ -356,6 +356,7 @@ fn whoever_hears_the_same_gives_the_same_identities_and_whoever_comes_later_take
         landmarks: Vec::new(),
         objects: map.objects.into_iter().chain([unseen]).collect(),
         pose_corrections: BTreeMap::new(),
+        neighbour_objects: Vec::new(),
     };
     newcomer.adopt_map(&map, at(29));
     let adopted = two_cars(&mut newcomer, 30..31, |_| true);

@@ -8,12 +8,13 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    CellDescription, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_TROUBLE_TEXT, MAX_TROUBLES,
-    NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION, Trouble,
-    Verdict, Verdicts,
+    CellDescription, CellMap, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_TROUBLE_TEXT,
+    MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION,
+    Trouble, Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, is_label, is_plain_text};
+use crate::model::origin::GeographicOrigin;
 use crate::model::time::Timestamp;
 
 /// Maximum length of the text of a cell's description in bytes; all vehicles get it with each connection to a broker.
@@ -110,6 +111,7 @@ macro_rules! payloads {
 payloads! {
     ObjectReport: at most payload_bytes, checked by ObjectReport::validate;
     GlobalMap: at most map_bytes, checked by check_map;
+    CellMap: at most map_bytes, checked by check_cell_map;
     Verdicts: at most map_bytes, checked by check_verdicts;
     Reputations: at most map_bytes, checked by check_reputations;
     CellDescription: at most map_bytes, checked by check_description;
@@ -211,7 +213,24 @@ fn check_map(map: &GlobalMap, _: &Limits) -> Result<(), RejectReason> {
     check_integers([map.epoch, map.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))?;
     map.landmarks.iter().try_for_each(check_landmark)?;
     map.objects.iter().try_for_each(check_object)?;
+    map.neighbour_objects.iter().try_for_each(|neighbour| {
+        check_between(neighbour.age_s, 0.0, f64::MAX)?;
+        check_object(&neighbour.object)
+    })?;
     map.pose_corrections.values().try_for_each(check_correction)
+}
+
+fn check_cell_map(message: &CellMap, limits: &Limits) -> Result<(), RejectReason> {
+    if message.map.schema != SCHEMA_VERSION {
+        return Err(RejectReason::UnknownSchema);
+    }
+    check_integers([message.sent_at_us.micros()])?;
+    let GeographicOrigin { latitude_deg, longitude_deg, height_m, rotation_deg } = message.origin;
+    for number in [latitude_deg, longitude_deg, height_m, rotation_deg] {
+        check_between(number, f64::MIN, f64::MAX)?;
+    }
+    message.origin.validate().map_err(|_| RejectReason::OutOfRange)?;
+    check_map(&message.map, limits)
 }
 
 fn check_verdicts(verdicts: &Verdicts, _: &Limits) -> Result<(), RejectReason> {

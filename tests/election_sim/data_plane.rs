@@ -161,6 +161,7 @@ impl World {
             landmarks: Vec::new(),
             objects: Vec::new(),
             pose_corrections: Default::default(),
+            neighbour_objects: Vec::new(),
         };
         let Ok(accepted) = node.filter.accept_map(&global, Origin::Claimed, received_at, &node.leadership) else {
             node.refused += 1;

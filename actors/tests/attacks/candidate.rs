@@ -124,6 +124,7 @@ async fn largest_round(target: Target) -> anyhow::Result<()> {
         landmarks: Vec::new(),
         objects: Vec::new(),
         pose_corrections: Default::default(),
+        neighbour_objects: Vec::new(),
     };
     let maps =
         TERMS.map(|epoch| publish(&format!("ecod/v1/{CELL}/global_detections"), &encode(&map(epoch), Encoding::Json)));

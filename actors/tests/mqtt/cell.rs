@@ -203,5 +203,6 @@ pub(crate) fn map(aggregator: &str, round: u64) -> Arc<GlobalMap> {
         landmarks: vec![],
         objects: vec![],
         pose_corrections: Default::default(),
+        neighbour_objects: Vec::new(),
     })
 }

@@ -278,6 +278,7 @@ fn map(epoch: u64, round: u64) -> Vec<u8> {
         landmarks: Vec::new(),
         objects: Vec::new(),
         pose_corrections: Default::default(),
+        neighbour_objects: Vec::new(),
     };
     encode(&map, Encoding::Json)
 }

@@ -34,6 +34,7 @@ fn map(objects: Vec<FusedObject>, landmarks: Vec<LandmarkState>) -> GlobalMap {
         landmarks,
         objects,
         pose_corrections: Default::default(),
+        neighbour_objects: Vec::new(),
     }
 }
 

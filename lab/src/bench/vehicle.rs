@@ -216,6 +216,7 @@ mod tests {
             landmarks: vec![],
             objects: vec![],
             pose_corrections: Default::default(),
+            neighbour_objects: Vec::new(),
         };
         let verdicts = Verdicts {
             schema: SCHEMA_VERSION,

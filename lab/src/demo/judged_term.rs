@@ -73,6 +73,7 @@ mod tests {
             landmarks: Vec::new(),
             objects: Vec::new(),
             pose_corrections: Default::default(),
+            neighbour_objects: Vec::new(),
         };
         ReceivedMap { received_at: Timestamp(at_ms * 1000), map: Arc::new(map) }
     }

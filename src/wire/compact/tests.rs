@@ -1,8 +1,10 @@
 use super::*;
+use crate::model::geometry::Covariance;
 use crate::wire::{
     CellDescription, ContentHash, DescriptionStatus, Encoding, FieldOfView, FusedObject, GlobalMap, LabelReading,
-    LandmarkState, Limits, NodeState, NodeStatus, ObjectReport, Payload, PerceivedObject, PoseCorrection, Reputation,
-    Reputations, Role, SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose, decode, encode,
+    LandmarkState, Limits, NeighbourObject, NodeState, NodeStatus, ObjectReport, Payload, PerceivedObject,
+    PoseCorrection, Reputation, Reputations, Role, SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose, decode,
+    encode,
 };
 
 fn report() -> ObjectReport {
@@ -104,6 +106,11 @@ fn every_field_of_every_payload_survives() {
             PoseCorrection { about_m: [1.0, 2.0], dx_m: 0.2, dy_m: -0.1, dheading_rad: 0.015625, pairs: 12.5 },
         )]
         .into(),
+        neighbour_objects: vec![NeighbourObject {
+            cell: node("lot-2"),
+            age_s: 0.125,
+            object: FusedObject::new(Uuid::max(), "car", 0.5, 7.5, -1.25, Covariance { xx: 0.25, xy: 0.0, yy: 0.5 }),
+        }],
     });
     survives(&Verdicts {
         schema: SCHEMA_VERSION,

@@ -6,7 +6,7 @@ use uuid::Uuid;
 
 use super::*;
 use crate::model::names::{Label, NodeName};
-use crate::wire::{Encoding, NodeState, Reputation, Role, decode, encode};
+use crate::wire::{Encoding, NeighbourObject, NodeState, Reputation, Role, decode, encode};
 
 fn edge() -> NodeName {
     NodeName::from_static("edge")
@@ -47,6 +47,17 @@ fn map() -> GlobalMap {
             PoseCorrection { about_m: [1.0, 2.0], dx_m: 0.2, dy_m: -0.1, dheading_rad: 0.01, pairs: 12.5 },
         )]
         .into(),
+        neighbour_objects: Vec::new(),
+    }
+}
+
+fn cell_map() -> CellMap {
+    CellMap {
+        schema: SCHEMA_VERSION,
+        cell: NodeName::from_static("lot-1"),
+        sent_at_us: Timestamp(1_732_154_400_130_000),
+        origin: GeographicOrigin { latitude_deg: 48.8, longitude_deg: 2.3, height_m: 30.0, rotation_deg: 5.0 },
+        map: map(),
     }
 }
 
@@ -257,4 +268,23 @@ proptest! {
             prop_assert!(verdict.votes.values().chain([&verdict.score, &verdict.margin]).all(|n| n.is_finite()));
         }
     }
+}
+
+#[test]
+fn a_map_for_others_is_taken_with_a_place_on_earth_alone() {
+    let limits = Limits::default();
+    for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
+        decode::<CellMap>(&encode(&cell_map(), encoding), &limits).unwrap();
+    }
+    let rejected = |message: CellMap| message.check(&limits).unwrap_err();
+    let origin = GeographicOrigin { latitude_deg: 91.0, ..cell_map().origin };
+    assert_eq!(rejected(CellMap { origin, ..cell_map() }), RejectReason::OutOfRange);
+    let origin = GeographicOrigin { longitude_deg: f64::NAN, ..cell_map().origin };
+    assert_eq!(rejected(CellMap { origin, ..cell_map() }), RejectReason::NotFinite);
+    let map = GlobalMap { schema: 2, ..map() };
+    assert_eq!(rejected(CellMap { map, ..cell_map() }), RejectReason::UnknownSchema);
+    let mut message = cell_map();
+    let object = FusedObject { confidence: 2.0, ..message.map.objects[0].clone() };
+    message.map.neighbour_objects = vec![NeighbourObject { cell: edge(), age_s: 0.1, object }];
+    assert_eq!(rejected(message), RejectReason::ConfidenceOutOfRange);
 }

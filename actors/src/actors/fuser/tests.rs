@@ -29,6 +29,7 @@ fn global_map(Epoch { term, leader }: Epoch, round: u64) -> Arc<GlobalMap> {
         landmarks: Vec::new(),
         objects: Vec::new(),
         pose_corrections: BTreeMap::new(),
+        neighbour_objects: Vec::new(),
     })
 }
 

@@ -468,6 +468,7 @@ mod tests {
             landmarks: Vec::new(),
             objects: Vec::new(),
             pose_corrections: Default::default(),
+            neighbour_objects: Vec::new(),
         };
         builder.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
         assert_eq!(

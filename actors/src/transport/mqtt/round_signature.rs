@@ -121,6 +121,7 @@ mod tests {
             landmarks: Vec::new(),
             objects: Vec::new(),
             pose_corrections: Default::default(),
+            neighbour_objects: Vec::new(),
         }
     }
 

@@ -196,6 +196,7 @@ fn map(at: u64, objects: &[(u128, f64)]) -> GlobalMap {
         landmarks: Vec::new(),
         objects: objects.iter().map(object).collect(),
         pose_corrections: BTreeMap::new(),
+        neighbour_objects: Vec::new(),
     }
 }
 

@@ -31,6 +31,7 @@ fn map(testbed: &Testbed, scene: &Scene, otherwise: &[(&str, Option<&str>)]) -> 
         landmarks: scene.spots.iter().map(state).collect(),
         objects: Vec::new(),
         pose_corrections: Default::default(),
+        neighbour_objects: Vec::new(),
     }
 }
 

@@ -383,6 +383,7 @@ mod tests {
             landmarks: vec![state("p0"), state("p1")],
             objects: vec![car],
             pose_corrections: BTreeMap::new(),
+            neighbour_objects: Vec::new(),
         };
         let entities = style.map(&map).entities;
         assert_eq!(entities.iter().map(|entity| entity.arrows.len()).collect::<Vec<_>>(), [0, 1, 0]);

@@ -1,0 +1,45 @@
+//! What a cell tells beyond itself: its map with its place on Earth; and what it hears of its neighbours.
+
+use minicbor::{Decode, Encode};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::compact::{Form, Half};
+use super::{FusedObject, GlobalMap};
+use crate::model::names::NodeName;
+use crate::model::origin::GeographicOrigin;
+use crate::model::time::Timestamp;
+
+/// A cell's map for those outside of the cell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct CellMap {
+    /// Major version of the payload, [`super::SCHEMA_VERSION`].
+    #[n(0)]
+    pub schema: u32,
+    /// The cell; equals the level of the topic.
+    #[n(1)]
+    pub cell: NodeName,
+    /// When it was sent, by the sender's own clock. Receivers judge age by how long messages of this cell take at least.
+    #[n(2)]
+    pub sent_at_us: Timestamp,
+    /// The place on Earth of the map's frame.
+    #[n(3)]
+    pub origin: GeographicOrigin,
+    /// The map.
+    #[n(4)]
+    pub map: GlobalMap,
+}
+
+/// An object of a neighbouring cell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct NeighbourObject {
+    /// The cell whose map has it.
+    #[n(0)]
+    pub cell: NodeName,
+    /// Time in seconds since the neighbour's map was fused, as far as it is known.
+    #[cbor(n(1), with = "Half")]
+    pub age_s: f64,
+    /// The object as that map has it, in this cell's frame.
+    #[n(2)]
+    pub object: FusedObject,
+}
