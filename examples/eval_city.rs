@@ -23,7 +23,7 @@ struct Options {
 }
 
 fn options() -> anyhow::Result<Options> {
-    let mut options = Options { seeds: 3, seconds: 60.0, roads: 3, table: None };
+    let mut options = Options { seeds: 3, seconds: 60.0, roads: 2, table: None };
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
         let value = args.next().with_context(|| format!("{key} needs a value"))?;
@@ -59,9 +59,9 @@ fn main() -> anyhow::Result<()> {
         let recording = generate(&traffic, &mut || rng.random());
         for (row, (name, link)) in links.iter().enumerate() {
             let result = run(&traffic, &recording, *link, &mut || rng.random())?;
-            let TownResult { identities, handed_over, received, refused, .. } = &result;
+            let TownResult { identities, hand_overs, received, refused, .. } = &result;
             eprintln!(
-                "seed {seed}, {name}: {identities} identities, {handed_over} handed over, {received} maps received, \
+                "seed {seed}, {name}: {identities} identities, {hand_overs:?}, {received} maps received, \
                  {refused} refused"
             );
             if row == 0 {

@@ -15,6 +15,7 @@ use ecod::aggregator::{Algorithms, FusionConfig};
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
+use ecod::tracking::HandOvers;
 use ecod::wire::{FusedObject, ObjectReport};
 use hashbrown::HashMap;
 use nalgebra::Point2;
@@ -70,7 +71,8 @@ pub struct TownScores {
     pub all: TrackScores,
     /// Within [`BORDER_M`] of a border.
     pub border: TrackScores,
-    /// Elsewhere.
+    /// As near to a line through the middle of cells, and not at a border. Where cells have an even number of roads, both
+    /// kinds of lines run between roads.
     pub middle: TrackScores,
 }
 
@@ -83,8 +85,8 @@ pub struct TownResult {
     pub cells: TownScores,
     /// Number of identities in maps of the cells.
     pub identities: usize,
-    /// Number of times that an object's identity in a cell was changed for that of another cell.
-    pub handed_over: usize,
+    /// Identities that tracks took over from other cells.
+    pub hand_overs: HandOvers,
     /// Maps that cells received, and those of them that did not count.
     pub received: u64,
     /// Maps of the other cells that did not count.
@@ -144,7 +146,10 @@ pub fn run(
         single: maps(std::slice::from_ref(&single))?,
         cells: maps(&cells)?,
         identities: cells.iter().flat_map(TownCell::identities).collect::<BTreeSet<Uuid>>().len(),
-        handed_over: cells.iter().map(|cell| cell.renamed).sum(),
+        hand_overs: cells.iter().map(TownCell::hand_overs).fold(HandOvers::default(), |all, cell| HandOvers {
+            begun: all.begun + cell.begun,
+            renamed: all.renamed + cell.renamed,
+        }),
         received: cells.iter().map(|cell| cell.received).sum(),
         refused: cells.iter().map(|cell| cell.refused).sum(),
     })
@@ -214,13 +219,23 @@ impl TownPlan {
     /// Distance to the next border between cells, metres.
     fn border_m(&self, place: &Point2<f64>) -> f64 {
         let borders = (1..CELLS_A_SIDE).map(|number| self.from_m + number as f64 * self.side_m);
-        let distances = borders.flat_map(|border| [(place.x - border).abs(), (place.y - border).abs()]);
-        distances.min_by(f64::total_cmp).unwrap_or(f64::INFINITY)
+        distance_m(place, borders)
     }
 
     fn is_at_border(&self, place: &Point2<f64>) -> bool {
         self.border_m(place) < BORDER_M
     }
+
+    fn is_in_middle(&self, place: &Point2<f64>) -> bool {
+        let middles = (0..CELLS_A_SIDE).map(|number| self.from_m + (number as f64 + 0.5) * self.side_m);
+        distance_m(place, middles) < BORDER_M && !self.is_at_border(place)
+    }
+}
+
+/// Distance of a place to the next of lines along both axes.
+fn distance_m(place: &Point2<f64>, lines: impl Iterator<Item = f64>) -> f64 {
+    let distances = lines.flat_map(|line| [(place.x - line).abs(), (place.y - line).abs()]);
+    distances.min_by(f64::total_cmp).unwrap_or(f64::INFINITY)
 }
 
 #[expect(clippy::expect_used, reason = "letters, a dash and a digit are a name")]
@@ -250,7 +265,7 @@ fn judge(plan: &TownPlan, truth: &TrafficTruth, cells: &[TownCell]) -> Result<To
     Ok(TownScores {
         all: part(&|_| true)?,
         border: part(&|place| plan.is_at_border(place))?,
-        middle: part(&|place| !plan.is_at_border(place))?,
+        middle: part(&|place| plan.is_in_middle(place))?,
     })
 }
 

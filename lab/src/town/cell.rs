@@ -9,6 +9,7 @@ use ecod::model::names::NodeName;
 use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
 use ecod::model::time::Timestamp;
 use ecod::neighbours::Neighbours;
+use ecod::tracking::HandOvers;
 use ecod::wire::{
     CellMap, FusedObject, GlobalMap, ObjectReport, RegionTopic, RegionTopicKind, ReportKind, SCHEMA_VERSION,
 };
@@ -29,7 +30,6 @@ pub(super) struct TownCell {
     considered: usize,
     pub(super) received: u64,
     pub(super) refused: u64,
-    pub(super) renamed: usize,
 }
 
 impl TownCell {
@@ -45,7 +45,6 @@ impl TownCell {
             considered: 0,
             received: 0,
             refused: 0,
-            renamed: 0,
         }
     }
 
@@ -110,6 +109,10 @@ impl TownCell {
         let Some((time, map)) = near.min_by_key(|(time, _)| distance(*time)) else { return Vec::new() };
         let ahead_s = at.micros_from(*time) as f64 * 1e-6;
         map.objects.iter().map(|object| self.frame.town_object(object, ahead_s)).collect()
+    }
+
+    pub(super) fn hand_overs(&self) -> HandOvers {
+        self.aggregator.hand_overs()
     }
 
     pub(super) fn identities(&self) -> BTreeSet<Uuid> {
