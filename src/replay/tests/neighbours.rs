@@ -69,7 +69,7 @@ fn a_journal_gives_the_same_maps_with_objects_of_neighbours_and_those_that_came_
     }
     assert_eq!(serde_json::to_string(&maps).unwrap(), serde_json::to_string(&replayed).unwrap());
     let ids = |map: &GlobalMap| -> Vec<u128> { map.neighbour_objects.iter().map(|o| o.object.id.as_u128()).collect() };
-    let at_time = |ms| maps.iter().rfind(|map| map.fused_at_us <= at(ms + 1000)).unwrap();
+    let at_time = |ms: u64| maps.iter().rfind(|map| map.fused_at_us <= at(ms + 1000)).unwrap();
     assert_eq!(ids(at_time(900)), [7, 8]);
     assert_eq!(ids(at_time(1600)), [8], "it has come over");
     let came = at_time(1600).objects.iter().find(|object| object.id.as_u128() == 7).unwrap();
