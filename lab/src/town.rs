@@ -24,7 +24,7 @@ use uuid::Uuid;
 use crate::eval::tracks::{SaidObject, TrackEvaluation, TrackScores, TrackTruth, TrackTruthError};
 use crate::traffic::{TrafficConfig, TrafficRecording, TrafficTruth, TruthFrame};
 use cell::TownCell;
-use links::Links;
+use links::TownLinks;
 use place::CellFrame;
 
 /// Where the town is.
@@ -129,7 +129,7 @@ pub fn run(
     let mut single = TownCell::new(whole, CellFrame::new(&TOWN, TOWN, 0), config.clone(), start);
     let mut cells: Vec<TownCell> =
         plan.frames(uniform).map(|(name, frame)| TownCell::new(name, frame, config.clone(), start)).collect();
-    let mut links = Links::new(link, uniform);
+    let mut links = TownLinks::new(link, uniform);
     let mut cell_of: BTreeMap<NodeName, usize> = BTreeMap::new();
     for arrived in &recording.reports {
         let now = arrived.received_at_us.unwrap_or(arrived.report.captured_at_us);
@@ -156,7 +156,7 @@ pub fn run(
 }
 
 /// Closes rounds and delivers maps that are due until `now`, in the order of time.
-fn advance(cells: &mut [TownCell], links: &mut Links<'_>, now: Timestamp) {
+fn advance(cells: &mut [TownCell], links: &mut TownLinks<'_>, now: Timestamp) {
     loop {
         let rounds = cells.iter().enumerate().map(|(number, cell)| (cell.deadline(), number));
         let Some((round_at, number)) = rounds.min() else { return };

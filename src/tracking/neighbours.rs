@@ -18,7 +18,7 @@ const REMEMBERED: Duration = Duration::from_secs(1);
 
 /// Neighbours of one track.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Neighbours(SmallVec<[Neighbour; 1]>);
+pub(super) struct TrackNeighbours(SmallVec<[Neighbour; 1]>);
 
 #[derive(Debug, Clone)]
 struct Neighbour {
@@ -28,7 +28,7 @@ struct Neighbour {
     at: Timestamp,
 }
 
-impl Neighbours {
+impl TrackNeighbours {
     /// Records a detection of either at `at`, and whether one vehicle resolved both in one frame.
     pub(super) fn observe(&mut self, id: Uuid, is_resolved: bool, at: Timestamp) {
         self.0.retain(|neighbour| at.since(neighbour.at) <= REMEMBERED);

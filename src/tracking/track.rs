@@ -12,7 +12,7 @@ use super::detection_history::DetectionHistory;
 use super::existence::{BaseRate, MAX_DENIAL_NATS, SensorHistory, logistic, persistence_nats};
 use super::grid::IndexedTrack;
 use super::kinematics::{KinematicState, Measurement};
-use super::neighbours::Neighbours;
+use super::neighbours::TrackNeighbours;
 use super::sensors::SensorId;
 use super::store::TrackIndex;
 use crate::model::geometry::{Covariance, wrap_angle};
@@ -68,7 +68,7 @@ pub(super) struct Track {
     pub(super) hits: u32,
     /// Number of identities taken over from neighbouring cells.
     pub(super) renames: u8,
-    pub(super) neighbours: Neighbours,
+    pub(super) neighbours: TrackNeighbours,
     /// Log-odds from another aggregator, which fade, and the time at which they came.
     inherited: Option<(f64, Timestamp)>,
     /// Probability that the track never was an object, by the last estimate.
@@ -91,7 +91,7 @@ impl Track {
             vehicle: None,
             hits: 0,
             renames: 0,
-            neighbours: Neighbours::default(),
+            neighbours: TrackNeighbours::default(),
             inherited: None,
             clutter: None,
         }

@@ -11,7 +11,7 @@ use super::LinkConfig;
 use super::cell::TownCell;
 
 /// Maps that are under way.
-pub(super) struct Links<'a> {
+pub(super) struct TownLinks<'a> {
     config: LinkConfig,
     uniform: &'a mut dyn FnMut() -> f64,
     /// By time and number of the delivery: the receiver and the message.
@@ -19,7 +19,7 @@ pub(super) struct Links<'a> {
     number: u64,
 }
 
-impl<'a> Links<'a> {
+impl<'a> TownLinks<'a> {
     pub(super) fn new(config: LinkConfig, uniform: &'a mut dyn FnMut() -> f64) -> Self {
         Self { config, uniform, under_way: BTreeMap::new(), number: 0 }
     }
