@@ -75,8 +75,17 @@ fn a_stolen_key_of_a_cell_lets_nobody_into_another_even_with_its_chain() {
     for cell in &mut city.cells {
         cell.issue(&edge, Role::Edge, DAY, clock::now()).unwrap();
     }
-    let of_north = city.load(&city.cells[0], &edge, 0);
-    let stolen = certificate(city.cells[1].files_of(&edge).0);
+    let files = city.files(&city.cells[0], &edge, 0);
+    // Without lists, nothing but the chain can be wrong.
+    let open_city = files.city.clone().map(|city| CityTlsConfig { revocation_list: None, ..city });
+    let without_lists = TlsConfig { revocation_list: None, city: open_city, ..files.clone() };
+    for files in [files, without_lists] {
+        refuses_the_other_cell(&city, &Credentials::load(&files, &edge).unwrap().current(), &edge);
+    }
+}
+
+fn refuses_the_other_cell(city: &City, of_north: &LoadedCredentials, edge: &NodeName) {
+    let stolen = certificate(city.cells[1].files_of(edge).0);
     let chain = [certificate(city.cells[1].ca()), certificate(city.city.ca())];
     of_north.verify_node(&stolen, UnixTime::now()).unwrap_err();
     of_north.clients.verify_client_cert(&stolen, &chain, UnixTime::now()).unwrap_err();
@@ -95,7 +104,7 @@ fn a_stolen_key_of_a_cell_lets_nobody_into_another_even_with_its_chain() {
         .is_ok()
     };
     assert!(!trusts(&stolen), "the foreign cell's");
-    assert!(trusts(&certificate(city.cells[0].files_of(&edge).0)), "the own cell's");
+    assert!(trusts(&certificate(city.cells[0].files_of(edge).0)), "the own cell's");
 }
 
 #[test]
