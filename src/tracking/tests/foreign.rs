@@ -37,7 +37,7 @@ fn an_object_that_comes_over_keeps_its_identity_and_its_velocity() {
         let x_m = frame as f64 - 20.0;
         if frame % 5 == 0 && frame <= 15 {
             let car = stated("west", 0.1, foreign_car(7, x_m - 1.0, 0.0, [10.0, 0.0]));
-            tracker.take_neighbours(&[car.clone()], at(frame));
+            tracker.take_neighbours(std::slice::from_ref(&car), at(frame));
             assert_eq!(tracker.hides(&car), frame > 10, "shown as the neighbour's until it is this cell's");
         }
         let seen = if frame < 10 { Vec::new() } else { vec![car(x_m, 0.1), car(0.0, 20.0)] };
