@@ -87,9 +87,9 @@ pub struct TownResult {
     pub identities: usize,
     /// Identities that tracks took over from other cells.
     pub hand_overs: HandOvers,
-    /// Maps that cells received, and those of them that did not count.
+    /// Maps that cells received.
     pub received: u64,
-    /// Maps of the other cells that did not count.
+    /// Those of them that did not count.
     pub refused: u64,
 }
 

@@ -14,9 +14,15 @@ use super::cell::TownCell;
 pub(super) struct TownLinks<'a> {
     config: LinkConfig,
     uniform: &'a mut dyn FnMut() -> f64,
-    /// By time and number of the delivery: the receiver and the message.
-    under_way: BTreeMap<(Timestamp, u64), (usize, Arc<(RegionTopic, CellMap)>)>,
+    /// By time and number.
+    under_way: BTreeMap<(Timestamp, u64), MapUnderWay>,
     number: u64,
+}
+
+/// A map and the number of the cell that gets it.
+struct MapUnderWay {
+    to: usize,
+    message: Arc<(RegionTopic, CellMap)>,
 }
 
 impl<'a> TownLinks<'a> {
@@ -39,7 +45,7 @@ impl<'a> TownLinks<'a> {
                 let queued_s = -self.config.delay_s * (1.0 - (self.uniform)()).ln();
                 let takes = Duration::from_secs_f64(self.config.min_delay_s + late_s + queued_s);
                 self.number += 1;
-                self.under_way.insert((now + takes, self.number), (to, Arc::clone(&message)));
+                self.under_way.insert((now + takes, self.number), MapUnderWay { to, message: Arc::clone(&message) });
             }
         }
     }
@@ -51,7 +57,7 @@ impl<'a> TownLinks<'a> {
 
     /// Delivers the next map.
     pub(super) fn deliver(&mut self, cells: &mut [TownCell]) {
-        let Some(((at, _), (to, message))) = self.under_way.pop_first() else { return };
+        let Some(((at, _), MapUnderWay { to, message })) = self.under_way.pop_first() else { return };
         cells[to].receive(&message.0, message.1.clone(), at);
     }
 }
