@@ -4,7 +4,7 @@
 //! watches of leadership and newest map ── Look ──> Uplink ── CellMap, CellDescription, NodeStatus ──> region's broker
 //! LeaderElection ── SetStatus ─────────────────────> │ ▲
 //! Node ── Configure ───────────────────────────────> │ └── Take ── RegionInbox ◄── maps of the tiles around ──┘
-//!                                                    └── HearNeighbours ──> Fuser
+//!                                                    └── TakeNeighbours ──> Fuser
 //! ```
 //!
 //! - Nobody in the cell waits for it: without the region the cell goes on, and no map is kept for later.
@@ -23,7 +23,8 @@ use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
-use ecod::wire::{CellDescription, CellMap, GlobalMap, NodeState, NodeStatus, SCHEMA_VERSION};
+use ecod::neighbours::Neighbours;
+use ecod::wire::{CellDescription, CellMap, GlobalMap, NodeState, NodeStatus, RegionTopic, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -37,9 +38,9 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::newest::ReceivedMap;
 use crate::messages::uplink::UplinkMessage;
 use crate::platform::clock;
-use crate::telemetry::counters::Counters;
+use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::link::{LinkId, LinkSink};
-use crate::transport::mqtt::region_inbox::RegionInbox;
+use crate::transport::mqtt::region_inbox::{RegionInbox, source};
 use crate::transport::mqtt::{BrokerAddress, FromRegion, MqttConfig, Security};
 
 /// Arguments of an uplink's start.
@@ -94,8 +95,13 @@ pub struct UplinkState {
     link: Option<RegionLink>,
     next_link: u64,
     pace: MapPace,
-    /// Epoch and round of the map that was published last.
+    /// Epoch and round of the map that was published last, and of the own map that was looked at last.
     published: Option<(u64, u64)>,
+    seen: Option<(u64, u64)>,
+    /// The neighbours of a cell that has a place on Earth.
+    neighbours: Option<Neighbours>,
+    /// True if a neighbour's map was accepted since the fuser was told.
+    has_news: bool,
     watcher: JoinHandle<()>,
 }
 
@@ -129,7 +135,7 @@ impl Actor for Uplink {
             }
             UplinkMessage::Configure { origin, description } => state.configure(origin, description, &myself),
             UplinkMessage::Take { delivery } => match delivery.message {
-                FromRegion::Map(map) => state.take_map(&map, delivery.received_at),
+                FromRegion::Map { topic, map } => state.take_map(&topic, *map, delivery.received_at),
                 FromRegion::Status(status) => state.hear_status(&status),
             },
             UplinkMessage::LinkChanged { event } => {
@@ -169,9 +175,12 @@ impl UplinkState {
             seed,
         } = arguments;
         Self {
+            neighbours: origin.map(|origin| Neighbours::new(cell.clone(), origin)),
             cell,
             status,
             broker,
+            has_news: false,
+            seen: None,
             connection: config.connection(&mqtt),
             pace: MapPace::new(config.max_hz),
             config,
@@ -268,19 +277,19 @@ impl UplinkState {
         NodeStatus { state: NodeState::Aggregating, epoch, aggregator, ..self.status.clone() }
     }
 
-    /// Publishes the newest map, if it is this leader's own, new and due.
+    /// Looks at the newest map, if it is this leader's own, and publishes it if it is new and due.
     fn publish_map(&mut self) {
-        let (Some(link), Some(origin)) = (&mut self.link, self.origin) else { return };
-        let now = clock::now();
         let newest = self.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.map));
-        let Some(map) = newest.filter(|map| map.aggregator == self.status.node && self.pace.is_due(now)) else {
-            return;
-        };
-        let order = (map.epoch, map.round);
-        if self.published.is_some_and(|published| order <= published) {
+        let Some(map) = newest.filter(|map| self.link.is_some() && map.aggregator == self.status.node) else { return };
+        let order = Some((map.epoch, map.round));
+        if order > std::mem::replace(&mut self.seen, order) {
+            self.tell_neighbours(&map);
+        }
+        let (Some(link), Some(origin), now) = (&mut self.link, self.origin, clock::now()) else { return };
+        if order <= self.published || !self.pace.is_due(now) {
             return;
         }
-        self.published = Some(order);
+        self.published = order;
         self.pace.advance(now);
         // Objects of neighbours are theirs to tell.
         let map = GlobalMap { neighbour_objects: Vec::new(), ..GlobalMap::clone(&map) };
@@ -295,7 +304,10 @@ impl UplinkState {
         description: Option<Arc<CellDescription>>,
         myself: &ActorRef<UplinkMessage>,
     ) {
-        (self.origin, self.description) = (origin, description);
+        if std::mem::replace(&mut self.origin, origin) != origin {
+            self.neighbours = origin.map(|origin| Neighbours::new(self.cell.clone(), origin));
+        }
+        self.description = description;
         let tile = origin.map(|origin| Quadkey::of_cell(&origin));
         match self.link.take() {
             Some(link) if tile == Some(link.tile()) => self.link = Some(link),
@@ -317,8 +329,35 @@ impl UplinkState {
         }
     }
 
-    fn take_map(&mut self, _map: &CellMap, _received_at: Timestamp) {
-        let _ = &self.fuser;
+    /// Takes the map of another cell; one that does not count is counted by its reason and cell.
+    fn take_map(&mut self, topic: &RegionTopic, map: CellMap, received_at: Timestamp) {
+        let Some(neighbours) = &mut self.neighbours else { return };
+        let losses = |neighbours: &Neighbours| {
+            let losses = neighbours.losses().get(&topic.cell).copied().unwrap_or_default();
+            losses.outside + losses.refused
+        };
+        let before = losses(neighbours);
+        match neighbours.accept(topic, map, received_at) {
+            Ok(()) => {
+                self.counters.count(Event::CellMapAccepted);
+                self.counters.add(Event::NeighbourRefused, losses(neighbours).saturating_sub(before));
+                self.pace.note_neighbour(received_at);
+                self.has_news = true;
+            }
+            Err(reason) => self.counters.reject_message(reason, &source(&topic.cell), || {
+                format!("map of the cell {} not used: {}", topic.cell, reason.in_words())
+            }),
+        }
+    }
+
+    /// Tells the fuser of the objects of others, once for each own map: the next one has them.
+    fn tell_neighbours(&mut self, map: &GlobalMap) {
+        let (Some(neighbours), now) = (&mut self.neighbours, clock::now()) else { return };
+        neighbours.observe_own(map, now);
+        if std::mem::take(&mut self.has_news) {
+            let objects = neighbours.near(now).into();
+            self.fuser.send(FuserMessage::TakeNeighbours { objects, stated_at: now });
+        }
     }
 }
 

@@ -119,6 +119,8 @@ pub enum Event {
     RegionReceived,
     /// A map of a neighbouring cell, newer than all of that cell before, was accepted.
     CellMapAccepted,
+    /// An object of a neighbouring cell was not used: outside of what that cell may tell of, or beyond the maximum number.
+    NeighbourRefused,
 }
 
 impl Event {
@@ -256,7 +258,7 @@ fn trouble_of(reason: RejectReason) -> Option<TroubleKind> {
         | Reason::UnknownTerm => None,
         Reason::FromTheFuture => Some(TroubleKind::Untimely),
         Reason::NotFused => Some(TroubleKind::NotFused),
-        Reason::TooManyVehicles => Some(TroubleKind::Overload),
+        Reason::TooManyVehicles | Reason::TooManyCells => Some(TroubleKind::Overload),
         Reason::BadSignature | Reason::Unattested | Reason::Implausible | Reason::NotPermitted => {
             Some(TroubleKind::NotPermitted)
         }

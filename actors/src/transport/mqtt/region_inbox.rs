@@ -20,7 +20,12 @@ use crate::telemetry::counters::{Counters, Event, ShedReason};
 #[derive(Debug)]
 pub enum FromRegion {
     /// The map of another cell.
-    Map(Arc<CellMap>),
+    Map {
+        /// Where it was published.
+        topic: RegionTopic,
+        /// The map.
+        map: Box<CellMap>,
+    },
     /// The status of another leader of the own cell, or a last will of this one.
     Status(NodeStatus),
 }
@@ -70,11 +75,8 @@ impl RegionInbox {
                     self.counters.shed(ShedReason::CellThrottled, &source(&topic.cell));
                     return Ok(PacketOutcome::Done);
                 }
-                let map: CellMap = decode(payload, &self.limits)?;
-                if map.cell != topic.cell || Quadkey::of_cell(&map.origin) != topic.tile {
-                    return Err(RejectReason::NodeMismatch);
-                }
-                self.deliver(FromRegion::Map(Arc::new(map)), received_at);
+                let map = Box::new(decode(payload, &self.limits)?);
+                self.deliver(FromRegion::Map { topic: topic.clone(), map }, received_at);
             }
             RegionTopicKind::Status if is_own && topic.tile == self.tile && !payload.is_empty() => {
                 let status: NodeStatus = decode(payload, &self.limits)?;
