@@ -1,9 +1,18 @@
 //! Regions that do not let a cell in, and cells that have no place in one.
 
+use std::time::Duration;
+
+use ecod::model::names::NodeName;
+use ecod::wire::Role;
+use ecod_actors::messages::description_keeper::DescriptionKeeperMessage;
+use ecod_actors::platform::clock;
+use ecod_actors::platform::secret::Secret;
+use ecod_actors::telemetry::counters::Event;
+use ecod_actors::transport::pki::{Authority, TlsConfig};
+
 use crate::cell::{config, round, start, trouble, until};
 use crate::mosquitto::Mosquitto;
 use crate::region::{Broker, Subscriber};
-use ecod_actors::platform::secret::Secret;
 
 /// A wrong password is told as such, with the broker's address, and costs the cell nothing.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -25,11 +34,8 @@ async fn wrong_credentials_are_told_and_right_ones_work() {
         node.stop().await;
 
         let node = start(right).await;
-        use ecod_actors::telemetry::counters::Event;
-        until("maps come back", async || {
-            node.counters().events(Event::Echo) > 0 && node.counters().events(Event::RegionPublished) > 2
-        })
-        .await;
+        // The own maps and status.
+        until("what it tells comes back", async || node.counters().events(Event::RegionReceived) > 3).await;
         assert!(trouble(&node, "broker_refuses").is_none());
         node.stop().await;
     }
@@ -59,7 +65,6 @@ async fn a_cell_without_origin_says_so() {
     until("the trouble", async || trouble(&node, "no_origin").is_some()).await;
     assert!(subscriber.heard().is_empty());
 
-    use ecod_actors::messages::description_keeper::DescriptionKeeperMessage;
     let text = "[origin]\nlatitude_deg = 52.2\nlongitude_deg = 21.0\n";
     node.slots().description.send(DescriptionKeeperMessage::Set { text: text.into() });
     until("maps in the region", async || !subscriber.maps("north").is_empty()).await;
@@ -75,5 +80,40 @@ async fn a_cell_without_origin_says_so() {
     let late = Subscriber::new(&broker.address());
     until("what is retained", async || late.status("north").is_some() && late.description("north").is_some()).await;
     assert!(late.heard().iter().all(|heard| heard.topic.tile == subscriber.heard().last().unwrap().topic.tile));
+    node.stop().await;
+}
+
+/// A broker that asks for certificates takes the node's own; one with another certificate than `ca` says is refused.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn certificates_of_both_sides_are_checked() {
+    let (directory, name) = (tempfile::tempdir().unwrap(), NodeName::from_static("edge"));
+    let mut authority = Authority::init(directory.path(), &NodeName::from_static("north"), clock::now()).unwrap();
+    authority.issue(&name, Role::Edge, Duration::from_secs(3600), clock::now()).unwrap();
+    let (certificate, key) = authority.files_of(&name);
+    let [region, other] = ["region", "other"].map(|name| {
+        let made = rcgen::generate_simple_self_signed(vec!["127.0.0.1".to_owned()]).unwrap();
+        let [certificate, key] = ["pem", "key"].map(|end| directory.path().join(format!("{name}.{end}")));
+        std::fs::write(&certificate, made.cert.pem()).unwrap();
+        std::fs::write(&key, made.signing_key.serialize_pem()).unwrap();
+        (certificate, key)
+    });
+    let broker = Mosquitto::configured(|_| {
+        let (certificate, key, ca) = (region.0.display(), region.1.display(), authority.ca());
+        let files = format!("certfile {certificate}\nkeyfile {key}\ncafile {}\n", ca.display());
+        files + "require_certificate true\nuse_identity_as_username true\n"
+    });
+    let mut config = config("north", broker.address());
+    config.tls = Some(TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None });
+    config.uplink.ca = Some(other.0);
+    let node = start(config.clone()).await;
+    until("the refusal", async || trouble(&node, "broker_refuses").is_some()).await;
+    let refused = trouble(&node, "broker_refuses").unwrap();
+    assert!(refused.cause.contains("certificate"), "{refused:?}");
+    node.stop().await;
+
+    config.uplink.ca = Some(region.0);
+    let node = start(config).await;
+    until("what it tells comes back", async || node.counters().events(Event::RegionReceived) > 3).await;
+    assert!(trouble(&node, "broker_refuses").is_none());
     node.stop().await;
 }
