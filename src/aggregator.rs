@@ -355,6 +355,9 @@ impl Aggregator {
     /// clock of `now`. They are in the next maps until they are too old, and lend identities to objects that tracking
     /// finds where they are.
     pub fn take_neighbours(&mut self, objects: &Arc<[NeighbourObject]>, stated_at: Timestamp) {
+        if let Some(tracks) = &mut self.tracks {
+            tracks.take_neighbours(objects, stated_at);
+        }
         self.neighbours = NeighbourView::new(Arc::clone(objects), stated_at);
     }
 
@@ -438,7 +441,7 @@ impl Aggregator {
             fused_at_us: fused_at,
             oldest_capture_us: oldest.map(|oldest| self.in_cell_time(oldest)),
             landmarks,
-            neighbour_objects: self.neighbours.shown(&objects, now, self.cell_offset_us),
+            neighbour_objects: self.neighbours.shown(&objects, self.tracks.as_ref(), now, self.cell_offset_us),
             objects,
             pose_corrections,
         });

@@ -12,6 +12,7 @@ mod config;
 mod coverage;
 mod detection_history;
 mod existence;
+mod foreign;
 mod gating;
 mod gauge;
 mod grid;
