@@ -19,11 +19,12 @@ use std::sync::Arc;
 
 use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Leadership;
+use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
-use ecod::neighbours::Neighbours;
+use ecod::neighbours::{MAX_AGE, Neighbours};
 use ecod::wire::{CellDescription, CellMap, GlobalMap, NodeState, NodeStatus, RegionTopic, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
@@ -277,15 +278,20 @@ impl UplinkState {
         NodeStatus { state: NodeState::Aggregating, epoch, aggregator, ..self.status.clone() }
     }
 
-    /// Looks at the newest map, if it is this leader's own, and publishes it if it is new and due.
+    /// Looks at the newest map, if it is of this leadership and not old, and publishes it if it is new and due.
     fn publish_map(&mut self) {
-        let newest = self.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.map));
-        let Some(map) = newest.filter(|map| self.link.is_some() && map.aggregator == self.status.node) else { return };
+        let now = clock::now();
+        let Some(ReceivedMap { received_at, map }) = self.newest.borrow().clone() else { return };
+        let epoch = Epoch::new(map.epoch, map.aggregator.clone());
+        let is_own = map.aggregator == self.status.node && self.leadership.borrow().present_epoch() == Some(&epoch);
+        if self.link.is_none() || !is_own || now.since(received_at) > MAX_AGE {
+            return;
+        }
         let order = Some((map.epoch, map.round));
         if order > std::mem::replace(&mut self.seen, order) {
-            self.tell_neighbours(&map);
+            self.tell_neighbours(&map, now);
         }
-        let (Some(link), Some(origin), now) = (&mut self.link, self.origin, clock::now()) else { return };
+        let (Some(link), Some(origin)) = (&mut self.link, self.origin) else { return };
         if order <= self.published || !self.pace.is_due(now) {
             return;
         }
@@ -351,8 +357,8 @@ impl UplinkState {
     }
 
     /// Tells the fuser of the objects of others, once for each own map: the next one has them.
-    fn tell_neighbours(&mut self, map: &GlobalMap) {
-        let (Some(neighbours), now) = (&mut self.neighbours, clock::now()) else { return };
+    fn tell_neighbours(&mut self, map: &GlobalMap, now: Timestamp) {
+        let Some(neighbours) = &mut self.neighbours else { return };
         neighbours.observe_own(map, now);
         if std::mem::take(&mut self.has_news) {
             let objects = neighbours.near(now).into();
