@@ -59,8 +59,10 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
     let of_region = RegionTopicKind::ALL.map(|kind| RegionTopic { tile, cell: NodeName::from_static("cell"), kind });
     let spoken = &spoken | &of_region.iter().map(RegionTopic::path).collect();
     let addresses = values(&document, "address: ", '\n');
-    let documented: BTreeSet<_> =
-        addresses.iter().map(|address| address.replace("{cell}", "cell").replace("{node}", "node").replace("{tile}", "0")).collect();
+    let documented: BTreeSet<_> = addresses
+        .iter()
+        .map(|address| address.replace("{cell}", "cell").replace("{node}", "node").replace("{tile}", "0"))
+        .collect();
     assert_eq!(documented, spoken);
     let schemas = ecod::wire::schemas();
     let files: BTreeSet<_> = schemas.keys().map(|name| format!("{name}.json")).collect();

@@ -2,15 +2,15 @@
 
 use std::time::Duration;
 
+use ecod::model::quadkey::Quadkey;
 use ecod::neighbours::{CellMapFilter, MAX_AGE};
-use ecod::wire::{RegionTopic, RegionTopicKind};
+use ecod::wire::{NodeState, RegionTopic, RegionTopicKind};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
 
 use crate::cell::{config, round, start, trouble, until};
 use crate::mosquitto::Mosquitto;
 use crate::region::{Broker, Subscriber, assert_in_order};
-use ecod::model::quadkey::Quadkey;
 
 /// Without its region the cell goes on as before and says what is wrong; nothing waits for the region's return.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -76,5 +76,24 @@ async fn a_burst_of_old_maps_after_a_hang_reaches_nobody() {
     let too_old = ages.iter().filter(|age| **age > MAX_AGE + Duration::from_millis(200)).count();
     eprintln!("{} of {} maps count, {too_old} of them too old", ages.len(), maps.len());
     assert!(too_old == 0 && ages.len() >= 6, "{ages:?}");
+    node.stop().await;
+}
+
+/// An uplink that ends is started anew, and the last will of the one before does not stay.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn an_uplink_that_was_killed_is_started_anew() {
+    let broker = Mosquitto::start();
+    let subscriber = Subscriber::new(&broker.address());
+    let node = start(config("north", broker.address())).await;
+    until("maps in the region", async || subscriber.maps("north").len() >= 2).await;
+    let uplink = node.slots().uplink.get().unwrap();
+    uplink.kill();
+    until("another uplink", async || node.slots().uplink.get().is_some_and(|now| now.get_id() != uplink.get_id()))
+        .await;
+    let heard = subscriber.maps("north").len();
+    until("maps again", async || subscriber.maps("north").len() >= heard + 4).await;
+    assert_in_order(&subscriber.maps("north"));
+    let is_told = || subscriber.status("north").is_some_and(|status| status.state == NodeState::Aggregating);
+    until("the leader's status", async || is_told()).await;
     node.stop().await;
 }
