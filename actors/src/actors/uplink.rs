@@ -259,7 +259,6 @@ impl UplinkState {
             link.publish_description(description);
         }
         self.pace = MapPace::new(self.config.max_hz);
-        self.published = None;
         self.publish_map();
     }
 
