@@ -41,7 +41,7 @@ use crate::model::time::Timestamp;
 use crate::pace::{Pace, PaceRound};
 use crate::perception::landmark::{Landmark, LandmarkIndex};
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
+use crate::tracking::{HandOvers, Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
     FusedObject, GlobalMap, LandmarkState, NeighbourObject, ObjectReport, PerceivedObject, RejectReason, ReportKind,
@@ -371,6 +371,17 @@ impl Aggregator {
     /// Numbers of reports and objects so far that tracking could not use.
     pub fn tracks_losses(&self) -> TracksLosses {
         self.tracks.as_ref().map(Tracker::losses).unwrap_or_default()
+    }
+
+    /// Numbers of identities so far that tracking took over from neighbouring cells.
+    pub fn hand_overs(&self) -> HandOvers {
+        self.tracks.as_ref().map(Tracker::hand_overs).unwrap_or_default()
+    }
+
+    /// Weight of a neighbouring cell's statements, 0 to 1: 1 of a newcomer, 0 of a proven liar. Without tracking nobody is
+    /// judged.
+    pub fn trust_in_cell(&self, cell: &NodeName) -> f64 {
+        self.tracks.as_ref().map_or(1.0, |tracks| tracks.trust_in_cell(cell))
     }
 
     /// Number of reports so far that only tracking used, because a later one of their vehicle came before.

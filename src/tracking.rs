@@ -54,6 +54,15 @@ pub struct TracksRound {
     pub evidence: Vec<Evidence>,
 }
 
+/// Numbers of identities that tracks took over from neighbouring cells.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct HandOvers {
+    /// By new tracks.
+    pub begun: u64,
+    /// By tracks that had an identity of this cell.
+    pub renamed: u64,
+}
+
 /// Numbers of reports and objects that were not used.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TracksLosses {

@@ -13,6 +13,7 @@ use std::time::Duration;
 use nalgebra::Vector2;
 use uuid::Uuid;
 
+use super::HandOvers;
 use super::config::TracksConfig;
 use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::{MERGE_M, measurement};
@@ -55,6 +56,7 @@ const MAX_RENAMES: u8 = 2;
 pub(super) struct ForeignObjects {
     objects: Vec<ForeignObject>,
     trust: DormantCounts,
+    pub(super) hand_overs: HandOvers,
 }
 
 /// An object of a neighbouring cell.
@@ -200,6 +202,7 @@ impl ForeignObjects {
                 (track.id, track.renames) = (object.track.id, track.renames + 1);
                 track.first_seen = track.first_seen.min(object.track.first_seen);
                 object.same = Some((track.id, since));
+                self.hand_overs.renamed += 1;
             }
         }
     }

@@ -13,7 +13,7 @@ use super::store::TrackStore;
 use super::track::Track;
 use super::turning::TurningFrame;
 use super::update::{ReportOutcome, ReportUpdate};
-use super::{TracksLosses, TracksRound};
+use super::{HandOvers, TracksLosses, TracksRound};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::neighbours::MAX_AGE;
@@ -114,6 +114,11 @@ impl Tracker {
     /// Weight of a neighbouring cell's statements, 0 to 1: 1 of a newcomer, 0 of a proven liar.
     pub fn trust_in_cell(&self, cell: &NodeName) -> f64 {
         self.foreign.trust(cell, &self.sensors.fleet)
+    }
+
+    /// Identities that tracks took over from neighbouring cells so far.
+    pub fn hand_overs(&self) -> HandOvers {
+        self.foreign.hand_overs
     }
 
     /// Begins a leadership: earlier observations are for the leader before to judge.

@@ -146,8 +146,11 @@ impl<'a> ReportUpdate<'a> {
             let innovation = self.tracks[track].state.innovation(at, &measurement, density);
             innovation.offset.norm() <= self.config.gate_m || innovation.distance_squared <= self.config.gate()
         });
-        let spawn = |update: &mut Self| update.tracks.add(update.begin(&measurement, usize::MAX, None));
-        let Some(index) = known.or_else(|| spawn(self)) else { return };
+        let begin = |update: &mut Self| {
+            let track = update.begin(&measurement, usize::MAX, None);
+            update.tracks.add(track)
+        };
+        let Some(index) = known.or_else(|| begin(self)) else { return };
         self.tracks.set_vehicle(index, vehicle);
         let track = &mut self.tracks[index];
         if is_in_reach {
@@ -333,10 +336,14 @@ impl<'a> ReportUpdate<'a> {
     }
 
     /// A new track at a measurement of object `index` of the report: an object of a neighbouring cell, if one is there.
-    fn begin(&self, measurement: &Measurement, index: usize, detected: Option<&PerceivedObject>) -> Track {
+    fn begin(&mut self, measurement: &Measurement, index: usize, detected: Option<&PerceivedObject>) -> Track {
         let (at, config) = (self.at, self.config);
         match self.foreign.find(at, measurement, detected, self.tracks, self.fleet, config) {
-            Some(foreign) => foreign.lend(at, measurement, config),
+            Some(foreign) => {
+                let track = foreign.lend(at, measurement, config);
+                self.foreign.hand_overs.begun += 1;
+                track
+            }
             None => Track::new(track_id(self.report, index), at, measurement, config),
         }
     }

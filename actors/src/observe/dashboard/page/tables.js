@@ -139,7 +139,7 @@ const DROPS = {
 const REJECTS = {
   too_large: "too large", malformed: "cannot be read", unknown_schema: "unknown version", node_mismatch: "in another node's name", too_many_objects: "too many objects",
   not_finite: "a number that cannot be", out_of_range: "a number out of its range", confidence_out_of_range: "confidence not from 0 to 1", invalid_label: "label empty or too long",
-  from_the_future: "dated in the future", stale: "too old", too_many_vehicles: "too many vehicles", unknown_topic: "unknown topic", superseded: "of an earlier leader", not_elected: "not of the leader",
+  from_the_future: "dated in the future", stale: "too old", too_many_vehicles: "too many vehicles", too_many_cells: "too many cells", unknown_topic: "unknown topic", superseded: "of an earlier leader", not_elected: "not of the leader",
   not_fused: "for an algorithm that does not run here", bad_signature: "no valid signature", not_candidate: "evidence of a node that may not lead", unknown_term: "evidence of an unknown term",
   unattested: "evidence without proof", implausible: "more votes than there can be", not_permitted: "beyond the sender's rights",
 };
