@@ -108,7 +108,7 @@ async fn certificates_of_both_sides_are_checked() {
         files + "require_certificate true\nuse_identity_as_username true\n"
     });
     let mut config = config("north", broker.address());
-    config.tls = Some(TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None });
+    config.tls = Some(TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None });
     config.uplink.ca = Some(other.0);
     let node = start(config.clone()).await;
     until("the refusal", async || trouble(&node, "broker_refuses").is_some()).await;

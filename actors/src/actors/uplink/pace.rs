@@ -73,8 +73,8 @@ mod tests {
         assert_eq!(count(&mut pace, 15_000), 20);
         pace.note_neighbour(Timestamp(25_000_000));
         let beside = count(&mut pace, 25_000);
-        assert!((58..=61).contains(&beside), "{beside}: for five seconds all of ten a second, then two a second");
-        assert_eq!(count(&mut pace, 35_000), 20, "without it as before");
+        assert!((54..=60).contains(&beside), "{beside}: for five seconds all of ten a second, then two a second");
+        assert!((19..=21).contains(&count(&mut pace, 35_000)), "without it as before");
         assert_eq!(count(&mut MapPace::new(0.5), 5_000), 6);
     }
 }
