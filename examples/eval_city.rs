@@ -3,7 +3,8 @@
 //! `make eval-city`, or `cargo run --release --example eval_city -- [--seeds N] [--seconds S] [--roads N] [--write-table FILE]`
 
 use std::fmt::Write as _;
-use std::path::PathBuf;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::{Context, bail};
@@ -23,7 +24,7 @@ struct Options {
 }
 
 fn options() -> anyhow::Result<Options> {
-    let mut options = Options { seeds: 3, seconds: 60.0, roads: 2, table: None };
+    let mut options = Options { seeds: 4, seconds: 60.0, roads: 2, table: None };
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
         let value = args.next().with_context(|| format!("{key} needs a value"))?;
@@ -72,6 +73,19 @@ fn main() -> anyhow::Result<()> {
     }
     let table = table(&rows);
     print!("{table}");
+    match options.table {
+        Some(path) => write_table(&path, &table).with_context(|| path.display().to_string()),
+        None => Ok(()),
+    }
+}
+
+/// Writes the table between its marks in a document.
+fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
+    const MARKS: [&str; 2] = ["<!-- make eval-city -->\n", "<!-- end of make eval-city -->"];
+    let text = fs::read_to_string(path)?;
+    let (head, rest) = text.split_once(MARKS[0]).context("has no mark for the table")?;
+    let (_, tail) = rest.split_once(MARKS[1]).context("has no mark for the table's end")?;
+    fs::write(path, format!("{head}{}{table}{}{tail}", MARKS[0], MARKS[1]))?;
     Ok(())
 }
 
