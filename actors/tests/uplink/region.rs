@@ -4,6 +4,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{CellDescription, CellMap, Limits, NodeStatus, Payload, RegionTopic, RegionTopicKind, decode};
 use ecod_actors::platform::clock;
@@ -152,10 +153,24 @@ pub(crate) fn longest_gap(maps: &[(CellMap, Timestamp)]) -> Duration {
     maps.windows(2).map(|pair| pair[1].1.since(pair[0].1)).max().unwrap_or_default()
 }
 
+/// The maps that subscribers take: each later than all before. Where two lead for a moment, the later epoch's count.
+pub(crate) fn in_order(maps: Vec<(CellMap, Timestamp)>) -> Vec<(CellMap, Timestamp)> {
+    let mut taken: Vec<(CellMap, Timestamp)> = Vec::new();
+    for (message, at) in maps {
+        if taken.last().is_none_or(|(last, _)| order(last) < order(&message)) {
+            taken.push((message, at));
+        }
+    }
+    taken
+}
+
+fn order(message: &CellMap) -> (u64, NodeName, u64) {
+    (message.map.epoch, message.map.aggregator.clone(), message.map.round)
+}
+
 /// Maps come in the order of epoch and round, each once.
 #[track_caller]
 pub(crate) fn assert_in_order(maps: &[(CellMap, Timestamp)]) {
-    let order = |message: &CellMap| (message.map.epoch, message.map.aggregator.clone(), message.map.round);
     for pair in maps.windows(2) {
         assert!(order(&pair[0].0) < order(&pair[1].0), "{:?} after {:?}", order(&pair[1].0), order(&pair[0].0));
     }

@@ -17,8 +17,8 @@ use crate::transport::mqtt::connection::{LastWill, MaxQos, Retention, offline_pa
 use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink, PacketSink};
 use crate::transport::mqtt::{MqttConfig, Security};
 
-/// Time limit for sending the DISCONNECT.
-const LEAVE_TIMEOUT: Duration = Duration::from_millis(300);
+/// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node that stops waits for it.
+const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Materials of a link to the region's broker.
 pub(super) struct RegionLinkSetup {
