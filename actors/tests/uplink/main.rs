@@ -41,7 +41,7 @@ async fn a_region_gets_maps_at_their_rate_and_keeps_status_and_description() {
         let (first, last) = (&maps[0].1, &maps[10].1);
         let mean = last.since(*first).as_secs_f64() / 10.0;
         eprintln!("{}: {:.3} s from map to map", broker.name(), mean);
-        assert!((0.4..0.7).contains(&mean), "{mean}");
+        assert!((0.4..1.0).contains(&mean), "{mean}");
         assert!(maps.iter().all(|(message, _)| message.origin == ORIGIN && message.map.aggregator.as_str() == "edge"));
         let tile = Quadkey::of_cell(&ORIGIN);
         assert!(subscriber.heard().iter().all(|heard| heard.topic.tile == tile));
