@@ -26,7 +26,7 @@ const FORGOTTEN_AFTER: Duration = Duration::from_secs(60);
 ///
 /// The clocks of cells differ. A map's age is therefore its delay beyond the least that maps of this cell take. It goes by
 /// the sender's clock or by the cell's time, whichever makes it younger: the one may be new, the other may jump. While
-/// neither is known, no map counts: for [`SETTLES_AFTER`] from the first map of a cell on.
+/// neither is known, no map counts: for a second from the first map of a cell on.
 #[derive(Debug, Clone)]
 pub struct CellMapFilter {
     max_cells: usize,
