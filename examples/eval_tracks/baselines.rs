@@ -38,7 +38,7 @@ pub(crate) fn found(report: &ObjectReport) -> Vec<Found> {
         score: object.confidence,
         position: Point2::new(object.x_m, object.y_m),
     });
-    let own = report.pose.map(|pose| Found {
+    let own = report.pose.filter(|_| report.moving != Some(false)).map(|pose| Found {
         label: Label::new_static("car"),
         score: 1.0,
         position: Point2::new(pose.x_m, pose.y_m),

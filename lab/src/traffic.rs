@@ -263,7 +263,8 @@ impl<'a> Watch<'a> {
         let watcher = &mut self.observers[number];
         watcher.seq += 1;
         let stamp = time_of(step).shifted(watcher.clock_us);
-        let mut report = ObjectReport::new(watcher.name.clone(), watcher.seq, stamp);
+        let moving = config.fixed.then_some(false);
+        let mut report = ObjectReport { moving, ..ObjectReport::new(watcher.name.clone(), watcher.seq, stamp) };
         watcher.sensor.observe(config, &around, &mut report, dice);
         watcher.due += (STEPS_PER_S / config.sensor.rate_hz).round() as u64;
         watcher.shutter = if config.synchronous { watcher.due } else { watcher.due - 1 + dice.below(3) as u64 };

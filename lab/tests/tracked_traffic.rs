@@ -135,6 +135,25 @@ fn velocities_headings_and_sizes_that_are_said_make_maps_better() {
     assert!(plain[2].is_nan() && rich[2] < 1.0, "lengths are off by {} m", rich[2]);
 }
 
+#[test]
+fn confidences_can_be_taken_at_their_word_whoever_looks_and_however_often() {
+    let town = TrafficConfig { duration_s: 15.0, ..TrafficConfig::default() };
+    let slow = SensorConfig { rate_hz: 2.0, ..SensorConfig::default() };
+    let towns = [1, 4].map(|observers| TrafficConfig { observers, ..town.clone() });
+    let slow = TrafficConfig { observers: 4, sensor: slow, ..town.clone() };
+    for config in towns.into_iter().chain([slow, TrafficConfig { fixed: true, observers: 4, ..town }]) {
+        let recording = recording_of(&config);
+        let mut judge = TrackEvaluation::new(TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap());
+        fuse(&recording, |_, map| map.into_iter().for_each(|map| judge.map(map)));
+        let scores = judge.result();
+        let error = scores.calibration.confidence.ece_pct.unwrap();
+        let default = &scores.at_default;
+        let f1 = 200.0 * default.matches as f64 / (2 * default.matches + default.false_alarms + default.misses) as f64;
+        let lost = scores.best_f1_pct.unwrap() - f1;
+        assert!(error < 5.0 && lost < 1.5, "{config:?}: calibration error {error} %, 0.5 loses {lost} of F1");
+    }
+}
+
 /// Average precision and greatest MODA at 0.5, 1 and 2 m in percent, of each: aggregators with and without `align`, and
 /// late fusion.
 fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 3] {

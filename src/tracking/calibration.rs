@@ -69,6 +69,11 @@ impl DetectionCalibration {
         (self.slope * (log_odds - self.even)).clamp(-4.0, 4.0)
     }
 
+    /// Log-odds of the even confidence above the assumed one.
+    pub(super) fn even_excess(&self) -> f64 {
+        self.even - self.assumed
+    }
+
     /// A test for confidences of detections that are likelier real than not.
     pub(super) fn likely(&self) -> impl Fn(f64) -> bool + use<> {
         let even_confidence = logistic(self.even);

@@ -41,16 +41,47 @@ pub(super) const MAX_DENIAL_NATS: f64 = 4.2;
 
 /// Evidence for each e-folding of the time for which an object was detected, nats: the lives of false alarms have a long
 /// tail (Lomax).
-const PERSISTENCE_NATS: f64 = 0.88;
+const PERSISTENCE_NATS: f64 = 0.6;
 
 /// Scale of these lives, seconds.
-const PERSISTENCE_S: f64 = 0.1;
+const PERSISTENCE_S: f64 = 0.05;
 
 /// Time in seconds beyond which a false alarm stays as long as an object.
 const MAX_PERSISTENCE_S: f64 = 1.0;
 
+/// Log-odds of existence of a track without evidence at the usual rate of looks, beside the base rate.
+const ALONE_NATS: f64 = -0.2;
+
+/// Usual rate of looks, hertz.
+pub(super) const USUAL_LOOKS_HZ: f64 = 10.0;
+
+/// Log-odds that each e-folding of the looks per second takes: every look brings clutter, but objects come with time.
+const LOOKS_NATS: f64 = 0.3;
+
+/// Log-odds that each nat of a detector's even confidence above the assumed one takes: such a detector reports more clutter,
+/// which also comes back more often than the rule for the even confidence assumes.
+const EVEN_NATS: f64 = 0.6;
+
 /// Minimum number of looks before a vehicle's statement is judged.
 const MIN_JUDGED_LOOKS: u32 = 5;
+
+/// Properties of a vehicle that its evidence of any object depends on.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct SensorQuality {
+    /// Weight of its evidence, 0 to 1.
+    pub(super) trust: f64,
+    /// Looks per second.
+    pub(super) looks_hz: f64,
+    /// Log-odds of its even confidence above the assumed one.
+    pub(super) even_excess: f64,
+}
+
+/// Log-odds of existence of a track before any evidence, beside the base rate. `looks_hz` is the rate at which all vehicles
+/// look at it, `even_excess` the least of those that detect it.
+pub(super) fn alone_nats(looks_hz: f64, even_excess: f64) -> f64 {
+    let looks = if looks_hz > 0.0 { (looks_hz / USUAL_LOOKS_HZ).ln() } else { 0.0 };
+    ALONE_NATS - LOOKS_NATS * looks - EVEN_NATS * even_excess.max(0.0)
+}
 
 /// Detections and misses of one object by one vehicle.
 #[derive(Debug, Clone)]
@@ -289,7 +320,7 @@ impl BaseRate {
 
     /// Usual share of objects, and the number of tracks that it counts as.
     const USUAL: f64 = 0.33;
-    const USUAL_TRACKS: f64 = 5.0;
+    const USUAL_TRACKS: f64 = 10.0;
 
     /// Number of tracks as which those that one vehicle alone detects count at most: its clutter is its own.
     const MAX_OF_ONE: f64 = 10.0;

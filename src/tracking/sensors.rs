@@ -9,7 +9,7 @@ use nalgebra::{Matrix2, Vector2};
 use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
-use super::existence::{ClutterRates, DetectionRates, LookRates};
+use super::existence::{ClutterRates, DetectionRates, LookRates, SensorQuality, USUAL_LOOKS_HZ};
 use super::registration::Registration;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
 use crate::model::geometry::Covariance;
@@ -23,6 +23,11 @@ const STAYS: f64 = 0.25;
 
 /// Time after which a vehicle that states no pose and stays is known to stand.
 const STAYS_FOR: Duration = Duration::from_secs(120);
+
+/// Bounds of the time between two reports in seconds, and the weight of the latest in its mean.
+const MIN_INTERVAL_S: f64 = 0.02;
+const MAX_INTERVAL_S: f64 = 1.0;
+const INTERVAL_GAIN: f64 = 0.2;
 
 /// Number of a vehicle that is heard. [`Sensors::forget_silent`] frees it for another vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -104,6 +109,12 @@ impl Sensors {
         self.models.iter_mut().flatten().map(Box::as_mut)
     }
 
+    /// Properties of all vehicles that their evidence depends on, by number.
+    pub(super) fn qualities(&self) -> Vec<SensorQuality> {
+        let quality = |model: &Box<SensorModel>| model.quality(self.fleet.trust(model.id));
+        self.models.iter().map(|slot| slot.as_ref().map(quality).unwrap_or_default()).collect()
+    }
+
     /// Takes the counts of all vehicles from a ledger: of the latest votes that are remembered. Vehicles that are not in
     /// it have none.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
@@ -152,6 +163,8 @@ pub(super) struct SensorModel {
     pub(super) id: SensorId,
     pub(super) node: NodeName,
     last_report: Timestamp,
+    /// Fading mean of the time between two reports, seconds; none before the second.
+    interval_s: Option<f64>,
     pose: Option<WirePose>,
     /// Place about which the median of its detections stays, metres, and since when.
     place: (Vector2<f64>, Timestamp),
@@ -169,6 +182,7 @@ impl SensorModel {
             id,
             node,
             last_report: at,
+            interval_s: None,
             pose: None,
             place: (Vector2::zeros(), at),
             registration: Registration::new(at, &config.bias_prior()),
@@ -180,6 +194,12 @@ impl SensorModel {
         }
     }
 
+    /// Properties that its evidence of any object depends on, with its trust.
+    fn quality(&self, trust: f64) -> SensorQuality {
+        let looks_hz = self.interval_s.map_or(USUAL_LOOKS_HZ, |interval_s| 1.0 / interval_s);
+        SensorQuality { trust, looks_hz, even_excess: self.calibration.even_excess() }
+    }
+
     /// Rates at a look, with those of an object.
     pub(super) fn look_rates(&self, object: DetectionRates) -> LookRates {
         LookRates { object, clutter: self.clutter.rates(), is_view_stated: self.coverage.is_stated() }
@@ -189,6 +209,11 @@ impl SensorModel {
     pub(super) fn observe(&mut self, report: &ObjectReport, at: Timestamp, config: &TracksConfig) -> bool {
         let passed_s = at.since(self.last_report).as_secs_f64();
         self.last_report = self.last_report.max(at);
+        if passed_s > 0.0 {
+            let passed_s = passed_s.clamp(MIN_INTERVAL_S, MAX_INTERVAL_S);
+            let mean_s = self.interval_s.unwrap_or(passed_s);
+            self.interval_s = Some(mean_s + INTERVAL_GAIN * (passed_s - mean_s));
+        }
         let has_jumped = self.coverage.observe(report);
         if has_jumped {
             self.registration = Registration::new(at, &config.bias_prior());

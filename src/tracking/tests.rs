@@ -406,6 +406,23 @@ fn a_detector_with_low_confidences_is_understood_after_a_while() {
 }
 
 #[test]
+fn a_new_detection_is_the_likelier_an_object_the_rarer_the_looks() {
+    let existence = |step: u64| {
+        let mut tracker = tracker();
+        let mut round = TracksRound::default();
+        for frame in (0..10).map(|look| look * step) {
+            let mut objects = vec![car(0.0, 0.0)];
+            objects.extend((frame == 9 * step).then(|| car(30.0, 0.0)));
+            tracker.observe(report("euclid", frame, objects), at(frame));
+            round = tracker.close(at(frame));
+        }
+        round.objects.iter().find(|object| near(object, 30.0, 0.0, 1.0)).unwrap().existence.unwrap()
+    };
+    let [often, rarely] = [1, 5].map(existence);
+    assert!(rarely > often + 0.05, "{often} at 10 Hz, {rarely} at 2 Hz");
+}
+
+#[test]
 fn no_more_objects_than_an_area_can_hold_are_kept() {
     let config = TracksConfig { max_density: 4, max_tracks: 20, ..TracksConfig::default() };
     let mut tracker = Tracker::new(config, ReputationConfig::default());

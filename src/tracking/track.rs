@@ -9,7 +9,9 @@ use uuid::Uuid;
 
 use super::config::TracksConfig;
 use super::detection_history::DetectionHistory;
-use super::existence::{BaseRate, MAX_DENIAL_NATS, SensorHistory, logistic, persistence_nats};
+use super::existence::{
+    BaseRate, MAX_DENIAL_NATS, SensorHistory, SensorQuality, alone_nats, logistic, persistence_nats,
+};
 use super::grid::IndexedTrack;
 use super::kinematics::{KinematicState, Measurement};
 use super::neighbours::TrackNeighbours;
@@ -35,9 +37,6 @@ const USABLE_M: f64 = 1.5;
 /// Rate at which the probability of a position error falls, in standard deviations: errors of associated detections have
 /// an exponential tail.
 const ERROR_RATE: f64 = 1.23;
-
-/// Log-odds of existence of a track without evidence, beside the base rate.
-const ALONE_NATS: f64 = -0.96;
 
 /// Rate at which objects disappear, per second.
 const DISAPPEARANCE_RATE: f64 = 0.02;
@@ -166,21 +165,32 @@ impl Track {
     }
 
     /// Estimates whether the track is of an object; returns the probability that it is still there. `base_rate` are the
-    /// log-odds of any track, `trust` weighs the evidence of each vehicle.
-    pub(super) fn estimate_existence(&mut self, at: Timestamp, base_rate: f64, trust: impl Fn(SensorId) -> f64) -> f64 {
+    /// log-odds of any track, `quality` weighs the evidence of each vehicle.
+    pub(super) fn estimate_existence(
+        &mut self,
+        at: Timestamp,
+        base_rate: f64,
+        quality: impl Fn(SensorId) -> SensorQuality,
+    ) -> f64 {
         let (mut evidence, mut denied, mut detected) = (0.0, 0.0, 0.0);
+        let (mut looks_hz, mut even_excess) = (0.0, None);
         let has_one_witness = self.witnesses().nth(1).is_none();
         for history in self.history.iter() {
-            let trust = trust(history.sensor);
+            let sensor = quality(history.sensor);
             let (shared, denial) = history.shared_nats(at);
-            evidence += trust * shared;
-            denied += trust * denial;
-            detected = if history.last_hit.is_some() { trust.max(detected) } else { detected };
+            evidence += sensor.trust * shared;
+            denied += sensor.trust * denial;
+            looks_hz += sensor.trust * sensor.looks_hz;
+            if history.last_hit.is_some() && sensor.trust > 0.0 {
+                detected = sensor.trust.max(detected);
+                even_excess = Some(even_excess.unwrap_or(sensor.even_excess).min(sensor.even_excess));
+            }
         }
         let persistence = persistence_nats(self.last_seen.since(self.first_seen).as_secs_f64());
         let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
         let evidence = if has_one_witness { evidence - denied.min(MAX_DENIAL_NATS) } else { evidence };
-        let nats = base_rate + ALONE_NATS + evidence + detected * persistence + inherited;
+        let alone = alone_nats(looks_hz, even_excess.unwrap_or_default());
+        let nats = base_rate + alone + evidence + detected * persistence + inherited;
         self.clutter = Some(logistic(-nats));
         logistic(nats + SURVIVAL_POWER * self.survival(at).ln())
     }
@@ -237,7 +247,7 @@ impl Track {
     /// Takes existence and attributes from another aggregator's object.
     pub(super) fn inherit(&mut self, object: &FusedObject, at: Timestamp) {
         let existence = object.existence.unwrap_or(object.confidence).clamp(0.01, 0.99);
-        let alone = BaseRate::usual_log_odds() + ALONE_NATS;
+        let alone = BaseRate::usual_log_odds() + alone_nats(0.0, 0.0);
         self.inherited = Some(((existence / (1.0 - existence)).ln() - alone, at));
         self.first_seen = object.first_seen_us.map_or(self.first_seen, |first| first.min(self.first_seen));
         self.labels = object.scores.iter().map(|(label, score)| (label.clone(), *score)).collect();

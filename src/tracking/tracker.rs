@@ -8,7 +8,7 @@ use super::existence::BaseRate;
 use super::foreign::ForeignObjects;
 use super::lifecycle::{adopt_map, merge, prune};
 use super::registration::{RegistrationFrame, register};
-use super::sensors::Sensors;
+use super::sensors::{SensorId, Sensors};
 use super::store::TrackStore;
 use super::track::Track;
 use super::turning::TurningFrame;
@@ -196,11 +196,12 @@ impl Tracker {
     }
 
     fn objects(&mut self, now: Timestamp) -> Vec<FusedObject> {
-        let trust = |id| self.sensors.fleet.trust(id);
+        let qualities = self.sensors.qualities();
+        let quality = |id: SensorId| qualities[id.number()];
         let name = |id| self.sensors.get(id).map(|sensor| sensor.node.clone());
         let base_rate = self.base_rate.log_odds();
         let mut existences = Vec::with_capacity(self.tracks.len());
-        existences.extend(self.tracks.iter_mut().map(|track| track.estimate_existence(now, base_rate, trust)));
+        existences.extend(self.tracks.iter_mut().map(|track| track.estimate_existence(now, base_rate, quality)));
         let witnesses = self.tracks.iter().map(Track::only_witness);
         self.base_rate.learn(now, witnesses.zip(existences.iter().copied()));
         let tracks = self.tracks.iter().zip(existences);
