@@ -15,6 +15,7 @@ pub mod round;
 mod answer;
 mod command;
 mod config;
+mod neighbouring;
 mod report_doubt;
 #[cfg(test)]
 mod tests;
@@ -28,6 +29,7 @@ pub use config::{Algorithms, FusionConfig};
 pub use report_doubt::ReportDoubt;
 
 use nalgebra::Point2;
+use neighbouring::NeighbourView;
 use report_doubt::{MAX_AWAY_M, MIN_MISPLACED};
 
 use crate::admission::report_window::{Admitted, ReportWindow};
@@ -42,8 +44,8 @@ use crate::reputation::{Evidence, ReputationLedger};
 use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
-    FusedObject, GlobalMap, LandmarkState, ObjectReport, PerceivedObject, RejectReason, ReportKind, Reputation,
-    SCHEMA_VERSION, Verdict, Verdicts,
+    FusedObject, GlobalMap, LandmarkState, NeighbourObject, ObjectReport, PerceivedObject, RejectReason, ReportKind,
+    Reputation, SCHEMA_VERSION, Verdict, Verdicts,
 };
 
 /// A closed round.
@@ -88,6 +90,7 @@ pub struct Aggregator {
     /// Reports that only tracking used, because a later one of their vehicle came before.
     overtaken: u64,
     placements: Placements,
+    neighbours: NeighbourView,
     vote: Option<Vote>,
     by_packets: bool,
     /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
@@ -116,6 +119,7 @@ impl Aggregator {
             tracks_open_cell,
             overtaken: 0,
             placements: Placements::default(),
+            neighbours: NeighbourView::default(),
             vote,
             by_packets,
             voted: false,
@@ -347,6 +351,13 @@ impl Aggregator {
         }
     }
 
+    /// Takes all objects of other cells near this one, of the age that they state at `stated_at`. Their times are by the
+    /// clock of `now`. They are in the next maps until they are too old, and lend identities to objects that tracking
+    /// finds where they are.
+    pub fn take_neighbours(&mut self, objects: &Arc<[NeighbourObject]>, stated_at: Timestamp) {
+        self.neighbours = NeighbourView::new(Arc::clone(objects), stated_at);
+    }
+
     /// Notes the cell's time less the time given as `now` in microseconds, 0 at first. Reports and rounds are dated in the
     /// cell's time, which may jump; everything else goes by `now`, which does not.
     pub fn set_cell_offset(&mut self, offset_us: i64) {
@@ -427,9 +438,9 @@ impl Aggregator {
             fused_at_us: fused_at,
             oldest_capture_us: oldest.map(|oldest| self.in_cell_time(oldest)),
             landmarks,
+            neighbour_objects: self.neighbours.shown(&objects, now, self.cell_offset_us),
             objects,
             pose_corrections,
-            neighbour_objects: Vec::new(),
         });
         let verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());

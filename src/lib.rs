@@ -15,6 +15,7 @@ pub mod description;
 pub mod diagnostics;
 pub mod leadership;
 pub mod model;
+pub mod neighbours;
 pub mod pace;
 pub mod perception;
 pub mod replay;

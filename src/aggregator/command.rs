@@ -14,7 +14,7 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::perception::landmark::{Landmark, LandmarkConfig};
 use crate::reputation::ReputationLedger;
-use crate::wire::{GlobalMap, Reputation};
+use crate::wire::{GlobalMap, NeighbourObject, Reputation};
 
 /// A call of an aggregator's method of the same name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -49,6 +49,13 @@ pub enum Command {
         /// When it was received.
         received_at: Timestamp,
     },
+    /// [`Aggregator::take_neighbours`].
+    TakeNeighbours {
+        /// All objects of other cells near this one; their times are by the aggregator's clock.
+        objects: Arc<[NeighbourObject]>,
+        /// When they were of the age that they state.
+        stated_at: Timestamp,
+    },
     /// [`Aggregator::resume`].
     Resume {
         /// The reputations.
@@ -80,6 +87,7 @@ impl Aggregator {
             Command::StepDown => self.step_down(),
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
+            Command::TakeNeighbours { objects, stated_at } => self.take_neighbours(objects, *stated_at),
             Command::Resume { reputations } => self.resume(reputations),
             Command::Configure { fusion, landmarks } => {
                 self.configure(FusionConfig::clone(fusion), landmarks.iter().map(Landmark::from).collect());

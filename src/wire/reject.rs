@@ -52,6 +52,8 @@ reject_reasons! {
     OutOfOrder = "out_of_order",
     /// A vehicle beyond the maximum number that an aggregator keeps.
     TooManyVehicles = "too_many_vehicles",
+    /// A map of a cell beyond the maximum number that a subscriber keeps.
+    TooManyCells = "too_many_cells",
     /// A topic outside this cell.
     UnknownTopic = "unknown_topic",
     /// From an aggregator or epoch that has been superseded.

@@ -1,0 +1,177 @@
+//! Neighbouring cells: which of their maps count, and which of their objects are near this cell.
+//!
+//! Call [`Neighbours::accept`] with every map of another cell and [`Neighbours::observe_own`] with every map of this one.
+//! When either has changed anything, [`Neighbours::near`] has what the aggregator is told next, by
+//! [`Command::TakeNeighbours`](crate::aggregator::Command::TakeNeighbours). That command is recorded, so replays are exact.
+//!
+//! - A cell tells of its own tile and of [`COVER_M`] around it. Objects elsewhere are refused and counted.
+//! - Maps count in the order of epoch and round, and no older than [`MAX_AGE`]. [`CellMapFilter`] says how age is known.
+//! - Objects are put into this cell's frame through their place on Earth.
+
+mod extent;
+mod filter;
+mod frame;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+
+use nalgebra::Point2;
+
+pub use filter::{AdmittedMap, CellMapFilter, MAX_AGE};
+
+use crate::model::names::NodeName;
+use crate::model::origin::GeographicOrigin;
+use crate::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
+use crate::model::time::Timestamp;
+use crate::wire::{CellMap, FusedObject, GlobalMap, NeighbourObject, RegionTopic, RejectReason};
+use extent::Extent;
+use frame::FrameChange;
+
+/// Distance in metres from its tile up to which a cell may tell of objects. An origin in the middle of its cell leaves
+/// room for a cell 600 m across, wherever in the tile it is.
+pub const COVER_M: f64 = 300.0;
+
+/// Distance in metres from what this cell knows up to which objects of others are handed on: 7 s at 50 km/h.
+pub const MARGIN_M: f64 = 100.0;
+
+/// Maximum number of neighbouring cells.
+const MAX_CELLS: usize = 256;
+
+/// Maximum number of objects of all neighbouring cells together.
+const MAX_OBJECTS: usize = 1024;
+
+/// Objects of accepted maps that were not used.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct NeighbourLosses {
+    /// Outside of what their cell may tell of.
+    pub outside: u64,
+    /// Beyond the maximum number.
+    pub refused: u64,
+}
+
+/// The neighbours of one cell; see the [module](self).
+#[derive(Debug, Clone)]
+pub struct Neighbours {
+    cell: NodeName,
+    origin: GeographicOrigin,
+    extent: Extent,
+    filter: CellMapFilter,
+    cells: BTreeMap<NodeName, NeighbourMap>,
+    losses: BTreeMap<NodeName, NeighbourLosses>,
+}
+
+/// The newest map of a cell.
+#[derive(Debug, Clone)]
+struct NeighbourMap {
+    /// When it was fused, by this node's clock.
+    fused_at: Timestamp,
+    /// The objects near this cell, in its frame; their times are by this node's clock.
+    objects: Vec<FusedObject>,
+}
+
+impl Neighbours {
+    /// No neighbours yet of a cell at `origin`.
+    pub fn new(cell: NodeName, origin: GeographicOrigin) -> Self {
+        Self {
+            cell,
+            origin,
+            extent: Extent::default(),
+            filter: CellMapFilter::new(MAX_CELLS),
+            cells: BTreeMap::new(),
+            losses: BTreeMap::new(),
+        }
+    }
+
+    /// The tiles whose cells can be neighbours.
+    pub fn tiles(&self) -> Vec<Quadkey> {
+        tile_of(&self.origin).with_neighbours()
+    }
+
+    /// Takes a map of another cell, which came on `topic` and was read at `received_at` by this node's steady clock.
+    ///
+    /// # Errors
+    /// The reason why it does not count; at most the estimate of that cell's clock has changed.
+    pub fn accept(
+        &mut self,
+        topic: &RegionTopic,
+        message: CellMap,
+        received_at: Timestamp,
+    ) -> Result<(), RejectReason> {
+        if message.cell == self.cell {
+            return Err(RejectReason::NodeMismatch);
+        }
+        let AdmittedMap { age } = self.filter.admit(topic, &message, received_at)?;
+        let CellMap { cell, origin, map, .. } = message;
+        let fused_at = received_at - age;
+        let clock_us = fused_at.micros_from(map.fused_at_us);
+        let change = FrameChange::new(&origin, &self.origin);
+        let losses = self.losses.entry(cell.clone()).or_default();
+        let mut near = Vec::new();
+        for mut object in map.objects {
+            let place = origin.to_wgs84(object.x_m, object.y_m, 0.0);
+            if !change.is_covered(&place) {
+                losses.outside += 1;
+                continue;
+            }
+            change.apply(&place, &mut object);
+            object.first_seen_us = object.first_seen_us.map(|first_seen| first_seen.shifted(clock_us));
+            let distance_m = self.extent.distance_m(&Point2::new(object.x_m, object.y_m));
+            if distance_m <= MARGIN_M {
+                near.push((distance_m, object));
+            }
+        }
+        near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.id.cmp(&b.1.id)));
+        near.dedup_by_key(|(_, object)| object.id);
+        self.cells.remove(&cell);
+        self.forget_silent(received_at);
+        let held: usize = self.cells.values().map(|map| map.objects.len()).sum();
+        let room = MAX_OBJECTS.saturating_sub(held);
+        if let Some(losses) = self.losses.get_mut(&cell) {
+            losses.refused += near.len().saturating_sub(room) as u64;
+        }
+        let objects = near.into_iter().take(room).map(|(_, object)| object).collect();
+        self.cells.insert(cell, NeighbourMap { fused_at, objects });
+        Ok(())
+    }
+
+    /// Takes a map of this cell, closed at `now`: it tells where this cell is.
+    pub fn observe_own(&mut self, map: &GlobalMap, now: Timestamp) {
+        let objects = map.objects.iter().map(|object| Point2::new(object.x_m, object.y_m));
+        let places = map.landmarks.iter().map(|place| Point2::new(place.x_m, place.y_m));
+        self.extent.observe(objects.chain(places), now);
+    }
+
+    /// The objects of others near this cell, each cell's nearest first, as their maps have them.
+    pub fn near(&mut self, now: Timestamp) -> Vec<NeighbourObject> {
+        self.forget_silent(now);
+        let of_cell = |(cell, map): (&NodeName, &NeighbourMap)| {
+            let (cell, age_s) = (cell.clone(), now.since(map.fused_at).as_secs_f64());
+            let objects = map.objects.clone().into_iter();
+            objects.map(move |object| NeighbourObject { cell: cell.clone(), age_s, object })
+        };
+        self.cells.iter().flat_map(of_cell).collect()
+    }
+
+    /// The cells of which a map counts at `now`, and the number of their objects near this cell.
+    pub fn cells(&self, now: Timestamp) -> impl Iterator<Item = (&NodeName, usize)> {
+        let is_present = move |map: &NeighbourMap| now.since(map.fused_at) <= MAX_AGE;
+        self.cells.iter().filter(move |(_, map)| is_present(map)).map(|(cell, map)| (cell, map.objects.len()))
+    }
+
+    /// Objects by cell that were not used so far; cells that are silent for long are forgotten.
+    pub fn losses(&self) -> &BTreeMap<NodeName, NeighbourLosses> {
+        &self.losses
+    }
+
+    fn forget_silent(&mut self, now: Timestamp) {
+        self.cells.retain(|_, map| now.since(map.fused_at) <= MAX_AGE);
+        self.filter.forget_silent(now);
+        let filter = &self.filter;
+        self.losses.retain(|cell, _| filter.knows(cell));
+    }
+}
+
+fn tile_of(origin: &GeographicOrigin) -> Quadkey {
+    Quadkey::of(&origin.to_wgs84(0.0, 0.0, 0.0), CELL_TILE_DIGITS)
+}
