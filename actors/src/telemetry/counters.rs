@@ -248,7 +248,7 @@ fn trouble_of(reason: RejectReason) -> Option<TroubleKind> {
         | Reason::UnknownTerm => None,
         Reason::FromTheFuture => Some(TroubleKind::Untimely),
         Reason::NotFused => Some(TroubleKind::NotFused),
-        Reason::TooManyVehicles => Some(TroubleKind::Overload),
+        Reason::TooManyVehicles | Reason::TooManyCells => Some(TroubleKind::Overload),
         Reason::BadSignature | Reason::Unattested | Reason::Implausible | Reason::NotPermitted => {
             Some(TroubleKind::NotPermitted)
         }

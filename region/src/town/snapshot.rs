@@ -131,9 +131,42 @@ pub const MAX_CELLS_SHOWN: usize = 512;
 pub const MAX_OBJECTS_SHOWN: usize = 4096;
 
 impl Town {
+    /// Number of cells in each state; `asked` are the tiles whose maps are asked for.
+    pub fn states(&self, asked: &BTreeSet<Quadkey>, now: Timestamp) -> BTreeMap<CellState, usize> {
+        let asked: Vec<_> = asked.iter().map(Quadkey::to_string).collect();
+        let mut states: BTreeMap<_, _> = CellState::ALL.into_iter().map(|state| (state, 0)).collect();
+        for ((tile, _), cell) in self.cells() {
+            *states.entry(cell.state(now, is_within(*tile, &asked))).or_default() += 1;
+        }
+        states
+    }
+
+    /// Number of cells within tiles.
+    pub fn count_within(&self, tiles: &[Quadkey]) -> usize {
+        let tiles: Vec<_> = tiles.iter().map(Quadkey::to_string).collect();
+        self.cells().keys().filter(|(tile, _)| is_within(*tile, &tiles)).count()
+    }
+
     /// The town within bounds; `asked` are the tiles whose maps are asked for.
     pub fn view(&self, bounds: &Bounds, asked: &BTreeSet<Quadkey>, now: Timestamp) -> TownView {
-        let is_asked = |tile: &Quadkey| asked.iter().any(|asked| contains(asked, tile));
+        self.view_up_to([MAX_CELLS_SHOWN, MAX_OBJECTS_SHOWN], bounds, asked, now)
+    }
+
+    /// The town within bounds with all its cells and objects, of which all maps are asked for.
+    pub fn view_whole(&self, bounds: &Bounds, now: Timestamp) -> TownView {
+        let asked = bounds.tiles(1).into_iter().collect();
+        self.view_up_to([usize::MAX; 2], bounds, &asked, now)
+    }
+
+    fn view_up_to(
+        &self,
+        [max_cells, max_objects]: [usize; 2],
+        bounds: &Bounds,
+        asked: &BTreeSet<Quadkey>,
+        now: Timestamp,
+    ) -> TownView {
+        let asked: Vec<_> = asked.iter().map(Quadkey::to_string).collect();
+        let is_asked = |tile: &Quadkey| is_within(*tile, &asked);
         let (mut region, mut known) = (TownTotals::default(), None::<Bounds>);
         let mut shown = Vec::new();
         for ((tile, name), cell) in self.cells() {
@@ -147,8 +180,8 @@ impl Town {
         let mut view = TownTotals::default();
         shown.iter().for_each(|(_, _, cell, state)| view.add(cell, *state));
         let has_maps = !shown.is_empty() && shown.iter().all(|(tile, ..)| is_asked(tile));
-        let cells = if shown.len() > MAX_CELLS_SHOWN { &[] } else { &*shown };
-        let objects = if view.objects > MAX_OBJECTS_SHOWN { &[] } else { &*shown };
+        let cells = if shown.len() > max_cells { &[] } else { &*shown };
+        let objects = if view.objects > max_objects { &[] } else { &*shown };
         TownView {
             known,
             region,
@@ -180,9 +213,10 @@ fn tiles(bounds: &Bounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<TileView> 
     tiles.into_iter().filter_map(view).collect()
 }
 
-/// True if `inner` is in `outer` or the same.
-fn contains(outer: &Quadkey, inner: &Quadkey) -> bool {
-    inner.to_string().starts_with(&outer.to_string())
+/// True if a tile is one of these or in one.
+fn is_within(tile: Quadkey, tiles: &[String]) -> bool {
+    let key = tile.to_string();
+    tiles.iter().any(|outer| key.starts_with(outer))
 }
 
 impl TownTotals {
