@@ -2,8 +2,6 @@
 
 mod bounds;
 mod snapshot;
-#[cfg(test)]
-mod tests;
 
 use std::collections::BTreeMap;
 use std::time::Duration;

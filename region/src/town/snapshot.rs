@@ -125,10 +125,10 @@ pub struct ObjectView {
 const MAX_TILES_SHOWN: usize = 1024;
 
 /// Maximum number of cells of a view that are told one by one.
-pub const MAX_CELLS_SHOWN: usize = 512;
+pub(super) const MAX_CELLS_SHOWN: usize = 512;
 
 /// Maximum number of objects of a view that are told one by one.
-pub const MAX_OBJECTS_SHOWN: usize = 4096;
+pub(super) const MAX_OBJECTS_SHOWN: usize = 4096;
 
 impl Town {
     /// Number of cells in each state; `asked` are the tiles whose maps are asked for.
