@@ -59,6 +59,11 @@ impl BrokerArguments {
 }
 
 impl BrokerLogin {
+    /// A plaintext connection without a login.
+    pub fn anonymous(address: BrokerAddress) -> Self {
+        Self { address, tls: None, login: None }
+    }
+
     /// A plaintext login by user and password.
     pub fn plain(address: BrokerAddress, user: &str, password: &str) -> Self {
         Self { address, tls: None, login: Some((user.to_owned(), Secret::new(password))) }
