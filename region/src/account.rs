@@ -5,6 +5,7 @@ use std::fmt::Write;
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicPosition;
 use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
+use ecod::wire::{RegionTopic, RegionTopicKind};
 
 /// The account of a cell. All nodes of the cell that may lead share it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -30,12 +31,16 @@ impl CellAccount {
         vec![format!("ecod/v1/geo/{}/{cell}/#", tile.levels()), format!("{REPUTATIONS}/+/{cell}")]
     }
 
-    /// MQTT filters of what the cell may read: the tiles around it, and reputations.
+    /// MQTT filters of what the cell may read: its own, maps and descriptions of the tiles around, and reputations.
+    ///
+    /// Statuses of others are not among them: they name the runs of nodes, and so what their connections may be called.
     pub fn reads(&self) -> Vec<String> {
-        let tiles = self.tile.with_neighbours().into_iter();
-        let mut filters: Vec<_> = tiles.map(|tile| format!("ecod/v1/geo/{}/#", tile.levels())).collect();
-        filters.push(format!("{REPUTATIONS}/#"));
-        filters
+        let Self { cell, tile } = self;
+        let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
+        let around = tile.with_neighbours().into_iter();
+        let around = around.flat_map(|tile| kinds.map(|kind| RegionTopic::filter(tile, kind)));
+        let own = [format!("ecod/v1/geo/{}/{cell}/#", tile.levels()), format!("{REPUTATIONS}/+/+")];
+        own.into_iter().chain(around).collect()
     }
 
     /// The user as an element of `users` in NATS's configuration.
@@ -88,7 +93,7 @@ mod tests {
         let account = CellAccount::new(NodeName::from_static("lot-1"), &origin);
         let own = "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0";
         assert_eq!(account.writes(), [format!("{own}/lot-1/#"), "ecod/v1/rep/+/lot-1".to_owned()]);
-        assert_eq!(account.reads().len(), 10, "nine tiles and the reputations");
+        assert_eq!(account.reads().len(), 20, "its own, the reputations, two kinds of nine tiles");
         let nats = account.nats("secret");
         assert!(nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.>\", \"ecod.v1.rep.*.lot-1\""), "{nats}");
         assert!(account.mosquitto().contains(&format!("topic write {own}/lot-1/#\n")));

@@ -19,7 +19,7 @@ use uuid::Uuid;
 #[derive(Debug, Clone, Args)]
 pub struct BrokerArguments {
     /// The region's broker
-    #[arg(long, value_name = "HOST:PORT", env = "ECOD_REGION_BROKER")]
+    #[arg(long, value_name = "HOST:PORT")]
     pub broker: BrokerAddress,
     /// PEM file with the CAs of the broker's certificate; without it the connection is plaintext
     #[arg(long, value_name = "FILE")]

@@ -110,8 +110,9 @@ impl Drop for Cluster {
 fn spawn(directory: &Path, number: usize, addresses: &[SocketAddr; 4]) -> anyhow::Result<Child> {
     let log = fs::File::options().create(true).append(true).open(directory.join(format!("server-{number}.log")))?;
     let [mqtt, route, clients, monitor] = addresses.map(|address| address.to_string());
-    Command::new("nats-server")
-        .args(["-c", "nats-cluster.conf"])
+    // The servers end with this program, however that ends.
+    Command::new("setpriv")
+        .args(["--pdeathsig", "KILL", "nats-server", "-c", "nats-cluster.conf"])
         .current_dir(directory)
         .env("REGION_SERVER", format!("region-{}", number + 1))
         .env("REGION_MQTT", mqtt)

@@ -1,7 +1,8 @@
 //! A city on one machine: three NATS servers, thousands of simulated cells and some real ones, and what happens to them.
 //!
 //! `make city` runs it. Each simulated cell has a connection and an account of its own, as a cell's leader has; each real
-//! one is an `ecod-node` with an uplink and a vehicle that reports to it. Two subscribers on two servers read all maps.
+//! one is an `ecod-node` with an uplink and a vehicle that reports to it. Two subscribers on two servers read half of the
+//! town each.
 
 mod cluster;
 mod fleet;
@@ -63,8 +64,10 @@ fn main() -> anyhow::Result<()> {
     let places = fleet::places(arguments.cells + arguments.real);
     let (simulated, real) = places.split_at(arguments.cells);
     let cluster = Cluster::start(directory.path(), &places)?;
+    let halves = fleet::halves(&places);
     let mut city = City {
-        watches: [0, 1].map(|server| Watch::start(cluster.login(server, "region.reader"))),
+        of_halves: halves.each_ref().map(|half| half.cells),
+        watches: [0, 1].map(|half| Watch::start(cluster.login(half, "region.reader"), &halves[half])),
         fleet: Fleet::start(simulated, &cluster, arguments.hz, arguments.objects)?,
         real: RealCells::start(arguments.node.as_deref(), real, &cluster, directory.path())?,
         cluster,
@@ -87,7 +90,7 @@ fn main() -> anyhow::Result<()> {
         let at = clock::now();
         city.cluster.signal(1, Signal::SIGSTOP)?;
         std::thread::sleep(PAUSE);
-        city.until_whole_at(&[0], "for the subscriber on another server", at)?;
+        city.until_whole_at(&[0], "for the half of the cells that is read on another server", at)?;
         let at = clock::now();
         city.cluster.signal(1, Signal::SIGCONT)?;
         city.until_whole("after it goes on", at)?;
@@ -121,6 +124,8 @@ struct City {
     real: RealCells,
     cluster: Cluster,
     cells: usize,
+    /// Cells that each subscriber reads.
+    of_halves: [usize; 2],
 }
 
 impl City {
@@ -135,13 +140,14 @@ impl City {
         what: &str,
         since: Timestamp,
     ) -> anyhow::Result<()> {
-        let wanted = self.cells - self.cells / 100;
+        let cells: usize = watches.iter().map(|watch| self.of_halves[*watch]).sum();
+        let wanted = cells - cells / 100;
         let begun = Instant::now();
         let mut first = None;
         loop {
             let now = clock::now();
-            let fresh = watches.iter().map(|watch| self.watches[*watch].sent_after(since)).min().unwrap_or(0);
-            if fresh >= self.cells / 2 {
+            let fresh: usize = watches.iter().map(|watch| self.watches[*watch].sent_after(since)).sum();
+            if fresh >= cells / 2 {
                 first.get_or_insert(now.since(since));
             }
             if fresh >= wanted {
@@ -151,7 +157,7 @@ impl City {
                 return Ok(());
             }
             let troubles = || self.watches.each_ref().map(Watch::trouble);
-            ensure!(begun.elapsed() < PATIENCE, "only {fresh} of {} cells {what}; {:?}", self.cells, troubles());
+            ensure!(begun.elapsed() < PATIENCE, "only {fresh} of {cells} cells {what}; {:?}", troubles());
             std::thread::sleep(Duration::from_millis(100));
         }
     }
@@ -196,7 +202,7 @@ impl City {
         self.real.cut(5);
         let since = clock::now() + Duration::from_secs(1);
         let apart = percent();
-        let others = self.watches[0].sent_after(since);
+        let others: usize = self.watches.iter().map(|watch| watch.sent_after(since)).sum();
         self.real.mend();
         println!("  meanwhile {others} of {} cells are heard", self.cells);
         println!("  a real node: {connected:.1} % of a core with its uplink, {apart:.1} % while it is cut off");

@@ -58,7 +58,12 @@ impl RealCells {
             let file = directory.join(format!("{cell}.toml"));
             fs::write(&file, config)?;
             let log = fs::File::create(directory.join(format!("{cell}.log")))?;
-            let child = Command::new(node)
+            let mut command = Command::new(node);
+            // The node is what its file says, whatever the environment says to others.
+            for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+                command.env_remove(key);
+            }
+            let child = command
                 .args(["--log-format", "text", "--stop-at-eof", "--config"])
                 .arg(&file)
                 .stdin(Stdio::piped())

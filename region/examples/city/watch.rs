@@ -1,4 +1,4 @@
-//! A subscriber of all tiles, and its figures.
+//! A subscriber of a half of the town, and its figures.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -13,6 +13,7 @@ use ecod_region::reader::{self, RegionState};
 use ecod_region::town::Accepted;
 use hdrhistogram::Histogram;
 
+use crate::fleet::Half;
 use crate::spawn_thread;
 
 /// A subscriber on a thread of its own, until the process ends.
@@ -39,11 +40,9 @@ struct Figures {
 const TOLERANCE: Duration = Duration::from_millis(200);
 
 impl Watch {
-    pub(crate) fn start(login: BrokerLogin) -> Self {
+    pub(crate) fn start(login: BrokerLogin, half: &Half) -> Self {
         let watch = Self::start_overview(login);
-        if let Ok(all) = "".parse() {
-            watch.state.ask([all].into());
-        }
+        watch.state.ask(half.tiles.clone());
         watch
     }
 
@@ -102,17 +101,20 @@ impl Watch {
         lock(&self.figures).too_old
     }
 
-    pub(crate) fn trouble(&self) -> Option<String> {
-        self.state.link().trouble
+    /// What is wrong with the connection, and the messages so far.
+    pub(crate) fn trouble(&self) -> String {
+        format!("{:?}, {:?}", self.state.link(), self.state.town().counts())
     }
 
     /// The figures of a time in seconds, in a line.
     pub(crate) fn figures(&self, span: f64) -> String {
         let Figures { ages, bytes, maps, missing, stale, other, too_old, .. } = &*lock(&self.figures);
         let milliseconds = |quantile| ages.value_at_quantile(quantile) as f64 / 1000.0;
-        let lost = 100.0 * *missing as f64 / (maps + missing).max(1) as f64;
+        // Those that came too late are not among the maps that count either.
+        let lost = missing.saturating_sub(*stale);
+        let percent = 100.0 * lost as f64 / (maps + missing).max(1) as f64;
         format!(
-            "{:.0} maps/s, {:.1} MB/s, age p50 {:.1} ms, p99 {:.1} ms, most {:.0} ms; {missing} missing ({lost:.3} %), \
+            "{:.0} maps/s, {:.1} MB/s, age p50 {:.1} ms, p99 {:.1} ms, most {:.0} ms; {lost} lost ({percent:.3} %), \
              {stale} not taken as too old, {other} for other reasons, {too_old} taken too old",
             *maps as f64 / span,
             *bytes as f64 / span / 1e6,

@@ -144,7 +144,7 @@ fn add_cell(directory: &Path, name: &str, latitude: f64, longitude: f64) {
     let output = Command::new(Path::new(DEPLOY).join("add-cell"))
         .args([name, &latitude.to_string(), &longitude.to_string()])
         .env("REGION_CONFIG", directory)
-        .env("ECOD_REGION", env!("CARGO_BIN_EXE_ecod-region"))
+        .env("REGION_PROGRAM", env!("CARGO_BIN_EXE_ecod-region"))
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));

@@ -60,7 +60,10 @@ async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
     let tiles = lot.account.tile.with_neighbours();
     let around: Vec<_> = tiles.iter().map(|tile| RegionTopic::filter(*tile, RegionTopicKind::Map)).collect();
     assert_eq!(lot.subscribe(&around).await, [true; 9]);
+    let own_status = lot.topic(RegionTopicKind::Status);
+    assert_eq!(lot.subscribe(&[own_status]).await, [true]);
     let foreign = [
+        RegionTopic::filter(tiles[0], RegionTopicKind::Status),
         "#".to_owned(),
         "ecod/v1/geo/#".to_owned(),
         "ecod/v1/+/#".to_owned(),
@@ -70,7 +73,7 @@ async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
         "$MQTT/#".to_owned(),
         "$SYS/#".to_owned(),
     ];
-    assert_eq!(lot.subscribe(&foreign).await, [false; 8]);
+    assert_eq!(lot.subscribe(&foreign).await, [false; 9]);
     // What a cell says of vehicles goes under its own name.
     assert_eq!(lot.subscribe(&["ecod/v1/rep/+/+".to_owned()]).await, [true]);
     far.publish("ecod/v1/rep/euclid/lot-1", true, b"forged".to_vec());
