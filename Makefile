@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 clean
+.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -69,7 +69,7 @@ eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics f
 
 # All programs are built before the first test: those of ecod-lab need ecod-node beside it.
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
-test: PACKAGES += libfaketime mosquitto mosquitto-clients
+test: PACKAGES += libfaketime mosquitto mosquitto-clients nats-server
 test: setup ## all tests
 	cargo test --locked
 
@@ -220,6 +220,14 @@ release-check: setup ## after make release: prove that two clean clones give the
 
 edge-only: setup ## an aggregator without camera and OpenCV
 	cargo build --locked -p ecod-actors --no-default-features
+
+# CITY=quick is a minute; CITY="--cells 500" takes other options of the program.
+city: PACKAGES += nats-server
+city: setup ## a region of three servers with 2000 simulated cells and 20 real ones: killed, stopped, cut off, restarted
+	cargo build --profile $(PROFILE) --locked -p ecod-actors --bin ecod-node
+	cargo build --profile $(PROFILE) --locked -p ecod-region --bin ecod-region --example city
+	REGION_PROGRAM=$(PROGRAMS)/ecod-region $(PROGRAMS)/examples/city --node $(PROGRAMS)/ecod-node \
+	    $(if $(filter quick,$(CITY)),--quick --cells 200 --real 2 --seconds 6,--real 20 $(CITY))
 
 bench: setup ## speed of the core, the detectors and the path through the broker, in target/bench.json
 	packaging/bench

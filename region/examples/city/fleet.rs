@@ -52,8 +52,9 @@ pub(crate) struct Fleet {
 /// Distance between cells in degrees: some 800 m, so that each is alone in its tile or nearly so.
 const STEP_DEG: f64 = 0.0075;
 
-/// Places in a square about a town.
-pub(crate) fn places(count: usize) -> Vec<Place> {
+/// Places of simulated and of real cells, in a square about a town.
+pub(crate) fn places(simulated: usize, real: usize) -> Vec<Place> {
+    let count = simulated + real;
     let side = (count as f64).sqrt().ceil() as usize;
     let place = |number: usize| {
         let (row, column) = (number / side, number % side);
@@ -62,7 +63,8 @@ pub(crate) fn places(count: usize) -> Vec<Place> {
             longitude_deg: 2.2 + column as f64 * 1.5 * STEP_DEG,
             height_m: 0.0,
         };
-        Some(Place { cell: NodeName::new(format!("cell-{number}")).ok()?, position })
+        let name = if number < simulated { format!("cell-{number}") } else { format!("real-{number}") };
+        Some(Place { cell: NodeName::new(name).ok()?, position })
     };
     (0..count).filter_map(place).collect()
 }

@@ -55,13 +55,16 @@ struct Arguments {
 /// Maximum time until a city is whole again.
 const PATIENCE: Duration = Duration::from_secs(120);
 
+/// Time before a measurement.
+const SETTLE: Duration = Duration::from_secs(5);
+
 /// Time for which a server is stopped by SIGSTOP, and for which cells are cut off.
 const PAUSE: Duration = Duration::from_secs(12);
 
 fn main() -> anyhow::Result<()> {
     let arguments = Arguments::parse();
     let directory = TempDir::new()?;
-    let places = fleet::places(arguments.cells + arguments.real);
+    let places = fleet::places(arguments.cells, arguments.real);
     let (simulated, real) = places.split_at(arguments.cells);
     let cluster = Cluster::start(directory.path(), &places)?;
     let halves = fleet::halves(&places);
@@ -162,8 +165,9 @@ impl City {
         }
     }
 
-    /// Measures for some seconds.
+    /// Measures for some seconds, once what came before has settled.
     fn steady(&self, seconds: u64) {
+        std::thread::sleep(SETTLE);
         self.watches.iter().for_each(Watch::reset);
         let meters = self.cluster.pids().into_iter().map(Meter::start).collect::<Vec<_>>();
         let own = Meter::start(std::process::id());

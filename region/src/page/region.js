@@ -1,7 +1,7 @@
 // The page of a region: asks for the town in view once a second.
 
 import { byId, counted, n, rows, span, text } from "./dom.js";
-import { bounds, draw, fit, hasView, start } from "./town.js";
+import { bounds, draw, fit, hasView, open, start } from "./town.js";
 
 const PERIOD_MS = 1000;
 const MOVED_MS = 150;
@@ -21,7 +21,7 @@ async function ask() {
     const answer = await fetch(`/api/view${query}`, { signal: AbortSignal.timeout(PATIENCE_MS) });
     if (!answer.ok) throw new Error(`the region answers ${answer.status}`);
     latest = await answer.json();
-    if (!hasView() && latest.known) fit(latest.known);
+    if (!hasView()) open(latest.known);
     show(latest);
   } catch (error) {
     state("stale", `No answer: ${error.message}`);
@@ -67,7 +67,8 @@ function show(town) {
 function list({ cells, view }) {
   const key = (cell) => `${cell.tile} ${cell.cell}`;
   text(byId("list-count"), cells.length < view.cells ? "zoom in for single cells" : counted(view.cells, "cell"));
-  byId("cells-empty").hidden = view.cells > 0;
+  byId("cells-empty").hidden = cells.length > 0;
+  text(byId("cells-empty"), view.cells > 0 ? "Too many cells for a list. Zoom in, or press a tile." : "No cell is in view.");
   const word = { live: "live", told: "leads", silent: "silent", offline: "offline" };
   rows(byId("cells"), cells, key, (cell) => [
     cell.page ? { text: cell.cell, href: `http://${cell.page}/`, colour: undefined } : cell.cell,

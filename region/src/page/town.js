@@ -14,9 +14,12 @@ const y = (latitude) => 0.5 - Math.asinh(Math.tan((latitude * Math.PI) / 180)) /
 const longitude = (at) => at * 360 - 180;
 const latitude = (at) => (Math.atan(Math.sinh(Math.PI * (1 - 2 * at))) * 180) / Math.PI;
 
-/// Calls `moved` whenever the view changes.
+/// Calls `moved` whenever the view changes. The address keeps the view, so that it can be shared.
 export function start(moved) {
-  onMove = moved;
+  onMove = () => {
+    history.replaceState(null, "", `#${bounds().map((degrees) => degrees.toFixed(5)).join(",")}`);
+    moved();
+  };
   byId("zoom-in").onclick = () => zoom(2);
   byId("zoom-out").onclick = () => zoom(1 / 2);
   frame.onwheel = (event) => { event.preventDefault(); zoom(2 ** (-event.deltaY / 240), event.offsetX, event.offsetY); };
@@ -39,11 +42,18 @@ export function start(moved) {
   new ResizeObserver(() => view && onMove()).observe(frame);
 }
 
+/// Shows the bounds that the address has, or else these.
+export function open(known) {
+  const [west, south, east, north] = location.hash.slice(1).split(",").map(Number);
+  if (west < east && south < north) fit({ west, south, east, north }, 1);
+  else if (known) fit(known);
+}
+
 /// Shows these bounds with some room.
-export function fit(bounds) {
+export function fit(bounds, share = 0.92) {
   const [width, height] = size();
   const [west, east, north, south] = [x(bounds.west), x(bounds.east), y(bounds.north), y(bounds.south)];
-  const scale = Math.min(width / (east - west), height / (south - north)) * 0.92;
+  const scale = Math.min(width / (east - west), height / (south - north)) * share;
   view = { x: (west + east) / 2, y: (north + south) / 2, scale: clamp(scale) };
   onMove();
 }
@@ -123,7 +133,7 @@ function drawCells(cells, names, all) {
   keyed(cells, all, key, (cell) => {
     const sign = svg("circle", { r: 7 });
     sign.append(svg("title"));
-    sign.onclick = () => { if (sign.page) open(`http://${sign.page}/`, "_blank", "noopener"); };
+    sign.onclick = () => { if (sign.page) window.open(`http://${sign.page}/`, "_blank", "noopener"); };
     return sign;
   }, (sign, cell) => {
     const [cx, cy] = places.get(key(cell));
