@@ -108,14 +108,14 @@ impl Watch {
 
     /// The figures of a time in seconds, in a line.
     pub(crate) fn figures(&self, span: f64) -> String {
-        let Figures { ages, bytes, maps, missing, stale, other, too_old, .. } = &*lock(&self.figures);
+        let Figures { ages, bytes, maps, missing, stale, other, .. } = &*lock(&self.figures);
         let milliseconds = |quantile| ages.value_at_quantile(quantile) as f64 / 1000.0;
         // Those that came too late are not among the maps that count either.
         let lost = missing.saturating_sub(*stale);
         let percent = 100.0 * lost as f64 / (maps + missing).max(1) as f64;
         format!(
             "{:.0} maps/s, {:.1} MB/s, age p50 {:.1} ms, p99 {:.1} ms, most {:.0} ms; {lost} lost ({percent:.3} %), \
-             {stale} not taken as too old, {other} for other reasons, {too_old} taken too old",
+             {stale} too late and not taken, {other} not taken for other reasons",
             *maps as f64 / span,
             *bytes as f64 / span / 1e6,
             milliseconds(0.5),
