@@ -142,7 +142,13 @@ mod tests {
         let mut authority = Authority::init(directory, &config.cell, now).unwrap();
         authority.issue(&name, Role::Edge, Duration::from_secs(60 * 86_400), now).unwrap();
         let (certificate, key) = authority.files_of(&name);
-        TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) }
+        TlsConfig {
+            ca: authority.ca(),
+            certificate,
+            key,
+            revocation_list: Some(authority.revocation_list()),
+            city: None,
+        }
     }
 
     #[tokio::test]

@@ -123,7 +123,7 @@ async fn the_documented_commands_of_mosquitto_receive_by_a_nodes_certificate() {
     let (certificate, key) = authority.files_of(&name);
     std::fs::copy(&certificate, directory.path().join("node.pem")).unwrap();
     std::fs::copy(&key, directory.path().join("node.key")).unwrap();
-    let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+    let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
     let (node, broker) = edge(Some(tls)).await;
     let output = tokio::task::spawn_blocking(move || {
         let scripts = commands("docs/protocol.md", "From a shell");

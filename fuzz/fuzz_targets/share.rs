@@ -26,7 +26,13 @@ static EDGE: LazyLock<(Mutex<EvidenceSigner>, LedgerShare)> = LazyLock::new(|| {
     let mut authority = Authority::init(&directory, &cell, clock::now()).expect("a new directory");
     authority.issue(&edge, Role::Edge, Duration::from_secs(86_400), clock::now()).expect("a certificate");
     let (certificate, key) = authority.files_of(&edge);
-    let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) };
+    let files = TlsConfig {
+        ca: authority.ca(),
+        certificate,
+        key,
+        revocation_list: Some(authority.revocation_list()),
+        city: None,
+    };
     let signer = EvidenceSigner::new(cell, Arc::new(Credentials::load(&files, &edge).expect("just made")));
     let honest = decode(HONEST, &Limits::default()).expect("a share");
     let honest = signer.sign(honest).expect("a key of the right kind");

@@ -176,7 +176,10 @@ fn with_certificates_a_program_of_the_node_publishes_cpms() {
     authority.issue(&name, Role::Edge, Duration::from_secs(86_400), time).unwrap();
     let (certificate, key) = authority.files_of(&name);
     let client = Tls::of_door(authority.ca(), &certificate, &key);
-    let edge = Edge::start(Some((TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None }, client)));
+    let edge = Edge::start(Some((
+        TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None },
+        client,
+    )));
     let (sender, reader) = (Cell::connect(edge.settings.clone()), Cell::connect(edge.settings.clone()));
     let (sender, reader) = (sender.unwrap(), reader.unwrap());
     let began = Instant::now();

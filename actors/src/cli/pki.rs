@@ -1,4 +1,4 @@
-//! `ecod-node pki`: certificates of a cell.
+//! `ecod-node pki`: certificates of a cell or city.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -8,6 +8,7 @@ use clap::{Args, Subcommand};
 use ecod::leadership::Rights;
 use ecod::leadership::election::ElectionConfig;
 use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
 use ecod::wire::Role;
 
 use super::{Failure, print};
@@ -24,6 +25,9 @@ pub(super) enum PkiCommand {
         /// Name of the cell
         #[arg(long)]
         cell: NodeName,
+        /// Directory of the CA of the city that signs the cell's CA; by default the cell stands alone
+        #[arg(long, value_name = "DIR")]
+        city: Option<PathBuf>,
     },
     /// Make a key and a certificate for a node
     Issue {
@@ -48,6 +52,50 @@ pub(super) enum PkiCommand {
         /// Name of the node
         node: NodeName,
     },
+    /// Certificates of a city, whose vehicles take part in all its cells
+    #[command(subcommand)]
+    City(CityCommand),
+}
+
+/// Commands of `pki city`.
+#[derive(Debug, Subcommand)]
+pub(super) enum CityCommand {
+    /// Make the city's CA and an empty revocation list
+    Init {
+        #[command(flatten)]
+        ca: CityDir,
+        /// Name of the city
+        #[arg(long)]
+        city: NodeName,
+    },
+    /// Make a key and a certificate for a vehicle; it leads in no cell
+    Issue {
+        #[command(flatten)]
+        ca: CityDir,
+        /// Name of the vehicle
+        vehicle: NodeName,
+        /// Validity of the certificate in days
+        #[arg(long, default_value_t = DEFAULT_DAYS, value_parser = clap::value_parser!(u32).range(1..=3650))]
+        days: u32,
+    },
+    /// Revoke all certificates of a vehicle, or the CA of a cell
+    Revoke {
+        #[command(flatten)]
+        ca: CityDir,
+        /// Name of the vehicle
+        #[arg(required_unless_present = "cell")]
+        vehicle: Option<NodeName>,
+        /// Name of a cell whose CA, and all that it has certified, counts no more
+        #[arg(long, conflicts_with = "vehicle")]
+        cell: Option<NodeName>,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(super) struct CityDir {
+    /// Directory of the city's CA; anyone who can read its `ca.key` can make cells and vehicles
+    #[arg(long, value_name = "DIR", default_value = "city")]
+    dir: PathBuf,
 }
 
 #[derive(Debug, Args)]
@@ -61,25 +109,72 @@ pub(super) struct AuthorityDir {
 pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
     let now = clock::now();
     let message = match command {
-        PkiCommand::Init { ca, cell } => {
-            let authority = Authority::init(&ca.dir, cell, now).map_err(failure)?;
+        PkiCommand::Init { ca, cell, city } => {
+            let authority = match city {
+                Some(city) => Authority::open(city).and_then(|mut city| city.init_cell(&ca.dir, cell, now)),
+                None => Authority::init(&ca.dir, cell, now),
+            };
+            let authority = authority.map_err(failure)?;
             format!("made a CA for {cell}; copy its certificate to every node: {}\n", shown(&authority.ca()))
         }
         PkiCommand::Issue { ca, node, role, priority, days } => {
-            let mut authority = Authority::open(&ca.dir).map_err(failure)?;
-            let role = role_named(role);
-            let valid = Duration::from_secs(u64::from(*days) * 86_400);
-            authority.issue(node, Rights { role, priority: *priority }, valid, now).map_err(failure)?;
+            let mut authority = open(&ca.dir, false)?;
+            let rights = Rights { role: role_named(role), priority: *priority };
+            authority.issue(node, rights, validity(*days), now).map_err(failure)?;
             configuration(&authority, node)
         }
         PkiCommand::Revoke { ca, node } => {
-            let mut authority = Authority::open(&ca.dir).map_err(failure)?;
+            let mut authority = open(&ca.dir, false)?;
             let count = authority.revoke(node, now).map_err(failure)?;
             let list = shown(&authority.revocation_list());
             format!("revoked {count} of {node}; copy the list to every node (no restart needed): {list}\n")
         }
+        PkiCommand::City(command) => run_city(command, now)?,
     };
     Ok(print(&message)?)
+}
+
+fn run_city(command: &CityCommand, now: Timestamp) -> Result<String, Failure> {
+    Ok(match command {
+        CityCommand::Init { ca, city } => {
+            let authority = Authority::init_city(&ca.dir, city, now).map_err(failure)?;
+            let [ca, list] = [authority.ca(), authority.revocation_list()].map(|path| shown(&path));
+            format!("made a CA for {city}; copy its certificate and list to every node of its cells: {ca} {list}\n")
+        }
+        CityCommand::Issue { ca, vehicle, days } => {
+            let mut authority = open(&ca.dir, true)?;
+            authority.issue(vehicle, Role::Cav, validity(*days), now).map_err(failure)?;
+            let (certificate, key) = authority.files_of(vehicle);
+            let [ca, certificate, key, list] =
+                [authority.ca(), certificate, key, authority.revocation_list()].map(|path| shown(&path));
+            format!(
+                "# ca and revocation_list of the cell where it takes part\n\
+                 [tls]\nca = \"ca.pem\"\nrevocation_list = \"revoked.pem\"\ncertificate = \"{certificate}\"\nkey = \"{key}\"\n\n\
+                 [tls.city]\nca = \"{ca}\"\nrevocation_list = \"{list}\"\n"
+            )
+        }
+        CityCommand::Revoke { ca, vehicle, cell } => {
+            let mut authority = open(&ca.dir, true)?;
+            let revoked = match (vehicle, cell) {
+                (Some(vehicle), _) => authority.revoke(vehicle, now).map(|count| format!("{count} of {vehicle}")),
+                (None, Some(cell)) => authority.revoke_cell(cell, now).map(|count| format!("{count} CAs of {cell}")),
+                (None, None) => return Err(anyhow!("name a vehicle, or a cell by --cell").into()),
+            };
+            let (revoked, list) = (revoked.map_err(failure)?, shown(&authority.revocation_list()));
+            format!("revoked {revoked}; copy the list to every node of the city's cells (no restart needed): {list}\n")
+        }
+    })
+}
+
+/// The CA of a cell or, if so wanted, a city in a directory.
+fn open(directory: &Path, is_city: bool) -> Result<Authority, Failure> {
+    let authority = Authority::open(directory).map_err(failure)?;
+    authority.check_is_city(is_city).map_err(failure)?;
+    Ok(authority)
+}
+
+fn validity(days: u32) -> Duration {
+    Duration::from_secs(u64::from(days) * 86_400)
 }
 
 /// The role of a flag, whose value is one of the three.

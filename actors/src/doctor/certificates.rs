@@ -33,7 +33,7 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
         Ok(credentials) => credentials,
         Err(error) => {
             let fix = match &error {
-                CredentialsError::File { key: "tls.revocation_list", .. } => {
+                CredentialsError::File { key: "tls.revocation_list" | "tls.city.revocation_list", .. } => {
                     "copy `revoked.pem` of the CA again".into()
                 }
                 _ => format!("`ecod-node pki issue {name}` creates new ones"),

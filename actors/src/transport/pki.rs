@@ -8,7 +8,8 @@
 //! EvidenceSigner      signatures under evidence that is passed on
 //! ```
 //!
-//! Each cell has its own CA, so that certificates of other cells are not valid in it. A certificate's common name is the
+//! Each cell has its own CA, so that certificates of other cells are not valid in it. A city's CA may stand above: it signs
+//! the CAs of cells, and certifies vehicles for all of them. A certificate's common name is the
 //! node's name. An alternative name of kind URI holds its highest role and priority. Only the certificate of a node that
 //! may lead also has [`BROKER_NAME`], which clients verify: a vehicle that never leads cannot pose as a broker, and
 //! addresses may change.
@@ -25,7 +26,7 @@ pub(crate) use attestation::{Distrust, MAX_CERTIFICATE_BYTES, is_signed_by};
 pub(crate) use authority::check_name;
 pub use authority::{Authority, AuthorityError, DEFAULT_DAYS};
 pub use broker_trust::{BrokerIdentity, BrokerTrust};
-pub use config::TlsConfig;
+pub use config::{CityTlsConfig, TlsConfig};
 pub use credentials::{Credentials, CredentialsError, LoadedCredentials, external_broker};
 pub use evidence::{EvidenceError, EvidenceSigner};
 pub use subject::{CertificateSubject, InvalidCertificate};

@@ -364,7 +364,13 @@ fn issue(authority: &mut Authority, name: &str, role: Role) -> anyhow::Result<Tl
     let name = NodeName::new(name)?;
     authority.issue(&name, role, Duration::from_secs(86_400), clock::now())?;
     let (certificate, key) = authority.files_of(&name);
-    Ok(TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) })
+    Ok(TlsConfig {
+        ca: authority.ca(),
+        certificate,
+        key,
+        revocation_list: Some(authority.revocation_list()),
+        city: None,
+    })
 }
 
 fn configuration(
@@ -383,7 +389,7 @@ fn configuration(
         Role::Cav => "cav",
         Role::Edge => "edge",
     };
-    let TlsConfig { ca, certificate, key, revocation_list } = tls;
+    let TlsConfig { ca, certificate, key, revocation_list, city: _ } = tls;
     let list = revocation_list.as_ref().map(|list| format!("revocation_list = {list:?}\n")).unwrap_or_default();
     let mut text = format!(
         "name = \"{name}\"\ncell = \"{CELL}\"\nrole = \"{role}\"\nlisten = \"{broker}\"\nstate_dir = \"state\"\n\n\

@@ -55,7 +55,7 @@ async fn evidence_of_the_revoked(target: Target) -> anyhow::Result<()> {
     let (pki, leader) = (target.home.join("pki"), NodeName::from_static(LEADER));
     let mut authority = Authority::open(&pki)?;
     let (certificate, key) = authority.files_of(&leader);
-    let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+    let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
     let signer = EvidenceSigner::new(NodeName::from_static(CELL), Arc::new(Credentials::load(&files, &leader)?));
     let _member = join(&target, Role::Auto).await?;
     let shares = TERMS.into_iter().filter_map(|term| signer.sign(inverted(CANDIDATE, term, LEADER)));

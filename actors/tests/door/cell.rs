@@ -220,7 +220,7 @@ impl Cell {
 
 fn files(authority: &Authority, node: &NodeName) -> TlsConfig {
     let (certificate, key) = authority.files_of(node);
-    TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) }
+    TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()), city: None }
 }
 
 fn loopback() -> SocketAddr {

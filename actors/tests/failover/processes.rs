@@ -61,7 +61,13 @@ fn certificates(name: &str, role: Role, directory: &Path) -> Option<TlsConfig> {
     let (mut authority, node) = (Authority::open(&directory.join(CA)).ok()?, NodeName::new(name).unwrap());
     authority.issue(&node, role, Duration::from_secs(3600), clock::now()).unwrap();
     let (certificate, key) = authority.files_of(&node);
-    Some(TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()) })
+    Some(TlsConfig {
+        ca: authority.ca(),
+        certificate,
+        key,
+        revocation_list: Some(authority.revocation_list()),
+        city: None,
+    })
 }
 
 /// Where a cell that has certificates keeps its CA.

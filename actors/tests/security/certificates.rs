@@ -1,9 +1,11 @@
 //! Clients that have no certificate of the cell, or none that is still good.
 
+use std::fs;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ecod::wire::Role;
+use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Event;
 use ecod_actors::transport::pki::{BROKER_NAME, TlsConfig, external_broker};
 use rustls::pki_types::ServerName;
@@ -12,7 +14,7 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_rustls::TlsConnector;
 
-use crate::fixture::{Cell, Client, DAY, GONE_WITHIN, Pki, SOON, client_config};
+use crate::fixture::{Cell, Client, DAY, GONE_WITHIN, Pki, SOON, client_config, node};
 
 /// A login as MQTT 3.1.1 writes it, with an empty client id.
 const LOGIN_PACKET: [u8; 14] = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 4, 2, 0, 60, 0, 0];
@@ -46,6 +48,33 @@ async fn a_certificate_of_another_cell_is_worth_nothing() {
     let refused = Client::new(cell.address, "euclid", &client_config("euclid", &theirs.0)).log_in().await;
     assert!(refused.is_err(), "{refused:?}");
     cell.counted(Event::ClientUntrusted, 1).await;
+    cell.honest_traffic_goes_on().await;
+}
+
+#[tokio::test]
+async fn a_vehicle_of_the_city_gets_in_and_nobody_of_its_other_cells_does_with_whatever_chain() {
+    let mut cell = Cell::start_in(Pki::in_city(), |_| ()).await;
+    let city = cell.pki.city.as_mut().unwrap();
+    city.issue(&node("gauss"), Role::Cav, DAY, clock::now()).unwrap();
+    let mut other = city.init_cell(&cell.pki.directory.path().join("other"), &node("other"), clock::now()).unwrap();
+    other.issue(&node("zeno"), Role::Edge, DAY, clock::now()).unwrap();
+
+    let gauss = cell.pki.files(cell.pki.city.as_ref().unwrap(), "gauss");
+    let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &gauss));
+    gauss.log_in().await.unwrap();
+
+    let zeno = cell.pki.files(&other, "zeno");
+    let chain = [&zeno.certificate, &other.ca(), &cell.pki.city.as_ref().unwrap().ca()];
+    let chain: String = chain.iter().map(|path| fs::read_to_string(path).unwrap()).collect();
+    let certificate = cell.pki.directory.path().join("chain.pem");
+    fs::write(&certificate, chain).unwrap();
+    let zeno = client_config("zeno", &TlsConfig { certificate, ..zeno });
+    let refused = Client::new(cell.address, "zeno", &zeno).log_in().await;
+    assert!(refused.is_err());
+    cell.counted(Event::ClientUntrusted, 1).await;
+
+    cell.pki.city.as_mut().unwrap().revoke(&node("gauss"), clock::now()).unwrap();
+    timeout(GONE_WITHIN, gauss.drive()).await.expect("still connected");
     cell.honest_traffic_goes_on().await;
 }
 

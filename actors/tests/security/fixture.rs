@@ -9,7 +9,7 @@ use ecod::wire::{Limits, Role, Topics};
 use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::{Counters, Event};
 use ecod_actors::transport::broker::{AccessPolicy, BrokerConfig, EmbeddedBroker, MqttBroker};
-use ecod_actors::transport::pki::{Authority, BROKER_NAME, Credentials, TlsConfig};
+use ecod_actors::transport::pki::{Authority, BROKER_NAME, CityTlsConfig, Credentials, TlsConfig};
 use rumqttc::{AsyncClient, EventLoop, MqttOptions, Packet, QoS, TlsConfiguration, Transport};
 use rustls::ClientConfig;
 use rustls::pki_types::ServerName;
@@ -41,25 +41,41 @@ pub(crate) fn node(name: &str) -> NodeName {
     NodeName::new(name).unwrap()
 }
 
-/// A CA and its directory.
+/// A CA, that of a city above it if there is one, and their directory.
 pub(crate) struct Pki {
-    _directory: TempDir,
+    pub(crate) directory: TempDir,
     pub(crate) authority: Authority,
+    pub(crate) city: Option<Authority>,
 }
 
 impl Pki {
     pub(crate) fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
         let authority = Authority::init(directory.path(), &node("lot"), clock::now()).unwrap();
-        Self { _directory: directory, authority }
+        Self { directory, authority, city: None }
+    }
+
+    /// The same below a city.
+    pub(crate) fn in_city() -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let mut city = Authority::init_city(&directory.path().join("city"), &node("town"), clock::now()).unwrap();
+        let authority = city.init_cell(&directory.path().join("lot"), &node("lot"), clock::now()).unwrap();
+        Self { directory, authority, city: Some(city) }
     }
 
     /// The files of a new certificate.
     pub(crate) fn issue(&mut self, name: &str, role: Role, valid: Duration) -> TlsConfig {
         self.authority.issue(&node(name), role, valid, clock::now()).unwrap();
-        let (certificate, key) = self.authority.files_of(&node(name));
+        self.files(&self.authority, name)
+    }
+
+    /// The files in this cell of a certificate that another CA may have issued.
+    pub(crate) fn files(&self, issuer: &Authority, name: &str) -> TlsConfig {
+        let (certificate, key) = issuer.files_of(&node(name));
         let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
-        TlsConfig { ca, certificate, key, revocation_list: Some(list) }
+        let city = self.city.as_ref();
+        let city = city.map(|city| CityTlsConfig { ca: city.ca(), revocation_list: Some(city.revocation_list()) });
+        TlsConfig { ca, certificate, key, revocation_list: Some(list), city }
     }
 }
 
@@ -108,7 +124,11 @@ impl Cell {
 
     /// The same with other limits.
     pub(crate) async fn start_with(adjust: impl FnOnce(&mut BrokerConfig)) -> Self {
-        let mut pki = Pki::new();
+        Self::start_in(Pki::new(), adjust).await
+    }
+
+    /// The same with certificates of this CA.
+    pub(crate) async fn start_in(mut pki: Pki, adjust: impl FnOnce(&mut BrokerConfig)) -> Self {
         let edge = pki.issue("edge", Role::Edge, DAY);
         let euclid = pki.issue("euclid", Role::Cav, DAY);
         let counters = Arc::<Counters>::default();

@@ -141,7 +141,7 @@ fn tls_of(authority: &mut Authority, name: &'static str, role: Role) -> (TlsConf
     authority.issue(&name, role, Duration::from_secs(86_400), clock::now()).unwrap();
     let (certificate, key) = authority.files_of(&name);
     let tls = Tls::of_door(authority.ca(), &certificate, &key);
-    (TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None }, tls)
+    (TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None }, tls)
 }
 
 #[test]

@@ -117,6 +117,7 @@ mod tests {
                 certificate: "euclid.pem".into(),
                 key: "euclid.key".into(),
                 revocation_list: None,
+                city: None,
             }),
             ..NodeConfig::default()
         };

@@ -125,7 +125,7 @@ impl Certificates {
         self.authority.issue(&name(node), Role::Auto, day, clock::now()).unwrap();
         let (certificate, key) = self.authority.files_of(&name(node));
         let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
-        let files = TlsConfig { ca, certificate, key, revocation_list: Some(list) };
+        let files = TlsConfig { ca, certificate, key, revocation_list: Some(list), city: None };
         Arc::new(Credentials::load(&files, &name(node)).unwrap())
     }
 

@@ -98,6 +98,7 @@ impl NodeDirectory {
             certificate: file("node.pem"),
             key: file("node.key"),
             revocation_list: Some(file("revoked.pem")),
+            city: None,
         };
         let state_dir = self.state_of_service.clone().unwrap_or_else(|| file("state"));
         let configuration = toml::to_string(&Configuration {

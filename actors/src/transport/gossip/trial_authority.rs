@@ -53,7 +53,7 @@ impl TrialAuthority {
     pub(crate) fn files(&self, name: &NodeName) -> TlsConfig {
         let (certificate, key) = self.authority.files_of(name);
         let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
-        TlsConfig { ca, certificate, key, revocation_list: Some(list) }
+        TlsConfig { ca, certificate, key, revocation_list: Some(list), city: None }
     }
 
     /// Revokes a node; the others learn of it when they read the list.

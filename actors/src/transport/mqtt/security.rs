@@ -212,7 +212,7 @@ mod tests {
             let mut authority = Authority::init(directory.path(), &cell, issued_at).unwrap();
             authority.issue(&name, Role::Edge, Duration::from_secs(3600), issued_at).unwrap();
             let (certificate, key) = authority.files_of(&name);
-            let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+            let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
             let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
             let security = Security::load(Some((&tls, &name)), &mqtt, (&membership, &cell)).unwrap();
             let fault = security.clock_fault();
@@ -228,7 +228,7 @@ mod tests {
         let [of_edge, of_euclid] = [&edge, &euclid].map(|name| {
             authority.issue(name, Role::Auto, Duration::from_secs(3600), clock::now()).unwrap();
             let (certificate, key) = authority.files_of(name);
-            let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+            let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
             let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
             Security::load(Some((&tls, name)), &mqtt, (&membership, &cell)).unwrap()
         });

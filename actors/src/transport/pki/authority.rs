@@ -1,4 +1,6 @@
-//! The cell's certificate authority: a directory on one machine, which need not belong to the cell.
+//! The certificate authority of a cell or city: a directory on one machine, which need not belong to the cell.
+
+mod city;
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -9,8 +11,9 @@ use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use rcgen::{
-    BasicConstraints, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose, IsCa,
-    Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, PublicKeyData, RevocationReason, RevokedCertParams, SerialNumber,
+    BasicConstraints, Certificate, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose,
+    IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, PublicKeyData, RevocationReason, RevokedCertParams,
+    SerialNumber,
 };
 use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
@@ -28,7 +31,7 @@ const CA_DAYS: u32 = 3650;
 /// Time by which the validity of a certificate begins in the past, as clocks of the cell may be behind.
 const CLOCK_ALLOWANCE: Duration = Duration::from_secs(3600);
 
-/// The CA of one cell and its register of certificates.
+/// The CA of one cell, or of a city above cells, and its register of certificates.
 #[derive(Debug)]
 pub struct Authority {
     directory: PathBuf,
@@ -38,14 +41,20 @@ pub struct Authority {
 /// Register of all issued certificates, in `issued.json`. The revocation list is made of it.
 #[derive(Debug, Serialize, Deserialize)]
 struct IssuedCertificates {
+    /// Name of the cell or city.
     cell: NodeName,
+    #[serde(default, skip_serializing_if = "is_false")]
+    is_city: bool,
     revision: u64,
     issued: Vec<IssuedCertificate>,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct IssuedCertificate {
+    /// The node, or the cell of a CA.
     node: NodeName,
+    #[serde(default, skip_serializing_if = "is_false")]
+    is_ca: bool,
     serial: String,
     expires_at_us: Timestamp,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -69,6 +78,16 @@ pub enum AuthorityError {
     /// The directory has a CA already, whose certificates would become invalid.
     #[error("{0} has a CA already; a new one needs an empty directory")]
     Exists(PathBuf),
+    /// The CA of a cell where that of a city is needed, or the other way round.
+    #[error("{directory} has the CA of a {found}: {remedy}")]
+    Kind {
+        /// The directory.
+        directory: PathBuf,
+        /// `cell` or `city`.
+        found: &'static str,
+        /// What to do.
+        remedy: &'static str,
+    },
     /// The register cannot be read.
     #[error("{path} cannot be used: {reason}; put a copy of it back")]
     Register {
@@ -100,22 +119,28 @@ impl Authority {
     /// # Errors
     /// [`AuthorityError`] when there is a CA or the directory cannot be written.
     pub fn init(directory: &Path, cell: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
+        let parameters = ca_parameters(&format!("ECOD cell {cell}"), 0, now)?;
+        Self::make(directory, cell, false, now, |key| Ok(parameters.self_signed(key)?))
+    }
+
+    /// Makes a CA whose certificate is signed by `certify`.
+    fn make(
+        directory: &Path,
+        name: &NodeName,
+        is_city: bool,
+        now: Timestamp,
+        certify: impl FnOnce(&KeyPair) -> Result<Certificate, AuthorityError>,
+    ) -> Result<Self, AuthorityError> {
         let file = |path: &Path, source| AuthorityError::File { path: path.into(), source };
         fs::create_dir_all(directory.join(NODES)).map_err(|source| file(directory, source))?;
         if directory.join(CA_KEY).exists() {
             return Err(AuthorityError::Exists(directory.into()));
         }
         let key = KeyPair::generate()?;
-        let mut parameters = CertificateParams::default();
-        parameters.distinguished_name.push(DnType::CommonName, format!("ECOD cell {cell}"));
-        parameters.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
-        parameters.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
-        set_validity(&mut parameters, now, days(CA_DAYS));
-        parameters.serial_number = Some(draw_serial()?);
-        let certificate = parameters.self_signed(&key)?;
+        let certificate = certify(&key)?;
         let secret = key.serialize_pem();
         write(&directory.join(CA), &certificate.pem())?;
-        let register = IssuedCertificates { cell: cell.clone(), revision: 0, issued: Vec::new() };
+        let register = IssuedCertificates { cell: name.clone(), is_city, revision: 0, issued: Vec::new() };
         let mut authority = Self { directory: directory.into(), register };
         authority.save(&Issuer::from_ca_cert_pem(&certificate.pem(), key)?, now)?;
         // Last: the key makes a CA complete. An attempt that failed before it can be repeated.
@@ -179,7 +204,8 @@ impl Authority {
         parameters.use_authority_key_identifier_extension = true;
         parameters.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         parameters.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth];
-        let rights = Some(rights.into()).filter(|rights: &Rights| rights.may_lead()).unwrap_or(Rights::NONE);
+        let may_lead = |rights: &Rights| rights.may_lead() && !self.register.is_city;
+        let rights = Some(rights.into()).filter(may_lead).unwrap_or(Rights::NONE);
         parameters.subject_alt_names.push(rcgen::SanType::URI(rights_uri(rights).try_into()?));
         if rights.may_lead() {
             parameters.subject_alt_names.push(rcgen::SanType::DnsName(BROKER_NAME.try_into()?));
@@ -190,21 +216,31 @@ impl Authority {
         parameters.serial_number = Some(serial.clone());
         let issuer = self.issuer()?;
         let certificate = parameters.signed_by(key, &issuer)?;
-        let _lock = self.lock()?;
         let serial = hex::encode(serial.as_ref());
         let issued = IssuedCertificate {
             node: node.clone(),
+            is_ca: false,
             serial: serial.clone(),
             expires_at_us: now + valid,
             revoked_at_us: None,
         };
-        // Registered before anyone has it, so that every valid certificate can be revoked.
-        self.register.issued.push(issued);
-        self.save(&issuer, now)?;
+        self.record(issued, &issuer, now)?;
         Ok((certificate.pem(), serial))
     }
 
-    /// Name of the cell.
+    /// Registers a certificate before anyone has it, so that every valid certificate can be revoked.
+    fn record(
+        &mut self,
+        issued: IssuedCertificate,
+        issuer: &Issuer<'_, KeyPair>,
+        now: Timestamp,
+    ) -> Result<(), AuthorityError> {
+        let _lock = self.lock()?;
+        self.register.issued.push(issued);
+        self.save(issuer, now)
+    }
+
+    /// Name of the cell or city.
     pub fn cell(&self) -> &NodeName {
         &self.register.cell
     }
@@ -221,7 +257,7 @@ impl Authority {
     /// # Errors
     /// [`AuthorityError`] when there are none or the list cannot be written.
     pub fn revoke(&mut self, node: &NodeName, now: Timestamp) -> Result<usize, AuthorityError> {
-        match self.revoke_where(|issued| issued.node == *node, now)? {
+        match self.revoke_where(|issued| issued.node == *node && !issued.is_ca, now)? {
             0 => Err(AuthorityError::NotIssued(node.clone())),
             revoked => Ok(revoked),
         }
@@ -319,6 +355,22 @@ fn read_register(directory: &Path) -> Result<IssuedCertificates, AuthorityError>
     let register = content(text.as_bytes());
     let register = register.and_then(|register| serde_json::from_slice(register).map_err(|error| error.to_string()));
     register.map_err(|reason| AuthorityError::Register { path, reason })
+}
+
+/// Parameters of a CA's certificate with so many CAs below it in a row.
+fn ca_parameters(name: &str, below: u8, now: Timestamp) -> Result<CertificateParams, AuthorityError> {
+    let mut parameters = CertificateParams::default();
+    parameters.distinguished_name.push(DnType::CommonName, name);
+    parameters.is_ca = IsCa::Ca(BasicConstraints::Constrained(below));
+    parameters.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+    set_validity(&mut parameters, now, days(CA_DAYS));
+    parameters.serial_number = Some(draw_serial()?);
+    Ok(parameters)
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 fn days(count: u32) -> Duration {

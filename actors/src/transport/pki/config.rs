@@ -18,6 +18,21 @@ pub struct TlsConfig {
     /// The CA's revocation list; default none: a certificate is then valid until it expires.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub revocation_list: Option<PathBuf>,
+    /// The city above the cell; default none. The city's CA has signed that of the cell, and vehicles that it certifies itself
+    /// take part in every cell of the city.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub city: Option<CityTlsConfig>,
+}
+
+/// The files that `ecod-node pki city` made for all cells of a city, in PEM.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CityTlsConfig {
+    /// The certificate of the city's CA.
+    pub ca: PathBuf,
+    /// The city's revocation list, of vehicles and of cells' CAs; needed where the cell has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub revocation_list: Option<PathBuf>,
 }
 
 impl TlsConfig {
@@ -26,13 +41,42 @@ impl TlsConfig {
     /// # Errors
     /// [`ConfigError`] with the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let list = self.revocation_list.as_ref();
+        let list = self.revocation_list.as_ref().map(|list| ("revocation_list", list));
+        let city = self.city.as_ref();
+        let city_list = city.and_then(|city| city.revocation_list.as_ref()).map(|list| ("city.revocation_list", list));
         let paths = [("ca", &self.ca), ("certificate", &self.certificate), ("key", &self.key)];
-        for (key, path) in paths.into_iter().chain(list.map(|list| ("revocation_list", list))) {
+        let city_ca = city.map(|city| ("city.ca", &city.ca));
+        for (key, path) in paths.into_iter().chain(list).chain(city_ca).chain(city_list) {
             if path.as_os_str().is_empty() {
                 return Err(ConfigError::new(key, "nothing", "the path of a PEM file"));
             }
         }
-        Ok(())
+        // Where there is any list, certificates of a CA without one are refused.
+        match (list, city_list) {
+            (None, Some(_)) => {
+                Err(ConfigError::new("revocation_list", "nothing", "set together with `city.revocation_list`"))
+            }
+            (Some(_), None) if city.is_some() => {
+                Err(ConfigError::new("city.revocation_list", "nothing", "set together with `revocation_list`"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_city_has_a_list_where_the_cell_has_one() {
+        let read = |cell: &str, city: &str| {
+            let text = format!("ca = \"a\"\ncertificate = \"b\"\nkey = \"c\"\n{cell}\n[city]\nca = \"d\"\n{city}");
+            toml::from_str::<TlsConfig>(&text).unwrap().validate().map_err(|error| error.key)
+        };
+        let list = "revocation_list = \"e\"";
+        assert_eq!([read("", ""), read(list, list)], [Ok(()), Ok(())]);
+        assert_eq!(read(list, "").unwrap_err(), "city.revocation_list");
+        assert_eq!(read("", list).unwrap_err(), "revocation_list");
     }
 }

@@ -1,5 +1,7 @@
 //! The certificates of one node, and the verifiers of others' certificates.
 
+mod city_trust;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -189,11 +191,20 @@ pub fn external_broker(ca: &Path, own: Option<&LoadedCredentials>) -> Result<Bro
 }
 
 fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, CredentialsError> {
-    let roots = Arc::new(roots("tls.ca", &files.ca)?);
+    let mut lists = files
+        .revocation_list
+        .as_deref()
+        .map(|path| lists("tls.revocation_list", path))
+        .transpose()?
+        .unwrap_or_default();
+    let roots = match &files.city {
+        Some(city) => city_trust::roots(&files.ca, city, &mut lists)?,
+        None => roots("tls.ca", &files.ca)?,
+    };
+    let roots = Arc::new(roots);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
     let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
     let key = key.map_err(|error| file_error("tls.key", &files.key, &error))?;
-    let lists = files.revocation_list.as_deref().map(lists).transpose()?.unwrap_or_default();
     let own =
         certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
     let identity =
@@ -242,7 +253,8 @@ fn client_verifier(
     if !lists.is_empty() {
         builder = builder.with_crls(lists.iter().cloned()).only_check_end_entity_revocation();
     }
-    builder.build().map_err(|error| CredentialsError::Unusable(error.to_string()))
+    let verifier = builder.build().map_err(|error| CredentialsError::Unusable(error.to_string()))?;
+    Ok(Arc::new(city_trust::DirectVerifier(verifier)))
 }
 
 fn server_verifier(
@@ -262,18 +274,20 @@ fn crypto() -> Arc<CryptoProvider> {
 
 fn roots(key: &'static str, path: &Path) -> Result<RootCertStore, CredentialsError> {
     let mut roots = RootCertStore::empty();
-    for certificate in pem::<CertificateDer<'static>>(key, path)? {
+    for certificate in authorities(key, path)? {
         roots.add(certificate).map_err(|error| file_error(key, path, &error))?;
-    }
-    if roots.is_empty() {
-        return Err(file_error(key, path, "no certificate"));
     }
     Ok(roots)
 }
 
+/// Certificates of CAs; at least one.
+fn authorities(key: &'static str, path: &Path) -> Result<Vec<CertificateDer<'static>>, CredentialsError> {
+    let certificates = pem(key, path)?;
+    if certificates.is_empty() { Err(file_error(key, path, "no certificate")) } else { Ok(certificates) }
+}
+
 /// Reads revocation lists. A file without any, such as one copied by half, is an error and not an empty list.
-fn lists(path: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, CredentialsError> {
-    let key = "tls.revocation_list";
+fn lists(key: &'static str, path: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, CredentialsError> {
     let lists = pem(key, path)?;
     if lists.is_empty() { Err(file_error(key, path, "no revocation list")) } else { Ok(lists) }
 }
@@ -302,8 +316,9 @@ fn fingerprints(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
         let facts = fs::metadata(path).ok()?;
         Some((facts.modified().ok()?, facts.len()))
     };
+    let city = files.city.iter().flat_map(|city| std::iter::once(&city.ca).chain(&city.revocation_list));
     let paths = [&files.ca, &files.certificate, &files.key];
-    paths.into_iter().chain(&files.revocation_list).map(stamp).collect()
+    paths.into_iter().chain(&files.revocation_list).chain(city).map(stamp).collect()
 }
 
 #[cfg(test)]
@@ -319,7 +334,7 @@ mod tests {
         authority.issue(&edge, Role::Edge, Duration::from_secs(60), clock::now()).unwrap();
         let ((certificate, key), list) = (authority.files_of(&edge), directory.path().join("copied.pem"));
         fs::copy(authority.revocation_list(), &list).unwrap();
-        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(list.clone()) };
+        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(list.clone()), city: None };
         let credentials = Credentials::load(&files, &edge).unwrap();
         let before = credentials.current();
         for text in ["", "# revoked\n", "-----BEGIN X509 CRL-----\nMIIB"] {
@@ -340,7 +355,7 @@ mod tests {
         let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
         authority.issue(&euclid, Role::Auto, Duration::from_secs(60), clock::now()).unwrap();
         let (certificate, key) = authority.files_of(&euclid);
-        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None };
+        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
         let credentials = Credentials::load(&files, &euclid).unwrap();
         assert!(credentials.check_rights(Role::Auto, 100).is_ok() && credentials.check_rights(Role::Cav, 255).is_ok());
         for (role, priority) in [(Role::Edge, 100), (Role::Auto, 101)] {

@@ -175,7 +175,7 @@ mod tests {
         authority.issue(&name(node), role, valid, now).unwrap();
         let (certificate, key) = authority.files_of(&name(node));
         let (ca, list) = (authority.ca(), authority.revocation_list());
-        let files = TlsConfig { ca, certificate, key, revocation_list: Some(list) };
+        let files = TlsConfig { ca, certificate, key, revocation_list: Some(list), city: None };
         EvidenceSigner::new(name("lot"), Arc::new(Credentials::load(&files, &name(node)).unwrap()))
     }
 

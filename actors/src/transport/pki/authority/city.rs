@@ -1,0 +1,66 @@
+//! The CA of a city, above those of its cells.
+
+use std::path::Path;
+
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+
+use super::{Authority, AuthorityError, CA_DAYS, IssuedCertificate, ca_parameters, days};
+
+impl Authority {
+    /// Makes a CA for a city, as [`Authority::init`] makes one for a cell. It certifies vehicles, which hold in all cells of
+    /// the city and lead in none, and the CAs of cells.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when there is a CA or the directory cannot be written.
+    pub fn init_city(directory: &Path, city: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
+        let parameters = ca_parameters(&format!("ECOD city {city}"), 1, now)?;
+        Self::make(directory, city, true, now, |key| Ok(parameters.self_signed(key)?))
+    }
+
+    /// Makes a CA for a cell of this city.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when this is no city, there is a CA or a directory cannot be written.
+    pub fn init_cell(&mut self, directory: &Path, cell: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
+        self.check_is_city(true)?;
+        let mut parameters = ca_parameters(&format!("ECOD cell {cell}"), 0, now)?;
+        parameters.use_authority_key_identifier_extension = true;
+        let serial = parameters.serial_number.as_ref().map(|serial| hex::encode(serial.as_ref())).unwrap_or_default();
+        let issuer = self.issuer()?;
+        Self::make(directory, cell, false, now, |key| {
+            let expires_at_us = now + days(CA_DAYS);
+            let issued =
+                IssuedCertificate { node: cell.clone(), is_ca: true, serial, expires_at_us, revoked_at_us: None };
+            self.record(issued, &issuer, now)?;
+            Ok(parameters.signed_by(key, &issuer)?)
+        })
+    }
+
+    /// Revokes the CAs of a cell, such as one whose key was stolen; returns their number.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when there are none or the list cannot be written.
+    pub fn revoke_cell(&mut self, cell: &NodeName, now: Timestamp) -> Result<usize, AuthorityError> {
+        match self.revoke_where(|issued| issued.node == *cell && issued.is_ca, now)? {
+            0 => Err(AuthorityError::NotIssued(cell.clone())),
+            revoked => Ok(revoked),
+        }
+    }
+
+    /// Checks that this is the CA of a city, or else that of a cell.
+    ///
+    /// # Errors
+    /// [`AuthorityError::Kind`].
+    pub fn check_is_city(&self, is_city: bool) -> Result<(), AuthorityError> {
+        if self.register.is_city == is_city {
+            return Ok(());
+        }
+        let (found, remedy) = if is_city {
+            ("cell", "name the directory that `ecod-node pki city init` made")
+        } else {
+            ("city", "use `ecod-node pki city`, or name the directory of a cell")
+        };
+        Err(AuthorityError::Kind { directory: self.directory.clone(), found, remedy })
+    }
+}
