@@ -95,7 +95,10 @@ mod tests {
         assert_eq!(account.writes(), [format!("{own}/lot-1/#"), "ecod/v1/rep/+/lot-1".to_owned()]);
         assert_eq!(account.reads().len(), 20, "its own, the reputations, two kinds of nine tiles");
         let nats = account.nats("secret");
-        assert!(nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.>\", \"ecod.v1.rep.*.lot-1\""), "{nats}");
+        assert!(
+            nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.>\", \"ecod.v1.rep.*.lot-1\""),
+            "{nats}"
+        );
         assert!(account.mosquitto().contains(&format!("topic write {own}/lot-1/#\n")));
     }
 }

@@ -49,8 +49,7 @@ pub fn main() -> ExitCode {
 fn run_until_stopped<T>(future: impl Future<Output = anyhow::Result<T>>) -> Result<Option<T>, Failure> {
     let runtime = Runtime::new().context("cannot start threads")?;
     let outcome = runtime.block_on(async {
-        let [mut interrupted, mut terminated] =
-            [signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?];
+        let [mut interrupted, mut terminated] = [signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?];
         tokio::select! {
             outcome = future => outcome.map(Some),
             _ = interrupted.recv() => Ok(None),

@@ -123,7 +123,8 @@ async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watc
         if *logged_in.borrow() == 0 {
             continue;
         }
-        let of_tiles = tiles.borrow_and_update().iter().map(|tile| RegionTopic::filter_within(*tile)).collect::<Vec<_>>();
+        let of_tiles =
+            tiles.borrow_and_update().iter().map(|tile| RegionTopic::filter_within(*tile)).collect::<Vec<_>>();
         let wanted: BTreeSet<_> = of_tiles.into_iter().chain([all_statuses()]).collect();
         let (new, old) = (&wanted - &present, &present - &wanted);
         for filter in old {

@@ -126,7 +126,8 @@ impl Town {
     }
 
     fn take(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, RejectReason> {
-        let topic = RegionTopic::parse(path).filter(|topic| topic.tile.to_string().len() == usize::from(CELL_TILE_DIGITS));
+        let topic =
+            RegionTopic::parse(path).filter(|topic| topic.tile.to_string().len() == usize::from(CELL_TILE_DIGITS));
         let topic = topic.ok_or(RejectReason::UnknownTopic)?;
         let key = (topic.tile, topic.cell.clone());
         // Who cleared a retained status has left for good.

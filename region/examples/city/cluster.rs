@@ -58,7 +58,9 @@ impl Cluster {
         fs::write(directory.join("routes.conf"), format!("routes: [{}]\n", routes.join(", ")))?;
         let spawned = addresses.iter().enumerate();
         let servers = spawned
-            .map(|(number, addresses)| Ok(Server { child: spawn(&directory, number, addresses)?, addresses: *addresses }))
+            .map(|(number, addresses)| {
+                Ok(Server { child: spawn(&directory, number, addresses)?, addresses: *addresses })
+            })
             .collect::<anyhow::Result<_>>()?;
         Ok(Self { directory, servers })
     }

@@ -76,7 +76,12 @@ fn main() -> anyhow::Result<()> {
         cluster,
         cells: places.len(),
     };
-    println!("{} simulated cells at {} Hz, {} real cells, {SERVERS} servers", simulated.len(), arguments.hz, real.len());
+    println!(
+        "{} simulated cells at {} Hz, {} real cells, {SERVERS} servers",
+        simulated.len(),
+        arguments.hz,
+        real.len()
+    );
     city.until_whole("from nothing", clock::now())?;
     city.steady(arguments.seconds);
     // While all log in at once, a backlog of seconds cannot be told from a clock that is as much behind.
@@ -140,12 +145,7 @@ impl City {
     }
 
     /// Waits until the subscribers have a map of 99 of 100 cells that was sent later than `since`.
-    fn until_whole_at(
-        &self,
-        watches: &[usize],
-        what: &str,
-        since: Timestamp,
-    ) -> anyhow::Result<()> {
+    fn until_whole_at(&self, watches: &[usize], what: &str, since: Timestamp) -> anyhow::Result<()> {
         let cells: usize = watches.iter().map(|watch| self.of_halves[*watch]).sum();
         let wanted = cells - cells / 100;
         let begun = Instant::now();
@@ -223,7 +223,11 @@ impl City {
             ensure!(begun.elapsed() < PATIENCE, "a new reader gets {} of {} statuses", watch.cells(), self.cells);
             std::thread::sleep(Duration::from_millis(10));
         }
-        println!("  a new reader has the status of all {} cells after {:.2} s", self.cells, begun.elapsed().as_secs_f64());
+        println!(
+            "  a new reader has the status of all {} cells after {:.2} s",
+            self.cells,
+            begun.elapsed().as_secs_f64()
+        );
         Ok(())
     }
 }

@@ -91,12 +91,16 @@ impl RealCells {
 
     /// Nothing goes over the lines of so many cells any more, and nobody tells them.
     pub(crate) fn cut(&self, count: usize) {
-        self.lines.iter().take(count).for_each(|line| { line.send_replace(false); });
+        self.lines.iter().take(count).for_each(|line| {
+            line.send_replace(false);
+        });
     }
 
     /// All lines work again.
     pub(crate) fn mend(&self) {
-        self.lines.iter().for_each(|line| { line.send_replace(true); });
+        self.lines.iter().for_each(|line| {
+            line.send_replace(true);
+        });
     }
 }
 

@@ -22,20 +22,20 @@ pub fn geojson(town: &Town, bounds: &Bounds, now: Timestamp) -> FeatureCollectio
         let Bounds { west, south, east, north } = tile.bounds;
         let ring = json!([[[west, south], [east, south], [east, north], [west, north], [west, south]]]);
         let properties = json!({ "key": tile.key, "cells": tile.totals.cells, "objects": tile.totals.objects });
-        features.push(feature("tile", "Polygon", ring, properties));
+        features.push(feature("tile", "Polygon", &ring, properties));
     }
     for cell in cells {
         let at = json!([cell.longitude_deg, cell.latitude_deg]);
-        features.push(feature("cell", "Point", at, json!(cell)));
+        features.push(feature("cell", "Point", &at, json!(cell)));
     }
     for object in objects {
         let at = json!([object.longitude_deg, object.latitude_deg]);
-        features.push(feature("object", "Point", at, json!(object)));
+        features.push(feature("object", "Point", &at, json!(object)));
     }
     FeatureCollection { r#type: "FeatureCollection", features }
 }
 
-fn feature(kind: &str, geometry: &str, coordinates: Value, properties: Value) -> Value {
+fn feature(kind: &str, geometry: &str, coordinates: &Value, properties: Value) -> Value {
     let mut told = Map::from_iter([("kind".to_owned(), json!(kind))]);
     if let Value::Object(properties) = properties {
         // The geometry has them.

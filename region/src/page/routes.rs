@@ -115,8 +115,7 @@ async fn show_view(State(api): Api, uri: Uri) -> Response {
     api.ask(Some(&bounds), now);
     let (link, asked) = (api.state.link(), api.state.tiles());
     let town = api.state.town().view(&bounds, &asked, now);
-    let answer =
-        ViewAnswer { broker_up: link.is_up, trouble: link.trouble, max_cells_read: MAX_CELLS_READ, town };
+    let answer = ViewAnswer { broker_up: link.is_up, trouble: link.trouble, max_cells_read: MAX_CELLS_READ, town };
     Json(answer).into_response()
 }
 

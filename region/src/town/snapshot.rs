@@ -188,7 +188,10 @@ impl Town {
             view,
             has_maps,
             tiles: tiles(bounds, &shown, now),
-            cells: cells.iter().map(|(tile, name, cell, state)| CellView::new(*tile, name, cell, *state, now)).collect(),
+            cells: cells
+                .iter()
+                .map(|(tile, name, cell, state)| CellView::new(*tile, name, cell, *state, now))
+                .collect(),
             objects: objects.iter().flat_map(|(_, name, cell, _)| cell.objects(name)).collect(),
         }
     }

@@ -95,7 +95,14 @@ impl Cell {
         let object = |number: usize| FusedObject {
             velocity_mps: Some([1.0, 2.0]),
             vehicle: (number == 0).then(|| NodeName::from_static("euclid")),
-            ..FusedObject::new(Uuid::from_u128(number as u128), "car", 0.9, number as f64, 5.0, Covariance::isotropic(0.1))
+            ..FusedObject::new(
+                Uuid::from_u128(number as u128),
+                "car",
+                0.9,
+                number as f64,
+                5.0,
+                Covariance::isotropic(0.1),
+            )
         };
         let map = GlobalMap {
             schema: SCHEMA_VERSION,

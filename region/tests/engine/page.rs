@@ -70,7 +70,10 @@ async fn the_page_counts_what_is_in_view_and_reads_no_more() {
     assert_eq!((&shown["view"]["cells"], &shown["has_maps"]), (&1.into(), &true.into()));
     assert_eq!((&shown["view"]["objects"], &shown["view"]["vehicles"]), (&3.into(), &1.into()));
     let cell = &shown["cells"][0];
-    assert_eq!((&cell["cell"], &cell["leader"], &cell["page"]), (&"lot-1".into(), &"edge".into(), &"10.0.0.3:8080".into()));
+    assert_eq!(
+        (&cell["cell"], &cell["leader"], &cell["page"]),
+        (&"lot-1".into(), &"edge".into(), &"10.0.0.3:8080".into())
+    );
     assert!(cell["age_s"].as_f64().unwrap() < 1.0 && cell["latitude_deg"] == 48.8584, "{cell}");
     let object = shown["objects"].as_array().unwrap().iter().find(|object| object["vehicle"] == "euclid").unwrap();
     // 5 m north of the origin; the frame is not turned.

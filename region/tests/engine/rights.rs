@@ -22,11 +22,8 @@ async fn listen(broker: &Broker) -> Arc<Mutex<Vec<String>>> {
 async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<String> {
     let (lot, far) = (Cell::connect(broker, LOT), Cell::connect(broker, FAR));
     // The last of its own messages shows that all before it had their chance.
-    let foreign_name = |kind| {
-        RegionTopic { tile: lot.account.tile, cell: far.account.cell.clone(), kind }.path()
-    };
-    let foreign_tile =
-        |kind| RegionTopic { tile: far.account.tile, cell: lot.account.cell.clone(), kind }.path();
+    let foreign_name = |kind| RegionTopic { tile: lot.account.tile, cell: far.account.cell.clone(), kind }.path();
+    let foreign_tile = |kind| RegionTopic { tile: far.account.tile, cell: lot.account.cell.clone(), kind }.path();
     for kind in RegionTopicKind::ALL {
         for topic in [far.topic(kind), foreign_name(kind), foreign_tile(kind)] {
             for retain in [false, true] {
