@@ -55,8 +55,8 @@ const SEND_QUEUE: usize = 64;
 const RETRY_MIN: Duration = Duration::from_millis(100);
 const RETRY_MAX: Duration = Duration::from_secs(5);
 
-/// Maximum time for a connection to be made, in seconds.
-const CONNECT_TIMEOUT_S: u64 = 5;
+/// Maximum time for a login in seconds. Servers that elect a JetStream leader take up to 4 s.
+const CONNECT_TIMEOUT_S: u64 = 10;
 
 impl RegionState {
     /// The town.

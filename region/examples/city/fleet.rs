@@ -120,7 +120,11 @@ struct SimulatedCell {
 
 /// First and longest wait before the next attempt to connect.
 const RETRY_MIN: Duration = Duration::from_millis(50);
-const RETRY_MAX: Duration = Duration::from_secs(2);
+const RETRY_MAX: Duration = Duration::from_secs(5);
+
+/// Time for a login in seconds. Servers that elect a JetStream leader take up to 4 s; who gives up before asks again, and
+/// thousands who do keep the servers from ever answering.
+const LOGIN_TIMEOUT_S: u64 = 10;
 
 /// Silence after which a broker is asked whether it is there, and then given up.
 const KEEP_ALIVE: Duration = Duration::from_secs(5);
@@ -154,7 +158,7 @@ impl SimulatedCell {
         options.set_last_will(LastWill::new(topic(RegionTopicKind::Status), gone, QoS::AtMostOnce, true));
         let (client, mut events) = AsyncClient::new(options, 8);
         let mut network = NetworkOptions::new();
-        network.set_connection_timeout(2);
+        network.set_connection_timeout(LOGIN_TIMEOUT_S);
         network.set_tcp_nodelay(true);
         events.set_network_options(network);
         loop {
