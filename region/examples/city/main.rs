@@ -94,9 +94,9 @@ fn main() -> anyhow::Result<()> {
     city.until_whole("on the two that are left", at)?;
     city.steady(arguments.seconds / 2);
     city.cluster.restart(2)?;
-    std::thread::sleep(PAUSE);
 
     if !arguments.quick {
+        std::thread::sleep(PAUSE);
         println!("\nserver 2 stopped for {PAUSE:?}, with a subscriber on it");
         let at = clock::now();
         city.cluster.signal(1, Signal::SIGSTOP)?;

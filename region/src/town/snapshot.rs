@@ -25,9 +25,9 @@ pub struct TownView {
     pub has_maps: bool,
     /// Tiles with cells in the view, in one size.
     pub tiles: Vec<TileView>,
-    /// Cells in the view; none if there are more than [`MAX_CELLS_SHOWN`].
+    /// Cells in the view; none if there are more than `MAX_CELLS_SHOWN`.
     pub cells: Vec<CellView>,
-    /// Objects in the view; none if there are more than [`MAX_OBJECTS_SHOWN`].
+    /// Objects in the view; none if there are more than `MAX_OBJECTS_SHOWN`.
     pub objects: Vec<ObjectView>,
 }
 
