@@ -4,4 +4,4 @@ mod geojson;
 mod log;
 
 pub use geojson::{FeatureCollection, geojson};
-pub use log::MapLog;
+pub use log::CellMapLog;

@@ -14,12 +14,12 @@ use rumqttc::{
 use tokio::sync::watch;
 
 use crate::broker::BrokerLogin;
-use crate::town::{Accepted, Town};
+use crate::town::{Accepted, RegionTown};
 
 /// What the reader knows, for page, metrics and exports.
 #[derive(Debug, Default)]
 pub struct RegionState {
-    town: Mutex<Town>,
+    town: Mutex<RegionTown>,
     link: Mutex<BrokerLink>,
     tiles: watch::Sender<BTreeSet<Quadkey>>,
 }
@@ -60,7 +60,7 @@ const CONNECT_TIMEOUT_S: u64 = 10;
 
 impl RegionState {
     /// The town.
-    pub fn town(&self) -> MutexGuard<'_, Town> {
+    pub fn town(&self) -> MutexGuard<'_, RegionTown> {
         self.town.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

@@ -6,7 +6,7 @@ mod snapshot;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-pub use bounds::{Bounds, InvalidBounds};
+pub use bounds::{GeographicBounds, InvalidBounds};
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
@@ -16,19 +16,19 @@ use ecod::wire::{
     CellDescription, CellMap, GlobalMap, Limits, NodeState, NodeStatus, Payload, RegionTopic, RegionTopicKind,
     RejectReason, decode,
 };
-pub use snapshot::{CellView, ObjectView, TileView, TownTotals, TownView};
+pub use snapshot::{ObjectView, TileView, TownCellView, TownTotals, TownView};
 
 /// Cells by tile and name, and what came of them.
 #[derive(Debug)]
-pub struct Town {
-    cells: BTreeMap<(Quadkey, NodeName), TownCell>,
+pub struct RegionTown {
+    cells: BTreeMap<(Quadkey, NodeName), RegionCell>,
     filter: CellMapFilter,
     counts: TownCounts,
 }
 
 /// The latest of one cell.
 #[derive(Debug, Default)]
-pub struct TownCell {
+pub struct RegionCell {
     /// The status of its leader.
     pub status: Option<NodeStatus>,
     /// The settings that its nodes share.
@@ -104,13 +104,13 @@ pub const MAX_CELLS: usize = 100_000;
 /// Maximum size of a map in bytes: a cell of some thousand objects.
 const MAX_MAP_BYTES: usize = 1 << 20;
 
-impl Default for Town {
+impl Default for RegionTown {
     fn default() -> Self {
         Self { cells: BTreeMap::new(), filter: CellMapFilter::new(MAX_CELLS), counts: TownCounts::default() }
     }
 }
 
-impl Town {
+impl RegionTown {
     /// Takes a message that was read at `now` by a steady clock.
     ///
     /// # Errors
@@ -154,7 +154,7 @@ impl Town {
     }
 
     /// All cells, by tile and name.
-    pub fn cells(&self) -> &BTreeMap<(Quadkey, NodeName), TownCell> {
+    pub fn cells(&self) -> &BTreeMap<(Quadkey, NodeName), RegionCell> {
         &self.cells
     }
 
@@ -176,7 +176,7 @@ impl Town {
 /// Maximum age of a map that is shown, as an old one.
 const KEPT_FOR: Duration = Duration::from_secs(60);
 
-impl TownCell {
+impl RegionCell {
     /// The cell's state at `now`; `is_asked` if its maps are asked for.
     pub fn state(&self, now: Timestamp, is_asked: bool) -> CellState {
         let age = self.map.as_ref().map(|map| now.since(map.sent_at));

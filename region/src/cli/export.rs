@@ -16,9 +16,9 @@ use ecod_actors::platform::clock;
 
 use super::run_until_stopped;
 use crate::broker::BrokerArguments;
-use crate::export::{MapLog, geojson};
+use crate::export::{CellMapLog, geojson};
 use crate::reader::{self, Reading, RegionState};
-use crate::town::{Accepted, Bounds};
+use crate::town::{Accepted, GeographicBounds};
 
 /// Flags of `export`.
 #[derive(Debug, Args)]
@@ -53,7 +53,7 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
     let state = Arc::new(RegionState::default());
     state.ask([arguments.tile].into());
     let log = match format {
-        ExportFormat::Mcap => Some(MapLog::create(&arguments.out)?),
+        ExportFormat::Mcap => Some(CellMapLog::create(&arguments.out)?),
         ExportFormat::GeoJson => None,
     };
     let (log, failed) = (RefCell::new(log), RefCell::new(None));
@@ -90,7 +90,7 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
 
 fn write_geojson(arguments: &ExportArguments, state: &RegionState, now: Timestamp) -> anyhow::Result<String> {
     let town = state.town();
-    let collection = geojson(&town, &Bounds::of(arguments.tile), now);
+    let collection = geojson(&town, &GeographicBounds::of(arguments.tile), now);
     let file = File::create(&arguments.out).with_context(|| format!("cannot write {}", arguments.out.display()))?;
     if let Err(error) = serde_json::to_writer(BufWriter::new(file), &collection) {
         bail!("cannot write {}: {error}", arguments.out.display());

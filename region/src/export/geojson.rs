@@ -4,7 +4,7 @@ use ecod::model::time::Timestamp;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use crate::town::{Bounds, Town, TownView};
+use crate::town::{GeographicBounds, RegionTown, TownView};
 
 /// A GeoJSON document.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -15,11 +15,11 @@ pub struct FeatureCollection {
 }
 
 /// The cells within bounds and all their objects. Each feature has `kind`: `cell`, `tile` or `object`.
-pub fn geojson(town: &Town, bounds: &Bounds, now: Timestamp) -> FeatureCollection {
+pub fn geojson(town: &RegionTown, bounds: &GeographicBounds, now: Timestamp) -> FeatureCollection {
     let TownView { cells, tiles, objects, .. } = town.view_whole(bounds, now);
     let mut features = Vec::new();
     for tile in tiles {
-        let Bounds { west, south, east, north } = tile.bounds;
+        let GeographicBounds { west, south, east, north } = tile.bounds;
         let ring = json!([[[west, south], [east, south], [east, north], [west, north], [west, south]]]);
         let properties = json!({ "key": tile.key, "cells": tile.totals.cells, "objects": tile.totals.objects });
         features.push(feature("tile", "Polygon", &ring, properties));

@@ -13,14 +13,14 @@ use mcap::Writer;
 use mcap::records::MessageHeader;
 
 /// A file that maps are written to: one channel for each cell, with its topic, in JSON.
-pub struct MapLog {
+pub struct CellMapLog {
     writer: Writer<BufWriter<File>>,
     schema: u16,
     /// Number of the channel and of the next message, by topic.
     channels: BTreeMap<String, (u16, u32)>,
 }
 
-impl MapLog {
+impl CellMapLog {
     /// An empty log.
     ///
     /// # Errors

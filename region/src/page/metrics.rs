@@ -30,7 +30,7 @@ impl PageCounts {
     }
 }
 
-type Labels = Vec<(&'static str, String)>;
+type RegionLabels = Vec<(&'static str, String)>;
 
 /// All metrics as text.
 ///
@@ -45,7 +45,7 @@ pub(super) fn metrics(state: &RegionState, page: &PageCounts, started_at: Timest
     };
     gauge(&mut registry, "broker_up", "Whether the region's broker lets the reader in", i64::from(link.is_up));
     counter(&mut registry, "broker_logins", "Logins at the region's broker", link.logins);
-    let states = Family::<Labels, Gauge>::default();
+    let states = Family::<RegionLabels, Gauge>::default();
     for (state, number) in cells {
         states.get_or_create(&vec![("state", state.as_str().to_owned())]).set(count(number));
     }
@@ -57,7 +57,7 @@ pub(super) fn metrics(state: &RegionState, page: &PageCounts, started_at: Timest
     bytes.inc_by(counts.bytes);
     registry.register_with_unit("received", "Payloads received", Unit::Bytes, bytes);
     counter(&mut registry, "maps", "Maps that count", counts.maps);
-    let rejected = Family::<Labels, Counter>::default();
+    let rejected = Family::<RegionLabels, Counter>::default();
     for (reason, number) in counts.rejected {
         rejected.get_or_create(&vec![("reason", reason.as_str().to_owned())]).inc_by(number);
     }

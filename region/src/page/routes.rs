@@ -18,7 +18,7 @@ use super::assets;
 use super::metrics::{self, PageCounts};
 use super::viewers::Viewers;
 use crate::reader::RegionState;
-use crate::town::{Bounds, TownView};
+use crate::town::{GeographicBounds, TownView};
 
 /// State of all routes.
 #[derive(Debug)]
@@ -48,7 +48,7 @@ const MAX_TILES_OF_VIEW: usize = 16;
 const MAX_CELLS_READ: usize = 2000;
 
 /// The whole map.
-const EARTH: Bounds = Bounds { west: -180.0, south: -85.06, east: 180.0, north: 85.06 };
+const EARTH: GeographicBounds = GeographicBounds { west: -180.0, south: -85.06, east: 180.0, north: 85.06 };
 
 impl RegionApi {
     pub(super) fn new(state: Arc<RegionState>, viewers: Viewers) -> Self {
@@ -56,7 +56,7 @@ impl RegionApi {
     }
 
     /// Asks for the tiles of all viewers, of whom one looks at `bounds` now.
-    pub(super) fn ask(&self, bounds: Option<&Bounds>, now: Timestamp) {
+    pub(super) fn ask(&self, bounds: Option<&GeographicBounds>, now: Timestamp) {
         let tiles = bounds.map(|bounds| bounds.tiles(MAX_TILES_OF_VIEW)).unwrap_or_default();
         let is_read = self.state.town().count_within(&tiles) <= MAX_CELLS_READ;
         let looked_at: &[Quadkey] = if is_read { &tiles } else { &[] };
@@ -66,7 +66,7 @@ impl RegionApi {
     }
 }
 
-type Api = State<Arc<RegionApi>>;
+type RegionRequest = State<Arc<RegionApi>>;
 
 /// All routes. Health needs no token, as the machines that ask hold no secrets.
 pub(super) fn router(api: &Arc<RegionApi>, access: PageAccess) -> Router {
@@ -84,14 +84,14 @@ pub(super) fn router(api: &Arc<RegionApi>, access: PageAccess) -> Router {
 }
 
 /// Health: the broker lets the reader in.
-async fn show_health(State(api): Api) -> Response {
+async fn show_health(State(api): RegionRequest) -> Response {
     match api.state.link().is_up {
         true => (StatusCode::OK, "ok\n").into_response(),
         false => (StatusCode::SERVICE_UNAVAILABLE, "no connection to the region's broker\n").into_response(),
     }
 }
 
-async fn show_metrics(State(api): Api) -> Response {
+async fn show_metrics(State(api): RegionRequest) -> Response {
     match metrics::metrics(&api.state, &api.counts, api.started_at) {
         Ok(text) => typed(metrics::CONTENT_TYPE, text),
         Err(error) => {
@@ -102,7 +102,7 @@ async fn show_metrics(State(api): Api) -> Response {
 }
 
 /// The town within `?bounds=WEST,SOUTH,EAST,NORTH`, whose maps are read from now on; without bounds, all of it.
-async fn show_view(State(api): Api, uri: Uri) -> Response {
+async fn show_view(State(api): RegionRequest, uri: Uri) -> Response {
     let query = uri.query().unwrap_or_default();
     let bounds = match query.split('&').find_map(|pair| pair.strip_prefix("bounds=")) {
         None => EARTH,

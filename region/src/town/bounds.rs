@@ -7,7 +7,7 @@ use serde::Serialize;
 
 /// A rectangle in degrees of latitude and longitude.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Bounds {
+pub struct GeographicBounds {
     /// West edge.
     pub west: f64,
     /// South edge.
@@ -18,12 +18,12 @@ pub struct Bounds {
     pub north: f64,
 }
 
-/// A text that is no [`Bounds`].
+/// A text that is no [`GeographicBounds`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("bounds are four numbers WEST,SOUTH,EAST,NORTH in degrees, west below east and south below north")]
 pub struct InvalidBounds;
 
-impl FromStr for Bounds {
+impl FromStr for GeographicBounds {
     type Err = InvalidBounds;
 
     fn from_str(text: &str) -> Result<Self, InvalidBounds> {
@@ -40,7 +40,7 @@ impl FromStr for Bounds {
     }
 }
 
-impl Bounds {
+impl GeographicBounds {
     /// The bounds of a tile.
     pub fn of(tile: Quadkey) -> Self {
         let [[north, west], [south, east]] = tile.corners_deg();
@@ -78,9 +78,9 @@ impl Bounds {
     }
 }
 
-fn bounds(tile: &str) -> Bounds {
-    let nowhere = Bounds { west: 0.0, south: 0.0, east: 0.0, north: 0.0 };
-    tile.parse().map_or(nowhere, Bounds::of)
+fn bounds(tile: &str) -> GeographicBounds {
+    let nowhere = GeographicBounds { west: 0.0, south: 0.0, east: 0.0, north: 0.0 };
+    tile.parse().map_or(nowhere, GeographicBounds::of)
 }
 
 #[cfg(test)]
@@ -90,15 +90,15 @@ mod tests {
     #[test]
     fn a_view_is_covered_by_few_tiles_whatever_its_size() {
         for (text, max_digits) in [("2.29,48.85,2.30,48.86", 15), ("2.0,48.5,2.6,49.1", 11), ("-180,-85,180,85", 2)] {
-            let view: Bounds = text.parse().unwrap();
+            let view: GeographicBounds = text.parse().unwrap();
             let tiles = view.tiles(16);
             assert!((1..=16).contains(&tiles.len()), "{text}: {}", tiles.len());
             assert!(tiles.iter().all(|tile| tile.to_string().len() <= max_digits), "{text}: {}", tiles[0]);
-            let all = tiles.iter().map(|tile| Bounds::of(*tile)).reduce(Bounds::with).unwrap();
+            let all = tiles.iter().map(|tile| GeographicBounds::of(*tile)).reduce(GeographicBounds::with).unwrap();
             assert!(all.west <= view.west && all.east >= view.east && all.north >= view.north, "{all:?}");
         }
         for stranger in ["", "1,2,3", "2,1,1,2", "a,b,c,d", "NaN,0,1,1"] {
-            assert_eq!(stranger.parse::<Bounds>(), Err(InvalidBounds), "{stranger}");
+            assert_eq!(stranger.parse::<GeographicBounds>(), Err(InvalidBounds), "{stranger}");
         }
     }
 }

@@ -10,13 +10,13 @@ use ecod::wire::{FusedObject, Trouble};
 use serde::Serialize;
 use uuid::Uuid;
 
-use super::{Bounds, CellState, Town, TownCell, TownMap};
+use super::{CellState, GeographicBounds, RegionCell, RegionTown, TownMap};
 
 /// The town within a view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TownView {
-    /// Bounds of all cells that are known.
-    pub known: Option<Bounds>,
+    /// GeographicBounds of all cells that are known.
+    pub known: Option<GeographicBounds>,
     /// Numbers of the whole region.
     pub region: TownTotals,
     /// Numbers of the view.
@@ -26,7 +26,7 @@ pub struct TownView {
     /// Tiles with cells in the view, in one size.
     pub tiles: Vec<TileView>,
     /// Cells in the view; none if there are more than `MAX_CELLS_SHOWN`.
-    pub cells: Vec<CellView>,
+    pub cells: Vec<TownCellView>,
     /// Objects in the view; none if there are more than `MAX_OBJECTS_SHOWN`.
     pub objects: Vec<ObjectView>,
 }
@@ -58,7 +58,7 @@ pub struct TileView {
     /// Its quadkey.
     pub key: String,
     /// Where it is.
-    pub bounds: Bounds,
+    pub bounds: GeographicBounds,
     /// What is in it.
     pub totals: TownTotals,
     /// Age in seconds of the oldest of the newest maps in it.
@@ -67,7 +67,7 @@ pub struct TileView {
 
 /// A cell.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct CellView {
+pub struct TownCellView {
     /// Its name.
     pub cell: NodeName,
     /// The quadkey of its tile.
@@ -130,7 +130,7 @@ pub(super) const MAX_CELLS_SHOWN: usize = 512;
 /// Maximum number of objects of a view that are told one by one.
 pub(super) const MAX_OBJECTS_SHOWN: usize = 4096;
 
-impl Town {
+impl RegionTown {
     /// Number of cells in each state; `asked` are the tiles whose maps are asked for.
     pub fn states(&self, asked: &BTreeSet<Quadkey>, now: Timestamp) -> BTreeMap<CellState, usize> {
         let asked: Vec<_> = asked.iter().map(Quadkey::to_string).collect();
@@ -148,12 +148,12 @@ impl Town {
     }
 
     /// The town within bounds; `asked` are the tiles whose maps are asked for.
-    pub fn view(&self, bounds: &Bounds, asked: &BTreeSet<Quadkey>, now: Timestamp) -> TownView {
+    pub fn view(&self, bounds: &GeographicBounds, asked: &BTreeSet<Quadkey>, now: Timestamp) -> TownView {
         self.view_up_to([MAX_CELLS_SHOWN, MAX_OBJECTS_SHOWN], bounds, asked, now)
     }
 
     /// The town within bounds with all its cells and objects, of which all maps are asked for.
-    pub fn view_whole(&self, bounds: &Bounds, now: Timestamp) -> TownView {
+    pub fn view_whole(&self, bounds: &GeographicBounds, now: Timestamp) -> TownView {
         let asked = bounds.tiles(1).into_iter().collect();
         self.view_up_to([usize::MAX; 2], bounds, &asked, now)
     }
@@ -161,16 +161,16 @@ impl Town {
     fn view_up_to(
         &self,
         [max_cells, max_objects]: [usize; 2],
-        bounds: &Bounds,
+        bounds: &GeographicBounds,
         asked: &BTreeSet<Quadkey>,
         now: Timestamp,
     ) -> TownView {
         let asked: Vec<_> = asked.iter().map(Quadkey::to_string).collect();
         let is_asked = |tile: &Quadkey| is_within(*tile, &asked);
-        let (mut region, mut known) = (TownTotals::default(), None::<Bounds>);
+        let (mut region, mut known) = (TownTotals::default(), None::<GeographicBounds>);
         let mut shown = Vec::new();
         for ((tile, name), cell) in self.cells() {
-            let (state, at) = (cell.state(now, is_asked(tile)), Bounds::of(*tile));
+            let (state, at) = (cell.state(now, is_asked(tile)), GeographicBounds::of(*tile));
             region.add(cell, state);
             known = Some(known.map_or(at, |known| known.with(at)));
             if at.meets(bounds) {
@@ -190,17 +190,17 @@ impl Town {
             tiles: tiles(bounds, &shown, now),
             cells: cells
                 .iter()
-                .map(|(tile, name, cell, state)| CellView::new(*tile, name, cell, *state, now))
+                .map(|(tile, name, cell, state)| TownCellView::new(*tile, name, cell, *state, now))
                 .collect(),
             objects: objects.iter().flat_map(|(_, name, cell, _)| cell.objects(name)).collect(),
         }
     }
 }
 
-type Shown<'a> = (Quadkey, &'a NodeName, &'a TownCell, CellState);
+type Shown<'a> = (Quadkey, &'a NodeName, &'a RegionCell, CellState);
 
 /// Tiles of one size with the cells in them.
-fn tiles(bounds: &Bounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<TileView> {
+fn tiles(bounds: &GeographicBounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<TileView> {
     let digits = bounds.tiles(MAX_TILES_SHOWN).first().map_or(0, |tile| tile.to_string().len());
     let mut tiles = BTreeMap::<String, (TownTotals, Option<f64>)>::new();
     for (tile, _, cell, state) in shown {
@@ -211,7 +211,7 @@ fn tiles(bounds: &Bounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<TileView> 
         *oldest_s = [*oldest_s, age_s].into_iter().flatten().reduce(f64::max);
     }
     let view = |(key, (totals, oldest_s)): (String, (TownTotals, Option<f64>))| {
-        Some(TileView { bounds: Bounds::of(key.parse().ok()?), key, totals, oldest_s })
+        Some(TileView { bounds: GeographicBounds::of(key.parse().ok()?), key, totals, oldest_s })
     };
     tiles.into_iter().filter_map(view).collect()
 }
@@ -223,7 +223,7 @@ fn is_within(tile: Quadkey, tiles: &[String]) -> bool {
 }
 
 impl TownTotals {
-    fn add(&mut self, cell: &TownCell, state: CellState) {
+    fn add(&mut self, cell: &RegionCell, state: CellState) {
         self.cells += 1;
         let number = match state {
             CellState::Live => &mut self.live,
@@ -251,7 +251,7 @@ impl TownMap {
     }
 }
 
-impl TownCell {
+impl RegionCell {
     /// The objects of its newest map, on Earth.
     pub fn objects<'a>(&'a self, name: &'a NodeName) -> impl Iterator<Item = ObjectView> + 'a {
         let placed = self.map.iter().flat_map(|map| map.map.objects.iter().map(|object| (&map.origin, object)));
@@ -276,8 +276,8 @@ impl ObjectView {
     }
 }
 
-impl CellView {
-    fn new(tile: Quadkey, name: &NodeName, cell: &TownCell, state: CellState, now: Timestamp) -> Self {
+impl TownCellView {
+    fn new(tile: Quadkey, name: &NodeName, cell: &RegionCell, state: CellState, now: Timestamp) -> Self {
         let (map, status) = (cell.map.as_ref(), cell.status.as_ref());
         let [[north, west], [south, east]] = tile.corners_deg();
         let middle = [(north + south) / 2.0, (west + east) / 2.0];

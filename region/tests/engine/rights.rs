@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 
 use ecod::wire::{NodeState, RegionTopic, RegionTopicKind};
-use ecod_region::town::Town;
+use ecod_region::town::RegionTown;
 
 use crate::broker::{Broker, FAR, LOT, until};
 use crate::cell::Cell;
@@ -121,7 +121,7 @@ async fn a_cell_is_added_while_the_others_stay_connected() {
 
 #[test]
 fn junk_of_a_cell_is_counted_and_harms_nothing() {
-    let mut town = Town::default();
+    let mut town = RegionTown::default();
     let now = ecod_actors::platform::clock::now();
     for (path, payload) in [
         ("ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/lot-1/map", &b"{"[..]),

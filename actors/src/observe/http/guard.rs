@@ -58,7 +58,7 @@ impl fmt::Debug for PageGuard {
     }
 }
 
-/// The routes with the security headers of [`HEADERS`] on every answer.
+/// The routes, with security headers on every answer.
 pub fn with_headers<S: Clone + Send + Sync + 'static>(routes: Router<S>) -> Router<S> {
     routes.layer(middleware::map_response(add_headers))
 }
