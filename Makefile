@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -62,6 +62,9 @@ eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI
 	cargo run --quiet --locked --example eval_real -- --program $(BUILD)/release/ecod-node --data "$(DIR)" --work $(BUILD)/eval-real
 	for set in CF CF_amt SP SP_amt; do cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node \
 	    --sets "$(DIR)/truth-inference-at-scale/data/active-crowd-toolkit/$$set" --work $(BUILD)/eval-real/labels || exit; done
+
+eval-city: setup ## nine cells in generated traffic beside one aggregator over everything; the table goes into docs/evaluation.md
+	cargo run --release --quiet --locked --example eval_city -- --write-table docs/evaluation.md
 
 eval-tracks-check: PACKAGES += python3-venv
 eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics from PyPI

@@ -41,7 +41,7 @@ use crate::model::time::Timestamp;
 use crate::pace::{Pace, PaceRound};
 use crate::perception::landmark::{Landmark, LandmarkIndex};
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::tracking::{Tracker, TracksLosses, TracksMode, TracksRound};
+use crate::tracking::{HandOvers, Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
     FusedObject, GlobalMap, LandmarkState, NeighbourObject, ObjectReport, PerceivedObject, RejectReason, ReportKind,
@@ -355,6 +355,9 @@ impl Aggregator {
     /// clock of `now`. They are in the next maps until they are too old, and lend identities to objects that tracking
     /// finds where they are.
     pub fn take_neighbours(&mut self, objects: &Arc<[NeighbourObject]>, stated_at: Timestamp) {
+        if let Some(tracks) = &mut self.tracks {
+            tracks.take_neighbours(objects, stated_at);
+        }
         self.neighbours = NeighbourView::new(Arc::clone(objects), stated_at);
     }
 
@@ -368,6 +371,17 @@ impl Aggregator {
     /// Numbers of reports and objects so far that tracking could not use.
     pub fn tracks_losses(&self) -> TracksLosses {
         self.tracks.as_ref().map(Tracker::losses).unwrap_or_default()
+    }
+
+    /// Numbers of identities so far that tracking took over from neighbouring cells.
+    pub fn hand_overs(&self) -> HandOvers {
+        self.tracks.as_ref().map(Tracker::hand_overs).unwrap_or_default()
+    }
+
+    /// Weight of a neighbouring cell's statements, 0 to 1: 1 of a newcomer, 0 of a proven liar. Without tracking nobody is
+    /// judged.
+    pub fn trust_in_cell(&self, cell: &NodeName) -> f64 {
+        self.tracks.as_ref().map_or(1.0, |tracks| tracks.trust_in_cell(cell))
     }
 
     /// Number of reports so far that only tracking used, because a later one of their vehicle came before.
@@ -438,7 +452,7 @@ impl Aggregator {
             fused_at_us: fused_at,
             oldest_capture_us: oldest.map(|oldest| self.in_cell_time(oldest)),
             landmarks,
-            neighbour_objects: self.neighbours.shown(&objects, now, self.cell_offset_us),
+            neighbour_objects: self.neighbours.shown(&objects, self.tracks.as_ref(), now, self.cell_offset_us),
             objects,
             pose_corrections,
         });

@@ -109,6 +109,10 @@ trouble_kinds! {
     BrokerUnreachable = "broker_unreachable", LONG, "check its address, the firewall, the certificates on both sides, and whether the broker runs";
     /// A broker that does not let this node do what it must.
     BrokerRefuses = "broker_refuses", UNTIL_SETTLED, "check password, certificate and permissions";
+    /// The region's broker cannot be reached.
+    UplinkUnreachable = "uplink_unreachable", LONG, "look at the link to the region, and whether its broker runs; the cell goes on without it";
+    /// An uplink of a cell that has no place on Earth.
+    NoOrigin = "no_origin", UNTIL_SETTLED, "set `[origin]` in the cell's description: `ecod-node cell set`";
     /// More troubles than are kept.
     NotShown = "not_shown", SHORT, "mend those that are shown, others then have room";
     /// State that cannot be saved.

@@ -22,7 +22,7 @@ pub use filter::{AdmittedMap, CellMapFilter, MAX_AGE};
 
 use crate::model::names::NodeName;
 use crate::model::origin::GeographicOrigin;
-use crate::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
+use crate::model::quadkey::Quadkey;
 use crate::model::time::Timestamp;
 use crate::wire::{CellMap, FusedObject, GlobalMap, NeighbourObject, RegionTopic, RejectReason};
 use extent::Extent;
@@ -173,5 +173,5 @@ impl Neighbours {
 }
 
 fn tile_of(origin: &GeographicOrigin) -> Quadkey {
-    Quadkey::of(&origin.to_wgs84(0.0, 0.0, 0.0), CELL_TILE_DIGITS)
+    Quadkey::of_cell(origin)
 }

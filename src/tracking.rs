@@ -12,6 +12,7 @@ mod config;
 mod coverage;
 mod detection_history;
 mod existence;
+mod foreign;
 mod gating;
 mod gauge;
 mod grid;
@@ -51,6 +52,15 @@ pub struct TracksRound {
     pub oldest_capture: Option<Timestamp>,
     /// Judgements of the vehicles' statements.
     pub evidence: Vec<Evidence>,
+}
+
+/// Numbers of identities that tracks took over from neighbouring cells.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct HandOvers {
+    /// By new tracks.
+    pub begun: u64,
+    /// By tracks that had an identity of this cell.
+    pub renamed: u64,
 }
 
 /// Numbers of reports and objects that were not used.

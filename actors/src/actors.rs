@@ -14,3 +14,4 @@ pub mod membership;
 pub mod projector;
 pub mod recorder;
 pub mod reputation_keeper;
+pub mod uplink;

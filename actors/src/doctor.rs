@@ -65,6 +65,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     findings.extend(camera::examine(config).await);
     findings.extend(units(config));
     findings.extend(network::broker(config).await);
+    findings.extend(network::uplink(config).await);
     findings.push(network::gossip(config));
     findings.extend(network::seeds(config).await);
     findings.extend(cell::examine(config).await);
@@ -301,6 +302,15 @@ mod tests {
         let finding = finding(&config, "broker").await;
         assert_eq!(finding.verdict, CheckResult::Broken);
         assert!(finding.seen.contains(&address.to_string()), "{finding:?}");
+    }
+
+    #[tokio::test]
+    async fn a_region_that_is_not_there_is_doubtful() {
+        let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let mut config = config();
+        config.uplink.broker = Some(address.into());
+        let finding = finding(&config, "uplink").await;
+        assert!(finding.verdict == CheckResult::Doubtful && finding.seen.contains(&address.to_string()), "{finding:?}");
     }
 
     #[tokio::test]

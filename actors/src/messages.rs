@@ -16,3 +16,4 @@ pub mod newest;
 pub mod projector;
 pub mod recorder;
 pub mod reputation_keeper;
+pub mod uplink;

@@ -10,6 +10,7 @@
 //! ├─ Follower          takes maps, verdicts, reputations  always
 //! ├─ ReputationKeeper  publishes and keeps reputations    may lead, in a cell that votes or tracks
 //! ├─ Fuser             closes rounds: maps and verdicts   may lead; publishes only while leading
+//! ├─ Uplink            cells around, a region's broker    may lead, if configured; connected only while leading
 //! ├─ LeaderElection    who leads, and what follows        always
 //! ├─ Dashboard         page, metrics and health           unless switched off
 //! ├─ Projector         detections -> report               with a camera

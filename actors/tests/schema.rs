@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use ecod::model::names::NodeName;
-use ecod::wire::{Topic, Topics};
+use ecod::model::quadkey::Quadkey;
+use ecod::wire::{RegionTopic, RegionTopicKind, Topic, Topics};
 
 const REGENERATE: &str = "regenerate with: ECOD_WRITE_SCHEMAS=1 cargo test -p ecod-actors --test schema";
 
@@ -52,11 +53,16 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
         Topic::Nodes(node.clone()),
     ];
     let spoken = kinds.iter().map(|topic| topics.path(topic)).chain([topics.clients(&node)]);
-    let spoken: BTreeSet<_> =
+    let spoken: BTreeSet<String> =
         spoken.chain(["map", "vehicles/node", "received/{receiver}"].map(|level| topics.cpm(level))).collect();
+    let tile: Quadkey = "0".parse().unwrap();
+    let of_region = RegionTopicKind::ALL.map(|kind| RegionTopic { tile, cell: NodeName::from_static("cell"), kind });
+    let spoken = &spoken | &of_region.iter().map(RegionTopic::path).collect();
     let addresses = values(&document, "address: ", '\n');
-    let documented: BTreeSet<_> =
-        addresses.iter().map(|address| address.replace("{cell}", "cell").replace("{node}", "node")).collect();
+    let documented: BTreeSet<_> = addresses
+        .iter()
+        .map(|address| address.replace("{cell}", "cell").replace("{node}", "node").replace("{tile}", "0"))
+        .collect();
     assert_eq!(documented, spoken);
     let schemas = ecod::wire::schemas();
     let files: BTreeSet<_> = schemas.keys().map(|name| format!("{name}.json")).collect();

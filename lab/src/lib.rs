@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! traffic   generated towns: reports and truth
+//! town      many cells in generated traffic, virtual time              (uses traffic, eval)
 //! eval      accuracy of maps, verdicts and objects by what is true
 //! testbed   recorded scenes: geometry, renderer, virtual-time trials   (uses eval)
 //! street    a street that moves: truth, network cameras, animation    (uses eval, testbed)
@@ -24,4 +25,5 @@ pub mod node_process;
 pub mod report;
 pub mod street;
 pub mod testbed;
+pub mod town;
 pub mod traffic;

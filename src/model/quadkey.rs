@@ -7,7 +7,7 @@ use std::f64::consts::PI;
 use std::fmt;
 use std::str::FromStr;
 
-use crate::model::origin::GeographicPosition;
+use crate::model::origin::{GeographicOrigin, GeographicPosition};
 
 /// Digits of the tile of a cell. Its side is 1.22 km at the equator, and 0.61 km at 60° of latitude.
 pub const CELL_TILE_DIGITS: u8 = 15;
@@ -42,6 +42,12 @@ impl Quadkey {
         // `as` saturates, so that the edges of the map stay in it.
         let index = |share: f64| ((share * tiles) as u32).min((1 << digits) - 1);
         Self { digits, x: index(east), y: index(south) }
+    }
+
+    /// The tile of the cell with this origin, of [`CELL_TILE_DIGITS`].
+    pub fn of_cell(origin: &GeographicOrigin) -> Self {
+        let GeographicOrigin { latitude_deg, longitude_deg, height_m, .. } = *origin;
+        Self::of(&GeographicPosition { latitude_deg, longitude_deg, height_m }, CELL_TILE_DIGITS)
     }
 
     /// This tile and those that touch it: nine, or fewer at the ends of the map in the north and south.

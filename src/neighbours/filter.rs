@@ -56,8 +56,9 @@ struct CellOrder {
 #[derive(Debug, Clone)]
 struct DelayEstimate {
     least: MinimumDelay,
-    /// When it was last undercut.
-    fell_at: Timestamp,
+    /// A delay in microseconds of late, and since when none was much shorter.
+    usual_us: i64,
+    since: Timestamp,
 }
 
 impl CellMapFilter {
@@ -128,16 +129,18 @@ impl CellOrder {
 
 impl DelayEstimate {
     fn new(now: Timestamp) -> Self {
-        Self { least: MinimumDelay::new(now), fell_at: now }
+        Self { least: MinimumDelay::new(now), usual_us: i64::MAX, since: now }
     }
 
     /// Takes a delay; returns what it is beyond the least one, if that is known.
     fn observe(&mut self, delay_us: i64, now: Timestamp) -> Option<Duration> {
-        if delay_us < self.least.least().saturating_sub(JITTER_US) {
-            self.fell_at = now;
-        }
         self.least.observe(delay_us, now);
-        let beyond_us = delay_us.saturating_sub(self.least.least());
-        (now.since(self.fell_at) >= SETTLES_AFTER).then(|| Duration::from_micros(beyond_us.unsigned_abs()))
+        let least_us = self.least.least();
+        if least_us < self.usual_us.saturating_sub(JITTER_US) {
+            (self.usual_us, self.since) = (least_us, now);
+        }
+        self.usual_us = self.usual_us.max(least_us);
+        let beyond_us = delay_us.saturating_sub(least_us);
+        (now.since(self.since) >= SETTLES_AFTER).then(|| Duration::from_micros(beyond_us.unsigned_abs()))
     }
 }

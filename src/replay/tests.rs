@@ -1,3 +1,5 @@
+mod neighbours;
+
 use nalgebra::Point2;
 
 use super::*;

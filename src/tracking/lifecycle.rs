@@ -16,7 +16,7 @@ use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, GlobalMap, ObjectReport};
 
 /// Maximum distance of two tracks of one object, metres.
-const MERGE_M: f64 = 2.0;
+pub(super) const MERGE_M: f64 = 2.0;
 
 /// The same in metres if their labels differ: people get in and out of cars, and stand beside each other.
 const MERGE_UNLIKE_M: f64 = 1.0;
@@ -128,7 +128,7 @@ pub(super) fn adopt_map(tracks: &mut TrackStore, map: &GlobalMap, now: Timestamp
     }
 }
 
-fn measurement(object: &FusedObject, config: &TracksConfig) -> Measurement {
+pub(super) fn measurement(object: &FusedObject, config: &TracksConfig) -> Measurement {
     let floor = Covariance::isotropic(config.noise_floor_m);
     Measurement {
         position: Vector2::new(object.x_m, object.y_m),

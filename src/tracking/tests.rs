@@ -1,6 +1,7 @@
 mod beside;
 mod fast;
 mod fixed;
+mod foreign;
 mod trust;
 
 use std::collections::BTreeSet;

@@ -66,6 +66,8 @@ pub(super) struct Track {
     pub(super) vehicle: Option<SensorId>,
     /// Number of detections.
     pub(super) hits: u32,
+    /// Number of identities taken over from neighbouring cells.
+    pub(super) renames: u8,
     pub(super) neighbours: Neighbours,
     /// Log-odds from another aggregator, which fade, and the time at which they came.
     inherited: Option<(f64, Timestamp)>,
@@ -88,6 +90,7 @@ impl Track {
             disappeared: 0.0,
             vehicle: None,
             hits: 0,
+            renames: 0,
             neighbours: Neighbours::default(),
             inherited: None,
             clutter: None,

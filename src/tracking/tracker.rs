@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use super::config::TracksConfig;
 use super::existence::BaseRate;
+use super::foreign::ForeignObjects;
 use super::lifecycle::{adopt_map, merge, prune};
 use super::registration::{RegistrationFrame, register};
 use super::sensors::Sensors;
@@ -12,11 +13,12 @@ use super::store::TrackStore;
 use super::track::Track;
 use super::turning::TurningFrame;
 use super::update::{ReportOutcome, ReportUpdate};
-use super::{TracksLosses, TracksRound};
+use super::{HandOvers, TracksLosses, TracksRound};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
+use crate::neighbours::MAX_AGE;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use crate::wire::{FusedObject, GlobalMap, ObjectReport, PerceivedObject, PoseCorrection};
+use crate::wire::{FusedObject, GlobalMap, NeighbourObject, ObjectReport, PerceivedObject, PoseCorrection};
 
 /// Tracks objects; see the [module](super).
 #[derive(Debug, Clone)]
@@ -24,6 +26,7 @@ pub struct Tracker {
     config: TracksConfig,
     pub(super) sensors: Sensors,
     tracks: TrackStore,
+    foreign: ForeignObjects,
     base_rate: BaseRate,
     /// Reports of the open round with their times of capture.
     pending: Vec<(Timestamp, Arc<ObjectReport>)>,
@@ -41,6 +44,7 @@ impl Tracker {
         Self {
             sensors: Sensors::new(reputation),
             tracks: TrackStore::new(&config),
+            foreign: ForeignObjects::default(),
             base_rate: BaseRate::default(),
             config,
             pending: Vec::new(),
@@ -96,6 +100,27 @@ impl Tracker {
         adopt_map(&mut self.tracks, steady.as_ref().unwrap_or(map), now, &self.config);
     }
 
+    /// Takes all objects of neighbouring cells, of the age that they state at `stated_at`; their times are by its clock.
+    /// Frames that turn have no place on Earth and no neighbours.
+    pub fn take_neighbours(&mut self, objects: &[NeighbourObject], stated_at: Timestamp) {
+        self.foreign.take(objects, stated_at, &mut self.tracks, &self.sensors.fleet, &self.config);
+    }
+
+    /// True if an object of a neighbouring cell is not to be shown: it is one of the tracks, or its cell is not believed.
+    pub fn hides(&self, object: &NeighbourObject) -> bool {
+        self.foreign.hides(object, &self.sensors.fleet)
+    }
+
+    /// Weight of a neighbouring cell's statements, 0 to 1: 1 of a newcomer, 0 of a proven liar.
+    pub fn trust_in_cell(&self, cell: &NodeName) -> f64 {
+        self.foreign.trust(cell, &self.sensors.fleet)
+    }
+
+    /// Identities that tracks took over from neighbouring cells so far.
+    pub fn hand_overs(&self) -> HandOvers {
+        self.foreign.hand_overs
+    }
+
     /// Begins a leadership: earlier observations are for the leader before to judge.
     pub(crate) fn begin_record(&mut self, now: Timestamp) {
         self.recorded_from = now;
@@ -118,6 +143,7 @@ impl Tracker {
         }
         merge(&mut self.tracks, now, &self.config);
         prune(&mut self.tracks, &mut self.sensors, now, &self.config);
+        self.foreign.forget(now - MAX_AGE, |vehicle| self.sensors.get(vehicle).is_some());
         let (mut objects, mut pose_corrections) = (self.objects(now), self.corrections());
         self.frame.restore(now, &mut objects, pose_corrections.values_mut());
         TracksRound { objects, pose_corrections, oldest_capture, evidence }
@@ -154,7 +180,8 @@ impl Tracker {
             self.tracks.reindex_if_stale(at);
             let (sensor, fleet) = self.sensors.hear(&report.node, at, &self.config);
             let id = sensor.id;
-            let update = ReportUpdate::new(&self.config, &mut self.tracks, (sensor, fleet), report, at);
+            let update =
+                ReportUpdate::new(&self.config, &mut self.tracks, (sensor, fleet), &mut self.foreign, report, at);
             let ReportOutcome { has_jumped, samples, evidence: judged } = update.run();
             if has_jumped {
                 frames.retain(|earlier| earlier.sensor != id);

@@ -59,9 +59,9 @@ struct PeerEvidence {
 }
 
 impl PeerEvidence {
-    fn of(history: &DetectionHistory, sensor: SensorId, at: Timestamp, fleet: &Fleet) -> Self {
+    fn of(history: &DetectionHistory, sensor: Option<SensorId>, at: Timestamp, fleet: &Fleet) -> Self {
         let mut peers = Self::default();
-        for history in history.iter().filter(|history| history.sensor != sensor) {
+        for history in history.iter().filter(|history| Some(history.sensor) != sensor) {
             if at.since(history.last_look) > JUDGED_AFTER {
                 continue;
             }
@@ -118,6 +118,11 @@ impl TrustCounts {
 
     fn total(&self) -> f64 {
         self.correct + self.incorrect
+    }
+
+    /// True if there are as many statements as the initial score weighs, and the reputation is no worse.
+    pub(super) fn is_proven(&self, config: &ReputationConfig) -> bool {
+        self.total() >= config.initial_votes && config.mean(self.correct, self.incorrect) >= config.initial
     }
 
     /// Weight of the vehicle's evidence: 1 from a newcomer's reputation up, 0 at that of a proven liar.
@@ -221,11 +226,16 @@ impl Fleet {
         distance_m: f64,
         at: Timestamp,
     ) -> Option<Judgement> {
-        let judgement = PeerEvidence::of(history, sensor, at, self).judge(statement)?;
+        let judgement = PeerEvidence::of(history, Some(sensor), at, self).judge(statement)?;
         if judgement != Judgement::FalsePositive {
             self.learn(distance_m, judgement == Judgement::Correct);
         }
         (judgement != Judgement::Miss || self.expects(distance_m)).then_some(judgement)
+    }
+
+    /// Judges the statement of somebody beyond these vehicles that an object exists, by what they saw of it.
+    pub(super) fn judge_stated(&self, history: &DetectionHistory, at: Timestamp) -> Option<Judgement> {
+        PeerEvidence::of(history, None, at, self).judge(ExistenceStatement { hits: 1, looks: 1 })
     }
 
     fn learn(&mut self, distance_m: f64, is_detected: bool) {

@@ -8,6 +8,7 @@ use nalgebra::{Matrix2, Vector2};
 use super::calibration::log_odds;
 use super::config::TracksConfig;
 use super::existence::{DetectionRates, ExistenceStatement, LookRates};
+use super::foreign::ForeignObjects;
 use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::track_id;
 use super::occlusion::OcclusionMap;
@@ -32,6 +33,9 @@ const MATURE_HITS: u32 = 8;
 /// Number of detections from which a track measures registration and detection rates.
 pub(super) const ESTABLISHED_HITS: u32 = 5;
 
+/// Maximum number of objects of neighbouring cells that are compared with a report.
+const MAX_FOREIGN: usize = 64;
+
 /// Log-odds of a vehicle's confidence that it exists itself.
 const OWN_NATS: f64 = 4.0;
 
@@ -54,6 +58,7 @@ pub(super) struct ReportUpdate<'a> {
     pub(super) sensor: &'a mut SensorModel,
     pub(super) at: Timestamp,
     fleet: &'a mut Fleet,
+    foreign: &'a mut ForeignObjects,
     report: &'a ObjectReport,
     /// Weight of the vehicle's evidence before the update, 0 to 1.
     trust: f64,
@@ -77,6 +82,7 @@ impl<'a> ReportUpdate<'a> {
         config: &'a TracksConfig,
         tracks: &'a mut TrackStore,
         (sensor, fleet): (&'a mut SensorModel, &'a mut Fleet),
+        foreign: &'a mut ForeignObjects,
         report: &'a ObjectReport,
         at: Timestamp,
     ) -> Self {
@@ -89,7 +95,7 @@ impl<'a> ReportUpdate<'a> {
         let trust = fleet.trust(sensor.id);
         let samples = Vec::with_capacity(report.objects.len());
         let outcome = ReportOutcome { has_jumped, samples, evidence: Vec::new() };
-        Self { config, tracks, sensor, at, fleet, report, trust, occlusion, outcome }
+        Self { config, tracks, sensor, at, fleet, foreign, report, trust, occlusion, outcome }
     }
 
     /// Carries out the update.
@@ -113,6 +119,7 @@ impl<'a> ReportUpdate<'a> {
             }
         }
         self.count_misses(&detected);
+        self.look_at_foreign(&detections);
         if self.is_trusted() {
             unassociated.into_iter().for_each(|detection| self.spawn(detection));
         }
@@ -139,8 +146,11 @@ impl<'a> ReportUpdate<'a> {
             let innovation = self.tracks[track].state.innovation(at, &measurement, density);
             innovation.offset.norm() <= self.config.gate_m || innovation.distance_squared <= self.config.gate()
         });
-        let spawn = || Track::new(track_id(self.report, usize::MAX), at, &measurement, self.config);
-        let Some(index) = known.or_else(|| self.tracks.add(spawn())) else { return };
+        let begin = |update: &mut Self| {
+            let track = update.begin(&measurement, usize::MAX, None);
+            update.tracks.add(track)
+        };
+        let Some(index) = known.or_else(|| begin(self)) else { return };
         self.tracks.set_vehicle(index, vehicle);
         let track = &mut self.tracks[index];
         if is_in_reach {
@@ -280,6 +290,39 @@ impl<'a> ReportUpdate<'a> {
         }
     }
 
+    /// Takes note of what the vehicle sees where cells state that objects are, and judges those cells.
+    fn look_at_foreign(&mut self, detections: &[TimedDetection<'_>]) {
+        let (id, at, gate) = (self.sensor.id, self.at, self.config.gate());
+        let Some(centre) = self.sensor.coverage.centre().filter(|_| !self.foreign.is_empty()) else { return };
+        let reach_m = self.sensor.coverage.range_m();
+        for foreign in self.foreign.stated_near(&centre, reach_m, at).take(MAX_FOREIGN) {
+            let position = foreign.state.position_at(at);
+            let rates = self.sensor.coverage.rates_at(&position).filter(|_| !self.occlusion.hides(&position));
+            let near = detections.iter().filter(|detection| {
+                let innovation = foreign.state.innovation(at, &detection.measurement, self.config.density());
+                // Its place is as old as its cell's map.
+                innovation.offset.norm() <= 2.0 * self.config.gate_m && innovation.distance_squared <= gate
+            });
+            let likeliest = near.map(|detection| detection.log_odds).max_by(f64::total_cmp);
+            match (likeliest, rates) {
+                (Some(log_odds), rates) => {
+                    let rates = self.sensor.look_rates(rates.unwrap_or(DetectionRates::PRIOR));
+                    if let Some(history) = foreign.history.for_hit(id, at) {
+                        history.hit(at, position, self.sensor.calibration.nats(log_odds), Some(rates));
+                    }
+                }
+                (None, Some(rates)) => {
+                    let rates = self.sensor.look_rates(rates);
+                    if let Some(history) = foreign.history.for_look(id, at) {
+                        history.miss(at, rates);
+                    }
+                }
+                (None, None) => {}
+            }
+        }
+        self.foreign.judge(self.fleet, at);
+    }
+
     /// Judges the vehicle's statement about a track by the evidence of the others.
     fn judge(&mut self, index: TrackIndex, reported: &Vector2<f64>, statement: ExistenceStatement) {
         let track = &self.tracks[index];
@@ -292,10 +335,23 @@ impl<'a> ReportUpdate<'a> {
         self.outcome.evidence.push(Evidence { node: self.sensor.node.clone(), label, correct });
     }
 
+    /// A new track at a measurement of object `index` of the report: an object of a neighbouring cell, if one is there.
+    fn begin(&mut self, measurement: &Measurement, index: usize, detected: Option<&PerceivedObject>) -> Track {
+        let (at, config) = (self.at, self.config);
+        match self.foreign.find(at, measurement, detected, self.tracks, self.fleet, config) {
+            Some(foreign) => {
+                let track = foreign.lend(at, measurement, config);
+                self.foreign.hand_overs.begun += 1;
+                track
+            }
+            None => Track::new(track_id(self.report, index), at, measurement, config),
+        }
+    }
+
     /// Spawns a track from a detection that no track explains.
     fn spawn(&mut self, detection: &TimedDetection<'_>) {
-        let (id, at) = (track_id(self.report, detection.index), self.at);
-        let mut track = Track::new(id, at, &detection.measurement, self.config);
+        let at = self.at;
+        let mut track = self.begin(&detection.measurement, detection.index, Some(detection.object));
         detection.describe(&mut track, self.sensor, at, self.config);
         let nats = self.sensor.calibration.nats(detection.log_odds);
         if let Some(history) = track.history.for_hit(self.sensor.id, at) {

@@ -4,6 +4,7 @@
 //! Gateway ── reports ──> LatestReportQueue ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
 //! Gateway ── TakeReports ──────────> │ ▲
 //! Follower ── TakeMap ─────────────> │ │
+//! Uplink ── TakeNeighbours ────────> │ │
 //! LeaderElection ── Lead, … ───────> │ │ └── Record ──> ReputationKeeper
 //! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
 //! ```
@@ -133,6 +134,9 @@ impl Actor for Fuser {
                 state.keeper.send(ReputationKeeperMessage::StepDown);
             }
             FuserMessage::Configure { fusion, landmarks } => state.command(Command::Configure { fusion, landmarks }),
+            FuserMessage::TakeNeighbours { objects, stated_at } => {
+                state.command(Command::TakeNeighbours { objects, stated_at });
+            }
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
             FuserMessage::Timeliness { reply } => {

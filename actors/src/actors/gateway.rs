@@ -20,6 +20,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
+use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, NodeState, NodeStatus, Payload, Topic, Topics, encode};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
@@ -32,7 +33,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
-use crate::transport::mqtt::connection::{LastWill, Retention, offline_payload};
+use crate::transport::mqtt::connection::{LastWill, MaxQos, Retention, offline_payload};
 use crate::transport::mqtt::inbox::{Inbox, Via};
 use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink};
 use crate::transport::mqtt::subscription_role::REPORTS;
@@ -86,6 +87,7 @@ pub struct GatewayState {
     too_large: BTreeSet<String>,
     /// Other living runs of this node's name.
     namesakes: BTreeSet<Uuid>,
+    inbox: Arc<Inbox>,
     setup: Arc<LinkSetup>,
 }
 
@@ -112,7 +114,7 @@ impl Actor for Gateway {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let inbox = Arc::clone(&state.setup.inbox);
+        let inbox = Arc::clone(&state.inbox);
         match message {
             GatewayMessage::SetBrokers { addresses } => state.set_brokers(addresses, &myself),
             GatewayMessage::SetReportBrokers { addresses } => state.report_brokers = Some(addresses),
@@ -196,8 +198,11 @@ impl GatewayState {
         // will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());
         let (will, inbox) = (Mutex::new(will), Arc::new(inbox));
-        let setup = LinkSetup { client_id, filters, will, config: mqtt, security, inbox, counters, seed };
+        let sink = Arc::<Inbox>::clone(&inbox);
+        let unreachable = TroubleKind::BrokerUnreachable;
+        let setup = LinkSetup { client_id, filters, will, config: mqtt, security, sink, unreachable, counters, seed };
         Self {
+            inbox,
             looks_on,
             report_brokers: None,
             watches_reports: false,
@@ -253,7 +258,7 @@ impl GatewayState {
         let reports = REPORTS.map(|level| self.topics.filter(level));
         for link in self.links.values().filter(|link| !self.takes_reports_of(&link.broker)) {
             let told = link.client.as_ref().map(|client| match wanted {
-                true => client.subscribe(&reports),
+                true => client.subscribe(&reports, MaxQos::AtLeastOnce),
                 false => client.unsubscribe(&reports),
             });
             tracing::debug!(broker = %link.broker, wanted, ?told, "subscription to reports changed");
@@ -291,7 +296,7 @@ impl GatewayState {
         for (link, reports) in self.links.values_mut().zip(reports) {
             if (of_all || reports) && link.state == LinkState::Up && link.misses_echo(now) {
                 link.state = LinkState::Stalled;
-                tell_state(&self.setup.inbox, link);
+                tell_state(&self.inbox, link);
             }
         }
     }
@@ -328,7 +333,7 @@ impl GatewayState {
             LinkChange::Accepted { client, node } => {
                 // The queue of a new connection is empty, so that both fit.
                 client.publish(&self.status_topic, &self.status_payload, Retention::Retained);
-                client.subscribe(&filters);
+                client.subscribe(&filters, MaxQos::AtLeastOnce);
                 (link.client, link.node) = (Some(client), node);
                 LinkState::Up
             }
@@ -355,7 +360,7 @@ impl GatewayState {
         };
         if link.state != state {
             link.state = state;
-            tell_state(&self.setup.inbox, link);
+            tell_state(&self.inbox, link);
         }
     }
 }

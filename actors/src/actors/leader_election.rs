@@ -35,6 +35,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::messages::uplink::UplinkMessage;
 use crate::observe::readiness::SharedFacts;
 use crate::observe::recorder::LogSender;
 use crate::platform::cell_clock::CellClock;
@@ -56,6 +57,8 @@ pub struct Parts {
     pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// Keeps the cell's description.
     pub description: ActorSlot<DescriptionKeeperMessage>,
+    /// Tells the region of the node's status.
+    pub uplink: ActorSlot<UplinkMessage>,
     /// The node's own broker.
     pub broker: ActorSlot<BrokerMessage>,
     /// Shows the node's status to programs.

@@ -19,7 +19,7 @@ use uuid::Uuid;
 use super::{Failure, print};
 use crate::node::config::{NodeConfig, SharedConfig};
 use crate::transport::mqtt::MqttVersion;
-use crate::transport::mqtt::connection::{Client, Connection, Packet, Retention, open};
+use crate::transport::mqtt::connection::{Client, Connection, MaxQos, Packet, Retention, open};
 use crate::transport::pki::{BrokerTrust, OBSERVER_MARK};
 
 /// Commands of `cell`.
@@ -152,7 +152,8 @@ impl DoorClient {
             };
             format!("no node at {address}: it must run on this machine; {remedy}")
         })?;
-        door.client.subscribe(&[door.topics.path(&Topic::Cell), door.topics.filter("nodes/+")]);
+        let filters = [door.topics.path(&Topic::Cell), door.topics.filter("nodes/+")];
+        door.client.subscribe(&filters, MaxQos::AtLeastOnce);
         Ok(door)
     }
 
@@ -206,7 +207,7 @@ impl DoorClient {
         self.present().await?;
         self.client.publish(&self.topics.path(&Topic::Cell), &payload, Retention::Acknowledged);
         // One that is the present one already is not published anew.
-        self.client.subscribe(&[self.topics.path(&Topic::Cell)]);
+        self.client.subscribe(&[self.topics.path(&Topic::Cell)], MaxQos::AtLeastOnce);
         loop {
             let description = self.present().await?;
             if description.version > 0 && description.text == request.text {

@@ -11,6 +11,7 @@ use super::Finding;
 use crate::node::config::NodeConfig;
 use crate::observe::dashboard::DEFAULT_ADDRESS;
 use crate::transport::gossip::DEFAULT_PORT;
+use crate::transport::mqtt::probe;
 
 /// Maximum time for a multicast datagram to return.
 const MULTICAST_TIMEOUT: Duration = Duration::from_millis(500);
@@ -25,7 +26,7 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
     if let Some(address) = &plane.external {
         let node = config.name.as_ref().map_or("node", NodeName::as_str);
         let answer = match config.security() {
-            Ok(security) => crate::transport::mqtt::probe(address, node, &config.mqtt, &security).await,
+            Ok(security) => probe(address, node, &config.mqtt, &security).await,
             Err(error) => Err(error.to_string()),
         };
         findings.push(match answer {
@@ -48,6 +49,29 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
         });
     }
     findings
+}
+
+/// Checks the connection to the region's broker.
+pub(super) async fn uplink(config: &NodeConfig) -> Option<Finding> {
+    let address = config.uplink.broker.as_ref().filter(|_| config.has_uplink())?;
+    let node = config.name.as_ref().map_or("node", NodeName::as_str);
+    let security = config.security().map_err(|error| error.to_string());
+    let security = security.and_then(|security| {
+        security.of_uplink(address.clone(), config.uplink.ca.clone()).map_err(|error| error.to_string())
+    });
+    let answer = match security {
+        Ok(security) => probe(address, node, &config.uplink.connection(&config.mqtt), &security).await,
+        Err(error) => Err(error),
+    };
+    Some(match answer {
+        Ok(()) => Finding::fine("uplink", format!("{address} accepts this node")),
+        Err(error) => Finding::doubtful(
+            "uplink",
+            format!("{address}: {error}"),
+            "the cell runs without it; look at the link, or correct `uplink.broker`, `uplink.user`, `uplink.password` and \
+             `uplink.ca`",
+        ),
+    })
 }
 
 /// Checks the gossip port.

@@ -11,7 +11,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::reputation::ReputationLedger;
-use ecod::wire::{GlobalMap, Reputation};
+use ecod::wire::{GlobalMap, NeighbourObject, Reputation};
 use ractor::RpcReplyPort;
 
 /// Messages to the fuser.
@@ -30,6 +30,13 @@ pub enum FuserMessage {
     ForgetMap {
         /// The aggregator.
         of: NodeName,
+    },
+    /// Show these objects of other cells, and take over their identities.
+    TakeNeighbours {
+        /// All that are near this cell; their times are by this node's clock.
+        objects: Arc<[NeighbourObject]>,
+        /// When they were of the age that they state.
+        stated_at: Timestamp,
     },
     /// Close the round if it is due.
     CloseRound,

@@ -4,6 +4,7 @@ mod arguments;
 #[cfg(feature = "camera")]
 mod cameras;
 mod describe;
+mod uplink;
 
 use std::fs::File;
 use std::io;
@@ -39,6 +40,7 @@ use crate::actors::membership::Membership;
 use crate::actors::projector::Projector;
 use crate::actors::recorder::Recorder;
 use crate::actors::reputation_keeper::{ReputationKeeper, SharedReputations};
+use crate::actors::uplink::Uplink;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::broker::BrokerMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
@@ -257,6 +259,7 @@ impl NodeBuilder {
             parts.extend(rates.then_some(ActorKind::ReputationKeeper));
             parts.push(ActorKind::Fuser);
         }
+        parts.extend(self.config.has_uplink().then_some(ActorKind::Uplink));
         parts.push(ActorKind::LeaderElection);
         parts.extend(self.config.dashboard.enabled.then_some(ActorKind::Dashboard));
         #[cfg(feature = "camera")]
@@ -302,6 +305,9 @@ impl NodeBuilder {
                 self.slots.election.send(LeaderElectionMessage::Note { input: Input::FuserRestarted });
                 Ok(id)
             }
+            ActorKind::Uplink => {
+                slot(&self.slots.uplink, Actor::spawn_linked(None, Uplink, self.uplink_arguments()?, supervisor).await)
+            }
             ActorKind::LeaderElection => {
                 let started = Actor::spawn_linked(None, LeaderElection, self.election_arguments(), supervisor).await;
                 slot(&self.slots.election, started)
@@ -338,6 +344,7 @@ impl NodeBuilder {
         }
         stop(&self.slots.dashboard).await;
         stop(&self.slots.election).await;
+        stop(&self.slots.uplink).await;
         stop(&self.slots.fuser).await;
         stop(&self.slots.keeper).await;
         stop(&self.slots.follower).await;

@@ -26,6 +26,7 @@ use serde::{Deserialize, Serialize};
 use self::extraction::{environment, extract};
 pub use self::shared::{DescriptionError, SharedConfig, StatedKeys};
 use crate::actors::reputation_keeper::ReputationKeeperConfig;
+use crate::actors::uplink::UplinkConfig;
 #[cfg(feature = "camera")]
 use crate::camera::config::CameraConfig;
 use crate::camera::vehicle_pose::PoseConfig;
@@ -73,6 +74,8 @@ pub struct NodeConfig {
     pub tls: Option<TlsConfig>,
     /// Limits of the embedded broker.
     pub broker: BrokerConfig,
+    /// The connection to a region of cells; used by the leader.
+    pub uplink: UplinkConfig,
     /// Settings of fusion; used by aggregators.
     pub fusion: FusionConfig,
     /// Periods at which reputations are published, saved and replicated; used by aggregators.
@@ -115,6 +118,7 @@ impl Default for NodeConfig {
             mqtt: MqttConfig::default(),
             tls: None,
             broker: BrokerConfig::default(),
+            uplink: UplinkConfig::default(),
             fusion: FusionConfig::default(),
             reputations: ReputationKeeperConfig::default(),
             dashboard: DashboardConfig::default(),
@@ -239,6 +243,7 @@ impl NodeConfig {
         }
         self.broker.validate().map_err(|error| error.within("broker"))?;
         self.validate_listen()?;
+        self.uplink.validate().map_err(|error| error.within("uplink"))?;
         let needed = self.mqtt.max_packet_bytes();
         if let Some(bytes) = self.broker.max_packet_bytes
             && (bytes as usize) < needed
@@ -294,6 +299,11 @@ impl NodeConfig {
     /// [`SecurityError`] naming the file.
     pub fn security(&self) -> Result<Security, SecurityError> {
         Security::load(self.tls.as_ref().zip(self.name.as_ref()), &self.mqtt, (&self.membership, &self.cell))
+    }
+
+    /// True if the node connects its cell to a region while it leads.
+    pub fn has_uplink(&self) -> bool {
+        self.may_lead() && self.uplink.broker.is_some()
     }
 
     /// True if the node may lead its cell.

@@ -15,6 +15,7 @@ use crate::messages::membership::MembershipMessage;
 use crate::messages::projector::ProjectorMessage;
 use crate::messages::recorder::RecorderMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::messages::uplink::UplinkMessage;
 #[cfg(feature = "camera")]
 use crate::node::config::NodeConfig;
 
@@ -37,6 +38,8 @@ pub enum ActorKind {
     ReputationKeeper,
     /// The maker of maps.
     Fuser,
+    /// The connection to the region.
+    Uplink,
     /// The node's part in the election.
     LeaderElection,
     /// The node's page.
@@ -77,6 +80,8 @@ pub struct ActorSlots {
     pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The fuser's.
     pub fuser: ActorSlot<FuserMessage>,
+    /// The uplink's.
+    pub uplink: ActorSlot<UplinkMessage>,
     /// The election's.
     pub election: ActorSlot<LeaderElectionMessage>,
     /// The dashboard's.

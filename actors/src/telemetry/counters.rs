@@ -111,6 +111,16 @@ pub enum Event {
     ClientStalled,
     /// The embedded broker cut off a client whose certificate was revoked or expired.
     ClientExpelled,
+    /// A map of the cell was handed to the connection to the region's broker.
+    RegionPublished,
+    /// A map of the cell was not sent to the region: its broker is not connected or passes nothing on.
+    RegionWithheld,
+    /// A packet came in from the region's broker.
+    RegionReceived,
+    /// A map of a neighbouring cell, newer than all of that cell before, was accepted.
+    CellMapAccepted,
+    /// An object of a neighbouring cell was not used: outside of what that cell may tell of, or beyond the maximum number.
+    NeighbourRefused,
 }
 
 impl Event {

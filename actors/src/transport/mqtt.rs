@@ -7,6 +7,7 @@ pub(crate) mod hearing;
 pub(crate) mod inbox;
 pub(crate) mod link;
 pub(crate) mod probe;
+pub(crate) mod region_inbox;
 mod round_signature;
 pub(crate) mod security;
 pub(crate) mod subscription_role;
@@ -16,6 +17,7 @@ pub use ecod::leadership::links::{DataPlane, LinkState};
 pub use ecod::leadership::{BrokerAddress, InvalidAddress};
 pub use link::LinkEvent;
 pub use probe::probe;
+pub use region_inbox::FromRegion;
 #[cfg(fuzzing)]
 pub use round_signature::splits_as_appended;
 pub use security::{ENVELOPE_BYTES, Security, SecurityError};

@@ -38,7 +38,8 @@ impl Mosquitto {
         })
     }
 
-    fn configured(settings: impl Fn(&Path) -> String) -> Self {
+    /// With further settings, whose files may be in the directory.
+    pub(crate) fn configured(settings: impl Fn(&Path) -> String) -> Self {
         assert!(Path::new(PROGRAM).exists(), "{PROGRAM} is missing: install Debian's package mosquitto");
         let directory = tempfile::tempdir().unwrap();
         let settings = settings(directory.path());

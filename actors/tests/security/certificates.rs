@@ -28,7 +28,7 @@ async fn without_a_certificate_nobody_gets_in() {
     timeout(SOON, plain.read_to_end(&mut answer)).await.expect("left waiting").ok();
     assert_ne!(answer.first(), Some(&0x20), "no CONNACK");
 
-    let anonymous = external_broker(&cell.pki.authority.ca(), None).unwrap().client();
+    let anonymous = external_broker(("mqtt.ca", &cell.pki.authority.ca()), None).unwrap().client();
     let stream = TcpStream::connect(cell.address).await.unwrap();
     let name = ServerName::try_from(BROKER_NAME).unwrap();
     // With TLS 1.3 the client learns of the refusal from what it reads first.

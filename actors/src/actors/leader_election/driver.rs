@@ -25,6 +25,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::messages::uplink::UplinkMessage;
 use crate::observe::recorder::LogItem;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
@@ -201,6 +202,7 @@ impl ElectionDriver {
             Effect::PublishStatus { status } => {
                 self.parts.door.publish_status(&status);
                 self.parts.recording.send(clock::now(), LogItem::Status(Arc::new(status.clone())));
+                self.parts.uplink.send(UplinkMessage::SetStatus { status: status.clone() });
                 self.parts.gateway.send(GatewayMessage::PublishStatus { status });
             }
             Effect::SendSnapshot { to } => {

@@ -276,7 +276,7 @@ impl NodeBuilder {
     }
 
     pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
-        let ActorSlots { membership, gateway, fuser, keeper, description, .. } = self.slots.clone();
+        let ActorSlots { membership, gateway, fuser, keeper, description, uplink, .. } = self.slots.clone();
         let (broker, door) = (self.cell_broker(), self.door.clone());
         LeaderElectionArguments {
             settings: NodeSettings {
@@ -296,6 +296,7 @@ impl NodeBuilder {
                 fuser,
                 keeper,
                 description,
+                uplink,
                 broker,
                 door,
                 recording: self.recording.clone(),
@@ -402,7 +403,7 @@ impl NodeBuilder {
     }
 
     /// The node's status when a part starts, also anew: it follows whom it followed before.
-    fn status(&self) -> NodeStatus {
+    pub(super) fn status(&self) -> NodeStatus {
         let newest = self.newest.map.borrow();
         let taken = newest.as_ref().map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone()));
         let leadership = self.leadership.borrow();

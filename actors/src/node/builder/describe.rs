@@ -24,6 +24,7 @@ impl NodeBuilder {
             self.note_units();
             tracing::info!(stamp = %description.stamp(), "the description of the cell is used");
         }
+        self.configure_uplink();
         self.door.publish_description(description);
         self.shared.send_replace(shared_facts(&self.config, &self.held));
         let input = Input::Described {

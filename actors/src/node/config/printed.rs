@@ -34,6 +34,9 @@ impl NodeConfig {
         if shown.mqtt.password.take().is_some() {
             comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
         }
+        if shown.uplink.password.take().is_some() {
+            comment.push_str("# `uplink.password` is set but not shown: add it, or set ECOD_UPLINK__PASSWORD\n");
+        }
         if shown.dashboard.token.take().is_some() {
             comment.push_str("# `dashboard.token` is set but not shown: add it, or set ECOD_DASHBOARD__TOKEN\n");
         }

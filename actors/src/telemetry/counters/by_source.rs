@@ -22,6 +22,8 @@ pub enum ShedReason {
     StatusThrottled,
     /// A newer report of the same vehicle came before the fuser read this one.
     ReportReplaced,
+    /// A neighbouring cell sent maps more often than 20 times a second; the map was not decoded.
+    CellThrottled,
 }
 
 impl ShedReason {

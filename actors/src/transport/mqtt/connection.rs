@@ -25,6 +25,17 @@ pub(crate) enum Retention {
     Acknowledged,
     /// QoS 1, retained: new subscribers need it.
     Retained,
+    /// QoS 0, retained: the sender repeats it on every connection.
+    Repeated,
+}
+
+/// Highest QoS of what a subscription brings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum MaxQos {
+    /// QoS 0: brokers keep nothing for the subscriber.
+    AtMostOnce,
+    /// QoS 1.
+    AtLeastOnce,
 }
 
 /// The sending half; never waits.
@@ -213,7 +224,8 @@ pub(crate) fn open(
 impl Client {
     /// Queues a message; false when there is no room or the connection has ended.
     pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
-        let (retain, is_acknowledged) = (retention == Retention::Retained, retention != Retention::Transient);
+        let retain = matches!(retention, Retention::Retained | Retention::Repeated);
+        let is_acknowledged = matches!(retention, Retention::Retained | Retention::Acknowledged);
         match self {
             Self::V311(client) => {
                 let qos = if is_acknowledged { QoS4::AtLeastOnce } else { QoS4::AtMostOnce };
@@ -226,19 +238,25 @@ impl Client {
         }
     }
 
-    /// Queues one subscription to all filters, with at most QoS 1; false when there is no room.
-    pub(crate) fn subscribe(&self, filters: &[String]) -> bool {
+    /// Queues one subscription to all filters; false when there is no room.
+    pub(crate) fn subscribe(&self, filters: &[String], max_qos: MaxQos) -> bool {
         match self {
-            Self::V311(client) => client
-                .try_subscribe_many(
-                    filters.iter().map(|path| rumqttc::SubscribeFilter::new(path.clone(), QoS4::AtLeastOnce)),
-                )
-                .is_ok(),
-            Self::V5(client) => client
-                .try_subscribe_many(
-                    filters.iter().map(|path| v5::mqttbytes::v5::Filter::new(path.clone(), QoS5::AtLeastOnce)),
-                )
-                .is_ok(),
+            Self::V311(client) => {
+                let qos = match max_qos {
+                    MaxQos::AtMostOnce => QoS4::AtMostOnce,
+                    MaxQos::AtLeastOnce => QoS4::AtLeastOnce,
+                };
+                let filters = filters.iter().map(|path| rumqttc::SubscribeFilter::new(path.clone(), qos));
+                client.try_subscribe_many(filters).is_ok()
+            }
+            Self::V5(client) => {
+                let qos = match max_qos {
+                    MaxQos::AtMostOnce => QoS5::AtMostOnce,
+                    MaxQos::AtLeastOnce => QoS5::AtLeastOnce,
+                };
+                let filters = filters.iter().map(|path| v5::mqttbytes::v5::Filter::new(path.clone(), qos));
+                client.try_subscribe_many(filters).is_ok()
+            }
         }
     }
 

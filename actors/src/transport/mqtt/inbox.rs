@@ -18,6 +18,7 @@ use uuid::Uuid;
 
 use super::config::MqttConfig;
 use super::delivery::{Delivery, Incoming, Subscriber};
+use super::link::PacketSink;
 use super::security::Security;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
@@ -93,24 +94,6 @@ impl Inbox {
 
     pub(crate) fn set_subscriber(&self, subscriber: Subscriber) {
         *self.subscriber.write().unwrap_or_else(PoisonError::into_inner) = subscriber;
-    }
-
-    /// Processes one packet of a broker. A payload that cannot be used is counted by its reason.
-    pub(crate) fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome {
-        self.counters.count(Event::Received);
-        self.read(via, topic, payload, received_at).unwrap_or_else(|reason| {
-            let source = self.source(via, topic);
-            match std::str::from_utf8(topic).ok().and_then(|path| self.topics.parse(path)) {
-                Some(Topic::Detections(_) | Topic::VoteDetections(_)) => {
-                    self.counters.reject_report(reason, &source, || self.fault(topic, payload, reason));
-                }
-                _ => self.counters.reject_message(reason, &source, || {
-                    format!("message on {} rejected: {}", String::from_utf8_lossy(topic), reason.in_words())
-                }),
-            }
-            tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
-            PacketOutcome::Done
-        })
     }
 
     /// Delivers a message that this node itself publishes or observes.
@@ -299,6 +282,26 @@ impl Inbox {
             self.counters.shed(reason, node.as_str());
         }
         is_shed
+    }
+}
+
+impl PacketSink for Inbox {
+    /// Processes one packet of a broker. A payload that cannot be used is counted by its reason.
+    fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome {
+        self.counters.count(Event::Received);
+        self.read(via, topic, payload, received_at).unwrap_or_else(|reason| {
+            let source = self.source(via, topic);
+            match std::str::from_utf8(topic).ok().and_then(|path| self.topics.parse(path)) {
+                Some(Topic::Detections(_) | Topic::VoteDetections(_)) => {
+                    self.counters.reject_report(reason, &source, || self.fault(topic, payload, reason));
+                }
+                _ => self.counters.reject_message(reason, &source, || {
+                    format!("message on {} rejected: {}", String::from_utf8_lossy(topic), reason.in_words())
+                }),
+            }
+            tracing::debug!(topic = %topic.escape_ascii(), bytes = payload.len(), %reason, "payload rejected");
+            PacketOutcome::Done
+        })
     }
 }
 

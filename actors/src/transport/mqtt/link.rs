@@ -20,7 +20,7 @@ use uuid::Uuid;
 use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet, Retention};
 use super::hearing::Hearing;
-use super::inbox::{Inbox, PacketOutcome, Via};
+use super::inbox::{PacketOutcome, Via};
 use super::security::Security;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
@@ -54,7 +54,13 @@ pub(crate) enum LinkChange {
 /// Callback for the events of links; false once the gateway has ended.
 pub(crate) type LinkSink = Arc<dyn Fn(LinkEvent) -> bool + Send + Sync>;
 
-/// Settings and inbox that all links of a gateway share.
+/// Receiver of the messages that come in on links.
+pub(crate) trait PacketSink: Send + Sync {
+    /// Processes one packet of a broker, on the link's task; it must not block.
+    fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome;
+}
+
+/// Settings and receiver that all links of an actor share.
 pub(crate) struct LinkSetup {
     pub(crate) client_id: String,
     pub(crate) filters: Vec<String>,
@@ -62,7 +68,9 @@ pub(crate) struct LinkSetup {
     pub(crate) will: Mutex<LastWill>,
     pub(crate) config: MqttConfig,
     pub(crate) security: Security,
-    pub(crate) inbox: Arc<Inbox>,
+    pub(crate) sink: Arc<dyn PacketSink>,
+    /// The trouble if the configured broker is not reached.
+    pub(crate) unreachable: TroubleKind,
     pub(crate) counters: Arc<Counters>,
     pub(crate) seed: u64,
 }
@@ -222,7 +230,7 @@ impl LinkTask {
     /// One connection from CONNECT to its end; `Ok` after DISCONNECT.
     async fn session(&mut self, tls: Option<(Arc<ClientConfig>, BrokerIdentity)>) -> Result<(), ConnectionError> {
         let setup = Arc::clone(&self.setup);
-        let LinkSetup { client_id, will, config, inbox, counters, .. } = &*setup;
+        let LinkSetup { client_id, will, config, sink, counters, .. } = &*setup;
         let will = will.lock().unwrap_or_else(PoisonError::into_inner).clone();
         let (tls, identity) = tls.unzip();
         let (client, mut connection) = connection::open(&self.broker, client_id, Some(&will), config, tls);
@@ -232,7 +240,7 @@ impl LinkTask {
         let node = identity.and_then(|identity| identity.node());
         self.hearing.note();
         self.end_refusal(|refusal| refusal.starts_with(NOT_ADMITTED));
-        counters.troubles().settle(TroubleKind::BrokerUnreachable, Some(&self.broker.to_string()));
+        counters.troubles().settle(setup.unreachable, Some(&self.broker.to_string()));
         if !self.tell(LinkChange::Accepted { client, node: node.clone() }) {
             return Ok(());
         }
@@ -259,7 +267,7 @@ impl LinkTask {
             match packet {
                 Packet::Message { topic, payload } => {
                     let via = Via { address: &self.broker, node: node.as_ref() };
-                    match inbox.accept(via, &topic, &payload, clock::now()) {
+                    match sink.accept(via, &topic, &payload, clock::now()) {
                         PacketOutcome::DeclaredOffline => {
                             self.tell(LinkChange::DeclaredOffline);
                         }
@@ -295,7 +303,7 @@ impl LinkTask {
         let is_expected = self.setup.config.broker.as_ref() == Some(&self.broker);
         if is_expected && error.rejection().is_none() && !matches!(error, ConnectionError::Oversized(_)) {
             let (broker, troubles) = (self.broker.to_string(), self.setup.counters.troubles());
-            troubles.note_about(&broker, TroubleKind::BrokerUnreachable, &format!("broker not reached: {error}"));
+            troubles.note_about(&broker, self.setup.unreachable, &format!("broker not reached: {error}"));
         }
     }
 
@@ -327,6 +335,8 @@ impl LinkTask {
 impl Drop for LinkTask {
     fn drop(&mut self) {
         self.end_refusal(|_| true);
+        // A link that is not wanted any more misses no broker.
+        self.setup.counters.troubles().settle(self.setup.unreachable, Some(&self.broker.to_string()));
     }
 }
 

@@ -32,7 +32,8 @@ pub struct Security {
 #[derive(Debug, Clone)]
 struct ExternalBroker {
     address: BrokerAddress,
-    ca: Option<PathBuf>,
+    /// The key of the configuration that names the CA, and the file.
+    ca: Option<(&'static str, PathBuf)>,
 }
 
 /// An error in the configured protection.
@@ -57,12 +58,27 @@ impl Security {
         (membership, cell): (&MembershipConfig, &NodeName),
     ) -> Result<Self, SecurityError> {
         let credentials = tls.map(|(files, name)| Credentials::load(files, name)).transpose()?.map(Arc::new);
-        let external = mqtt.broker.clone().map(|address| ExternalBroker { address, ca: mqtt.ca.clone() });
+        let external = mqtt
+            .broker
+            .clone()
+            .map(|address| ExternalBroker { address, ca: mqtt.ca.clone().map(|ca| ("mqtt.ca", ca)) });
         let signing = mqtt.sign.then(|| payload_key(membership, cell)).transpose()?;
         let security = Self { credentials, external, signing: signing.map(SigningKey), members: None };
         if let Some(external) = &security.external {
             security.tls(&external.address)?;
         }
+        Ok(security)
+    }
+
+    /// The protection of the connection to the region's broker, with the node's own certificate.
+    ///
+    /// # Errors
+    /// When the file of the CA cannot be used.
+    pub fn of_uplink(&self, broker: BrokerAddress, ca: Option<PathBuf>) -> Result<Self, CredentialsError> {
+        let external = ExternalBroker { address: broker, ca: ca.map(|ca| ("uplink.ca", ca)) };
+        let broker = external.address.clone();
+        let security = Self { credentials: self.credentials.clone(), external: Some(external), ..Self::default() };
+        security.tls(&broker)?;
         Ok(security)
     }
 
@@ -77,9 +93,9 @@ impl Security {
     /// When the credentials can no longer be used.
     pub fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
         match self.external.as_ref().filter(|external| external.address == *broker) {
-            Some(ExternalBroker { ca: Some(ca), .. }) => {
+            Some(ExternalBroker { ca: Some((key, ca)), .. }) => {
                 let current = self.credentials.as_ref().map(|credentials| credentials.current());
-                external_broker(ca, current.as_deref()).map(Some)
+                external_broker((*key, ca), current.as_deref()).map(Some)
             }
             Some(ExternalBroker { ca: None, .. }) => Ok(None),
             None => Ok(self.credentials.as_ref().map(BrokerTrust::of_cell)),

@@ -178,8 +178,11 @@ impl Credentials {
 ///
 /// # Errors
 /// [`CredentialsError`] naming the file.
-pub fn external_broker(ca: &Path, own: Option<&LoadedCredentials>) -> Result<BrokerTrust, CredentialsError> {
-    let roots = Arc::new(roots("mqtt.ca", ca)?);
+pub fn external_broker(
+    (key, ca): (&'static str, &Path),
+    own: Option<&LoadedCredentials>,
+) -> Result<BrokerTrust, CredentialsError> {
+    let roots = Arc::new(roots(key, ca)?);
     let verifier = server_verifier(Arc::clone(&roots), Vec::new())?;
     let builder = ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
     let builder = builder.map_err(unusable)?.with_root_certificates(roots);

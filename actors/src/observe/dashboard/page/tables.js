@@ -128,6 +128,7 @@ const DROPS = {
   name_conflict: "another node has this name", disconnected: "link lost", connect_failed: "link not established", broker_refused: "refused by a broker",
   client_throttled: "client refused: connects too often", client_timed_out: "client refused: login too late", client_untrusted: "client refused: no valid certificate",
   client_malformed: "client refused: malformed login", clients_full: "client refused: broker full", client_denied: "client request denied: no permission", client_stalled: "client disconnected: reads too slowly", client_expelled: "client disconnected: certificate revoked or expired",
+  region_withheld: "map not sent to the region: link down or stalled", neighbour_refused: "neighbouring cell's object not used: elsewhere, or too many",
   overreached: "node declares more than its certificate allows",
   record_failed: "log cannot be written", record_dropped: "entry missing in the log",
   vote_ignored: "vote ignored: no usable location", report_late: "report too late for tracking", object_refused: "new object not tracked: too many", reputations_not_saved: "reputations cannot be saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
@@ -138,7 +139,7 @@ const DROPS = {
 const REJECTS = {
   too_large: "too large", malformed: "cannot be read", unknown_schema: "unknown version", node_mismatch: "in another node's name", too_many_objects: "too many objects",
   not_finite: "a number that cannot be", out_of_range: "a number out of its range", confidence_out_of_range: "confidence not from 0 to 1", invalid_label: "label empty or too long",
-  from_the_future: "dated in the future", stale: "too old", too_many_vehicles: "too many vehicles", unknown_topic: "unknown topic", superseded: "of an earlier leader", not_elected: "not of the leader",
+  from_the_future: "dated in the future", stale: "too old", too_many_vehicles: "too many vehicles", too_many_cells: "too many cells", unknown_topic: "unknown topic", superseded: "of an earlier leader", not_elected: "not of the leader",
   not_fused: "for an algorithm that does not run here", bad_signature: "no valid signature", not_candidate: "evidence of a node that may not lead", unknown_term: "evidence of an unknown term",
   unattested: "evidence without proof", implausible: "more votes than there can be", not_permitted: "beyond the sender's rights",
 };

@@ -1,0 +1,393 @@
+//! The actor that connects the cell to a region of cells, while its node leads.
+//!
+//! ```text
+//! watches of leadership and newest map ── Look ──> Uplink ── CellMap, CellDescription, NodeStatus ──> region's broker
+//! LeaderElection ── SetStatus ─────────────────────> │ ▲
+//! Node ── Configure ───────────────────────────────> │ └── Take ── RegionInbox ◄── maps of the tiles around ──┘
+//!                                                    └── TakeNeighbours ──> Fuser
+//! ```
+//!
+//! - Nobody in the cell waits for it: without the region the cell goes on, and no map is kept for later.
+//! - Only the leader is connected. A new leader connects when it leads, so that a last will is always that of a leader.
+//! - Retained messages of a former leader may come late. The present one then repeats its own.
+
+mod config;
+mod pace;
+mod region_link;
+
+use std::sync::Arc;
+
+use ecod::diagnostics::TroubleKind;
+use ecod::leadership::Leadership;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::NodeName;
+use ecod::model::origin::GeographicOrigin;
+use ecod::model::quadkey::Quadkey;
+use ecod::model::time::Timestamp;
+use ecod::neighbours::{MAX_AGE, Neighbours};
+use ecod::wire::{CellDescription, CellMap, GlobalMap, NodeState, NodeStatus, RegionTopic, SCHEMA_VERSION};
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+pub use config::UplinkConfig;
+
+use self::pace::MapPace;
+use self::region_link::{RegionLink, RegionLinkSetup};
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::fuser::FuserMessage;
+use crate::messages::newest::ReceivedMap;
+use crate::messages::uplink::UplinkMessage;
+use crate::platform::clock;
+use crate::telemetry::counters::{Counters, Event};
+use crate::transport::mqtt::link::{LinkId, LinkSink};
+use crate::transport::mqtt::region_inbox::{RegionInbox, source};
+use crate::transport::mqtt::{BrokerAddress, FromRegion, MqttConfig, Security};
+
+/// Arguments of an uplink's start.
+pub struct UplinkArguments {
+    /// The cell's name.
+    pub cell: NodeName,
+    /// First status of the node. It holds the name and the id of this run.
+    pub status: NodeStatus,
+    /// The region's broker.
+    pub broker: BrokerAddress,
+    /// Rate of maps.
+    pub config: UplinkConfig,
+    /// Settings of the cell's own connections, for their limits.
+    pub mqtt: MqttConfig,
+    /// Protection of the connection.
+    pub security: Security,
+    /// The place of the cell's frame on Earth.
+    pub origin: Option<GeographicOrigin>,
+    /// The description of the cell.
+    pub description: Option<Arc<CellDescription>>,
+    /// The newest map of the cell.
+    pub newest: watch::Receiver<Option<ReceivedMap>>,
+    /// Who leads.
+    pub leadership: watch::Receiver<Leadership>,
+    /// Is told of the objects of neighbours.
+    pub fuser: ActorSlot<FuserMessage>,
+    /// The node's counters.
+    pub counters: Arc<Counters>,
+    /// Seed of the jitter between attempts to connect.
+    pub seed: u64,
+}
+
+/// The only owner of the connection to the region.
+#[derive(Debug, Default)]
+pub struct Uplink;
+
+/// The link, while there is one, and what is published on it.
+pub struct UplinkState {
+    cell: NodeName,
+    status: NodeStatus,
+    broker: BrokerAddress,
+    config: UplinkConfig,
+    connection: MqttConfig,
+    security: Security,
+    origin: Option<GeographicOrigin>,
+    description: Option<Arc<CellDescription>>,
+    newest: watch::Receiver<Option<ReceivedMap>>,
+    leadership: watch::Receiver<Leadership>,
+    fuser: ActorSlot<FuserMessage>,
+    counters: Arc<Counters>,
+    seed: u64,
+    link: Option<RegionLink>,
+    next_link: u64,
+    pace: MapPace,
+    /// Epoch and round of the map that was published last, and of the own map that was looked at last.
+    published: Option<(u64, u64)>,
+    seen: Option<(u64, u64)>,
+    /// The neighbours of a cell that has a place on Earth.
+    neighbours: Option<Neighbours>,
+    /// True if a neighbour's map was accepted since the fuser was told.
+    has_news: bool,
+    watcher: JoinHandle<()>,
+}
+
+impl Actor for Uplink {
+    type Msg = UplinkMessage;
+    type State = UplinkState;
+    type Arguments = UplinkArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let watcher = tokio::spawn(watch_cell(arguments.leadership.clone(), arguments.newest.clone(), myself.clone()));
+        let mut state = UplinkState::new(arguments, watcher);
+        state.look(&myself);
+        Ok(state)
+    }
+
+    async fn handle(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        message: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        match message {
+            UplinkMessage::Look => state.look(&myself),
+            UplinkMessage::SetStatus { status } => {
+                state.status = status;
+                state.publish_status();
+            }
+            UplinkMessage::Configure { origin, description } => state.configure(origin, description, &myself),
+            UplinkMessage::Take { delivery } => match delivery.message {
+                FromRegion::Map { topic, map } => state.take_map(&topic, *map, delivery.received_at),
+                FromRegion::Status(status) => state.hear_status(&status),
+            },
+            UplinkMessage::LinkChanged { event } => {
+                let link = state.link.as_mut().filter(|link| link.id() == event.link);
+                if link.is_some_and(|link| link.change(event.change)) {
+                    state.introduce();
+                }
+            }
+        }
+        Ok(())
+    }
+
+    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+        state.watcher.abort();
+        if let Some(link) = state.link.take() {
+            link.close(state.farewell().as_ref()).await;
+        }
+        Ok(())
+    }
+}
+
+impl UplinkState {
+    fn new(arguments: UplinkArguments, watcher: JoinHandle<()>) -> Self {
+        let UplinkArguments {
+            cell,
+            status,
+            broker,
+            config,
+            mqtt,
+            security,
+            origin,
+            description,
+            newest,
+            leadership,
+            fuser,
+            counters,
+            seed,
+        } = arguments;
+        Self {
+            neighbours: origin.map(|origin| Neighbours::new(cell.clone(), origin)),
+            cell,
+            status,
+            broker,
+            has_news: false,
+            seen: None,
+            connection: config.connection(&mqtt),
+            pace: MapPace::new(config.max_hz),
+            config,
+            security,
+            origin,
+            description,
+            newest,
+            leadership,
+            fuser,
+            counters,
+            seed,
+            link: None,
+            next_link: 0,
+            published: None,
+            watcher,
+        }
+    }
+
+    /// Connects, leaves or publishes, as the lead and the newest map want it.
+    fn look(&mut self, myself: &ActorRef<UplinkMessage>) {
+        let leads = self.leadership.borrow().is_leading();
+        let troubles = self.counters.troubles();
+        match (leads, self.origin) {
+            (true, None) => troubles.note(TroubleKind::NoOrigin, NO_ORIGIN),
+            _ => troubles.settle(TroubleKind::NoOrigin, None),
+        }
+        match (self.origin.filter(|_| leads), self.link.take()) {
+            (None, Some(link)) => self.leave(link),
+            (Some(origin), None) => self.link = Some(self.connect(Quadkey::of_cell(&origin), myself)),
+            (Some(_), link) => self.link = link,
+            (None, None) => {}
+        }
+        self.publish_map();
+    }
+
+    fn connect(&mut self, tile: Quadkey, myself: &ActorRef<UplinkMessage>) -> RegionLink {
+        let receiver = myself.clone();
+        // An uplink that has ended needs nothing.
+        let subscriber = Box::new(move |delivery| _ = receiver.cast(UplinkMessage::Take { delivery }));
+        let (limits, counters) = (self.connection.limits(), Arc::clone(&self.counters));
+        let sink =
+            RegionInbox::new((self.cell.clone(), tile), self.status.id, limits, Arc::clone(&counters), subscriber);
+        let setup = RegionLinkSetup {
+            cell: self.cell.clone(),
+            tile,
+            config: self.connection.clone(),
+            security: self.security.clone(),
+            sink: Arc::new(sink),
+            counters,
+            seed: self.seed,
+        };
+        let id = LinkId(self.next_link);
+        self.next_link += 1;
+        self.pace = MapPace::new(self.config.max_hz);
+        RegionLink::open(id, self.broker.clone(), setup, &self.own_status(), events_to(myself))
+    }
+
+    fn leave(&mut self, link: RegionLink) {
+        let last = self.farewell();
+        tokio::spawn(async move { link.close(last.as_ref()).await });
+    }
+
+    /// The last status of a node that leaves the region; none if another leads, which has told its own.
+    fn farewell(&self) -> Option<NodeStatus> {
+        let leadership = self.leadership.borrow();
+        let is_succeeded = leadership.leader().is_some_and(|leader| *leader != self.status.node);
+        let gone = || NodeStatus { state: NodeState::Offline, troubles: Vec::new(), ..self.status.clone() };
+        (!is_succeeded).then(gone)
+    }
+
+    /// Publishes on a new connection what the region is to know.
+    fn introduce(&mut self) {
+        self.publish_status();
+        if let (Some(link), Some(description)) = (&mut self.link, &self.description) {
+            link.publish_description(description);
+        }
+        self.pace = MapPace::new(self.config.max_hz);
+        self.publish_map();
+    }
+
+    fn publish_status(&mut self) {
+        let status = self.own_status();
+        if let Some(link) = &mut self.link {
+            link.publish_status(&status);
+        }
+    }
+
+    /// The status of the node as the leader.
+    fn own_status(&self) -> NodeStatus {
+        let leadership = self.leadership.borrow();
+        let epoch = leadership.epoch.as_ref().map_or(self.status.epoch, |epoch| epoch.term);
+        let aggregator = Some(self.status.node.clone());
+        NodeStatus { state: NodeState::Aggregating, epoch, aggregator, ..self.status.clone() }
+    }
+
+    /// Looks at the newest map, if it is of this leadership and not old, and publishes it if it is new and due.
+    fn publish_map(&mut self) {
+        let now = clock::now();
+        let Some(ReceivedMap { received_at, map }) = self.newest.borrow().clone() else { return };
+        let epoch = Epoch::new(map.epoch, map.aggregator.clone());
+        let is_own = map.aggregator == self.status.node && self.leadership.borrow().present_epoch() == Some(&epoch);
+        if self.link.is_none() || !is_own || now.since(received_at) > MAX_AGE {
+            return;
+        }
+        let order = Some((map.epoch, map.round));
+        if order > std::mem::replace(&mut self.seen, order) {
+            self.tell_neighbours(&map, now);
+        }
+        let (Some(link), Some(origin)) = (&mut self.link, self.origin) else { return };
+        if order <= self.published || !self.pace.is_due(now) {
+            return;
+        }
+        self.published = order;
+        self.pace.advance(now);
+        // Objects of neighbours are theirs to tell.
+        let map = GlobalMap { neighbour_objects: Vec::new(), ..GlobalMap::clone(&map) };
+        let (schema, cell) = (SCHEMA_VERSION, self.cell.clone());
+        link.publish_map(&CellMap { schema, cell, sent_at_us: now, origin, map }, now);
+    }
+
+    /// Goes on under other settings. A cell that is in another tile now leaves nothing in the former one.
+    fn configure(
+        &mut self,
+        origin: Option<GeographicOrigin>,
+        description: Option<Arc<CellDescription>>,
+        myself: &ActorRef<UplinkMessage>,
+    ) {
+        if std::mem::replace(&mut self.origin, origin) != origin {
+            self.neighbours = origin.map(|origin| Neighbours::new(self.cell.clone(), origin));
+        }
+        self.description = description;
+        let tile = origin.map(|origin| Quadkey::of_cell(&origin));
+        match self.link.take() {
+            Some(link) if tile == Some(link.tile()) => self.link = Some(link),
+            Some(link) => _ = tokio::spawn(link.withdraw()),
+            None => {}
+        }
+        if let (Some(link), Some(description)) = (&mut self.link, &self.description) {
+            link.publish_description(description);
+        }
+        self.look(myself);
+    }
+
+    /// Repeats the own status where a last will, or a former leader, has replaced it.
+    fn hear_status(&mut self, heard: &NodeStatus) {
+        let own = self.own_status();
+        let is_former = (heard.epoch, &heard.node) < (own.epoch, &own.node);
+        if heard.state == NodeState::Offline || is_former {
+            self.publish_status();
+        }
+    }
+
+    /// Takes the map of another cell; one that does not count is counted by its reason and cell.
+    fn take_map(&mut self, topic: &RegionTopic, map: CellMap, received_at: Timestamp) {
+        let Some(neighbours) = &mut self.neighbours else { return };
+        let losses = |neighbours: &Neighbours| {
+            let losses = neighbours.losses().get(&topic.cell).copied().unwrap_or_default();
+            losses.outside + losses.refused
+        };
+        let before = losses(neighbours);
+        match neighbours.accept(topic, map, received_at) {
+            Ok(()) => {
+                self.counters.count(Event::CellMapAccepted);
+                self.counters.add(Event::NeighbourRefused, losses(neighbours).saturating_sub(before));
+                self.pace.note_neighbour(received_at);
+                self.has_news = true;
+            }
+            Err(reason) => self.counters.reject_message(reason, &source(&topic.cell), || {
+                format!("map of the cell {} not used: {}", topic.cell, reason.in_words())
+            }),
+        }
+    }
+
+    /// Tells the fuser of the objects of others, once for each own map: the next one has them.
+    fn tell_neighbours(&mut self, map: &GlobalMap, now: Timestamp) {
+        let Some(neighbours) = &mut self.neighbours else { return };
+        neighbours.observe_own(map, now);
+        if std::mem::take(&mut self.has_news) {
+            let objects = neighbours.near(now).into();
+            self.fuser.send(FuserMessage::TakeNeighbours { objects, stated_at: now });
+        }
+    }
+}
+
+/// The cause of [`TroubleKind::NoOrigin`].
+const NO_ORIGIN: &str = "`uplink.broker` is set, and the cell has no origin: the region cannot tell where it is";
+
+/// Callback that sends a link's events to the uplink itself.
+fn events_to(uplink: &ActorRef<UplinkMessage>) -> LinkSink {
+    let uplink = uplink.clone();
+    Arc::new(move |event| uplink.cast(UplinkMessage::LinkChanged { event }).is_ok())
+}
+
+/// Wakes the uplink when the leadership or the newest map changes. Ends with either.
+async fn watch_cell(
+    mut leadership: watch::Receiver<Leadership>,
+    mut newest: watch::Receiver<Option<ReceivedMap>>,
+    uplink: ActorRef<UplinkMessage>,
+) {
+    loop {
+        let changed = tokio::select! {
+            changed = leadership.changed() => changed,
+            changed = newest.changed() => changed,
+        };
+        if changed.is_err() || uplink.cast(UplinkMessage::Look).is_err() {
+            return;
+        }
+    }
+}

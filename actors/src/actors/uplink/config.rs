@@ -1,0 +1,83 @@
+//! Configuration of the uplink.
+
+use std::path::PathBuf;
+
+use ecod::config::{ConfigError, check_range};
+use ecod::leadership::BrokerAddress;
+use ecod::wire::Encoding;
+use serde::{Deserialize, Serialize};
+
+use crate::platform::secret::Secret;
+use crate::transport::mqtt::MqttConfig;
+
+/// The broker of a region of cells, and the rate of maps to it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct UplinkConfig {
+    /// The region's broker as `host:port`; default none: the cell tells nobody beyond itself.
+    pub broker: Option<BrokerAddress>,
+    /// PEM file with the CAs of the broker's certificate; default none: plaintext. The host in `broker` must be a name in
+    /// the certificate. A node with `[tls]` presents its own certificate.
+    pub ca: Option<PathBuf>,
+    /// User name; default none. Needs `password`.
+    pub user: Option<String>,
+    /// Password; default none. Never printed.
+    pub password: Option<Secret>,
+    /// Maps per second to the region; default 2, and five times as many while a neighbouring cell is heard. Trade-off:
+    /// more bytes, and a neighbour sooner knows of what comes.
+    pub max_hz: f64,
+}
+
+impl Default for UplinkConfig {
+    fn default() -> Self {
+        Self { broker: None, ca: None, user: None, password: None, max_hz: 2.0 }
+    }
+}
+
+/// Messages that may wait to be sent. More would be old maps.
+const SEND_QUEUE: usize = 8;
+
+impl UplinkConfig {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with the key, the value and what is allowed.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        check_range("max_hz", self.max_hz, 0.1, 20.0)?;
+        self.connection(&MqttConfig::default()).validate()
+    }
+
+    /// Settings of the connection; the limits of payloads are those of `cell`.
+    pub(crate) fn connection(&self, cell: &MqttConfig) -> MqttConfig {
+        MqttConfig {
+            broker: self.broker.clone(),
+            ca: self.ca.clone(),
+            user: self.user.clone(),
+            password: self.password.clone(),
+            encoding: Encoding::Compact,
+            send_queue: SEND_QUEUE,
+            max_payload_bytes: cell.max_payload_bytes,
+            max_map_bytes: cell.max_map_bytes,
+            ..MqttConfig::default()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_are_checked_as_those_of_the_cells_broker() {
+        UplinkConfig::default().validate().unwrap();
+        for (text, key) in [
+            ("password = \"hush4711\"", "password"),
+            ("ca = \"region.pem\"", "ca"),
+            ("broker = \"region:8883\"\nmax_hz = 0", "max_hz"),
+        ] {
+            let error = toml::from_str::<UplinkConfig>(text).unwrap().validate().unwrap_err();
+            assert_eq!(error.key, key);
+            assert!(!error.to_string().contains("4711"), "{error}");
+        }
+    }
+}

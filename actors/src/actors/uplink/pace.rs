@@ -1,0 +1,80 @@
+//! Rate of maps to the region.
+
+use std::time::Duration;
+
+use ecod::model::time::Timestamp;
+
+/// Time after a neighbour's last map for which it counts as there.
+const NEIGHBOUR_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Factor of the rate while a neighbour is heard.
+const NEIGHBOUR_FACTOR: f64 = 5.0;
+
+/// Share of the interval by which a map may be early. Rounds close a little before or after due times.
+const MAX_EARLY_SHARE: f64 = 0.25;
+
+/// The times at which maps are due. They keep their grid whenever maps come, so that the mean rate is the configured one.
+#[derive(Debug)]
+pub(super) struct MapPace {
+    max_hz: f64,
+    due: Timestamp,
+    max_early: Duration,
+    neighbour_at: Option<Timestamp>,
+}
+
+impl MapPace {
+    /// With a map due at once.
+    pub(super) fn new(max_hz: f64) -> Self {
+        Self { max_hz, due: Timestamp::default(), max_early: Duration::ZERO, neighbour_at: None }
+    }
+
+    /// Notes that a neighbour's map was accepted.
+    pub(super) fn note_neighbour(&mut self, now: Timestamp) {
+        self.neighbour_at = Some(now);
+    }
+
+    /// True if a map is due.
+    pub(super) fn is_due(&self, now: Timestamp) -> bool {
+        now + self.max_early >= self.due
+    }
+
+    /// Notes that the map that was due is dealt with.
+    pub(super) fn advance(&mut self, now: Timestamp) {
+        let is_heard = self.neighbour_at.is_some_and(|at| now.since(at) < NEIGHBOUR_TIMEOUT);
+        let factor = if is_heard { NEIGHBOUR_FACTOR } else { 1.0 };
+        let interval = Duration::from_secs_f64(1.0 / (factor * self.max_hz));
+        self.max_early = interval.mul_f64(MAX_EARLY_SHARE);
+        self.due = if now.since(self.due) < interval { self.due } else { now } + interval;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Number of maps in ten seconds of rounds about every 100 ms, up to 10 ms early or late, from this time on.
+    fn count(pace: &mut MapPace, from_ms: u64) -> usize {
+        let rounds = (0..100).map(|round| from_ms + 100 * round + 7 * round % 20 - 10);
+        let due = rounds.filter(|ms| {
+            let now = Timestamp(ms * 1000);
+            let is_due = pace.is_due(now);
+            if is_due {
+                pace.advance(now);
+            }
+            is_due
+        });
+        due.count()
+    }
+
+    #[test]
+    fn the_mean_rate_is_the_configured_one_and_five_times_that_beside_a_neighbour() {
+        let mut pace = MapPace::new(2.0);
+        assert_eq!(count(&mut pace, 5_000), 21, "the first at once");
+        assert_eq!(count(&mut pace, 15_000), 20);
+        pace.note_neighbour(Timestamp(25_000_000));
+        let beside = count(&mut pace, 25_000);
+        assert!((54..=60).contains(&beside), "{beside}: for five seconds all of ten a second, then two a second");
+        assert!((19..=21).contains(&count(&mut pace, 35_000)), "without it as before");
+        assert_eq!(count(&mut MapPace::new(0.5), 5_000), 6);
+    }
+}

@@ -1,0 +1,61 @@
+//! Cells of one node with an uplink.
+
+use std::time::Duration;
+
+use ecod::aggregator::Algorithms;
+use ecod::model::names::NodeName;
+use ecod::model::origin::GeographicOrigin;
+use ecod::wire::{Role, Trouble};
+use ecod_actors::node::config::NodeConfig;
+use ecod_actors::node::{self, NodeHandle};
+use ecod_actors::transport::mqtt::BrokerAddress;
+
+/// Maximum time for anything.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
+
+/// The place of the first cell; others are some metres from it.
+pub(crate) const ORIGIN: GeographicOrigin =
+    GeographicOrigin { latitude_deg: 52.2, longitude_deg: 21.0, height_m: 100.0, rotation_deg: 0.0 };
+
+/// An edge on loopback alone that leads a cell without known locations.
+pub(crate) fn config(cell: &'static str, broker: BrokerAddress) -> NodeConfig {
+    let mut config = NodeConfig {
+        name: Some(NodeName::from_static("edge")),
+        cell: NodeName::from_static(cell),
+        role: Role::Edge,
+        listen: Some("127.0.0.1:0".parse().unwrap()),
+        origin: Some(ORIGIN),
+        ..NodeConfig::default()
+    };
+    config.fusion.algorithms = Algorithms::Pace;
+    config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
+    config.membership.multicast.enabled = false;
+    config.dashboard.enabled = false;
+    config.uplink.broker = Some(broker);
+    config.validate().unwrap();
+    config
+}
+
+pub(crate) async fn start(config: NodeConfig) -> NodeHandle {
+    node::start(config).await.unwrap()
+}
+
+/// The round of the node's newest map.
+pub(crate) fn round(node: &NodeHandle) -> u64 {
+    node.newest_map().borrow().as_ref().map_or(0, |newest| newest.map.round)
+}
+
+/// The present trouble of a kind.
+pub(crate) fn trouble(node: &NodeHandle, kind: &str) -> Option<Trouble> {
+    node.counters().troubles().present().into_iter().find(|trouble| trouble.kind == kind)
+}
+
+/// Lets time pass until it holds.
+pub(crate) async fn until(what: &str, holds: impl AsyncFn() -> bool) {
+    let reached = async {
+        while !holds().await {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, reached).await.unwrap_or_else(|_| panic!("not within {PATIENCE:?}: {what}"));
+}

@@ -1,0 +1,285 @@
+//! A town of many cells in virtual time: generated traffic, one aggregator for each cell, and their neighbours' maps.
+//!
+//! Each vehicle reports to the cell in which it is. Cells send each other their maps, which take their time, come twice,
+//! out of order or never. Each cell has a frame and a clock of its own. The town's map is all maps of one moment together,
+//! each identity once. Beside it, one aggregator gets all reports.
+
+mod cell;
+mod links;
+mod place;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+use ecod::aggregator::{Algorithms, FusionConfig};
+use ecod::model::names::NodeName;
+use ecod::model::origin::GeographicOrigin;
+use ecod::model::time::Timestamp;
+use ecod::tracking::HandOvers;
+use ecod::wire::{FusedObject, ObjectReport};
+use hashbrown::HashMap;
+use nalgebra::Point2;
+use uuid::Uuid;
+
+use crate::eval::tracks::{SaidObject, TrackEvaluation, TrackScores, TrackTruth, TrackTruthError};
+use crate::traffic::{TrafficConfig, TrafficRecording, TrafficTruth, TruthFrame};
+use cell::TownCell;
+use links::Links;
+use place::CellFrame;
+
+/// Where the town is.
+const TOWN: GeographicOrigin =
+    GeographicOrigin { latitude_deg: 48.137, longitude_deg: 11.575, height_m: 520.0, rotation_deg: 0.0 };
+
+/// Cells along each side.
+pub const CELLS_A_SIDE: usize = 3;
+
+/// Distance in metres of a border of cells up to which a place is at the border.
+pub const BORDER_M: f64 = 25.0;
+
+/// Metres by which a vehicle is in the next cell before it reports there.
+const HYSTERESIS_M: f64 = 5.0;
+
+/// Time of a map from the moment for which it counts, at most.
+const MOMENT: Duration = Duration::from_millis(75);
+
+/// Links between cells.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LinkConfig {
+    /// Maps a second that a cell sends.
+    pub map_hz: f64,
+    /// Least time in seconds that a map takes.
+    pub min_delay_s: f64,
+    /// Mean time in seconds that it takes beyond.
+    pub delay_s: f64,
+    /// Share of maps that are lost; as many come twice, and as many half a second late.
+    pub lost: f64,
+    /// False where cells tell each other nothing.
+    pub is_up: bool,
+}
+
+impl Default for LinkConfig {
+    fn default() -> Self {
+        Self { map_hz: 10.0, min_delay_s: 0.02, delay_s: 0.03, lost: 0.02, is_up: true }
+    }
+}
+
+/// Accuracy of one way to make the town's map.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TownScores {
+    /// Everywhere.
+    pub all: TrackScores,
+    /// Within [`BORDER_M`] of a border.
+    pub border: TrackScores,
+    /// As near to a line through the middle of cells, and not at a border. Where cells have an even number of roads, both
+    /// kinds of lines run between roads.
+    pub middle: TrackScores,
+}
+
+/// Result of a run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TownResult {
+    /// One aggregator over everything.
+    pub single: TownScores,
+    /// The cells together.
+    pub cells: TownScores,
+    /// Number of identities in maps of the cells.
+    pub identities: usize,
+    /// Identities that tracks took over from other cells.
+    pub hand_overs: HandOvers,
+    /// Maps that cells received, and those of them that did not count.
+    pub received: u64,
+    /// Maps of the other cells that did not count.
+    pub refused: u64,
+}
+
+/// A town whose traffic is such that every cell has two or more roads each way, and borders run between roads.
+pub fn town_traffic(roads_a_cell: usize, duration_s: f64) -> TrafficConfig {
+    let roads = CELLS_A_SIDE * roads_a_cell;
+    let share = (roads * (roads - 1)) as f64 / 12.0;
+    let scaled = |of_quarter: usize| (of_quarter as f64 * share) as usize;
+    let quarter = TrafficConfig::default();
+    TrafficConfig {
+        roads,
+        observers: scaled(quarter.observers),
+        vehicles: scaled(quarter.vehicles),
+        parked: scaled(quarter.parked),
+        people: scaled(quarter.people),
+        bicycles: scaled(quarter.bicycles),
+        duration_s,
+        ..quarter
+    }
+}
+
+/// Runs a recording through one aggregator and through nine; `uniform` gives numbers drawn evenly from [0, 1).
+///
+/// # Errors
+/// For a recording without truth.
+pub fn run(
+    traffic: &TrafficConfig,
+    recording: &TrafficRecording,
+    link: LinkConfig,
+    uniform: &mut dyn FnMut() -> f64,
+) -> Result<TownResult, TrackTruthError> {
+    let plan = TownPlan::new(traffic);
+    let config = FusionConfig { algorithms: Algorithms::Pace, ..FusionConfig::default() };
+    let Some(first) = recording.reports.first() else { return Err(TrackTruthError::Empty) };
+    let start = first.received_at_us.unwrap_or(first.report.captured_at_us);
+    let whole = NodeName::from_static("town");
+    let mut single = TownCell::new(whole, CellFrame::new(&TOWN, TOWN, 0), config.clone(), start);
+    let mut cells: Vec<TownCell> =
+        plan.frames(uniform).map(|(name, frame)| TownCell::new(name, frame, config.clone(), start)).collect();
+    let mut links = Links::new(link, uniform);
+    let mut cell_of: BTreeMap<NodeName, usize> = BTreeMap::new();
+    for arrived in &recording.reports {
+        let now = arrived.received_at_us.unwrap_or(arrived.report.captured_at_us);
+        single.close_until(now);
+        advance(&mut cells, &mut links, now);
+        single.report(&arrived.report, now);
+        let number = plan.cell_of(&arrived.report, &cell_of);
+        cell_of.insert(arrived.report.node.clone(), number);
+        cells[number].report(&arrived.report, now);
+        links.send_from(&mut cells, number, now);
+    }
+    let maps = |of: &[TownCell]| judge(&plan, &recording.truth, of);
+    Ok(TownResult {
+        single: maps(std::slice::from_ref(&single))?,
+        cells: maps(&cells)?,
+        identities: cells.iter().flat_map(TownCell::identities).collect::<BTreeSet<Uuid>>().len(),
+        hand_overs: cells.iter().map(TownCell::hand_overs).fold(HandOvers::default(), |all, cell| HandOvers {
+            begun: all.begun + cell.begun,
+            renamed: all.renamed + cell.renamed,
+        }),
+        received: cells.iter().map(|cell| cell.received).sum(),
+        refused: cells.iter().map(|cell| cell.refused).sum(),
+    })
+}
+
+/// Closes rounds and delivers maps that are due until `now`, in the order of time.
+fn advance(cells: &mut [TownCell], links: &mut Links<'_>, now: Timestamp) {
+    loop {
+        let rounds = cells.iter().enumerate().map(|(number, cell)| (cell.deadline(), number));
+        let Some((round_at, number)) = rounds.min() else { return };
+        let delivery = links.next_at().unwrap_or(Timestamp(u64::MAX));
+        if round_at.min(delivery) > now {
+            return;
+        }
+        if delivery <= round_at {
+            links.deliver(cells);
+        } else {
+            cells[number].close_until(round_at);
+            links.send_from(cells, number, round_at);
+        }
+    }
+}
+
+/// The borders of the cells.
+struct TownPlan {
+    /// West and south edge of the first cell, and side of a cell, metres.
+    from_m: f64,
+    side_m: f64,
+}
+
+impl TownPlan {
+    fn new(traffic: &TrafficConfig) -> Self {
+        let side_m = traffic.roads as f64 * traffic.block_m / CELLS_A_SIDE as f64;
+        Self { from_m: -traffic.block_m / 2.0, side_m }
+    }
+
+    /// Names and frames: each with a direction and a clock of its own, up to 2 s fast or slow.
+    fn frames<'a>(&'a self, uniform: &'a mut dyn FnMut() -> f64) -> impl Iterator<Item = (NodeName, CellFrame)> + 'a {
+        (0..CELLS_A_SIDE * CELLS_A_SIDE).map(move |number| {
+            let middle = |place: usize| self.from_m + (place as f64 + 0.5) * self.side_m;
+            let place = TOWN.to_wgs84(middle(number % CELLS_A_SIDE), middle(number / CELLS_A_SIDE), 0.0);
+            let origin = GeographicOrigin {
+                latitude_deg: place.latitude_deg,
+                longitude_deg: place.longitude_deg,
+                height_m: place.height_m,
+                rotation_deg: 360.0 * uniform(),
+            };
+            let clock_us = ((4.0 * uniform() - 2.0) * 1e6) as i64;
+            (cell_name(number), CellFrame::new(&TOWN, origin, clock_us))
+        })
+    }
+
+    fn index(&self, coordinate_m: f64) -> usize {
+        (((coordinate_m - self.from_m) / self.side_m).max(0.0) as usize).min(CELLS_A_SIDE - 1)
+    }
+
+    /// The cell to which a vehicle reports: where it is, or where it was until it is well inside another.
+    fn cell_of(&self, report: &ObjectReport, before: &BTreeMap<NodeName, usize>) -> usize {
+        let place = report.pose.map_or(Point2::origin(), |pose| Point2::new(pose.x_m, pose.y_m));
+        let here = self.index(place.x) + CELLS_A_SIDE * self.index(place.y);
+        match before.get(&report.node) {
+            Some(before) if self.border_m(&place) < HYSTERESIS_M => *before,
+            _ => here,
+        }
+    }
+
+    /// Distance to the next border between cells, metres.
+    fn border_m(&self, place: &Point2<f64>) -> f64 {
+        let borders = (1..CELLS_A_SIDE).map(|number| self.from_m + number as f64 * self.side_m);
+        distance_m(place, borders)
+    }
+
+    fn is_at_border(&self, place: &Point2<f64>) -> bool {
+        self.border_m(place) < BORDER_M
+    }
+
+    fn is_in_middle(&self, place: &Point2<f64>) -> bool {
+        let middles = (0..CELLS_A_SIDE).map(|number| self.from_m + (number as f64 + 0.5) * self.side_m);
+        distance_m(place, middles) < BORDER_M && !self.is_at_border(place)
+    }
+}
+
+/// Distance of a place to the next of lines along both axes.
+fn distance_m(place: &Point2<f64>, lines: impl Iterator<Item = f64>) -> f64 {
+    let distances = lines.flat_map(|line| [(place.x - line).abs(), (place.y - line).abs()]);
+    distances.min_by(f64::total_cmp).unwrap_or(f64::INFINITY)
+}
+
+#[expect(clippy::expect_used, reason = "letters, a dash and a digit are a name")]
+fn cell_name(number: usize) -> NodeName {
+    NodeName::new(format!("cell-{number}")).expect("letters, a dash and a digit are a name")
+}
+
+/// Judges the maps of cells together.
+fn judge(plan: &TownPlan, truth: &TrafficTruth, cells: &[TownCell]) -> Result<TownScores, TrackTruthError> {
+    let part = |is_part: &dyn Fn(&Point2<f64>) -> bool| -> Result<TrackScores, TrackTruthError> {
+        let frames = truth.frames.iter().map(|frame| {
+            let here = frame.objects.iter().filter(|object| is_part(&Point2::new(object.x_m, object.y_m)));
+            TruthFrame { t_us: frame.t_us, objects: here.cloned().collect() }
+        });
+        let part = TrafficTruth { frames: frames.collect() };
+        let text = serde_json::to_string(&part).unwrap_or_default();
+        let mut judge = TrackEvaluation::new(TrackTruth::parse(&text)?);
+        let mut ids = HashMap::new();
+        for frame in &truth.frames {
+            let moment = moment(cells, frame.t_us);
+            let said = moment.iter().filter(|object| is_part(&Point2::new(object.x_m, object.y_m)));
+            let said: Vec<SaidObject> = said.map(|object| SaidObject::of(object, &mut ids)).collect();
+            judge.said(frame.t_us, &said);
+        }
+        Ok(judge.result())
+    };
+    Ok(TownScores {
+        all: part(&|_| true)?,
+        border: part(&|place| plan.is_at_border(place))?,
+        middle: part(&|place| plan.is_in_middle(place))?,
+    })
+}
+
+/// All objects of all cells at a moment, each identity once: the one that is known best.
+fn moment(cells: &[TownCell], at: Timestamp) -> Vec<FusedObject> {
+    let mut known: BTreeMap<Uuid, FusedObject> = BTreeMap::new();
+    for object in cells.iter().flat_map(|cell| cell.objects_at(at, MOMENT)) {
+        let spread = |object: &FusedObject| object.covariance_m2[0] + object.covariance_m2[2];
+        match known.get(&object.id) {
+            Some(other) if spread(other) <= spread(&object) => {}
+            _ => {
+                known.insert(object.id, object);
+            }
+        }
+    }
+    known.into_values().collect()
+}

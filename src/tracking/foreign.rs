@@ -1,0 +1,295 @@
+//! Objects of neighbouring cells: they lend identities to tracks, and are judged by what this cell's vehicles see.
+//!
+//! No track is spawned or kept alive by them. A track that begins where such an object is takes over its identity, its
+//! velocity, its time of first detection and what is known of its existence and class. Its position is that of the
+//! detection. Two cells that found one object apart agree on the identity of the older one; of two that are about as
+//! old, on the smaller one.
+//!
+//! A cell is judged as a vehicle is (`trust`): it states that its objects exist.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use nalgebra::Vector2;
+use uuid::Uuid;
+
+use super::HandOvers;
+use super::config::TracksConfig;
+use super::kinematics::{KinematicState, Measurement};
+use super::lifecycle::{MERGE_M, measurement};
+use super::sensors::SensorId;
+use super::store::{TrackIndex, TrackStore};
+use super::track::{MIN_LABEL_SIMILARITY, Track};
+use super::trust::{DormantCounts, Fleet, JUDGED_AFTER, Judgement};
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
+use crate::wire::{NeighbourObject, PerceivedObject};
+
+/// Minimum existence of an object of which its cell states that it exists.
+const MIN_STATED: f64 = 0.8;
+
+/// Maximum time in seconds since its last detection of an object of which its cell states that it exists.
+const MAX_STATED_AGE_S: f64 = 0.5;
+
+/// Standard deviation of a velocity that is taken over: in metres per second, and as a share of it. With that share a
+/// track can follow an object that stands.
+const VELOCITY_SIGMA_MPS: f64 = 1.0;
+const VELOCITY_SIGMA_SHARE: f64 = 0.3;
+
+/// Time in seconds for which objects of two cells move apart by the errors of their clocks.
+const CLOCK_ERROR_S: f64 = 0.1;
+
+/// Time for which a cell's object and a track agree before the track may take over its identity.
+const AGREES_AFTER: Duration = Duration::from_millis(400);
+
+/// Difference in seconds of the times of first detection below which none is the older.
+const TIE_S: f64 = 1.0;
+
+/// Time after which the smaller identity holds, if the other cell has not taken over the one of the older track.
+const TIES_AFTER: Duration = Duration::from_secs(4);
+
+/// Maximum number of identities that a track takes over from cells one after the other.
+const MAX_RENAMES: u8 = 2;
+
+/// Objects of neighbouring cells, and the trust in those cells.
+#[derive(Debug, Clone, Default)]
+pub(super) struct ForeignObjects {
+    objects: Vec<ForeignObject>,
+    trust: DormantCounts,
+    pub(super) hand_overs: HandOvers,
+}
+
+/// An object of a neighbouring cell.
+#[derive(Debug, Clone)]
+pub(super) struct ForeignObject {
+    cell: NodeName,
+    /// The object as a track; its history is what this cell's vehicles saw there.
+    pub(super) track: Track,
+    stated: NeighbourObject,
+    /// When its cell's map was fused.
+    fused_at: Timestamp,
+    judged_at: Timestamp,
+    /// The track that is the same object, and since when.
+    same: Option<(Uuid, Timestamp)>,
+}
+
+impl ForeignObject {
+    fn new(stated: &NeighbourObject, fused_at: Timestamp, config: &TracksConfig) -> Self {
+        let NeighbourObject { cell, object, .. } = stated;
+        let mut track = Track::new(object.id, fused_at, &measurement(object, config), config);
+        track.inherit(object, fused_at);
+        if let Some(velocity) = object.velocity_mps {
+            lend_velocity(&mut track.state, fused_at, velocity.into(), config);
+        }
+        Self { cell: cell.clone(), track, stated: stated.clone(), fused_at, judged_at: fused_at, same: None }
+    }
+
+    /// True if its cell states that it exists.
+    pub(super) fn is_stated(&self) -> bool {
+        let object = &self.stated.object;
+        object.existence.unwrap_or(object.confidence) >= MIN_STATED && object.age_s.unwrap_or(0.0) <= MAX_STATED_AGE_S
+    }
+
+    /// The object with its errors at `at`, as a measurement.
+    fn measured_at(&self, at: Timestamp, config: &TracksConfig) -> Measurement {
+        let independent = self.track.state.covariance_at(at, config.density());
+        Measurement { position: self.track.state.position_at(at), independent, common_m: 0.0 }
+    }
+
+    /// Squared distance from a track in standard deviations, if both can be one object at `at`.
+    fn distance_from(&self, track: &Track, at: Timestamp, config: &TracksConfig) -> Option<f64> {
+        let innovation = track.state.innovation(at, &self.measured_at(at, config), config.density());
+        let velocity = self.track.state.velocity - track.state.velocity;
+        let variance = (self.track.state.velocity_covariance() + track.state.velocity_covariance()).trace() / 2.0;
+        let reach_m = MERGE_M + CLOCK_ERROR_S * self.track.state.velocity.norm();
+        let is_same = innovation.offset.norm() <= reach_m
+            && innovation.distance_squared <= config.gate()
+            && velocity.norm_squared() <= config.gate() * variance
+            && self.track.label(config) == track.label(config);
+        is_same.then_some(innovation.distance_squared)
+    }
+}
+
+impl ForeignObjects {
+    /// Takes all objects of neighbouring cells, of the age that they state at `stated_at`; tracks that are the same objects
+    /// take over the identities of older ones.
+    pub(super) fn take(
+        &mut self,
+        stated: &[NeighbourObject],
+        stated_at: Timestamp,
+        tracks: &mut TrackStore,
+        fleet: &Fleet,
+        config: &TracksConfig,
+    ) {
+        let known = std::mem::take(&mut self.objects);
+        self.objects = stated
+            .iter()
+            .map(|stated| {
+                let fused_at = stated_at - Duration::from_secs_f64(stated.age_s.clamp(0.0, 60.0));
+                let mut object = ForeignObject::new(stated, fused_at, config);
+                let of_cell = || known.iter().filter(|known| known.cell == stated.cell);
+                let by_id = of_cell().find(|known| known.track.id == stated.object.id);
+                // An object that changes its identity all the time is judged nevertheless.
+                let at_place = || {
+                    let position = object.track.state.position;
+                    of_cell().find(|known| (known.track.state.position_at(fused_at) - position).norm() < MERGE_M)
+                };
+                if let Some(known) = by_id.or_else(at_place) {
+                    object.track.history = known.track.history.clone();
+                    object.judged_at = known.judged_at;
+                    object.same = known.same.filter(|_| known.track.id == object.track.id);
+                }
+                object
+            })
+            .collect();
+        tracks.reindex(stated_at);
+        self.compare(tracks, stated_at, config);
+        self.agree(tracks, stated_at, fleet);
+    }
+
+    /// Forgets objects whose maps were fused before `limit`, and vehicles that are not `known`.
+    pub(super) fn forget(&mut self, limit: Timestamp, known: impl Fn(SensorId) -> bool) {
+        self.objects.retain(|object| object.fused_at >= limit);
+        self.objects.iter_mut().for_each(|object| object.track.history.retain(&known));
+    }
+
+    /// Finds the track that is the same as each object: of each cell one to one, the nearest first.
+    fn compare(&mut self, tracks: &TrackStore, now: Timestamp, config: &TracksConfig) {
+        let ids: BTreeSet<Uuid> = tracks.iter().map(|track| track.id).collect();
+        let mut pairs = Vec::new();
+        for (number, object) in self.objects.iter().enumerate() {
+            let position = object.track.state.position_at(now);
+            let reach_m = MERGE_M + CLOCK_ERROR_S * object.track.state.velocity.norm();
+            tracks.near(&position, reach_m, |indexed| {
+                let track = &tracks[indexed.track];
+                let is_known = ids.contains(&object.track.id);
+                if is_known && track.id == object.track.id {
+                    pairs.push((0.0, number, indexed.track));
+                } else if let Some(distance) = object.distance_from(track, now, config).filter(|_| !is_known) {
+                    pairs.push((distance, number, indexed.track));
+                }
+            });
+        }
+        pairs.sort_by(|a, b| a.0.total_cmp(&b.0).then_with(|| (a.1, a.2).cmp(&(b.1, b.2))));
+        let mut taken: BTreeSet<(&NodeName, TrackIndex)> = BTreeSet::new();
+        let mut same: Vec<Option<Uuid>> = vec![None; self.objects.len()];
+        for (_, number, track) in pairs {
+            if same[number].is_none() && taken.insert((&self.objects[number].cell, track)) {
+                same[number] = Some(tracks[track].id);
+            }
+        }
+        for (object, same) in self.objects.iter_mut().zip(same) {
+            let since = |id| object.same.filter(|(known, _)| *known == id).map_or(now, |(_, since)| since);
+            object.same = same.map(|id| (id, since(id)));
+        }
+    }
+
+    /// Lets tracks take over the identities of objects of proven cells.
+    fn agree(&mut self, tracks: &mut TrackStore, now: Timestamp, fleet: &Fleet) {
+        let mut ids: BTreeSet<Uuid> = tracks.iter().map(|track| track.id).collect();
+        for object in &mut self.objects {
+            let Some((id, since)) = object.same.filter(|(id, _)| *id != object.track.id) else { continue };
+            let agreed = now.since(since);
+            if agreed < AGREES_AFTER || !self.trust.of(&object.cell).is_proven(fleet.reputation()) {
+                continue;
+            }
+            let Some(track) = tracks.iter_mut().find(|track| track.id == id) else { continue };
+            let older_s = track.first_seen.micros_from(object.track.first_seen) as f64 * 1e-6;
+            let is_tie = older_s.abs() <= TIE_S || agreed >= TIES_AFTER;
+            let is_theirs = if is_tie { object.track.id < id } else { older_s > 0.0 };
+            if is_theirs && track.renames < MAX_RENAMES && ids.insert(object.track.id) {
+                ids.remove(&id);
+                (track.id, track.renames) = (object.track.id, track.renames + 1);
+                track.first_seen = track.first_seen.min(object.track.first_seen);
+                object.same = Some((track.id, since));
+                self.hand_overs.renamed += 1;
+            }
+        }
+    }
+
+    /// True if an object is not shown: it is one of this cell's, or its cell is not believed.
+    pub(super) fn hides(&self, stated: &NeighbourObject, fleet: &Fleet) -> bool {
+        let is_this = |object: &&ForeignObject| object.track.id == stated.object.id && object.cell == stated.cell;
+        let is_same = self.objects.iter().find(is_this).is_some_and(|object| object.same.is_some());
+        is_same || !self.is_trusted(&stated.cell, fleet)
+    }
+
+    /// Weight of what a cell states, 0 to 1.
+    pub(super) fn trust(&self, cell: &NodeName, fleet: &Fleet) -> f64 {
+        self.trust.of(cell).trust(fleet.reputation())
+    }
+
+    fn is_trusted(&self, cell: &NodeName, fleet: &Fleet) -> bool {
+        self.trust(cell, fleet) > 0.0
+    }
+
+    /// The objects near a place at `at` of which their cells state that they exist. Their histories are what this cell's
+    /// vehicles saw there.
+    pub(super) fn stated_near(
+        &mut self,
+        centre: &Vector2<f64>,
+        reach_m: f64,
+        at: Timestamp,
+    ) -> impl Iterator<Item = &mut Track> {
+        let stated = self.objects.iter_mut().filter(|object| object.is_stated()).map(|object| &mut object.track);
+        stated.filter(move |track| (track.state.position_at(at) - centre).norm() <= reach_m)
+    }
+
+    /// True if there is none.
+    pub(super) fn is_empty(&self) -> bool {
+        self.objects.is_empty()
+    }
+
+    /// Judges the statements that are due at `at`.
+    pub(super) fn judge(&mut self, fleet: &Fleet, at: Timestamp) {
+        for object in self.objects.iter_mut().filter(|object| at.since(object.judged_at) >= JUDGED_AFTER) {
+            object.judged_at = at;
+            let judgement = Some(&object.track.history).filter(|_| object.is_stated());
+            if let Some(judgement) = judgement.and_then(|history| fleet.judge_stated(history, at)) {
+                let mut counts = self.trust.of(&object.cell);
+                counts.count(judgement == Judgement::Correct, fleet.reputation());
+                self.trust.keep([(object.cell.clone(), counts)]);
+            }
+        }
+    }
+
+    /// The object of a trusted cell that a new track at `measurement` is, if there is one that no track is yet.
+    pub(super) fn find(
+        &self,
+        at: Timestamp,
+        measurement: &Measurement,
+        detected: Option<&PerceivedObject>,
+        tracks: &TrackStore,
+        fleet: &Fleet,
+        config: &TracksConfig,
+    ) -> Option<&ForeignObject> {
+        let candidates = self.objects.iter().filter(|object| object.same.is_none());
+        let near = candidates.filter_map(|object| {
+            let innovation = object.track.state.innovation(at, measurement, config.density());
+            let is_near = innovation.offset.norm() <= config.gate_m && innovation.distance_squared <= config.gate();
+            let is_like = |detected| object.track.label_similarity(detected) > MIN_LABEL_SIMILARITY;
+            (is_near && detected.is_none_or(is_like)).then_some((innovation.distance_squared, object))
+        });
+        let (_, nearest) = near.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.track.id.cmp(&b.1.track.id)))?;
+        let is_free = tracks.iter().all(|track| track.id != nearest.track.id);
+        (is_free && self.is_trusted(&nearest.cell, fleet)).then_some(nearest)
+    }
+}
+
+impl ForeignObject {
+    /// A track that begins with a measurement of this object at `at`.
+    pub(super) fn lend(&self, at: Timestamp, measurement: &Measurement, config: &TracksConfig) -> Track {
+        let mut track = Track::new(self.track.id, at, measurement, config);
+        track.inherit(&self.stated.object, at);
+        if let Some(velocity) = self.stated.object.velocity_mps {
+            lend_velocity(&mut track.state, at, velocity.into(), config);
+        }
+        track
+    }
+}
+
+fn lend_velocity(state: &mut KinematicState, at: Timestamp, velocity: Vector2<f64>, config: &TracksConfig) {
+    let sigma_mps = VELOCITY_SIGMA_MPS.hypot(VELOCITY_SIGMA_SHARE * velocity.norm());
+    state.update_velocity(at, velocity, sigma_mps, config.density());
+    state.limit_speed(config.max_speed_mps);
+}
