@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 clean
+.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -223,6 +223,13 @@ release-check: setup ## after make release: prove that two clean clones give the
 
 edge-only: setup ## an aggregator without camera and OpenCV
 	cargo build --locked -p ecod-actors --no-default-features
+
+# CITY=quick is a minute; CITY="--cells 500" takes other options of the program.
+city: PACKAGES += nats-server
+city: setup ## a region of three servers with 2000 simulated cells and 20 real ones: killed, stopped, cut off, restarted
+	cargo build --profile $(PROFILE) --locked -p ecod-actors -p ecod-region --bin ecod-node --bin ecod-region --example city
+	REGION_PROGRAM=$(PROGRAMS)/ecod-region $(PROGRAMS)/examples/city --node $(PROGRAMS)/ecod-node \
+	    $(if $(filter quick,$(CITY)),--quick --cells 200 --real 2 --seconds 6,--real 20 $(CITY))
 
 bench: setup ## speed of the core, the detectors and the path through the broker, in target/bench.json
 	packaging/bench

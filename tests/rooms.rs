@@ -13,12 +13,13 @@ use syn::visit::{self, Visit};
 type Module = Vec<String>;
 
 /// Crates by name in paths, and their sources.
-const CRATES: [(&str, &str); 5] = [
+const CRATES: [(&str, &str); 6] = [
     ("ecod", "src"),
     ("ecod_actors", "actors/src"),
     ("ecod_client", "clients/rust/src"),
     ("ecod_interop", "interop/src"),
     ("ecod_lab", "lab/src"),
+    ("ecod_region", "region/src"),
 ];
 
 #[test]

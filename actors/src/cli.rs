@@ -93,8 +93,14 @@ enum Command {
     Man(shell::ManArguments),
 }
 
-/// Commands of `ecod-lab`, which is not installed on vehicles.
-const LAB_COMMANDS: [&str; 4] = ["bench", "demo", "eval", "testbed"];
+/// Commands of other programs, which are not installed on vehicles.
+const ELSEWHERE: [(&str, &str); 5] = [
+    ("bench", "ecod-lab bench"),
+    ("demo", "ecod-lab demo"),
+    ("eval", "ecod-lab eval"),
+    ("region", "ecod-region"),
+    ("testbed", "ecod-lab testbed"),
+];
 
 /// A failed command and the exit code of the process.
 #[derive(Debug)]
@@ -130,16 +136,21 @@ pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
 
 /// The process's arguments; ends the process on those that no program of the project has.
 fn parse() -> Result<Cli, Failure> {
-    Cli::try_parse().map_err(|error| match error.get(ContextKind::InvalidSubcommand) {
-        Some(ContextValue::String(command)) if LAB_COMMANDS.contains(&command.as_str()) => in_lab(command),
-        _ => error.exit(),
+    Cli::try_parse().map_err(|error| {
+        let command = match error.get(ContextKind::InvalidSubcommand) {
+            Some(ContextValue::String(command)) => command.as_str(),
+            _ => error.exit(),
+        };
+        let other = ELSEWHERE.into_iter().find(|(name, _)| *name == command);
+        other.map_or_else(|| error.exit(), |(_, instead)| elsewhere(instead))
     })
 }
 
-/// Names the program that has the command, and how to get it.
-fn in_lab(command: &str) -> Failure {
-    let build = "build that program from the sources by `cargo build --release --bin ecod-lab`";
-    Failure::usage(anyhow!("run `ecod-lab {command}` instead; {build}"))
+/// Names the command of another program, and how to get that.
+fn elsewhere(instead: &str) -> Failure {
+    let program = instead.split(' ').next().unwrap_or_default();
+    let build = format!("build that program from the sources by `cargo build --release --bin {program}`");
+    Failure::usage(anyhow!("run `{instead}` instead; {build}"))
 }
 
 fn run_command(cli: Cli) -> Result<(), Failure> {

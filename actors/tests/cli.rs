@@ -252,18 +252,20 @@ fn a_vehicle_without_a_camera_is_told_that_only_programs_report() {
 }
 
 #[test]
-fn a_command_of_the_laboratory_is_told_where_it_is() {
+fn a_command_of_another_program_is_told_where_it_is() {
     for (arguments, run) in [
         (&["demo", "--seconds", "3"][..], "`ecod-lab demo`"),
         (&["--log-format", "text", "testbed"], "`ecod-lab testbed`"),
         (&["bench", "--costs"], "`ecod-lab bench`"),
         (&["eval", "--truth", "truth.json"], "`ecod-lab eval`"),
+        (&["region"], "`ecod-region`"),
         (&["report", "log", "--truth", "truth.json"], "`ecod-lab report --truth`"),
     ] {
         let output = ecod_node().args(arguments).output().unwrap();
         let error = stderr(&output);
         assert_eq!((output.status.code(), error.lines().count()), (Some(2), 1), "{error}");
-        assert!(error.contains(run) && error.contains("`cargo build --release --bin ecod-lab`"), "{error}");
+        let program = run.trim_matches('`').split(' ').next().unwrap();
+        assert!(error.contains(run) && error.contains(&format!("--bin {program}`")), "{error}");
     }
     let typo = ecod_node().arg("demos").output().unwrap();
     assert!(typo.status.code() == Some(2) && stderr(&typo).contains("unrecognized"), "{}", stderr(&typo));

@@ -7,7 +7,7 @@ use anyhow::{Context, anyhow};
 use clap::Args;
 
 use super::logs::{Logs, LogsNodeArguments};
-use super::{Failure, in_lab};
+use super::{Failure, elsewhere};
 use crate::cli::lines;
 use crate::observe::report::Report;
 
@@ -36,7 +36,7 @@ pub(super) struct ReportArguments {
 
 pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
     if arguments.truth.is_some() {
-        return Err(in_lab("report --truth"));
+        return Err(elsewhere("ecod-lab report --truth"));
     }
     page(&arguments.page, Report::default(), None, "ecod-node")
 }

@@ -1,12 +1,10 @@
 //! Page, API, metrics and health of a node over HTTP.
 
-pub(crate) mod access;
 pub(crate) mod assets;
 pub(crate) mod camera_feed;
 #[cfg(feature = "camera")]
 pub(crate) mod camera_picture;
 pub(crate) mod config;
-pub(crate) mod connection_limit;
 pub(crate) mod floor_plan;
 pub(crate) mod history;
 pub(crate) mod live_state;
@@ -16,14 +14,14 @@ pub(crate) mod metrics;
 pub(crate) mod mount_answer;
 pub(crate) mod node_monitor;
 pub(crate) mod node_sources;
-pub(crate) mod process_metrics;
+pub mod process_metrics;
 pub(crate) mod response_cache;
 pub(crate) mod routes;
 pub(crate) mod server;
 pub(crate) mod snapshot;
 pub(crate) mod timeline;
 
-pub use assets::paths as page_paths;
+pub use assets::{page_file, paths as page_paths};
 pub use camera_feed::CameraFeed;
 #[cfg(feature = "camera")]
 pub use camera_picture::{PictureBox, camera_event};

@@ -44,6 +44,11 @@ pub fn paths() -> impl Iterator<Item = &'static str> {
     ASSETS.iter().map(|asset| asset.path)
 }
 
+/// Content type and content of a file of the page, for pages of the same look.
+pub fn page_file(path: &str) -> Option<(&'static str, &'static str)> {
+    Asset::find(path).map(|asset| (asset.content_type, asset.content))
+}
+
 /// Style sheet of map and timeline, with the colours of all pages.
 pub(crate) const VIEW_STYLE: &str = include_str!("page/view.css");
 

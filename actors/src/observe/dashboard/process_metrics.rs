@@ -10,7 +10,7 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::{Registry, Unit};
 
 /// Registers CPU time, memory and time of start, as far as the operating system tells them.
-pub(crate) fn register(registry: &mut Registry, started_at: Timestamp) {
+pub fn register(registry: &mut Registry, started_at: Timestamp) {
     let started = Gauge::<f64, AtomicU64>::default();
     started.set(started_at.micros() as f64 / 1e6);
     registry.register_with_unit("process_start_time", "Unix time at which the node started", Unit::Seconds, started);

@@ -2,15 +2,14 @@
 
 use std::convert::Infallible;
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
+use axum::extract::State;
 #[cfg(feature = "camera")]
-use axum::extract::{DefaultBodyLimit, FromRequest};
-use axum::extract::{Request, State};
-use axum::http::{HeaderValue, StatusCode, Uri, header};
-use axum::middleware::{self, Next};
+use axum::extract::{DefaultBodyLimit, FromRequest, Request};
+use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 #[cfg(feature = "camera")]
@@ -26,9 +25,7 @@ use tokio::task::spawn_blocking;
 #[cfg(feature = "camera")]
 use tokio::time::timeout;
 
-use super::access::{AccessDecision, HEADERS, PageAccess};
 use super::assets::Asset;
-use super::connection_limit::ConnectionSlot;
 use super::floor_plan;
 use super::metrics;
 #[cfg(feature = "camera")]
@@ -37,30 +34,21 @@ use super::node_monitor::NodeMonitor;
 use super::node_sources::ShownCamera;
 use super::response_cache::ResponseCache;
 use super::snapshot::json;
+use crate::observe::http::{HttpRefusal, PageAccess, PageGuard, with_headers};
+#[cfg(feature = "camera")]
 use crate::platform::clock;
-use crate::platform::throttle::TokenBucket;
 use crate::telemetry::counters::Event;
 
 /// State of all routes.
 #[derive(Debug)]
 pub(crate) struct HttpApi {
     monitor: Arc<NodeMonitor>,
-    access: PageAccess,
-    answers: Mutex<TokenBucket>,
-    /// Separate, so that requests without access leave the rate of those with access alone.
-    refusals: Mutex<TokenBucket>,
     metrics: ResponseCache<Result<Bytes, fmt::Error>>,
     max_viewers: usize,
     /// One mount is fitted at a time.
     #[cfg(feature = "camera")]
     mounts: Arc<Semaphore>,
 }
-
-/// Burst of requests: some tabs open together unhindered.
-const BURST: u32 = 512;
-
-/// Time between further requests after a burst.
-const REQUEST_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Minimum age of the metrics before they are read again.
 const METRICS_MIN_AGE: Duration = Duration::from_millis(100);
@@ -79,12 +67,8 @@ const MAX_POSE_AGE: Duration = Duration::from_secs(5);
 
 impl HttpApi {
     /// At most half of the connections carry live snapshots.
-    pub(crate) fn new(monitor: Arc<NodeMonitor>, access: PageAccess, max_connections: usize) -> Self {
-        let throttle = || Mutex::new(TokenBucket::new(BURST, REQUEST_INTERVAL, clock::now()));
+    pub(crate) fn new(monitor: Arc<NodeMonitor>, max_connections: usize) -> Self {
         Self {
-            access,
-            answers: throttle(),
-            refusals: throttle(),
             metrics: ResponseCache::new(METRICS_MIN_AGE),
             max_viewers: max_connections / 2,
             #[cfg(feature = "camera")]
@@ -94,7 +78,7 @@ impl HttpApi {
     }
 
     /// All routes. Health needs no token, as the machines that ask hold no secrets.
-    pub(crate) fn router(self) -> Router {
+    pub(crate) fn router(self, access: PageAccess) -> Router {
         let api = Arc::new(self);
         let guarded = Router::new()
             .route("/metrics", get(show_metrics))
@@ -109,13 +93,18 @@ impl HttpApi {
         #[cfg(feature = "camera")]
         let guarded =
             guarded.route("/api/camera/mount", post(answer_mount).layer(DefaultBodyLimit::max(MAX_POINTS_BYTES)));
-        let guarded = guarded.layer(middleware::from_fn_with_state(Arc::clone(&api), guard));
-        Router::new()
+        let counted = Arc::clone(&api);
+        let guard = PageGuard::new(access, move |refusal| {
+            counted.count(match refusal {
+                HttpRefusal::Refused => Event::BrowserRefused,
+                HttpRefusal::Throttled => Event::BrowserThrottled,
+            });
+        });
+        let routes = Router::new()
             .route("/healthz", get(|| async { "ok\n" }))
             .route("/readyz", get(show_readiness))
-            .merge(guarded)
-            .layer(middleware::map_response(with_headers))
-            .with_state(api)
+            .merge(guard.protect(guarded));
+        with_headers(routes).with_state(api)
     }
 
     fn count(&self, event: Event) {
@@ -148,46 +137,6 @@ impl HttpApi {
 }
 
 type Api = State<Arc<HttpApi>>;
-
-/// Checks access and rate of a request.
-async fn guard(State(api): Api, request: Request, next: Next) -> Response {
-    let decision = api.access.decide(request.uri(), request.headers());
-    let is_allowed = matches!(decision, AccessDecision::Allowed | AccessDecision::SignIn);
-    let throttle = if is_allowed { &api.answers } else { &api.refusals };
-    if !throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(clock::now()) {
-        api.count(Event::BrowserThrottled);
-        return (StatusCode::TOO_MANY_REQUESTS, [(header::RETRY_AFTER, "1")], "too many requests\n").into_response();
-    }
-    if !is_allowed {
-        api.count(Event::BrowserRefused);
-    } else if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
-        slot.keep();
-    }
-    match decision {
-        AccessDecision::Allowed => next.run(request).await,
-        AccessDecision::SignIn => {
-            let location = HeaderValue::from_str(request.uri().path()).unwrap_or(HeaderValue::from_static("/"));
-            let mut answer = (StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response();
-            answer.headers_mut().extend(api.access.cookie().map(|cookie| (header::SET_COOKIE, cookie)));
-            answer
-        }
-        AccessDecision::Unauthorized => {
-            let challenge = [(header::WWW_AUTHENTICATE, "Bearer")];
-            let text = "open this page with ?token=… or send Authorization: Bearer …\n";
-            (StatusCode::UNAUTHORIZED, challenge, text).into_response()
-        }
-        AccessDecision::ForeignHost => {
-            (StatusCode::MISDIRECTED_REQUEST, "this page is served on loopback only\n").into_response()
-        }
-    }
-}
-
-async fn with_headers(mut answer: Response) -> Response {
-    for (name, value) in HEADERS {
-        answer.headers_mut().entry(name).or_insert(value);
-    }
-    answer
-}
 
 async fn show_readiness(State(api): Api) -> Response {
     let readiness = api.monitor.readiness();

@@ -1,4 +1,4 @@
-//! Access to the dashboard: the token, the host name of a request, and the security headers of every answer.
+//! Access to a page: the token, the host name of a request, and the security headers of every answer.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -12,7 +12,7 @@ use crate::platform::secret::Secret;
 
 /// Decides which requests are answered.
 #[derive(Debug)]
-pub(crate) struct PageAccess {
+pub struct PageAccess {
     loopback: bool,
     token: Option<PageToken>,
 }
@@ -57,7 +57,7 @@ pub(crate) const HEADERS: [(HeaderName, HeaderValue); 5] = [
 
 impl PageAccess {
     /// Access to the page of a node that listens on `address`.
-    pub(crate) fn new(token: Option<&Secret>, address: SocketAddr, node: &NodeName) -> Self {
+    pub fn new(token: Option<&Secret>, address: SocketAddr, node: &NodeName) -> Self {
         // Cookies are shared between the ports of a host, but not between names.
         let token =
             token.map(|token| PageToken { key: key(token.reveal().as_bytes()), cookie_name: format!("ecod-{node}") });

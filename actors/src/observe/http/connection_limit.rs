@@ -11,7 +11,7 @@ use crate::platform::throttle::host_network;
 /// Limits connections. A connection with an allowed request is kept until it is answered. When full, a new connection
 /// displaces the oldest other one of the address that has most of them.
 #[derive(Debug, Clone)]
-pub(crate) struct ConnectionLimit {
+pub struct ConnectionLimit {
     max: usize,
     open: Arc<Mutex<OpenConnections>>,
 }
@@ -49,7 +49,8 @@ pub(crate) struct AdmittedConnection {
 }
 
 impl ConnectionLimit {
-    pub(crate) fn new(max: usize) -> Self {
+    /// A limit of `max` connections.
+    pub fn new(max: usize) -> Self {
         Self { max, open: Arc::default() }
     }
 

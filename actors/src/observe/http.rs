@@ -1,0 +1,11 @@
+//! HTTP for pages: who is answered, how often, and over how many connections.
+
+pub(crate) mod access;
+pub(crate) mod connection_limit;
+mod guard;
+mod listener;
+
+pub use access::PageAccess;
+pub use connection_limit::ConnectionLimit;
+pub use guard::{HttpRefusal, PageGuard, with_headers};
+pub use listener::accept;

@@ -1,0 +1,104 @@
+//! Rights of one cell on a region's broker: it writes below its own tile and name, and reads the tiles around.
+
+use std::fmt::Write;
+
+use ecod::model::names::NodeName;
+use ecod::model::origin::GeographicPosition;
+use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
+use ecod::wire::{RegionTopic, RegionTopicKind};
+
+/// The account of a cell. All nodes of the cell that may lead share it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CellAccount {
+    /// The cell, and the user's name.
+    pub cell: NodeName,
+    /// The tile of the cell's origin.
+    pub tile: Quadkey,
+}
+
+/// Topics on which cells publish what they know of vehicles: `ecod/v1/rep/<vehicle>/<cell>`.
+const REPUTATIONS: &str = "ecod/v1/rep";
+
+impl CellAccount {
+    /// The account of a cell whose frame's origin is at a position.
+    pub fn new(cell: NodeName, origin: &GeographicPosition) -> Self {
+        Self { cell, tile: Quadkey::of(origin, CELL_TILE_DIGITS) }
+    }
+
+    /// MQTT filters of what the cell may publish.
+    pub fn writes(&self) -> Vec<String> {
+        let Self { cell, tile } = self;
+        vec![format!("ecod/v1/geo/{}/{cell}/#", tile.levels()), format!("{REPUTATIONS}/+/{cell}")]
+    }
+
+    /// MQTT filters of what the cell may read: its own, maps and descriptions of the tiles around, and reputations.
+    ///
+    /// Statuses of others are not among them: they name the runs of nodes, and so what their connections may be called.
+    pub fn reads(&self) -> Vec<String> {
+        let Self { cell, tile } = self;
+        let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
+        let around = tile.with_neighbours().into_iter();
+        let around = around.flat_map(|tile| kinds.map(|kind| RegionTopic::filter(tile, kind)));
+        let own = [format!("ecod/v1/geo/{}/{cell}/#", tile.levels()), format!("{REPUTATIONS}/+/+")];
+        own.into_iter().chain(around).collect()
+    }
+
+    /// The user as an element of `users` in NATS's configuration.
+    ///
+    /// The password stands there as it is: at 122 random bits a slow hash adds nothing, and costs a server 0.1 s of a core
+    /// for each login.
+    pub fn nats(&self, password: &str) -> String {
+        let list = |filters: Vec<String>| {
+            let subjects: Vec<_> = filters.iter().map(|filter| format!("\"{}\"", subject(filter))).collect();
+            subjects.join(", ")
+        };
+        let (writes, reads) = (list(self.writes()), list(self.reads()));
+        format!(
+            "{{user: \"{}\", password: \"{password}\", permissions: {{\n  publish: {{allow: [{writes}]}},\n  \
+             subscribe: {{allow: [{reads}]}}}}}}\n",
+            self.cell
+        )
+    }
+
+    /// The user as lines of mosquitto's `acl_file`.
+    pub fn mosquitto(&self) -> String {
+        let mut lines = format!("user {}\n", self.cell);
+        for (access, filters) in [("write", self.writes()), ("read", self.reads())] {
+            for filter in filters {
+                // Writing to a text does not fail.
+                let _ = writeln!(lines, "topic {access} {filter}");
+            }
+        }
+        lines
+    }
+}
+
+/// The NATS subject of an MQTT filter. Names of cells and vehicles have no dots.
+fn subject(filter: &str) -> String {
+    let tokens = filter.split('/').map(|level| match level {
+        "#" => ">",
+        "+" => "*",
+        level => level,
+    });
+    tokens.collect::<Vec<_>>().join(".")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cell_writes_below_its_own_tile_and_name_alone() {
+        let origin = GeographicPosition { latitude_deg: 48.8584, longitude_deg: 2.2945, height_m: 0.0 };
+        let account = CellAccount::new(NodeName::from_static("lot-1"), &origin);
+        let own = "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0";
+        assert_eq!(account.writes(), [format!("{own}/lot-1/#"), "ecod/v1/rep/+/lot-1".to_owned()]);
+        assert_eq!(account.reads().len(), 20, "its own, the reputations, two kinds of nine tiles");
+        let nats = account.nats("secret");
+        assert!(
+            nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.>\", \"ecod.v1.rep.*.lot-1\""),
+            "{nats}"
+        );
+        assert!(account.mosquitto().contains(&format!("topic write {own}/lot-1/#\n")));
+    }
+}

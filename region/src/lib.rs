@@ -1,0 +1,22 @@
+//! Many cells seen together: reads what cells tell on their region's broker.
+//!
+//! Rooms by floor, the top first; imports run downward only:
+//!
+//! ```text
+//! cli       the program
+//! page      page, API and metrics over HTTP     export  GeoJSON, MCAP
+//! reader    the connection to the broker
+//! town      the latest of each cell, and which of it is in view
+//! broker    address and login                   account rights of a cell
+//! ```
+
+#![deny(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+#![cfg_attr(not(test), deny(clippy::string_slice))]
+
+pub mod account;
+pub mod broker;
+pub mod cli;
+pub mod export;
+pub mod page;
+pub mod reader;
+pub mod town;

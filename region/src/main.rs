@@ -1,0 +1,5 @@
+//! The program `ecod-region`.
+
+fn main() -> std::process::ExitCode {
+    ecod_region::cli::main()
+}

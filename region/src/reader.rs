@@ -1,0 +1,203 @@
+//! The connection to a region's broker: reads the tiles that somebody looks at, and the status of every cell.
+
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
+use ecod::model::time::Timestamp;
+use ecod::wire::{RegionTopic, RegionTopicKind, RejectReason};
+use ecod_actors::platform::clock;
+use rumqttc::{
+    AsyncClient, Event, EventLoop, NetworkOptions, Outgoing, Packet, QoS, SubscribeFilter, SubscribeReasonCode,
+};
+use tokio::sync::watch;
+
+use crate::broker::BrokerLogin;
+use crate::town::{Accepted, RegionTown};
+
+/// What the reader knows, for page, metrics and exports.
+#[derive(Debug, Default)]
+pub struct RegionState {
+    town: Mutex<RegionTown>,
+    link: Mutex<BrokerLink>,
+    tiles: watch::Sender<BTreeSet<Quadkey>>,
+}
+
+/// The connection, as an operator sees it.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct BrokerLink {
+    /// True while the broker lets the reader in.
+    pub is_up: bool,
+    /// Number of logins so far.
+    pub logins: u64,
+    /// The reason why it is not, or filters that the broker refuses.
+    pub trouble: Option<String>,
+}
+
+/// A message, and what became of it.
+#[derive(Debug)]
+pub struct Reading<'a> {
+    /// Its topic.
+    pub topic: &'a str,
+    /// Its payload.
+    pub payload: &'a [u8],
+    /// When it was read.
+    pub at: Timestamp,
+    /// Whether it counts.
+    pub outcome: Result<Accepted, RejectReason>,
+}
+
+/// Requests that wait for the network at most.
+const SEND_QUEUE: usize = 64;
+
+/// First and longest wait before the next attempt to connect.
+const RETRY_MIN: Duration = Duration::from_millis(100);
+const RETRY_MAX: Duration = Duration::from_secs(5);
+
+/// Maximum time for a login in seconds. Servers that elect a JetStream leader take up to 4 s.
+const CONNECT_TIMEOUT_S: u64 = 10;
+
+impl RegionState {
+    /// The town.
+    pub fn town(&self) -> MutexGuard<'_, RegionTown> {
+        self.town.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The connection.
+    pub fn link(&self) -> BrokerLink {
+        lock(&self.link).clone()
+    }
+
+    /// The tiles whose maps are asked for.
+    pub fn tiles(&self) -> BTreeSet<Quadkey> {
+        self.tiles.borrow().clone()
+    }
+
+    /// Asks for the maps of these tiles and of no others. None of them may be in another.
+    pub fn ask(&self, tiles: BTreeSet<Quadkey>) {
+        self.tiles.send_if_modified(|asked| {
+            let is_news = *asked != tiles;
+            *asked = tiles;
+            is_news
+        });
+    }
+}
+
+/// Reads without end; `seen` is told of every message. A connection that is lost is made anew.
+pub async fn read(login: &BrokerLogin, state: &Arc<RegionState>, mut seen: impl FnMut(&Reading<'_>)) {
+    let (client, mut events) = AsyncClient::new(login.options(), SEND_QUEUE);
+    let mut network = NetworkOptions::new();
+    network.set_connection_timeout(CONNECT_TIMEOUT_S);
+    network.set_tcp_nodelay(true);
+    events.set_network_options(network);
+    let (logins, logged_in) = watch::channel(0_u64);
+    let asked = Arc::new(Mutex::new(VecDeque::new()));
+    let subscribing = subscribe(client, state, logged_in, &asked);
+    let polling = poll(login, &mut events, state, &logins, &asked, &mut seen);
+    tokio::join!(subscribing, polling);
+}
+
+/// Filters of each subscription that waits for its answer, in order.
+type Asked = Mutex<VecDeque<Vec<String>>>;
+
+/// Keeps the subscriptions as the tiles that are asked for.
+async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watch::Receiver<u64>, asked: &Asked) {
+    let mut tiles = state.tiles.subscribe();
+    let mut present = BTreeSet::new();
+    loop {
+        let is_new = tokio::select! {
+            changed = logged_in.changed() => match changed {
+                Ok(()) => true,
+                Err(_) => return,
+            },
+            changed = tiles.changed() => match changed {
+                Ok(()) => false,
+                Err(_) => return,
+            },
+        };
+        if is_new {
+            present = BTreeSet::new();
+            lock(asked).clear();
+        }
+        if *logged_in.borrow() == 0 {
+            continue;
+        }
+        let of_tiles =
+            tiles.borrow_and_update().iter().map(|tile| RegionTopic::filter_within(*tile)).collect::<Vec<_>>();
+        let wanted: BTreeSet<_> = of_tiles.into_iter().chain([all_statuses()]).collect();
+        let (new, old) = (&wanted - &present, &present - &wanted);
+        for filter in old {
+            // The next login subscribes anew if the connection has ended.
+            let _ = client.unsubscribe(filter).await;
+        }
+        if !new.is_empty() {
+            let filters: Vec<_> = new.into_iter().collect();
+            lock(asked).push_back(filters.clone());
+            let filters = filters.into_iter().map(|filter| SubscribeFilter::new(filter, QoS::AtMostOnce));
+            let _ = client.subscribe_many(filters).await;
+        }
+        present = wanted;
+    }
+}
+
+/// The filter for the status of every cell: topics of cells have all digits of a cell's tile.
+fn all_statuses() -> String {
+    let tile = ["+"; CELL_TILE_DIGITS as usize].join("/");
+    format!("ecod/v1/geo/{tile}/+/{}", RegionTopicKind::Status.level())
+}
+
+async fn poll(
+    login: &BrokerLogin,
+    events: &mut EventLoop,
+    state: &RegionState,
+    logins: &watch::Sender<u64>,
+    asked: &Asked,
+    seen: &mut impl FnMut(&Reading<'_>),
+) {
+    let mut wait = RETRY_MIN;
+    loop {
+        match events.poll().await {
+            Ok(Event::Incoming(Packet::ConnAck(_))) => {
+                wait = RETRY_MIN;
+                let mut link = lock(&state.link);
+                *link = BrokerLink { is_up: true, logins: link.logins + 1, trouble: None };
+                logins.send_replace(link.logins);
+            }
+            Ok(Event::Incoming(Packet::Publish(message))) => {
+                let at = clock::now();
+                let outcome = state.town().accept(&message.topic, &message.payload, at);
+                seen(&Reading { topic: &message.topic, payload: &message.payload, at, outcome });
+            }
+            Ok(Event::Incoming(Packet::SubAck(answer))) => {
+                let filters = lock(asked).pop_front().unwrap_or_default();
+                let answers = filters.into_iter().zip(answer.return_codes);
+                let refused = answers.filter(|(_, code)| *code == SubscribeReasonCode::Failure);
+                let refused: Vec<_> = refused.map(|(filter, _)| filter).collect();
+                if !refused.is_empty() {
+                    let trouble = format!("the broker lets this user not read {}", refused.join(", "));
+                    tracing::warn!(broker = %login.address(), trouble);
+                    lock(&state.link).trouble = Some(trouble);
+                }
+            }
+            Ok(Event::Outgoing(Outgoing::Disconnect)) => return,
+            Ok(_) => {}
+            Err(error) => {
+                let trouble = format!("no connection to {}: {error}", login.address());
+                {
+                    let mut link = lock(&state.link);
+                    if link.is_up || link.trouble.is_none() {
+                        tracing::warn!(broker = %login.address(), %error, "no connection to the region's broker");
+                    }
+                    *link = BrokerLink { is_up: false, logins: link.logins, trouble: Some(trouble) };
+                }
+                tokio::time::sleep(wait).await;
+                wait = (2 * wait).min(RETRY_MAX);
+            }
+        }
+    }
+}
+
+fn lock<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
+    shared.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,310 @@
+//! The town within a view, as the page and programs get it.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use ecod::model::names::{Label, NodeName};
+use ecod::model::origin::GeographicOrigin;
+use ecod::model::quadkey::Quadkey;
+use ecod::model::time::Timestamp;
+use ecod::wire::{FusedObject, Trouble};
+use serde::Serialize;
+use uuid::Uuid;
+
+use super::{CellState, GeographicBounds, RegionCell, RegionTown, TownMap};
+
+/// The town within a view.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TownView {
+    /// GeographicBounds of all cells that are known.
+    pub known: Option<GeographicBounds>,
+    /// Numbers of the whole region.
+    pub region: TownTotals,
+    /// Numbers of the view.
+    pub view: TownTotals,
+    /// True if the maps of the view are asked for.
+    pub has_maps: bool,
+    /// Tiles with cells in the view, in one size.
+    pub tiles: Vec<TileView>,
+    /// Cells in the view; none if there are more than `MAX_CELLS_SHOWN`.
+    pub cells: Vec<TownCellView>,
+    /// Objects in the view; none if there are more than `MAX_OBJECTS_SHOWN`.
+    pub objects: Vec<ObjectView>,
+}
+
+/// Numbers of cells.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct TownTotals {
+    /// All cells.
+    pub cells: usize,
+    /// Cells whose newest map is not old.
+    pub live: usize,
+    /// Cells that say that they lead, and whose maps are not asked for.
+    pub told: usize,
+    /// Cells that say that they lead, and of which no map comes.
+    pub silent: usize,
+    /// Cells that say that they are offline.
+    pub offline: usize,
+    /// Cells whose leader tells of troubles.
+    pub troubled: usize,
+    /// Objects of the maps.
+    pub objects: usize,
+    /// Vehicles in the maps.
+    pub vehicles: usize,
+}
+
+/// A tile and what is in it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TileView {
+    /// Its quadkey.
+    pub key: String,
+    /// Where it is.
+    pub bounds: GeographicBounds,
+    /// What is in it.
+    pub totals: TownTotals,
+    /// Age in seconds of the oldest of the newest maps in it.
+    pub oldest_s: Option<f64>,
+}
+
+/// A cell.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TownCellView {
+    /// Its name.
+    pub cell: NodeName,
+    /// The quadkey of its tile.
+    pub tile: String,
+    /// Latitude of its origin in degrees; of the middle of its tile while no map is known.
+    pub latitude_deg: f64,
+    /// Longitude in degrees.
+    pub longitude_deg: f64,
+    /// Its state: `live`, `told`, `silent` or `offline`.
+    pub state: &'static str,
+    /// Its leader.
+    pub leader: Option<NodeName>,
+    /// Term of the leadership.
+    pub epoch: Option<u64>,
+    /// Round of its newest map.
+    pub round: Option<u64>,
+    /// Age of that map in seconds.
+    pub age_s: Option<f64>,
+    /// Objects of the map.
+    pub objects: usize,
+    /// Vehicles in the map.
+    pub vehicles: usize,
+    /// Troubles that its leader tells of.
+    pub troubles: Vec<Trouble>,
+    /// Version of its leader's software.
+    pub version: Option<String>,
+    /// Version of its description.
+    pub description: Option<u64>,
+    /// Address of its leader's page.
+    pub page: Option<String>,
+}
+
+/// An object of a cell's map.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ObjectView {
+    /// Its identity.
+    pub id: Uuid,
+    /// The cell whose map has it.
+    pub cell: NodeName,
+    /// Its label.
+    pub label: Label,
+    /// The probability that it is there.
+    pub confidence: f64,
+    /// Latitude in degrees.
+    pub latitude_deg: f64,
+    /// Longitude in degrees.
+    pub longitude_deg: f64,
+    /// Velocity over ground in metres per second, to the east and to the north.
+    pub velocity_mps: Option<[f64; 2]>,
+    /// The vehicle that it is.
+    pub vehicle: Option<NodeName>,
+}
+
+/// Maximum number of tiles of a view that are told apart.
+const MAX_TILES_SHOWN: usize = 1024;
+
+/// Maximum number of cells of a view that are told one by one.
+pub(super) const MAX_CELLS_SHOWN: usize = 512;
+
+/// Maximum number of objects of a view that are told one by one.
+pub(super) const MAX_OBJECTS_SHOWN: usize = 4096;
+
+impl RegionTown {
+    /// Number of cells in each state; `asked` are the tiles whose maps are asked for.
+    pub fn states(&self, asked: &BTreeSet<Quadkey>, now: Timestamp) -> BTreeMap<CellState, usize> {
+        let asked: Vec<_> = asked.iter().map(Quadkey::to_string).collect();
+        let mut states: BTreeMap<_, _> = CellState::ALL.into_iter().map(|state| (state, 0)).collect();
+        for ((tile, _), cell) in self.cells() {
+            *states.entry(cell.state(now, is_within(*tile, &asked))).or_default() += 1;
+        }
+        states
+    }
+
+    /// Number of cells within tiles.
+    pub fn count_within(&self, tiles: &[Quadkey]) -> usize {
+        let tiles: Vec<_> = tiles.iter().map(Quadkey::to_string).collect();
+        self.cells().keys().filter(|(tile, _)| is_within(*tile, &tiles)).count()
+    }
+
+    /// The town within bounds; `asked` are the tiles whose maps are asked for.
+    pub fn view(&self, bounds: &GeographicBounds, asked: &BTreeSet<Quadkey>, now: Timestamp) -> TownView {
+        self.view_up_to([MAX_CELLS_SHOWN, MAX_OBJECTS_SHOWN], bounds, asked, now)
+    }
+
+    /// The town within bounds with all its cells and objects, of which all maps are asked for.
+    pub fn view_whole(&self, bounds: &GeographicBounds, now: Timestamp) -> TownView {
+        let asked = bounds.tiles(1).into_iter().collect();
+        self.view_up_to([usize::MAX; 2], bounds, &asked, now)
+    }
+
+    fn view_up_to(
+        &self,
+        [max_cells, max_objects]: [usize; 2],
+        bounds: &GeographicBounds,
+        asked: &BTreeSet<Quadkey>,
+        now: Timestamp,
+    ) -> TownView {
+        let asked: Vec<_> = asked.iter().map(Quadkey::to_string).collect();
+        let is_asked = |tile: &Quadkey| is_within(*tile, &asked);
+        let (mut region, mut known) = (TownTotals::default(), None::<GeographicBounds>);
+        let mut shown = Vec::new();
+        for ((tile, name), cell) in self.cells() {
+            let (state, at) = (cell.state(now, is_asked(tile)), GeographicBounds::of(*tile));
+            region.add(cell, state);
+            known = Some(known.map_or(at, |known| known.with(at)));
+            if at.meets(bounds) {
+                shown.push((*tile, name, cell, state));
+            }
+        }
+        let mut view = TownTotals::default();
+        shown.iter().for_each(|(_, _, cell, state)| view.add(cell, *state));
+        let has_maps = !shown.is_empty() && shown.iter().all(|(tile, ..)| is_asked(tile));
+        let cells = if shown.len() > max_cells { &[] } else { &*shown };
+        let objects = if view.objects > max_objects { &[] } else { &*shown };
+        TownView {
+            known,
+            region,
+            view,
+            has_maps,
+            tiles: tiles(bounds, &shown, now),
+            cells: cells
+                .iter()
+                .map(|(tile, name, cell, state)| TownCellView::new(*tile, name, cell, *state, now))
+                .collect(),
+            objects: objects.iter().flat_map(|(_, name, cell, _)| cell.objects(name)).collect(),
+        }
+    }
+}
+
+type Shown<'a> = (Quadkey, &'a NodeName, &'a RegionCell, CellState);
+
+/// Tiles of one size with the cells in them.
+fn tiles(bounds: &GeographicBounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<TileView> {
+    let digits = bounds.tiles(MAX_TILES_SHOWN).first().map_or(0, |tile| tile.to_string().len());
+    let mut tiles = BTreeMap::<String, (TownTotals, Option<f64>)>::new();
+    for (tile, _, cell, state) in shown {
+        let key = tile.to_string().chars().take(digits).collect();
+        let (totals, oldest_s) = tiles.entry(key).or_default();
+        totals.add(cell, *state);
+        let age_s = cell.map.as_ref().map(|map| map.age_s(now));
+        *oldest_s = [*oldest_s, age_s].into_iter().flatten().reduce(f64::max);
+    }
+    let view = |(key, (totals, oldest_s)): (String, (TownTotals, Option<f64>))| {
+        Some(TileView { bounds: GeographicBounds::of(key.parse().ok()?), key, totals, oldest_s })
+    };
+    tiles.into_iter().filter_map(view).collect()
+}
+
+/// True if a tile is one of these or in one.
+fn is_within(tile: Quadkey, tiles: &[String]) -> bool {
+    let key = tile.to_string();
+    tiles.iter().any(|outer| key.starts_with(outer))
+}
+
+impl TownTotals {
+    fn add(&mut self, cell: &RegionCell, state: CellState) {
+        self.cells += 1;
+        let number = match state {
+            CellState::Live => &mut self.live,
+            CellState::Told => &mut self.told,
+            CellState::Silent => &mut self.silent,
+            CellState::Offline => &mut self.offline,
+        };
+        *number += 1;
+        self.troubled += usize::from(cell.status.as_ref().is_some_and(|status| !status.troubles.is_empty()));
+        if let Some(TownMap { map, .. }) = &cell.map {
+            self.objects += map.objects.len();
+            self.vehicles += vehicles(&map.objects);
+        }
+    }
+}
+
+fn vehicles(objects: &[FusedObject]) -> usize {
+    objects.iter().filter(|object| object.vehicle.is_some()).count()
+}
+
+impl TownMap {
+    /// Age in seconds.
+    pub fn age_s(&self, now: Timestamp) -> f64 {
+        now.since(self.sent_at).as_secs_f64()
+    }
+}
+
+impl RegionCell {
+    /// The objects of its newest map, on Earth.
+    pub fn objects<'a>(&'a self, name: &'a NodeName) -> impl Iterator<Item = ObjectView> + 'a {
+        let placed = self.map.iter().flat_map(|map| map.map.objects.iter().map(|object| (&map.origin, object)));
+        placed.map(move |(origin, object)| ObjectView::new(name, origin, object))
+    }
+}
+
+impl ObjectView {
+    fn new(cell: &NodeName, origin: &GeographicOrigin, object: &FusedObject) -> Self {
+        let at = origin.to_wgs84(object.x_m, object.y_m, 0.0);
+        let (sin, cos) = origin.rotation_deg.to_radians().sin_cos();
+        Self {
+            id: object.id,
+            cell: cell.clone(),
+            label: object.label.clone(),
+            confidence: object.confidence,
+            latitude_deg: at.latitude_deg,
+            longitude_deg: at.longitude_deg,
+            velocity_mps: object.velocity_mps.map(|[x, y]| [x * cos - y * sin, x * sin + y * cos]),
+            vehicle: object.vehicle.clone(),
+        }
+    }
+}
+
+impl TownCellView {
+    fn new(tile: Quadkey, name: &NodeName, cell: &RegionCell, state: CellState, now: Timestamp) -> Self {
+        let (map, status) = (cell.map.as_ref(), cell.status.as_ref());
+        let [[north, west], [south, east]] = tile.corners_deg();
+        let middle = [(north + south) / 2.0, (west + east) / 2.0];
+        let [latitude_deg, longitude_deg] =
+            map.map_or(middle, |map| [map.origin.latitude_deg, map.origin.longitude_deg]);
+        let led = status.and_then(|status| status.aggregator.clone());
+        Self {
+            cell: name.clone(),
+            tile: tile.to_string(),
+            latitude_deg,
+            longitude_deg,
+            state: state.as_str(),
+            leader: map.map(|map| map.map.aggregator.clone()).or(led),
+            epoch: map.map(|map| map.map.epoch).or(status.map(|status| status.epoch)),
+            round: map.map(|map| map.map.round),
+            age_s: map.map(|map| map.age_s(now)),
+            objects: map.map_or(0, |map| map.map.objects.len()),
+            vehicles: map.map_or(0, |map| vehicles(&map.map.objects)),
+            troubles: status.map(|status| status.troubles.clone()).unwrap_or_default(),
+            version: status.map(|status| status.version.clone()),
+            description: cell.description.as_ref().map(|description| description.version),
+            page: status.and_then(|status| status.page.clone()).filter(|page| is_reachable(page)),
+        }
+    }
+}
+
+/// True if an announced address is one that browsers elsewhere can open.
+fn is_reachable(page: &str) -> bool {
+    page.parse::<std::net::SocketAddr>().is_ok_and(|address| !address.ip().is_unspecified())
+}

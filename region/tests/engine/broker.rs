@@ -1,0 +1,197 @@
+//! Brokers as processes of their own, in a directory of their own, on free ports of loopback.
+
+use std::fs;
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use ecod::leadership::BrokerAddress;
+use ecod_region::broker::{BrokerArguments, BrokerLogin};
+use ecod_region::reader::{self, Reading, RegionState};
+use tempfile::TempDir;
+
+/// A broker and its directory; ended when dropped.
+pub(crate) struct Broker {
+    child: Child,
+    directory: TempDir,
+    pub(crate) address: SocketAddr,
+}
+
+/// The place of cell `lot-1`, and of `far-1`, some kilometres off.
+pub(crate) const LOT: (&str, f64, f64) = ("lot-1", 48.8584, 2.2945);
+pub(crate) const FAR: (&str, f64, f64) = ("far-1", 48.80, 2.40);
+
+const DEPLOY: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/region");
+
+impl Broker {
+    /// NATS by `nats.conf`, with TLS and accounts of [`LOT`] and [`FAR`].
+    pub(crate) fn nats() -> Self {
+        let (directory, address) = (TempDir::new().unwrap(), free_address());
+        for file in ["common.conf", "nats.conf", "mqtt.conf"] {
+            fs::copy(Path::new(DEPLOY).join(file), directory.path().join(file)).unwrap();
+        }
+        make_certificates(&directory.path().join("tls"));
+        for (name, latitude, longitude) in [LOT, FAR] {
+            add_cell(directory.path(), name, latitude, longitude);
+        }
+        let mut command = Command::new("nats-server");
+        command
+            .args(["-c", "nats.conf"])
+            .env("REGION_SERVER", "region-1")
+            .env("REGION_MQTT", address.to_string())
+            .env("REGION_CLIENTS", free_address().to_string())
+            .env("REGION_MONITOR", free_address().to_string())
+            .env("REGION_DATA", directory.path().join("data"));
+        Self::start(command, directory, address)
+    }
+
+    /// mosquitto with the same accounts and certificates.
+    pub(crate) fn mosquitto() -> Self {
+        let (directory, address) = (TempDir::new().unwrap(), free_address());
+        let at = |file: &str| directory.path().join(file).display().to_string();
+        make_certificates(&directory.path().join("tls"));
+        let mut acl = "user region.reader\ntopic read ecod/v1/#\n".to_owned();
+        for (name, latitude, longitude) in [LOT, FAR] {
+            acl += &account(&["--engine", "mosquitto"], name, latitude, longitude);
+        }
+        fs::write(at("acl"), acl).unwrap();
+        fs::create_dir(at("passwords")).unwrap();
+        for user in ["region.reader", LOT.0, FAR.0] {
+            fs::write(at(&format!("passwords/{user}")), "secret\n").unwrap();
+            let (file, made) = (at("passwd"), directory.path().join("passwd").exists());
+            let create: &[&str] = if made { &[] } else { &["-c"] };
+            let status = Command::new("mosquitto_passwd").args(create).args(["-b", &file, user, "secret"]).status();
+            assert!(status.unwrap().success());
+        }
+        let conf = fs::read_to_string(Path::new(DEPLOY).join("mosquitto.conf")).unwrap();
+        let conf = conf
+            .replace("listener 8883", &format!("listener {} 127.0.0.1", address.port()))
+            .replace("/etc/ecod-region", directory.path().to_str().unwrap())
+            .replace("persistence true", "persistence false");
+        fs::write(at("mosquitto.conf"), conf).unwrap();
+        let mut command = Command::new("mosquitto");
+        command.args(["-c", "mosquitto.conf"]);
+        Self::start(command, directory, address)
+    }
+
+    fn start(mut command: Command, directory: TempDir, address: SocketAddr) -> Self {
+        let log = fs::File::create(directory.path().join("log")).unwrap();
+        command.current_dir(directory.path()).stdout(Stdio::null()).stderr(log).process_group(0);
+        let child = command.spawn().expect("nats-server and mosquitto are installed by `make test`");
+        let broker = Self { child, directory, address };
+        wait_for("the broker listens", || TcpStream::connect(address).is_ok());
+        broker
+    }
+
+    /// The directory with passwords and certificates.
+    pub(crate) fn directory(&self) -> &Path {
+        self.directory.path()
+    }
+
+    /// Sends a signal, such as `HUP`.
+    pub(crate) fn signal(&self, name: &str) {
+        let status = Command::new("kill").args([&format!("-{name}"), &self.child.id().to_string()]).status();
+        assert!(status.unwrap().success());
+    }
+
+    /// The broker and a user on the command line.
+    pub(crate) fn arguments(&self, user: &str) -> BrokerArguments {
+        BrokerArguments {
+            broker: BrokerAddress::from(self.address),
+            ca: Some(self.directory().join("tls/ca.pem")),
+            user: Some(user.to_owned()),
+            password_file: Some(self.directory().join("passwords").join(user)),
+        }
+    }
+
+    /// The login of a user.
+    pub(crate) fn login(&self, user: &str) -> BrokerLogin {
+        self.arguments(user).load().unwrap()
+    }
+
+    /// The account of one more cell, which the server takes while it runs.
+    pub(crate) fn add_cell(&self, name: &str, latitude: f64, longitude: f64) {
+        add_cell(self.directory(), name, latitude, longitude);
+        self.signal("HUP");
+    }
+
+    /// A reader of the whole region that tells of each message.
+    pub(crate) fn read(&self, seen: impl FnMut(&Reading<'_>) + Send + 'static) -> Arc<RegionState> {
+        let (login, state) = (self.login("region.reader"), Arc::new(RegionState::default()));
+        state.ask(["".parse().unwrap()].into());
+        let read = Arc::clone(&state);
+        tokio::spawn(async move { reader::read(&login, &read, seen).await });
+        state
+    }
+}
+
+impl Drop for Broker {
+    fn drop(&mut self) {
+        let _ = Command::new("kill").args(["-CONT", &self.child.id().to_string()]).status();
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        if std::thread::panicking() {
+            eprintln!("{}", fs::read_to_string(self.directory().join("log")).unwrap_or_default());
+        }
+    }
+}
+
+/// Runs `add-cell` as an operator does.
+fn add_cell(directory: &Path, name: &str, latitude: f64, longitude: f64) {
+    let output = Command::new(Path::new(DEPLOY).join("add-cell"))
+        .args([name, &latitude.to_string(), &longitude.to_string()])
+        .env("REGION_CONFIG", directory)
+        .env("REGION_PROGRAM", env!("CARGO_BIN_EXE_ecod-region"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+fn account(flags: &[&str], name: &str, latitude: f64, longitude: f64) -> String {
+    let place = [format!("--cell={name}"), format!("--latitude={latitude}"), format!("--longitude={longitude}")];
+    let output = Command::new(env!("CARGO_BIN_EXE_ecod-region")).arg("cell-account").args(place).args(flags).output();
+    let output = output.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// A CA, and the certificate of a server at this machine's loopback address.
+fn make_certificates(directory: &PathBuf) {
+    fs::create_dir(directory).unwrap();
+    let ca_key = rcgen::KeyPair::generate().unwrap();
+    let mut ca = rcgen::CertificateParams::new(Vec::new()).unwrap();
+    ca.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+    let ca_certificate = ca.self_signed(&ca_key).unwrap();
+    let issuer = rcgen::Issuer::new(ca, ca_key);
+    let key = rcgen::KeyPair::generate().unwrap();
+    let names = vec!["127.0.0.1".to_owned(), "localhost".to_owned()];
+    let server = rcgen::CertificateParams::new(names).unwrap().signed_by(&key, &issuer).unwrap();
+    fs::write(directory.join("ca.pem"), ca_certificate.pem()).unwrap();
+    fs::write(directory.join("server.pem"), server.pem()).unwrap();
+    fs::write(directory.join("server-key.pem"), key.serialize_pem()).unwrap();
+}
+
+pub(crate) fn free_address() -> SocketAddr {
+    TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap().local_addr().unwrap()
+}
+
+/// Waits until something is so.
+pub(crate) fn wait_for(what: &str, mut is_so: impl FnMut() -> bool) {
+    let patience = Instant::now() + Duration::from_secs(30);
+    while !is_so() {
+        assert!(Instant::now() < patience, "waited in vain until {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Waits until something is so, while others go on.
+pub(crate) async fn until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let patience = Instant::now() + Duration::from_secs(30);
+    while !is_so() {
+        assert!(Instant::now() < patience, "waited in vain until {what}");
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}

@@ -1,0 +1,7 @@
+//! A region on real brokers: NATS by the configuration and the scripts of deploy/region, and mosquitto.
+
+mod broker;
+mod cell;
+mod page;
+mod rights;
+mod timeliness;

@@ -1,0 +1,136 @@
+//! What a cell's credentials allow.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex};
+
+use ecod::wire::{NodeState, RegionTopic, RegionTopicKind};
+use ecod_region::town::RegionTown;
+
+use crate::broker::{Broker, FAR, LOT, until};
+use crate::cell::Cell;
+
+/// Topics of messages that arrive at a reader of everything.
+async fn listen(broker: &Broker) -> Arc<Mutex<Vec<String>>> {
+    let arrived = Arc::new(Mutex::new(Vec::new()));
+    let noted = Arc::clone(&arrived);
+    let state = broker.read(move |reading| noted.lock().unwrap().push(reading.topic.to_owned()));
+    until("the reader is there", || state.link().is_up).await;
+    arrived
+}
+
+/// Tries all that a cell must not, and then what it may; returns what came through.
+async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<String> {
+    let (lot, far) = (Cell::connect(broker, LOT), Cell::connect(broker, FAR));
+    // The last of its own messages shows that all before it had their chance.
+    let foreign_name = |kind| RegionTopic { tile: lot.account.tile, cell: far.account.cell.clone(), kind }.path();
+    let foreign_tile = |kind| RegionTopic { tile: far.account.tile, cell: lot.account.cell.clone(), kind }.path();
+    for kind in RegionTopicKind::ALL {
+        for topic in [far.topic(kind), foreign_name(kind), foreign_tile(kind)] {
+            for retain in [false, true] {
+                lot.publish(&topic, retain, b"forged".to_vec());
+            }
+        }
+    }
+    lot.publish("ecod/v1/geo", false, b"forged".to_vec());
+    lot.publish_map(1, 1);
+    far.publish_map(1, 1);
+    let both = [lot.topic(RegionTopicKind::Map), far.topic(RegionTopicKind::Map)];
+    until("both cells are heard", || both.iter().all(|topic| arrived.lock().unwrap().contains(topic))).await;
+    assert_eq!(lot.heard().logins, 1, "a refused message ends no connection");
+    // A retained forgery would come to whoever subscribes later.
+    let later = listen(broker).await;
+    lot.publish_map(2, 1);
+    until("the second reader hears", || !later.lock().unwrap().is_empty()).await;
+    let (arrived, later) = (arrived.lock().unwrap().clone(), later.lock().unwrap().clone());
+    arrived.into_iter().chain(later).collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
+    let broker = Broker::nats();
+    let arrived = listen(&broker).await;
+    let heard = attack(&broker, &arrived).await;
+    let lot = Cell::connect(&broker, LOT);
+    let (own, far) = (lot.topic(RegionTopicKind::Map), Cell::connect(&broker, FAR));
+    assert_eq!(heard, [own, far.topic(RegionTopicKind::Map)].into(), "nothing that is forged");
+
+    let tiles = lot.account.tile.with_neighbours();
+    let around: Vec<_> = tiles.iter().map(|tile| RegionTopic::filter(*tile, RegionTopicKind::Map)).collect();
+    assert_eq!(lot.subscribe(&around).await, [true; 9]);
+    let own_status = lot.topic(RegionTopicKind::Status);
+    assert_eq!(lot.subscribe(&[own_status]).await, [true]);
+    let foreign = [
+        RegionTopic::filter(tiles[0], RegionTopicKind::Status),
+        "#".to_owned(),
+        "ecod/v1/geo/#".to_owned(),
+        "ecod/v1/+/#".to_owned(),
+        RegionTopic::filter(far.account.tile, RegionTopicKind::Map),
+        RegionTopic::filter_within("12022".parse().unwrap()),
+        "$JS/#".to_owned(),
+        "$MQTT/#".to_owned(),
+        "$SYS/#".to_owned(),
+    ];
+    assert_eq!(lot.subscribe(&foreign).await, [false; 9]);
+    // What a cell says of vehicles goes under its own name.
+    assert_eq!(lot.subscribe(&["ecod/v1/rep/+/+".to_owned()]).await, [true]);
+    far.publish("ecod/v1/rep/euclid/lot-1", true, b"forged".to_vec());
+    far.publish("ecod/v1/rep/euclid/far-1", true, b"counts".to_vec());
+    until("a reputation is heard", || !lot.heard().topics.is_empty()).await;
+    assert_eq!(lot.heard().topics, ["ecod/v1/rep/euclid/far-1"]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn on_mosquitto_a_cell_writes_below_its_own_tile_and_hears_the_tiles_around() {
+    let broker = Broker::mosquitto();
+    let arrived = listen(&broker).await;
+    let heard = attack(&broker, &arrived).await;
+    let (lot, far) = (Cell::connect(&broker, LOT), Cell::connect(&broker, FAR));
+    let own = lot.topic(RegionTopicKind::Map);
+    assert_eq!(heard, [own.clone(), far.topic(RegionTopicKind::Map)].into(), "nothing that is forged");
+    // Subscriptions are granted, and nothing foreign comes.
+    lot.subscribe(&["ecod/v1/#".to_owned()]).await;
+    far.publish_map(2, 1);
+    far.publish("ecod/v1/rep/euclid/lot-1", false, b"forged".to_vec());
+    far.publish("ecod/v1/rep/euclid/far-1", false, b"counts".to_vec());
+    lot.publish_map(3, 1);
+    until("both are heard", || lot.heard().topics.len() >= 2).await;
+    let mut topics = lot.heard().topics;
+    topics.sort();
+    assert_eq!(topics, [own, "ecod/v1/rep/euclid/far-1".to_owned()]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cell_is_added_while_the_others_stay_connected() {
+    let broker = Broker::nats();
+    let lot = Cell::connect(&broker, LOT);
+    until("the cell is in", || lot.heard().logins == 1).await;
+    broker.add_cell("new-1", 48.86, 2.30);
+    let mut added = Cell::connect(&broker, ("new-1", 48.86, 2.30));
+    until("the new cell is in", || {
+        if added.heard().is_refused {
+            added = Cell::connect(&broker, ("new-1", 48.86, 2.30));
+        }
+        added.heard().logins == 1
+    })
+    .await;
+    added.publish(&added.topic(RegionTopicKind::Status), true, added.status(NodeState::Aggregating));
+    let state = broker.read(|_| ());
+    until("its status is read", || state.town().cells().len() == 1).await;
+    assert_eq!(lot.heard().logins, 1);
+}
+
+#[test]
+fn junk_of_a_cell_is_counted_and_harms_nothing() {
+    let mut town = RegionTown::default();
+    let now = ecod_actors::platform::clock::now();
+    for (path, payload) in [
+        ("ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/lot-1/map", &b"{"[..]),
+        ("ecod/v1/geo/1/2/lot-1/map", b"{}"),
+        ("ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/lot-1/status", b"junk"),
+        ("elsewhere", b""),
+    ] {
+        town.accept(path, payload, now).unwrap_err();
+    }
+    assert_eq!(town.counts().rejected.values().sum::<u64>(), 4);
+    assert!(town.cells().values().all(|cell| cell.map.is_none() && cell.status.is_none()));
+}
