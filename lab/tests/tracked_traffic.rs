@@ -143,7 +143,8 @@ fn confidences_can_be_taken_at_their_word_whoever_looks_and_however_often() {
     let slow = TrafficConfig { observers: 4, sensor: slow, ..town.clone() };
     for config in towns.into_iter().chain([slow, TrafficConfig { fixed: true, observers: 4, ..town }]) {
         let recording = recording_of(&config);
-        let mut judge = TrackEvaluation::new(TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap());
+        let mut judge =
+            TrackEvaluation::new(TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap());
         fuse(&recording, |_, map| map.into_iter().for_each(|map| judge.map(map)));
         let scores = judge.result();
         let error = scores.calibration.confidence.ece_pct.unwrap();

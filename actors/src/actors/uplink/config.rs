@@ -37,6 +37,9 @@ impl Default for UplinkConfig {
 /// Messages that may wait to be sent. More would be old maps.
 const SEND_QUEUE: usize = 8;
 
+/// Milliseconds within which the broker must accept a connection. After an outage the cells of a region all log in at once.
+const CONNECT_TIMEOUT_MS: u64 = 10_000;
+
 impl UplinkConfig {
     /// Checks every value.
     ///
@@ -56,6 +59,7 @@ impl UplinkConfig {
             password: self.password.clone(),
             encoding: Encoding::Compact,
             send_queue: SEND_QUEUE,
+            connect_timeout_ms: CONNECT_TIMEOUT_MS,
             max_payload_bytes: cell.max_payload_bytes,
             max_map_bytes: cell.max_map_bytes,
             ..MqttConfig::default()

@@ -11,6 +11,7 @@ use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::wire::{CellDescription, CellMap, NodeStatus, RegionTopic, RegionTopicKind, encode};
+use uuid::Uuid;
 
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::connection::{LastWill, MaxQos, Retention, offline_payload};
@@ -59,8 +60,8 @@ impl RegionLink {
         let filters = around.chain([status_topic.clone()]).collect();
         let will = LastWill { topic: status_topic, payload: offline_payload(status, config.encoding).into() };
         let setup = Arc::new(LinkSetup {
-            // One client id for each run, as in the cell.
-            client_id: format!("{cell}-{}-{}", status.node, status.id.simple()),
+            // Known to nobody else: who takes over a client id ends its connection. The id of this run is in the status.
+            client_id: format!("{cell}-{}-{}", status.node, Uuid::new_v4().simple()),
             filters,
             will: Mutex::new(will),
             config,
