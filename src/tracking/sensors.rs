@@ -111,8 +111,8 @@ impl Sensors {
 
     /// Properties of all vehicles that their evidence depends on, by number.
     pub(super) fn qualities(&self) -> Vec<SensorQuality> {
-        let quality = |model: &Box<SensorModel>| model.quality(self.fleet.trust(model.id));
-        self.models.iter().map(|slot| slot.as_ref().map(quality).unwrap_or_default()).collect()
+        let quality = |model: &SensorModel| model.quality(self.fleet.trust(model.id));
+        self.models.iter().map(|slot| slot.as_deref().map(quality).unwrap_or_default()).collect()
     }
 
     /// Takes the counts of all vehicles from a ledger: of the latest votes that are remembered. Vehicles that are not in
