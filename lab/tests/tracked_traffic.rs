@@ -18,7 +18,11 @@ use baselines::{Latest, Tracker, suppressed};
 const SEED: u64 = 2001;
 
 fn recording_of(config: &TrafficConfig) -> TrafficRecording {
-    let mut rng = ChaCha8Rng::seed_from_u64(SEED);
+    recording_by(SEED, config)
+}
+
+fn recording_by(seed: u64, config: &TrafficConfig) -> TrafficRecording {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
     generate(config, &mut || rng.random())
 }
 
@@ -135,26 +139,6 @@ fn velocities_headings_and_sizes_that_are_said_make_maps_better() {
     assert!(plain[2].is_nan() && rich[2] < 1.0, "lengths are off by {} m", rich[2]);
 }
 
-#[test]
-fn confidences_can_be_taken_at_their_word_whoever_looks_and_however_often() {
-    let town = TrafficConfig { duration_s: 15.0, ..TrafficConfig::default() };
-    let slow = SensorConfig { rate_hz: 2.0, ..SensorConfig::default() };
-    let towns = [1, 4].map(|observers| TrafficConfig { observers, ..town.clone() });
-    let slow = TrafficConfig { observers: 4, sensor: slow, ..town.clone() };
-    for config in towns.into_iter().chain([slow, TrafficConfig { fixed: true, observers: 4, ..town }]) {
-        let recording = recording_of(&config);
-        let mut judge =
-            TrackEvaluation::new(TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap());
-        fuse(&recording, |_, map| map.into_iter().for_each(|map| judge.map(map)));
-        let scores = judge.result();
-        let error = scores.calibration.confidence.ece_pct.unwrap();
-        let default = &scores.at_default;
-        let f1 = 200.0 * default.matches as f64 / (2 * default.matches + default.false_alarms + default.misses) as f64;
-        let lost = scores.best_f1_pct.unwrap() - f1;
-        assert!(error < 5.0 && lost < 1.5, "{config:?}: calibration error {error} %, 0.5 loses {lost} of F1");
-    }
-}
-
 /// Average precision and greatest MODA at 0.5, 1 and 2 m in percent, of each: aggregators with and without `align`, and
 /// late fusion.
 fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 3] {
@@ -187,23 +171,26 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 3] {
 }
 
 /// Two cameras on posts, whose positions are off by `pose_m` and as much again at 40 m by their headings.
-fn two_posts(pose_m: f64) -> TrafficRecording {
+fn two_posts(seed: u64, pose_m: f64) -> TrafficRecording {
     let sensor = SensorConfig { pose_m, pose_rad: pose_m / 40.0, lures: 0.1, ..SensorConfig::default() };
     let recording = TrafficConfig::two_vehicle_recording();
     let config = TrafficConfig { fixed: true, duration_s: 20.0, said: SaidConfig::default(), sensor, ..recording };
     config.validate().unwrap();
-    recording_of(&config)
+    recording_by(seed, &config)
 }
 
 #[test]
 fn alignment_costs_cameras_whose_poses_are_right_nothing() {
-    let [aligned, unaligned, _] = aligned_or_not(&two_posts(0.02));
+    // A single scene of 20 s is too short to tell half a point.
+    let scenes = [0, 1, 2, 3].map(|scene| aligned_or_not(&two_posts(SEED + scene, 0.02)));
+    let mean = |method: usize, figure: usize| scenes.iter().map(|scene| scene[method][figure]).sum::<f64>() / 4.0;
+    let [aligned, unaligned] = [0, 1].map(|method| [0, 1, 2, 3, 4, 5].map(|figure| mean(method, figure)));
     assert!((0..6).all(|figure| aligned[figure] > unaligned[figure] - 0.5), "{aligned:?} aligned, {unaligned:?} not");
 }
 
 #[test]
 fn aligned_cameras_on_posts_make_a_better_map_than_late_fusion() {
-    let [aligned, unaligned, late] = aligned_or_not(&two_posts(0.35));
+    let [aligned, unaligned, late] = aligned_or_not(&two_posts(SEED, 0.35));
     assert!((0..6).all(|figure| aligned[figure] > late[figure]), "{aligned:?}, {late:?} by late fusion");
     assert!(aligned[0] > unaligned[0], "{aligned:?} aligned, {unaligned:?} not");
 }
