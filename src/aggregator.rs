@@ -378,12 +378,6 @@ impl Aggregator {
         self.tracks.as_ref().map(Tracker::hand_overs).unwrap_or_default()
     }
 
-    /// Weight of a neighbouring cell's statements, 0 to 1: 1 of a newcomer, 0 of a proven liar. Without tracking nobody is
-    /// judged.
-    pub fn trust_in_cell(&self, cell: &NodeName) -> f64 {
-        self.tracks.as_ref().map_or(1.0, |tracks| tracks.trust_in_cell(cell))
-    }
-
     /// Number of reports so far that only tracking used, because a later one of their vehicle came before.
     pub fn overtaken(&self) -> u64 {
         self.overtaken

@@ -14,7 +14,8 @@ mod frame;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
 
 use nalgebra::Point2;
 
@@ -33,13 +34,22 @@ use frame::FrameChange;
 pub const COVER_M: f64 = 300.0;
 
 /// Distance in metres from what this cell knows up to which objects of others are handed on: 7 s at 50 km/h.
-pub const MARGIN_M: f64 = 100.0;
+const MARGIN_M: f64 = 100.0;
 
 /// Maximum number of neighbouring cells.
 const MAX_CELLS: usize = 256;
 
-/// Maximum number of objects of all neighbouring cells together.
-const MAX_OBJECTS: usize = 1024;
+/// Maximum number of objects of all neighbouring cells together. Each is compared with each that was known before.
+const MAX_OBJECTS: usize = 512;
+
+/// Maximum number of objects of one cell, so that it leaves room for others.
+const MAX_OBJECTS_EACH: usize = 128;
+
+/// Maximum number of classes with scores of an object; of one with more, only the label is taken.
+const MAX_SCORES: usize = 8;
+
+/// Longest time for which an object counts as seen: a cell that dates its objects far back owns no identity by that.
+const MAX_SEEN_FOR: Duration = Duration::from_secs(600);
 
 /// Objects of accepted maps that were not used.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -101,6 +111,7 @@ impl Neighbours {
         if message.cell == self.cell {
             return Err(RejectReason::NodeMismatch);
         }
+        self.forget_silent(received_at);
         let AdmittedMap { age } = self.filter.admit(topic, &message, received_at)?;
         let CellMap { cell, origin, map, .. } = message;
         let fused_at = received_at - age;
@@ -115,21 +126,30 @@ impl Neighbours {
                 continue;
             }
             change.apply(&place, &mut object);
-            object.first_seen_us = object.first_seen_us.map(|first_seen| first_seen.shifted(clock_us));
+            let earliest = fused_at - MAX_SEEN_FOR;
+            object.first_seen_us =
+                object.first_seen_us.map(|first_seen| first_seen.shifted(clock_us).clamp(earliest, fused_at));
+            object.contributors.clear();
+            if object.scores.len() > MAX_SCORES {
+                object.scores.clear();
+            }
+            // What was valid in its own frame need not be so in this one, and receivers refuse a map with one wrong value.
+            if object.validate().is_err() {
+                losses.refused += 1;
+                continue;
+            }
             let distance_m = self.extent.distance_m(&Point2::new(object.x_m, object.y_m));
             if distance_m <= MARGIN_M {
                 near.push((distance_m, object));
             }
         }
         near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.id.cmp(&b.1.id)));
-        near.dedup_by_key(|(_, object)| object.id);
+        let mut ids = BTreeSet::new();
+        near.retain(|(_, object)| ids.insert(object.id));
         self.cells.remove(&cell);
-        self.forget_silent(received_at);
         let held: usize = self.cells.values().map(|map| map.objects.len()).sum();
-        let room = MAX_OBJECTS.saturating_sub(held);
-        if let Some(losses) = self.losses.get_mut(&cell) {
-            losses.refused += near.len().saturating_sub(room) as u64;
-        }
+        let room = MAX_OBJECTS.saturating_sub(held).min(MAX_OBJECTS_EACH);
+        losses.refused += near.len().saturating_sub(room) as u64;
         let objects = near.into_iter().take(room).map(|(_, object)| object).collect();
         self.cells.insert(cell, NeighbourMap { fused_at, objects });
         Ok(())
@@ -151,12 +171,6 @@ impl Neighbours {
             objects.map(move |object| NeighbourObject { cell: cell.clone(), age_s, object })
         };
         self.cells.iter().flat_map(of_cell).collect()
-    }
-
-    /// The cells of which a map counts at `now`, and the number of their objects near this cell.
-    pub fn cells(&self, now: Timestamp) -> impl Iterator<Item = (&NodeName, usize)> {
-        let is_present = move |map: &NeighbourMap| now.since(map.fused_at) <= MAX_AGE;
-        self.cells.iter().filter(move |(_, map)| is_present(map)).map(|(cell, map)| (cell, map.objects.len()))
     }
 
     /// Objects by cell that were not used so far; cells that are silent for long are forgotten.

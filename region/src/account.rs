@@ -28,7 +28,9 @@ impl CellAccount {
     /// MQTT filters of what the cell may publish.
     pub fn writes(&self) -> Vec<String> {
         let Self { cell, tile } = self;
-        vec![format!("ecod/v1/geo/{}/{cell}/#", tile.levels()), format!("{REPUTATIONS}/+/{cell}")]
+        let (tile, cell) = (*tile, cell.clone());
+        let own = RegionTopicKind::ALL.map(|kind| RegionTopic { tile, cell: cell.clone(), kind }.path());
+        own.into_iter().chain([format!("{REPUTATIONS}/+/{cell}")]).collect()
     }
 
     /// MQTT filters of what the cell may read: its own, maps and descriptions of the tiles around, and reputations.
@@ -45,8 +47,7 @@ impl CellAccount {
 
     /// The user as an element of `users` in NATS's configuration.
     ///
-    /// The password stands there as it is: at 122 random bits a slow hash adds nothing, and costs a server 0.1 s of a core
-    /// for each login.
+    /// The password stands there as it is; docs/city.md says why.
     pub fn nats(&self, password: &str) -> String {
         let list = |filters: Vec<String>| {
             let subjects: Vec<_> = filters.iter().map(|filter| format!("\"{}\"", subject(filter))).collect();

@@ -130,9 +130,13 @@ impl RegionTown {
             RegionTopic::parse(path).filter(|topic| topic.tile.to_string().len() == usize::from(CELL_TILE_DIGITS));
         let topic = topic.ok_or(RejectReason::UnknownTopic)?;
         let key = (topic.tile, topic.cell.clone());
-        // Who cleared a retained status has left for good.
-        if payload.is_empty() && topic.kind == RegionTopicKind::Status {
-            self.cells.remove(&key);
+        // A cell that clears what it retained has left for good.
+        if payload.is_empty() && topic.kind != RegionTopicKind::Map {
+            if topic.kind == RegionTopicKind::Status {
+                self.cells.remove(&key);
+            } else if let Some(cell) = self.cells.get_mut(&key) {
+                cell.description = None;
+            }
             return Ok(Accepted::Other(topic));
         }
         if self.cells.len() >= MAX_CELLS && !self.cells.contains_key(&key) {

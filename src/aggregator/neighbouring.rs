@@ -11,6 +11,12 @@ use crate::neighbours::MAX_AGE;
 use crate::tracking::Tracker;
 use crate::wire::{FusedObject, NeighbourObject};
 
+/// Distance in metres between two cells' places of one object that stands.
+const SAME_PLACE_M: f64 = 4.0;
+
+/// Error in seconds of the ages of maps.
+const CLOCK_ERROR_S: f64 = 0.2;
+
 /// The objects of other cells near this one, as last told.
 #[derive(Debug, Clone, Default)]
 pub(super) struct NeighbourView {
@@ -24,7 +30,8 @@ impl NeighbourView {
         Self { objects, stated_at }
     }
 
-    /// Those that are not too old at `now`, believed, and none of this cell's `own` objects, each identity once.
+    /// Those that are not too old at `now`, believed, and none of this cell's `own` objects. Cells that tell of one object are
+    /// heard once. Cells that use one identity for different places are both heard: none of them hides the other's object.
     pub(super) fn shown(
         &self,
         own: &[FusedObject],
@@ -33,16 +40,25 @@ impl NeighbourView {
         cell_offset_us: i64,
     ) -> Vec<NeighbourObject> {
         let passed_s = now.since(self.stated_at).as_secs_f64();
-        let mut known: BTreeSet<Uuid> = own.iter().map(|object| object.id).collect();
-        let mut shown = Vec::new();
+        let known: BTreeSet<Uuid> = own.iter().map(|object| object.id).collect();
+        let mut shown: Vec<NeighbourObject> = Vec::new();
         for stated in &*self.objects {
             let age_s = stated.age_s + passed_s;
             let is_hidden = age_s > MAX_AGE.as_secs_f64() || tracks.is_some_and(|tracks| tracks.hides(stated));
-            if !is_hidden && known.insert(stated.object.id) {
+            let is_told =
+                || shown.iter().any(|told| told.object.id == stated.object.id && is_near(told, stated, age_s));
+            if !is_hidden && !known.contains(&stated.object.id) && !is_told() {
                 shown.push(NeighbourObject { age_s, ..stated.clone() });
             }
         }
         shown.iter_mut().for_each(|stated| date_objects(std::slice::from_mut(&mut stated.object), cell_offset_us));
         shown
     }
+}
+
+/// True if two statements can be of one object, by its speed and their ages; `age_s` is that of the second.
+fn is_near(told: &NeighbourObject, stated: &NeighbourObject, age_s: f64) -> bool {
+    let [a, b] = [&told.object, &stated.object];
+    let speed_mps = a.velocity_mps.map_or(0.0, |[east, north]| east.hypot(north));
+    (a.x_m - b.x_m).hypot(a.y_m - b.y_m) <= SAME_PLACE_M + speed_mps * ((told.age_s - age_s).abs() + CLOCK_ERROR_S)
 }

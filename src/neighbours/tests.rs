@@ -127,8 +127,11 @@ fn more_objects_than_there_is_room_for_are_counted_and_the_nearest_stay() {
     let crowd = (0..2000).map(|number| object(number, 0.0, -0.02 * number as f64));
     neighbours.accept(&east(), map(1, "a", 100, ms(2000), crowd.collect()), ms(2050)).unwrap();
     let near = neighbours.near(ms(2050));
-    assert_eq!((near.len(), neighbours.losses()[&name("east")].refused), (MAX_OBJECTS, 2000 - MAX_OBJECTS as u64));
-    assert!(near.iter().all(|near| near.object.id.as_u128() < MAX_OBJECTS as u128));
+    assert_eq!(
+        (near.len(), neighbours.losses()[&name("east")].refused),
+        (MAX_OBJECTS_EACH, 2000 - MAX_OBJECTS_EACH as u64)
+    );
+    assert!(near.iter().all(|near| near.object.id.as_u128() < MAX_OBJECTS_EACH as u128));
 }
 
 #[test]
@@ -192,9 +195,8 @@ fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
 fn a_silent_cell_is_forgotten() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
-    let count = |neighbours: &mut Neighbours, at| (neighbours.near(at).len(), neighbours.cells(at).count());
-    assert_eq!(count(&mut neighbours, ms(3400)), (1, 1));
-    assert_eq!(count(&mut neighbours, ms(3600)), (0, 0));
+    assert_eq!(neighbours.near(ms(3400)).len(), 1);
+    assert_eq!(neighbours.near(ms(3600)).len(), 0);
     assert_eq!(neighbours.losses().len(), 1);
     neighbours.near(ms(70_000));
     assert_eq!(neighbours.losses().len(), 0);
@@ -249,4 +251,43 @@ proptest! {
         }
         prop_assert!(last.is_some());
     }
+}
+
+#[test]
+fn whatever_a_neighbour_tells_receivers_of_the_own_map_can_read_it() {
+    let mut neighbours = home();
+    live(&mut neighbours, 0, 2000);
+    let origin = beside(200.0, 45.0);
+    let scores = (0..100).map(|class| (format!("class {class}").into(), 0.01)).collect();
+    let mut objects = vec![
+        FusedObject { velocity_mps: Some([1e4, 1e4]), ..object(21, 0.0, 0.0) },
+        FusedObject { covariance_m2: [1e200, 0.0, 1e-200], ..object(22, 0.0, 0.0) },
+        FusedObject { first_seen_us: Some(Timestamp(crate::wire::MAX_INTEGER)), ..object(23, 0.0, 0.0) },
+        FusedObject { first_seen_us: Some(Timestamp(0)), scores, ..object(24, 0.0, 0.0) },
+        FusedObject { contributors: vec![name("zeno"); 10_000], ..object(25, 0.0, 0.0) },
+        object(25, 10.0, 0.0),
+    ];
+    objects.extend((100..1100).map(|number| object(number, 0.0, 0.0)));
+    let mut message = CellMap { origin, ..map(1, "a", 100, ms(2000), objects) };
+    message.map.fused_at_us = Timestamp(5);
+    neighbours.accept(&topic("east", &origin), message, ms(2060)).unwrap();
+    let near = neighbours.near(ms(2060));
+    assert!(near.iter().all(|stated| stated.object.validate().is_ok() && stated.object.contributors.is_empty()));
+    let seen = near.iter().filter_map(|stated| stated.object.first_seen_us);
+    assert!(seen.into_iter().all(|seen| ms(2060).since(seen) <= MAX_SEEN_FOR + MAX_AGE && seen <= ms(2060)));
+    let ids: BTreeSet<_> = near.iter().map(|stated| stated.object.id).collect();
+    assert_eq!((near.len(), ids.len()), (MAX_OBJECTS_EACH, MAX_OBJECTS_EACH), "one cell leaves room for others");
+}
+
+#[test]
+fn a_forged_epoch_shuts_a_lone_neighbour_out_for_a_minute_only() {
+    let mut neighbours = home();
+    live(&mut neighbours, 0, 2000);
+    neighbours.accept(&east(), map(u64::MAX >> 11, "a", 1, ms(2000), Vec::new()), ms(2050)).ok();
+    let mut accept = |round: u64| {
+        let at = 2000 + 100 * round;
+        neighbours.accept(&east(), map(1, "a", 100 + round, ms(at), Vec::new()), ms(at + 50))
+    };
+    assert_eq!(accept(1), Err(RejectReason::Superseded));
+    assert!((2..620).filter(|round| accept(*round).is_ok()).count() > 0);
 }

@@ -160,9 +160,9 @@ impl ForeignObjects {
         for (number, object) in self.objects.iter().enumerate() {
             let position = object.track.state.position_at(now);
             let reach_m = MERGE_M + CLOCK_ERROR_S * object.track.state.velocity.norm();
+            let is_known = ids.contains(&object.track.id);
             tracks.near(&position, reach_m, |indexed| {
                 let track = &tracks[indexed.track];
-                let is_known = ids.contains(&object.track.id);
                 if is_known && track.id == object.track.id {
                     pairs.push((0.0, number, indexed.track));
                 } else if let Some(distance) = object.distance_from(track, now, config).filter(|_| !is_known) {
@@ -270,9 +270,16 @@ impl ForeignObjects {
             let is_like = |detected| object.track.label_similarity(detected) > MIN_LABEL_SIMILARITY;
             (is_near && detected.is_none_or(is_like)).then_some((innovation.distance_squared, object))
         });
-        let (_, nearest) = near.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.track.id.cmp(&b.1.track.id)))?;
-        let is_free = tracks.iter().all(|track| track.id != nearest.track.id);
-        (is_free && self.is_trusted(&nearest.cell, fleet)).then_some(nearest)
+        // A cell that is not believed, or copies identities, must not stand before others. One that is not proven lends only
+        // what it can be judged by.
+        let usable = near.filter(|(_, object)| {
+            let trust = self.trust.of(&object.cell);
+            let is_believed = trust.trust(fleet.reputation()) > 0.0;
+            is_believed
+                && (object.is_stated() || trust.is_proven(fleet.reputation()))
+                && tracks.iter().all(|track| track.id != object.track.id)
+        });
+        usable.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.track.id.cmp(&b.1.track.id))).map(|(_, object)| object)
     }
 }
 

@@ -212,10 +212,10 @@ fn check_map(map: &GlobalMap, _: &Limits) -> Result<(), RejectReason> {
     let times = [Some(map.fused_at_us), map.oldest_capture_us];
     check_integers([map.epoch, map.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))?;
     map.landmarks.iter().try_for_each(check_landmark)?;
-    map.objects.iter().try_for_each(check_object)?;
+    map.objects.iter().try_for_each(FusedObject::validate)?;
     map.neighbour_objects.iter().try_for_each(|neighbour| {
         check_between(neighbour.age_s, 0.0, f64::MAX)?;
-        check_object(&neighbour.object)
+        neighbour.object.validate()
     })?;
     map.pose_corrections.values().try_for_each(check_correction)
 }
@@ -309,16 +309,22 @@ fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {
     check_labels([&*state.id].into_iter().chain(state.label.as_deref()).chain(read))
 }
 
-fn check_object(object: &FusedObject) -> Result<(), RejectReason> {
-    check_place(object.x_m, object.y_m)?;
-    check_covariance(object.covariance())?;
-    check_confidence(object.confidence)?;
-    object.existence.map_or(Ok(()), check_confidence)?;
-    check_motion(object.velocity_mps, object.heading_rad, object.size_m)?;
-    check_scores(&object.scores)?;
-    object.age_s.map_or(Ok(()), |age_s| check_between(age_s, 0.0, MAX_INTEGER as f64))?;
-    check_integers(object.first_seen_us.map(Timestamp::micros))?;
-    check_labels([&*object.label])
+impl FusedObject {
+    /// Checks numbers and labels.
+    ///
+    /// # Errors
+    /// The first reason found.
+    pub fn validate(&self) -> Result<(), RejectReason> {
+        check_place(self.x_m, self.y_m)?;
+        check_covariance(self.covariance())?;
+        check_confidence(self.confidence)?;
+        self.existence.map_or(Ok(()), check_confidence)?;
+        check_motion(self.velocity_mps, self.heading_rad, self.size_m)?;
+        check_scores(&self.scores)?;
+        self.age_s.map_or(Ok(()), |age_s| check_between(age_s, 0.0, MAX_INTEGER as f64))?;
+        check_integers(self.first_seen_us.map(Timestamp::micros))?;
+        check_labels([&*self.label])
+    }
 }
 
 fn check_correction(correction: &PoseCorrection) -> Result<(), RejectReason> {

@@ -294,15 +294,16 @@ impl UplinkState {
         if order <= self.published || !self.pace.is_due(now) {
             return;
         }
-        self.published = order;
         self.pace.advance(now);
         // Objects of neighbours are theirs to tell.
         let map = GlobalMap { neighbour_objects: Vec::new(), ..GlobalMap::clone(&map) };
         let (schema, cell) = (SCHEMA_VERSION, self.cell.clone());
-        link.publish_map(&CellMap { schema, cell, sent_at_us: now, origin, map }, now);
+        if link.publish_map(&CellMap { schema, cell, sent_at_us: now, origin, map }, now) {
+            self.published = order;
+        }
     }
 
-    /// Goes on under other settings. A cell that is in another tile now leaves nothing in the former one.
+    /// Goes on under other settings. A cell that is in another tile now empties the former one, if it is connected.
     fn configure(
         &mut self,
         origin: Option<GeographicOrigin>,

@@ -81,8 +81,12 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
         }
         None => write_geojson(arguments, &state, clock::now())?,
     };
-    if let (Some(trouble), 0) = (state.link().trouble, state.town().counts().maps) {
-        return Err(anyhow!(trouble).into());
+    let link = state.link();
+    let trouble = link
+        .trouble
+        .or_else(|| (link.logins == 0).then(|| "the broker has not answered; give it more --seconds".into()));
+    if let (Some(trouble), 0) = (trouble, state.town().counts().maps) {
+        return Err(anyhow!("{trouble}").into());
     }
     print(&format!("{}: {summary}\n", arguments.out.display()))?;
     Ok(())

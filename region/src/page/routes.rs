@@ -8,7 +8,6 @@ use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
-use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod_actors::observe::http::{HttpRefusal, PageAccess, PageGuard, with_headers};
 use ecod_actors::platform::clock;
@@ -32,8 +31,9 @@ pub(super) struct RegionApi {
 /// Answer to `/api/view`.
 #[derive(Debug, Serialize)]
 struct ViewAnswer {
-    /// The broker, as messages name it, and what is wrong with it.
+    /// True while the broker lets the reader in.
     broker_up: bool,
+    /// The reason why it does not, or filters that it refuses.
     trouble: Option<String>,
     /// Number of cells in a view above which their maps are not read.
     max_cells_read: usize,
@@ -59,9 +59,12 @@ impl RegionApi {
     pub(super) fn ask(&self, bounds: Option<&GeographicBounds>, now: Timestamp) {
         let tiles = bounds.map(|bounds| bounds.tiles(MAX_TILES_OF_VIEW)).unwrap_or_default();
         let is_read = self.state.town().count_within(&tiles) <= MAX_CELLS_READ;
-        let looked_at: &[Quadkey] = if is_read { &tiles } else { &[] };
         let mut viewers = self.viewers.lock().unwrap_or_else(PoisonError::into_inner);
-        viewers.look(looked_at, now);
+        if is_read {
+            viewers.look(&tiles, now);
+        } else {
+            viewers.forget(&tiles);
+        }
         self.state.ask(viewers.tiles(now));
     }
 }

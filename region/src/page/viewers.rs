@@ -33,6 +33,11 @@ impl Viewers {
         }
     }
 
+    /// Forgets tiles that are too much to read.
+    pub(super) fn forget(&mut self, tiles: &[Quadkey]) {
+        self.until.retain(|tile, _| !tiles.contains(tile));
+    }
+
     /// All tiles that are looked at, without those that are in another.
     pub(super) fn tiles(&mut self, now: Timestamp) -> BTreeSet<Quadkey> {
         self.until.retain(|_, until| *until > now);

@@ -65,6 +65,9 @@ impl GeographicBounds {
 
     /// The smallest tiles that cover the bounds, at most so many, none smaller than a cell's.
     pub fn tiles(&self, max: usize) -> Vec<Quadkey> {
+        if !self.meets(&bounds("")) {
+            return Vec::new();
+        }
         let mut tiles = vec![String::new()];
         for _ in 0..CELL_TILE_DIGITS {
             let parts = tiles.iter().flat_map(|tile| (0..4).map(move |digit| format!("{tile}{digit}")));

@@ -15,7 +15,7 @@ use super::{CellState, GeographicBounds, RegionCell, RegionTown, TownMap};
 /// The town within a view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TownView {
-    /// GeographicBounds of all cells that are known.
+    /// Bounds of the tiles of all known cells.
     pub known: Option<GeographicBounds>,
     /// Numbers of the whole region.
     pub region: TownTotals,
@@ -306,5 +306,6 @@ impl TownCellView {
 
 /// True if an announced address is one that browsers elsewhere can open.
 fn is_reachable(page: &str) -> bool {
-    page.parse::<std::net::SocketAddr>().is_ok_and(|address| !address.ip().is_unspecified())
+    let ip = page.parse::<std::net::SocketAddr>().map(|address| address.ip());
+    ip.is_ok_and(|ip| !ip.is_unspecified() && !ip.is_loopback())
 }

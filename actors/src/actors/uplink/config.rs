@@ -37,6 +37,9 @@ impl Default for UplinkConfig {
 /// Messages that may wait to be sent. More would be old maps.
 const SEND_QUEUE: usize = 8;
 
+/// Largest map in bytes that is sent and decoded; NATS takes no larger message unless told so.
+const MAX_MAP_BYTES: usize = 1024 * 1024;
+
 /// Milliseconds within which the broker must accept a connection. After an outage the cells of a region all log in at once.
 const CONNECT_TIMEOUT_MS: u64 = 10_000;
 
@@ -46,7 +49,7 @@ impl UplinkConfig {
     /// # Errors
     /// [`ConfigError`] with the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        check_range("max_hz", self.max_hz, 0.1, 20.0)?;
+        check_range("max_hz", self.max_hz, 0.1, 4.0)?;
         self.connection(&MqttConfig::default()).validate()
     }
 
@@ -61,7 +64,7 @@ impl UplinkConfig {
             send_queue: SEND_QUEUE,
             connect_timeout_ms: CONNECT_TIMEOUT_MS,
             max_payload_bytes: cell.max_payload_bytes,
-            max_map_bytes: cell.max_map_bytes,
+            max_map_bytes: cell.max_map_bytes.min(MAX_MAP_BYTES),
             ..MqttConfig::default()
         }
     }

@@ -107,11 +107,12 @@ impl RegionLink {
         state == LinkState::Up && before != LinkState::Stalled
     }
 
-    /// Publishes a map, unless the broker is not there or passes nothing on: maps do not wait.
-    pub(super) fn publish_map(&mut self, map: &CellMap, now: Timestamp) {
+    /// Publishes a map, unless the broker is not there or passes nothing on: maps do not wait. True if it is sent.
+    pub(super) fn publish_map(&mut self, map: &CellMap, now: Timestamp) -> bool {
         let payload = Bytes::from(encode(map, self.setup.config.encoding));
         if payload.len() > self.setup.config.max_map_bytes {
-            return self.setup.counters.count(Event::PublishTooLarge);
+            self.setup.counters.count(Event::PublishTooLarge);
+            return false;
         }
         self.send_unsent();
         let is_sent = self.link.state == LinkState::Up
@@ -122,6 +123,7 @@ impl RegionLink {
             self.link.state = LinkState::Stalled;
             tracing::info!(broker = %self.link.broker, state = ?LinkState::Stalled, "uplink changed");
         }
+        is_sent
     }
 
     /// Publishes the node's status, now if there is a connection, and as the last will of later ones.
@@ -145,7 +147,7 @@ impl RegionLink {
         self.link.leave(LEAVE_TIMEOUT).await;
     }
 
-    /// Ends the connection of a cell that is not in its tile any more, and removes what the tile has of it.
+    /// Ends the connection of a cell that is not in its tile any more, and removes what the tile has of it, if it is connected.
     pub(super) async fn withdraw(mut self) {
         self.retain(RegionTopicKind::Status, Bytes::new());
         self.retain(RegionTopicKind::Cell, Bytes::new());

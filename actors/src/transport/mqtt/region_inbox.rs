@@ -47,7 +47,7 @@ pub(crate) struct RegionInbox {
 }
 
 /// Maximum maps that wait for the uplink: some seconds of all cells around.
-const CAPACITY: usize = 256;
+const CAPACITY: usize = 32;
 
 /// Maximum maps per second of one cell that are decoded, twice as many as a neighbour sends by default.
 const MAX_MAP_HZ: u32 = 20;

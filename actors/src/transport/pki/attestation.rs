@@ -44,12 +44,25 @@ impl LoadedCredentials {
         verified.map(|_| subject).map_err(Distrust::Untrusted)
     }
 
-    /// True if the cell's CA has revoked a certificate, which may have expired.
+    /// True if the cell's CA has revoked a certificate, which may have expired, or the city that CA.
     pub(crate) fn has_revoked(&self, certificate: &[u8]) -> bool {
+        if self.revoked_cas.iter().any(|ca| is_issued_by(ca, certificate)) {
+            return true;
+        }
         let Some(began) = began(certificate) else { return false };
         let verified = self.clients.verify_client_cert(&CertificateDer::from(certificate), &[], began);
         verified.is_err_and(|error| error == rustls::Error::InvalidCertificate(CertificateError::Revoked))
     }
+}
+
+/// True if a CA has signed a certificate, by ECDSA over P-256 with SHA-256.
+pub(super) fn is_issued_by(ca: &[u8], certificate: &[u8]) -> bool {
+    let (Ok((_, ca)), Ok((_, certificate))) = (X509Certificate::from_der(ca), X509Certificate::from_der(certificate))
+    else {
+        return false;
+    };
+    let (key, signature) = (&ca.public_key().subject_public_key.data, &certificate.signature_value.data);
+    certificate.issuer() == ca.subject() && is_signed_with(key, certificate.tbs_certificate.as_ref(), signature)
 }
 
 /// Time at which a certificate's validity begins.

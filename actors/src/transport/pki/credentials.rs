@@ -58,6 +58,8 @@ pub struct LoadedCredentials {
     pub(super) brokers: Arc<WebPkiServerVerifier>,
     pub(super) broker_name: ServerName<'static>,
     pub(super) certificates: Vec<CertificateDer<'static>>,
+    /// CAs of the cell that the city has revoked.
+    pub(super) revoked_cas: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
     /// Signer of the membership's handshakes.
     pub(super) signer: Box<dyn Signer>,
@@ -200,9 +202,9 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .map(|path| lists("tls.revocation_list", path))
         .transpose()?
         .unwrap_or_default();
-    let roots = match &files.city {
+    let (roots, revoked_cas) = match &files.city {
         Some(city) => city_trust::roots(&files.ca, city, &mut lists)?,
-        None => roots("tls.ca", &files.ca)?,
+        None => (roots("tls.ca", &files.ca)?, Vec::new()),
     };
     let roots = Arc::new(roots);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
@@ -245,7 +247,18 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .map_err(unusable)?;
     client.resumption = Resumption::disabled();
     let (server, client) = (Arc::new(server), Arc::new(client));
-    Ok(LoadedCredentials { identity, server, client, clients, brokers, broker_name, certificates, key, signer })
+    Ok(LoadedCredentials {
+        identity,
+        server,
+        client,
+        clients,
+        brokers,
+        broker_name,
+        certificates,
+        revoked_cas,
+        key,
+        signer,
+    })
 }
 
 fn client_verifier(

@@ -200,6 +200,15 @@ class PoseCorrection:
 
 
 @dataclass(frozen=True)
+class NeighbourObject:
+    """An object of a neighbouring cell, in this cell's frame."""
+
+    cell: Name
+    age_s: Amount
+    object: FusedObject
+
+
+@dataclass(frozen=True)
 class GlobalMap:
     """The fused map of one round (PACE)."""
 
@@ -212,6 +221,7 @@ class GlobalMap:
     landmarks: list[LandmarkState]
     objects: list[FusedObject]
     pose_corrections: dict[Name, PoseCorrection] = field(default_factory=dict)
+    neighbour_objects: list[NeighbourObject] = field(default_factory=list)
 
     @property
     def fused_at(self) -> datetime:

@@ -14,11 +14,12 @@ use x509_parser::certificate::X509Certificate;
 use x509_parser::prelude::FromDer;
 use x509_parser::revocation_list::CertificateRevocationList;
 
-use super::super::attestation::is_signed_with;
+use super::super::attestation::is_issued_by;
 use super::super::config::CityTlsConfig;
 use super::{CredentialsError, authorities, file_error, lists};
 
-/// The CAs of the cell that the city has signed and not revoked, and the city's. The city's revocation lists are put to `all`.
+/// The CAs of the cell that the city has signed and not revoked, with the city's; and those that it has revoked. The city's
+/// revocation lists are put to `all`.
 ///
 /// # Errors
 /// [`CredentialsError`] naming the file, in particular for a CA of the cell that the city has not signed.
@@ -26,15 +27,15 @@ pub(super) fn roots(
     cell: &Path,
     city: &CityTlsConfig,
     all: &mut Vec<CertificateRevocationListDer<'static>>,
-) -> Result<RootCertStore, CredentialsError> {
+) -> Result<(RootCertStore, Vec<CertificateDer<'static>>), CredentialsError> {
     let own = city.revocation_list.as_deref().map(|path| lists("tls.city.revocation_list", path)).transpose()?;
     let own = own.unwrap_or_default();
     let city_cas = authorities("tls.city.ca", &city.ca)?;
-    let mut roots = RootCertStore::empty();
+    let (mut roots, mut revoked) = (RootCertStore::empty(), Vec::new());
     for certificate in authorities("tls.ca", cell)? {
         let unusable = |reason: &str| file_error("tls.ca", cell, reason);
         let (_, parsed) = X509Certificate::from_der(&certificate).map_err(|_| unusable("not an X.509 certificate"))?;
-        if !city_cas.iter().any(|city_ca| has_signed(city_ca, &parsed)) {
+        if !city_cas.iter().any(|city_ca| is_issued_by(city_ca, &certificate)) {
             let city_ca = city.ca.display();
             return Err(unusable(&format!(
                 "{city_ca} has not signed it: make the cell's CA by `ecod-node pki init --city`"
@@ -43,6 +44,7 @@ pub(super) fn roots(
         if own.iter().any(|list| revokes(list, &parsed)) {
             tracing::error!(cell = %parsed.subject(), "the city has revoked the cell's CA: none of its certificates counts; \
                 make a new one by `ecod-node pki init --city`");
+            revoked.push(certificate.clone());
         } else {
             roots.add(certificate.clone()).map_err(|error| unusable(&error.to_string()))?;
         }
@@ -51,14 +53,7 @@ pub(super) fn roots(
         roots.add(certificate).map_err(|error| file_error("tls.city.ca", &city.ca, &error))?;
     }
     all.extend(own);
-    Ok(roots)
-}
-
-/// True if a CA has signed a certificate, by ECDSA over P-256 with SHA-256.
-fn has_signed(ca: &[u8], certificate: &X509Certificate<'_>) -> bool {
-    let Ok((_, ca)) = X509Certificate::from_der(ca) else { return false };
-    let (key, signature) = (&ca.public_key().subject_public_key.data, &certificate.signature_value.data);
-    certificate.issuer() == ca.subject() && is_signed_with(key, certificate.tbs_certificate.as_ref(), signature)
+    Ok((roots, revoked))
 }
 
 /// True if the issuer of a certificate has revoked it by a list.

@@ -117,6 +117,8 @@ fn nothing_of_a_cell_whose_ca_the_city_has_revoked_counts_and_vehicles_stay() {
     let of_euclid = city.load(&city.city, &euclid, 0);
     of_euclid.verify_node(&certificate(city.cells[0].files_of(&edge).0), UnixTime::now()).unwrap_err();
     of_euclid.verify_node(of_euclid.certificate(), UnixTime::now()).unwrap();
+    assert!(of_euclid.has_revoked(&certificate(city.cells[0].files_of(&edge).0)), "what it stated goes with it");
+    assert!(!of_euclid.has_revoked(of_euclid.certificate()));
     city.city.revoke_cell(&NodeName::from_static("south"), clock::now()).unwrap();
     city.city.revoke(&NodeName::from_static("south"), clock::now()).unwrap_err();
 }
