@@ -93,13 +93,14 @@ mod tests {
         let origin = GeographicPosition { latitude_deg: 48.8584, longitude_deg: 2.2945, height_m: 0.0 };
         let account = CellAccount::new(NodeName::from_static("lot-1"), &origin);
         let own = "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0";
-        assert_eq!(account.writes(), [format!("{own}/lot-1/#"), "ecod/v1/rep/+/lot-1".to_owned()]);
+        let below = ["map", "cell", "status"].map(|kind| format!("{own}/lot-1/{kind}"));
+        assert_eq!(account.writes(), [&below[..], &["ecod/v1/rep/+/lot-1".to_owned()]].concat());
         assert_eq!(account.reads().len(), 20, "its own, the reputations, two kinds of nine tiles");
         let nats = account.nats("secret");
         assert!(
-            nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.>\", \"ecod.v1.rep.*.lot-1\""),
+            nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.status\", \"ecod.v1.rep.*.lot-1\""),
             "{nats}"
         );
-        assert!(account.mosquitto().contains(&format!("topic write {own}/lot-1/#\n")));
+        assert!(account.mosquitto().contains(&format!("topic write {own}/lot-1/map\n")));
     }
 }
