@@ -76,8 +76,8 @@ async fn what_a_neighbour_sees_nearby_is_in_the_own_map() {
         eprintln!("{}: {hz:.1} maps a second beside a neighbour, age there {:.0} ms", broker.name(), 1e3 * near.age_s);
         let rounds = round(&south) - first_round;
         let rounds_hz = rounds as f64 / clock::now().since(since).as_secs_f64();
-        // Two of ten without a neighbour. A busy machine passes over rounds.
-        assert!(hz > 0.4 * rounds_hz, "{hz} maps a second of {rounds_hz}");
+        // Two of ten without a neighbour. Rounds close with each pair of reports, twenty a second on a machine that keeps up.
+        assert!(hz > 0.5 * rounds_hz.min(10.0), "{hz} maps a second of {rounds_hz} rounds");
         let maps = subscriber.maps("north");
         assert!(maps.iter().all(|(message, _)| message.map.neighbour_objects.is_empty()));
         assert!(north.counters().events(Event::CellMapAccepted) > 10);
