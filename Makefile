@@ -227,7 +227,7 @@ edge-only: setup ## an aggregator without camera and OpenCV
 # CITY=quick is a minute; CITY="--cells 500" takes other options of the program.
 city: PACKAGES += nats-server
 city: setup ## a region of three servers with 2000 simulated cells and 20 real ones: killed, stopped, cut off, restarted
-	cargo build --profile $(PROFILE) --locked -p ecod-actors -p ecod-region --bin ecod-node --bin ecod-region --example city
+	cargo build --profile $(PROFILE) --locked --bin ecod-node --bin ecod-region --example city
 	REGION_PROGRAM=$(PROGRAMS)/ecod-region $(PROGRAMS)/examples/city --node $(PROGRAMS)/ecod-node \
 	    $(if $(filter quick,$(CITY)),--quick --cells 200 --real 2 --seconds 6,--real 20 $(CITY))
 
