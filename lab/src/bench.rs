@@ -26,6 +26,7 @@ pub mod measurement;
 pub mod page;
 pub mod saturation;
 mod schedule;
+pub mod target;
 pub mod two_hop;
 pub mod usage;
 mod vehicle;

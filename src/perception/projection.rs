@@ -13,6 +13,7 @@ mod box_width;
 mod coco_sizes;
 mod config;
 mod corners;
+mod error_sources;
 mod estimate;
 mod ground;
 mod level_sight;

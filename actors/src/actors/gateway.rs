@@ -34,8 +34,9 @@ use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::connection::{LastWill, MaxQos, Retention, offline_payload};
-use crate::transport::mqtt::inbox::{Inbox, Via};
+use crate::transport::mqtt::inbox::Inbox;
 use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink};
+use crate::transport::mqtt::packet_sink::Via;
 use crate::transport::mqtt::subscription_role::REPORTS;
 use crate::transport::mqtt::{
     BrokerAddress, Incoming, LinkEvent, LinkState, MqttConfig, Security, Subscriber, SubscriptionRole,

@@ -6,6 +6,7 @@ mod delivery;
 pub(crate) mod hearing;
 pub(crate) mod inbox;
 pub(crate) mod link;
+pub(crate) mod packet_sink;
 pub(crate) mod probe;
 pub(crate) mod region_inbox;
 mod round_signature;

@@ -14,7 +14,7 @@ use tokio::net::TcpStream;
 
 use super::access::BrokerAccess;
 use super::load::landmarks;
-use super::measurement::Target;
+use super::target::Target;
 use crate::node_process::{NodeProcess, free_address};
 
 /// All vehicles of the largest load vote.

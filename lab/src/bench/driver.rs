@@ -8,8 +8,8 @@ use rumqttc::{AsyncClient, QoS};
 
 use super::echo::stamped;
 use super::load::Load;
-use super::measurement::Target;
 use super::schedule::{Schedule, wait_until};
+use super::target::Target;
 
 /// Messages of one vehicle.
 #[derive(Debug)]

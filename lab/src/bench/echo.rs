@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::AtomicUsize;
+use std::sync::atomic::Ordering::Relaxed;
 use std::thread;
 
 use anyhow::Context;
@@ -9,13 +11,25 @@ use rumqttc::{Event, Packet, QoS};
 use tokio::sync::oneshot;
 
 use super::access::BrokerAccess;
-use super::vehicle::AnswerBytes;
 
 /// Where vehicles send; below it their names.
 pub(super) const OUT: &str = "ecod/bench/out";
 
 /// Where the answers are.
 pub(super) const BACK: &str = "ecod/bench/back";
+
+/// Bytes of the newest map and of the newest verdicts, as they travel.
+#[derive(Debug, Default)]
+pub(super) struct AnswerBytes {
+    pub(super) map: AtomicUsize,
+    pub(super) verdict: AtomicUsize,
+}
+
+impl AnswerBytes {
+    pub(super) fn all(&self) -> [usize; 2] {
+        [&self.map, &self.verdict].map(|bytes| bytes.load(Relaxed))
+    }
+}
 
 /// Answers once all vehicles have sent, with a map's and a verdict's bytes; has a thread of its own, as the aggregator
 /// has, and ends when dropped.

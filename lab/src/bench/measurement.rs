@@ -5,36 +5,17 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use ecod::model::names::NodeName;
-use ecod::perception::landmark::LandmarkConfig;
-use ecod::wire::{Encoding, ReportKind, Topics};
+use ecod::wire::{ReportKind, Topics};
 use tokio::sync::{oneshot, watch};
 
-use super::access::BrokerAccess;
 use super::driver::{Sender, Sent, drive};
-use super::echo::{Echo, OUT};
+use super::echo::{AnswerBytes, Echo, OUT};
 use super::latency::Answers;
 use super::load::{self, Load};
 use super::schedule::Schedule;
+use super::target::Target;
 use super::usage::{Usage, UsageMeter};
-use super::vehicle::{AnswerBytes, BenchVehicle, Came, Common};
-
-/// The cell that is measured.
-#[derive(Debug, Clone)]
-pub struct Target {
-    /// Where its data goes.
-    pub access: BrokerAccess,
-    /// Its name.
-    pub cell: NodeName,
-    /// Its known locations.
-    pub landmarks: Vec<LandmarkConfig>,
-    /// Encoding of reports.
-    pub encoding: Encoding,
-    /// True if its rounds make verdicts.
-    pub votes: bool,
-    /// The aggregator's process, if it is on this machine and to be watched.
-    pub aggregator: Option<u32>,
-}
+use super::vehicle::{BenchVehicle, Came, Common};
 
 /// Result of a load.
 #[derive(Debug, Clone)]

@@ -6,7 +6,8 @@ use serde::Serialize;
 
 use super::latency::Quantiles;
 use super::load::Load;
-use super::measurement::{BenchFigure, Target, measure};
+use super::measurement::{BenchFigure, measure};
+use super::target::Target;
 
 /// A load is carried while 99 of 100 answers take less, and none is missing.
 pub const LIMIT: Duration = Duration::from_millis(100);

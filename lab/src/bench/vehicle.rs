@@ -1,6 +1,5 @@
 //! A simulated vehicle: one MQTT connection, and when answers came over it.
 
-use std::sync::atomic::AtomicUsize;
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
@@ -12,7 +11,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use super::access::BrokerAccess;
-use super::echo::{BACK, tick_of};
+use super::echo::{AnswerBytes, BACK, tick_of};
 use super::schedule::Schedule;
 
 /// State that the vehicles of a run share.
@@ -25,19 +24,6 @@ pub(super) struct Common {
     pub(super) answer_bytes: Arc<AnswerBytes>,
     /// True once a map has come.
     pub(super) has_map: watch::Sender<bool>,
-}
-
-/// Bytes of the newest map and of the newest verdicts, as they travel.
-#[derive(Debug, Default)]
-pub(super) struct AnswerBytes {
-    map: AtomicUsize,
-    verdict: AtomicUsize,
-}
-
-impl AnswerBytes {
-    pub(super) fn all(&self) -> [usize; 2] {
-        [&self.map, &self.verdict].map(|bytes| bytes.load(Relaxed))
-    }
 }
 
 /// When the answers to each tick came by one way; `None` until they do.

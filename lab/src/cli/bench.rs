@@ -22,9 +22,10 @@ use crate::bench::aggregator::OwnAggregator;
 use crate::bench::doors::DoorFigures;
 use crate::bench::latency::{Answers, Latencies, Quantiles};
 use crate::bench::load::Load;
-use crate::bench::measurement::{BenchFigure, Target, measure};
+use crate::bench::measurement::{BenchFigure, measure};
 use crate::bench::page;
 use crate::bench::saturation::{self, AggregatorShares, Saturation, Step};
+use crate::bench::target::Target;
 use crate::node_process::node_program;
 
 /// Flags of `bench`.

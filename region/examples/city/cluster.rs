@@ -13,7 +13,7 @@ use ecod_region::broker::{BrokerLogin, read_secret};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-use crate::fleet::Place;
+use crate::places::Place;
 
 /// Servers of the region.
 pub(crate) const SERVERS: usize = 3;

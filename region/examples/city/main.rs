@@ -6,6 +6,7 @@
 
 mod cluster;
 mod fleet;
+mod places;
 mod probe;
 mod real;
 mod watch;
@@ -64,10 +65,10 @@ const PAUSE: Duration = Duration::from_secs(12);
 fn main() -> anyhow::Result<()> {
     let arguments = Arguments::parse();
     let directory = TempDir::new()?;
-    let places = fleet::places(arguments.cells, arguments.real);
+    let places = places::places(arguments.cells, arguments.real);
     let (simulated, real) = places.split_at(arguments.cells);
     let cluster = Cluster::start(directory.path(), &places)?;
-    let halves = fleet::halves(&places);
+    let halves = places::halves(&places);
     let mut city = City {
         of_halves: halves.each_ref().map(|half| half.cells),
         watches: [0, 1].map(|half| Watch::start(cluster.login(half, "region.reader"), &halves[half])),

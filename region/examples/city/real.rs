@@ -21,7 +21,7 @@ use tokio::runtime::Runtime;
 use tokio::sync::watch;
 
 use crate::cluster::{Cluster, PASSWORD, free_address};
-use crate::fleet::Place;
+use crate::places::Place;
 
 /// Nodes that run; ended when dropped.
 pub(crate) struct RealCells {

@@ -13,7 +13,7 @@ use ecod_region::reader::{self, RegionState};
 use ecod_region::town::Accepted;
 use hdrhistogram::Histogram;
 
-use crate::fleet::Half;
+use crate::places::Half;
 use crate::spawn_thread;
 
 /// A subscriber on a thread of its own, until the process ends.

@@ -2,7 +2,8 @@
 
 use nalgebra::Point2;
 
-use super::estimate::{Errors, Estimate, Source};
+use super::error_sources::{Errors, Source};
+use super::estimate::Estimate;
 use super::ground::HalfDepth;
 use super::level_sight::LevelSight;
 use super::{LineOfSight, ObjectSize, Projection};

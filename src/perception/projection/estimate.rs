@@ -1,24 +1,8 @@
 //! Estimates of one distance, the errors that they share, and their combination.
 
-use nalgebra::SVector;
-
 use super::LineOfSight;
+use super::error_sources::Errors;
 use super::level_sight::LevelSight;
-
-/// Sources of errors that the estimates of one box have in common.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Source {
-    FootRow,
-    HeadRow,
-    Pitch,
-    Roll,
-    CameraHeight,
-    ObjectHeight,
-    Depth,
-}
-
-/// Changes by an error of one standard deviation of each [`Source`], to first order.
-pub(super) type Errors = SVector<f64, 7>;
 
 /// A horizontal distance.
 #[derive(Debug, Clone, Copy)]

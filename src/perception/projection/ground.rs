@@ -1,6 +1,7 @@
 //! Ranging by where the foot of the box meets the ground, with the height of the camera known.
 
-use super::estimate::{Errors, Estimate, Source};
+use super::error_sources::{Errors, Source};
+use super::estimate::Estimate;
 use super::level_sight::LevelSight;
 use super::{Cut, ObjectSize, Projection};
 use crate::model::detection::BoundingBox;

@@ -3,7 +3,7 @@
 use nalgebra::{Point2, Vector3};
 
 use super::Projection;
-use super::estimate::{Errors, Source};
+use super::error_sources::{Errors, Source};
 
 /// The line of sight of a pixel.
 #[derive(Debug, Clone, Copy)]

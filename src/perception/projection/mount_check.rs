@@ -3,7 +3,8 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::estimate::{CONFLICT_SIGMAS, Source};
+use super::error_sources::Source;
+use super::estimate::CONFLICT_SIGMAS;
 use super::ground::HalfDepth;
 use super::{Cut, Projection, Ranging, box_height};
 use crate::model::detection::Detection;

@@ -8,7 +8,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::estimate::Source;
+use super::error_sources::Source;
 use super::ground::HalfDepth;
 use super::{ObjectSize, Projection, ProjectionConfig, box_height};
 use crate::model::detection::BoundingBox;

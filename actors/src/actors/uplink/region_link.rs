@@ -15,7 +15,8 @@ use uuid::Uuid;
 
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::connection::{LastWill, MaxQos, Retention, offline_payload};
-use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink, PacketSink};
+use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink};
+use crate::transport::mqtt::packet_sink::PacketSink;
 use crate::transport::mqtt::{MqttConfig, Security};
 
 /// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node that stops waits for it.

@@ -4,7 +4,6 @@
 
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 
-use ecod::leadership::BrokerAddress;
 use ecod::leadership::links::LinkState;
 use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
@@ -18,20 +17,12 @@ use uuid::Uuid;
 
 use super::config::MqttConfig;
 use super::delivery::{Delivery, Incoming, Subscriber};
-use super::link::PacketSink;
+use super::packet_sink::{PacketOutcome, PacketSink, Via};
 use super::security::Security;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::throttle::KeyedThrottle;
 use crate::telemetry::counters::{Counters, Event, ShedReason};
-
-/// The broker that passed a packet on.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Via<'a> {
-    pub(crate) address: &'a BrokerAddress,
-    /// The node whose certificate it has proven, for a broker of a cell with certificates.
-    pub(crate) node: Option<&'a NodeName>,
-}
 
 /// Decodes, checks and delivers packets; shared by the links of a gateway.
 pub(crate) struct Inbox {
@@ -51,19 +42,6 @@ pub(crate) struct Inbox {
 }
 
 type NodeThrottle = Mutex<KeyedThrottle<NodeName>>;
-
-/// The effect of a packet on its link.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) enum PacketOutcome {
-    /// None.
-    Done,
-    /// The broker published this node's last will: the link must publish the status again.
-    DeclaredOffline,
-    /// The broker returned this run's own status: the node may publish there.
-    OwnStatus,
-    /// Another run with this node's name is alive.
-    Namesake(Uuid),
-}
 
 impl Inbox {
     pub(crate) fn new(

@@ -20,7 +20,7 @@ use uuid::Uuid;
 use super::config::MqttConfig;
 use super::connection::{self, Client, ConnectionError, LastWill, Packet, Retention};
 use super::hearing::Hearing;
-use super::inbox::{PacketOutcome, Via};
+use super::packet_sink::{PacketOutcome, PacketSink, Via};
 use super::security::Security;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
@@ -53,12 +53,6 @@ pub(crate) enum LinkChange {
 
 /// Callback for the events of links; false once the gateway has ended.
 pub(crate) type LinkSink = Arc<dyn Fn(LinkEvent) -> bool + Send + Sync>;
-
-/// Receiver of the messages that come in on links.
-pub(crate) trait PacketSink: Send + Sync {
-    /// Processes one packet of a broker, on the link's task; it must not block.
-    fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome;
-}
 
 /// Settings and receiver that all links of an actor share.
 pub(crate) struct LinkSetup {

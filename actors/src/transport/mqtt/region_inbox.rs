@@ -11,8 +11,7 @@ use tokio::sync::Semaphore;
 use uuid::Uuid;
 
 use super::delivery::Delivery;
-use super::inbox::{PacketOutcome, Via};
-use super::link::PacketSink;
+use super::packet_sink::{PacketOutcome, PacketSink, Via};
 use crate::platform::throttle::KeyedThrottle;
 use crate::telemetry::counters::{Counters, Event, ShedReason};
 

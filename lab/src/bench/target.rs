@@ -1,0 +1,24 @@
+//! The cell that is measured.
+
+use ecod::model::names::NodeName;
+use ecod::perception::landmark::LandmarkConfig;
+use ecod::wire::Encoding;
+
+use super::access::BrokerAccess;
+
+/// The cell that is measured.
+#[derive(Debug, Clone)]
+pub struct Target {
+    /// Where its data goes.
+    pub access: BrokerAccess,
+    /// Its name.
+    pub cell: NodeName,
+    /// Its known locations.
+    pub landmarks: Vec<LandmarkConfig>,
+    /// Encoding of reports.
+    pub encoding: Encoding,
+    /// True if its rounds make verdicts.
+    pub votes: bool,
+    /// The aggregator's process, if it is on this machine and to be watched.
+    pub aggregator: Option<u32>,
+}
