@@ -95,7 +95,7 @@ impl Neighbours {
 
     /// The tiles whose cells can be neighbours.
     pub fn tiles(&self) -> Vec<Quadkey> {
-        tile_of(&self.origin).with_neighbours()
+        Quadkey::of_cell(&self.origin).with_neighbours()
     }
 
     /// Takes a map of another cell, which came on `topic` and was read at `received_at` by this node's steady clock.
@@ -133,7 +133,8 @@ impl Neighbours {
             if object.scores.len() > MAX_SCORES {
                 object.scores.clear();
             }
-            // What was valid in its own frame need not be so in this one, and receivers refuse a map with one wrong value.
+            // Values that are valid in its own frame need not be so in this one. Receivers refuse a map with one
+            // wrong value.
             if object.validate().is_err() {
                 losses.refused += 1;
                 continue;
@@ -184,8 +185,4 @@ impl Neighbours {
         let filter = &self.filter;
         self.losses.retain(|cell, _| filter.knows(cell));
     }
-}
-
-fn tile_of(origin: &GeographicOrigin) -> Quadkey {
-    Quadkey::of_cell(origin)
 }

@@ -11,6 +11,7 @@
 //! - Memory is bounded by the cell, not by the recording.
 
 mod clock;
+mod envelope;
 mod flaw;
 mod journal;
 mod records;

@@ -3,8 +3,8 @@
 use std::fmt::Write;
 
 use ecod::model::names::NodeName;
-use ecod::model::origin::GeographicPosition;
-use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
+use ecod::model::origin::GeographicOrigin;
+use ecod::model::quadkey::Quadkey;
 use ecod::wire::{RegionTopic, RegionTopicKind};
 
 /// The account of a cell. All nodes of the cell that may lead share it.
@@ -20,9 +20,9 @@ pub struct CellAccount {
 const REPUTATIONS: &str = "ecod/v1/rep";
 
 impl CellAccount {
-    /// The account of a cell whose frame's origin is at a position.
-    pub fn new(cell: NodeName, origin: &GeographicPosition) -> Self {
-        Self { cell, tile: Quadkey::of(origin, CELL_TILE_DIGITS) }
+    /// The account of a cell.
+    pub fn new(cell: NodeName, origin: &GeographicOrigin) -> Self {
+        Self { cell, tile: Quadkey::of_cell(origin) }
     }
 
     /// MQTT filters of what the cell may publish.
@@ -41,7 +41,7 @@ impl CellAccount {
         let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
         let around = tile.with_neighbours().into_iter();
         let around = around.flat_map(|tile| kinds.map(|kind| RegionTopic::filter(tile, kind)));
-        let own = [format!("ecod/v1/geo/{}/{cell}/#", tile.levels()), format!("{REPUTATIONS}/+/+")];
+        let own = [RegionTopic::filter_of_cell(*tile, cell), format!("{REPUTATIONS}/+/+")];
         own.into_iter().chain(around).collect()
     }
 
@@ -90,7 +90,8 @@ mod tests {
 
     #[test]
     fn a_cell_writes_below_its_own_tile_and_name_alone() {
-        let origin = GeographicPosition { latitude_deg: 48.8584, longitude_deg: 2.2945, height_m: 0.0 };
+        let origin =
+            GeographicOrigin { latitude_deg: 48.8584, longitude_deg: 2.2945, height_m: 0.0, rotation_deg: 0.0 };
         let account = CellAccount::new(NodeName::from_static("lot-1"), &origin);
         let own = "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0";
         let below = ["map", "cell", "status"].map(|kind| format!("{own}/lot-1/{kind}"));

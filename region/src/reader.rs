@@ -4,7 +4,7 @@ use std::collections::{BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
+use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::wire::{RegionTopic, RegionTopicKind, RejectReason};
 use ecod_actors::platform::clock;
@@ -16,7 +16,7 @@ use tokio::sync::watch;
 use crate::broker::BrokerLogin;
 use crate::town::{Accepted, RegionTown};
 
-/// What the reader knows, for page, metrics and exports.
+/// Town and connection, for page, metrics and exports.
 #[derive(Debug, Default)]
 pub struct RegionState {
     town: Mutex<RegionTown>,
@@ -44,7 +44,7 @@ pub struct Reading<'a> {
     pub payload: &'a [u8],
     /// When it was read.
     pub at: Timestamp,
-    /// Whether it counts.
+    /// Its content if it counts, otherwise the reason.
     pub outcome: Result<Accepted, RejectReason>,
 }
 
@@ -125,7 +125,8 @@ async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watc
         }
         let of_tiles =
             tiles.borrow_and_update().iter().map(|tile| RegionTopic::filter_within(*tile)).collect::<Vec<_>>();
-        let wanted: BTreeSet<_> = of_tiles.into_iter().chain([all_statuses()]).collect();
+        let wanted: BTreeSet<_> =
+            of_tiles.into_iter().chain([RegionTopic::filter_everywhere(RegionTopicKind::Status)]).collect();
         let (new, old) = (&wanted - &present, &present - &wanted);
         for filter in old {
             // The next login subscribes anew if the connection has ended.
@@ -139,12 +140,6 @@ async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watc
         }
         present = wanted;
     }
-}
-
-/// The filter for the status of every cell: topics of cells have all digits of a cell's tile.
-fn all_statuses() -> String {
-    let tile = ["+"; CELL_TILE_DIGITS as usize].join("/");
-    format!("ecod/v1/geo/{tile}/+/{}", RegionTopicKind::Status.level())
 }
 
 async fn poll(

@@ -126,8 +126,7 @@ impl RegionTown {
     }
 
     fn take(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, RejectReason> {
-        let topic =
-            RegionTopic::parse(path).filter(|topic| topic.tile.to_string().len() == usize::from(CELL_TILE_DIGITS));
+        let topic = RegionTopic::parse(path).filter(|topic| topic.tile.digits() == CELL_TILE_DIGITS);
         let topic = topic.ok_or(RejectReason::UnknownTopic)?;
         let key = (topic.tile, topic.cell.clone());
         // A cell that clears what it retained has left for good.

@@ -18,8 +18,8 @@ const MAX_LATITUDE_DEG: f64 = 85.051_128_78;
 /// Maximum digits of a tile.
 const MAX_DIGITS: usize = 30;
 
-/// A tile, and all tiles in it. As text: one digit for each level, the largest tile first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+/// A tile, and all tiles in it. As text: one digit for each level, the largest tile first. Without digits: the whole map.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Quadkey {
     digits: u8,
     x: u32,
@@ -65,6 +65,32 @@ impl Quadkey {
         tiles
     }
 
+    /// Number of digits; 0 for the whole map.
+    pub fn digits(self) -> u8 {
+        self.digits
+    }
+
+    /// The tile of so many digits, at most its own, that this one is in.
+    #[must_use]
+    pub fn outer(self, digits: u8) -> Self {
+        let fewer = self.digits.saturating_sub(digits);
+        Self { digits: self.digits - fewer, x: self.x >> fewer, y: self.y >> fewer }
+    }
+
+    /// True if another tile is this one or in it.
+    pub fn contains(self, inner: Self) -> bool {
+        inner.digits >= self.digits && inner.outer(self.digits) == self
+    }
+
+    /// The four tiles of one digit more.
+    pub fn quarters(self) -> [Self; 4] {
+        [0, 1, 2, 3].map(|digit| Self {
+            digits: self.digits + 1,
+            x: self.x << 1 | digit & 1,
+            y: self.y << 1 | digit >> 1,
+        })
+    }
+
     /// Levels of a topic, one digit each: `0/2/1`.
     pub fn levels(self) -> String {
         let digits: Vec<_> = self.to_string().chars().map(String::from).collect();
@@ -100,9 +126,9 @@ impl FromStr for Quadkey {
         if text.len() > MAX_DIGITS {
             return Err(invalid());
         }
-        text.chars().try_fold(Self { digits: 0, x: 0, y: 0 }, |tile, digit| {
+        text.chars().try_fold(Self::default(), |tile, digit| {
             let digit = digit.to_digit(4).ok_or_else(invalid)?;
-            Ok(Self { digits: tile.digits + 1, x: tile.x << 1 | digit & 1, y: tile.y << 1 | digit >> 1 })
+            Ok(tile.quarters()[digit as usize])
         })
     }
 }
@@ -126,6 +152,15 @@ mod tests {
         for stranger in ["4", "21x", "0123012301230123012301230123012"] {
             assert!(stranger.parse::<Quadkey>().is_err(), "{stranger}");
         }
+    }
+
+    #[test]
+    fn a_tile_contains_its_quarters_and_nothing_beside_it() {
+        let [outer, inner, beside] = ["213", "21302", "2120"].map(|key| key.parse::<Quadkey>().unwrap());
+        assert!(outer.contains(outer) && outer.contains(inner) && Quadkey::default().contains(outer));
+        assert!(!outer.contains(beside) && !inner.contains(outer));
+        assert_eq!((inner.outer(3), inner.outer(9)), (outer, inner));
+        assert!(outer.quarters().iter().all(|quarter| outer.contains(*quarter) && quarter.digits() == 4));
     }
 
     #[test]

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::tile_of;
 use crate::admission::minimum_delay::MinimumDelay;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
+use crate::model::quadkey::Quadkey;
 use crate::model::time::Timestamp;
 use crate::wire::{CellMap, RegionTopic, RegionTopicKind, RejectReason};
 
@@ -40,7 +40,7 @@ pub struct AdmittedMap {
     pub age: Duration,
 }
 
-/// What is known of a cell's maps.
+/// Order and delays of a cell's maps.
 #[derive(Debug, Clone)]
 struct CellOrder {
     epoch: Epoch,
@@ -79,7 +79,8 @@ impl CellMapFilter {
     ) -> Result<AdmittedMap, RejectReason> {
         let CellMap { cell, sent_at_us, origin, map, .. } = message;
         // A cell is in one tile, and its broker lets it write there only.
-        let is_own = topic.cell == *cell && topic.tile == tile_of(origin) && topic.kind == RegionTopicKind::Map;
+        let is_own =
+            topic.cell == *cell && topic.tile == Quadkey::of_cell(origin) && topic.kind == RegionTopicKind::Map;
         if !is_own {
             return Err(RejectReason::NodeMismatch);
         }

@@ -2,9 +2,10 @@
 
 use nalgebra::{Point2, Rotation2, Vector2};
 
-use super::{COVER_M, tile_of};
+use super::COVER_M;
 use crate::model::geometry::{Covariance, wrap_angle};
 use crate::model::origin::{GeographicOrigin, GeographicPosition};
+use crate::model::quadkey::Quadkey;
 use crate::wire::FusedObject;
 
 /// Metres in a degree of latitude.
@@ -27,7 +28,7 @@ impl FrameChange {
         // The angle is the same for all of the frame to 1 µrad within a kilometre.
         let place = |x_m| own.to_map(&from.to_wgs84(x_m, 0.0, 0.0)).xy();
         let east = place(100.0) - place(0.0);
-        let [[north_deg, west_deg], [south_deg, east_deg]] = tile_of(from).corners_deg();
+        let [[north_deg, west_deg], [south_deg, east_deg]] = Quadkey::of_cell(from).corners_deg();
         let middle_deg = [(north_deg + south_deg) / 2.0, (west_deg + east_deg) / 2.0];
         let cover_deg = COVER_M / DEGREE_M;
         let half_deg = [

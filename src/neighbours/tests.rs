@@ -51,7 +51,7 @@ fn map(epoch: u64, leader: &str, round: u64, at: Timestamp, objects: Vec<FusedOb
 }
 
 fn topic(cell: &str, origin: &GeographicOrigin) -> RegionTopic {
-    RegionTopic { tile: tile_of(origin), cell: name(cell), kind: RegionTopicKind::Map }
+    RegionTopic { tile: Quadkey::of_cell(origin), cell: name(cell), kind: RegionTopicKind::Map }
 }
 
 fn east() -> RegionTopic {

@@ -1,6 +1,6 @@
 //! Faults of a line of a recording, in words.
 
-use super::records::Envelope;
+use super::envelope::Envelope;
 use crate::wire::flaw::read_json;
 use crate::wire::{Flaw, Limits, RejectReason};
 

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use super::envelope::Envelope;
 use super::flaw;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
@@ -26,15 +27,6 @@ pub(super) struct RecordedReport {
     /// True if every object has a position.
     pub(super) is_placed: bool,
     pub(super) report: ObjectReport,
-}
-
-/// The optional fields of a line beside its report.
-#[derive(Debug, Deserialize)]
-pub(super) struct Envelope {
-    #[serde(default)]
-    topic: Option<String>,
-    #[serde(default)]
-    received_at_us: Option<Timestamp>,
 }
 
 impl RecordedReport {

@@ -58,8 +58,8 @@ pub(super) const USUAL_LOOKS_HZ: f64 = 10.0;
 /// Log-odds that each e-folding of the looks per second takes: every look brings clutter, but objects come with time.
 const LOOKS_NATS: f64 = 0.3;
 
-/// Log-odds that each nat of a detector's even confidence above the assumed one takes: such a detector reports more clutter,
-/// which also comes back more often than the rule for the even confidence assumes.
+/// Log-odds that each nat of a detector's even confidence above the assumed one takes. Such a detector reports more
+/// clutter, and its clutter comes back more often than the rule for the even confidence assumes.
 const EVEN_NATS: f64 = 0.6;
 
 /// Minimum number of looks before a vehicle's statement is judged.

@@ -1,9 +1,9 @@
 //! Objects of neighbouring cells: they lend identities to tracks, and are judged by what this cell's vehicles see.
 //!
-//! No track is spawned or kept alive by them. A track that begins where such an object is takes over its identity, its
-//! velocity, its time of first detection and what is known of its existence and class. Its position is that of the
-//! detection. Two cells that found one object apart agree on the identity of the older one; of two that are about as
-//! old, on the smaller one.
+//! No track is spawned or kept alive by them. A track that begins where such an object is takes over its identity,
+//! velocity, time of first detection, existence and class. Its position is that of the
+//! detection. Two cells that found one object apart agree on the identity of the older one. Of two that are about as
+//! old, they take the smaller one.
 //!
 //! A cell is judged as a vehicle is (`trust`): it states that its objects exist.
 
@@ -111,8 +111,8 @@ impl ForeignObject {
 }
 
 impl ForeignObjects {
-    /// Takes all objects of neighbouring cells, of the age that they state at `stated_at`; tracks that are the same objects
-    /// take over the identities of older ones.
+    /// Takes all objects of neighbouring cells, of the age that they state at `stated_at`. Tracks that are the same
+    /// objects take over the identities of older ones.
     pub(super) fn take(
         &mut self,
         stated: &[NeighbourObject],

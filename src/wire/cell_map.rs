@@ -1,4 +1,4 @@
-//! What a cell tells beyond itself: its map with its place on Earth; and what it hears of its neighbours.
+//! Messages from cell to cell: a map with its place on Earth, and objects of neighbours.
 
 use minicbor::{Decode, Encode};
 use schemars::JsonSchema;

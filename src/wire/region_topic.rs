@@ -1,7 +1,7 @@
 //! The topics of a region, on which cells tell of themselves by their place on Earth.
 
 use crate::model::names::NodeName;
-use crate::model::quadkey::Quadkey;
+use crate::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
 
 /// First levels of every topic of a region's cells.
 const ROOT: &str = "ecod/v1/geo";
@@ -54,11 +54,22 @@ impl RegionTopic {
         format!("{ROOT}/{}/+/{}", tile.levels(), kind.level())
     }
 
+    /// The filter for all topics of one cell.
+    pub fn filter_of_cell(tile: Quadkey, cell: &NodeName) -> String {
+        format!("{ROOT}/{}/{cell}/#", tile.levels())
+    }
+
+    /// The filter for one kind of topic of all cells everywhere.
+    pub fn filter_everywhere(kind: RegionTopicKind) -> String {
+        let tile = ["+"; CELL_TILE_DIGITS as usize].join("/");
+        format!("{ROOT}/{tile}/+/{}", kind.level())
+    }
+
     /// The filter for all topics within a tile of any size; an empty tile is the whole Earth.
     pub fn filter_within(tile: Quadkey) -> String {
-        match tile.levels() {
-            levels if levels.is_empty() => format!("{ROOT}/#"),
-            levels => format!("{ROOT}/{levels}/#"),
+        match tile.digits() {
+            0 => format!("{ROOT}/#"),
+            _ => format!("{ROOT}/{}/#", tile.levels()),
         }
     }
 

@@ -64,9 +64,9 @@ pub struct UplinkArguments {
     pub description: Option<Arc<CellDescription>>,
     /// The newest map of the cell.
     pub newest: watch::Receiver<Option<ReceivedMap>>,
-    /// Who leads.
+    /// The present leadership.
     pub leadership: watch::Receiver<Leadership>,
-    /// Is told of the objects of neighbours.
+    /// Receiver of the objects of neighbours.
     pub fuser: ActorSlot<FuserMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
@@ -80,24 +80,15 @@ pub struct Uplink;
 
 /// The link, while there is one, and what is published on it.
 pub struct UplinkState {
-    cell: NodeName,
-    status: NodeStatus,
-    broker: BrokerAddress,
-    config: UplinkConfig,
+    /// Status, origin and description are the present ones.
+    setup: UplinkArguments,
     connection: MqttConfig,
-    security: Security,
-    origin: Option<GeographicOrigin>,
-    description: Option<Arc<CellDescription>>,
-    newest: watch::Receiver<Option<ReceivedMap>>,
-    leadership: watch::Receiver<Leadership>,
-    fuser: ActorSlot<FuserMessage>,
-    counters: Arc<Counters>,
-    seed: u64,
     link: Option<RegionLink>,
     next_link: u64,
     pace: MapPace,
-    /// Epoch and round of the map that was published last, and of the own map that was looked at last.
+    /// Epoch and round of the map that was published last.
     published: Option<(u64, u64)>,
+    /// Epoch and round of the own map that was looked at last.
     seen: Option<(u64, u64)>,
     /// The neighbours of a cell that has a place on Earth.
     neighbours: Option<Neighbours>,
@@ -131,7 +122,7 @@ impl Actor for Uplink {
         match message {
             UplinkMessage::Look => state.look(&myself),
             UplinkMessage::SetStatus { status } => {
-                state.status = status;
+                state.setup.status = status;
                 state.publish_status();
             }
             UplinkMessage::Configure { origin, description } => state.configure(origin, description, &myself),
@@ -159,40 +150,14 @@ impl Actor for Uplink {
 }
 
 impl UplinkState {
-    fn new(arguments: UplinkArguments, watcher: JoinHandle<()>) -> Self {
-        let UplinkArguments {
-            cell,
-            status,
-            broker,
-            config,
-            mqtt,
-            security,
-            origin,
-            description,
-            newest,
-            leadership,
-            fuser,
-            counters,
-            seed,
-        } = arguments;
+    fn new(setup: UplinkArguments, watcher: JoinHandle<()>) -> Self {
         Self {
-            neighbours: origin.map(|origin| Neighbours::new(cell.clone(), origin)),
-            cell,
-            status,
-            broker,
+            neighbours: setup.origin.map(|origin| Neighbours::new(setup.cell.clone(), origin)),
             has_news: false,
             seen: None,
-            connection: config.connection(&mqtt),
-            pace: MapPace::new(config.max_hz),
-            config,
-            security,
-            origin,
-            description,
-            newest,
-            leadership,
-            fuser,
-            counters,
-            seed,
+            connection: setup.config.connection(&setup.mqtt),
+            pace: MapPace::new(setup.config.max_hz),
+            setup,
             link: None,
             next_link: 0,
             published: None,
@@ -202,13 +167,13 @@ impl UplinkState {
 
     /// Connects, leaves or publishes, as the lead and the newest map want it.
     fn look(&mut self, myself: &ActorRef<UplinkMessage>) {
-        let leads = self.leadership.borrow().is_leading();
-        let troubles = self.counters.troubles();
-        match (leads, self.origin) {
+        let leads = self.setup.leadership.borrow().is_leading();
+        let troubles = self.setup.counters.troubles();
+        match (leads, self.setup.origin) {
             (true, None) => troubles.note(TroubleKind::NoOrigin, NO_ORIGIN),
             _ => troubles.settle(TroubleKind::NoOrigin, None),
         }
-        match (self.origin.filter(|_| leads), self.link.take()) {
+        match (self.setup.origin.filter(|_| leads), self.link.take()) {
             (None, Some(link)) => self.leave(link),
             (Some(origin), None) => self.link = Some(self.connect(Quadkey::of_cell(&origin), myself)),
             (Some(_), link) => self.link = link,
@@ -221,22 +186,27 @@ impl UplinkState {
         let receiver = myself.clone();
         // An uplink that has ended needs nothing.
         let subscriber = Box::new(move |delivery| _ = receiver.cast(UplinkMessage::Take { delivery }));
-        let (limits, counters) = (self.connection.limits(), Arc::clone(&self.counters));
-        let sink =
-            RegionInbox::new((self.cell.clone(), tile), self.status.id, limits, Arc::clone(&counters), subscriber);
+        let (limits, counters) = (self.connection.limits(), Arc::clone(&self.setup.counters));
+        let sink = RegionInbox::new(
+            (self.setup.cell.clone(), tile),
+            self.setup.status.id,
+            limits,
+            Arc::clone(&counters),
+            subscriber,
+        );
         let setup = RegionLinkSetup {
-            cell: self.cell.clone(),
+            cell: self.setup.cell.clone(),
             tile,
             config: self.connection.clone(),
-            security: self.security.clone(),
+            security: self.setup.security.clone(),
             sink: Arc::new(sink),
             counters,
-            seed: self.seed,
+            seed: self.setup.seed,
         };
         let id = LinkId(self.next_link);
         self.next_link += 1;
-        self.pace = MapPace::new(self.config.max_hz);
-        RegionLink::open(id, self.broker.clone(), setup, &self.own_status(), events_to(myself))
+        self.pace = MapPace::new(self.setup.config.max_hz);
+        RegionLink::open(id, self.setup.broker.clone(), setup, &self.own_status(), events_to(myself))
     }
 
     fn leave(&mut self, link: RegionLink) {
@@ -246,19 +216,19 @@ impl UplinkState {
 
     /// The last status of a node that leaves the region; none if another leads, which has told its own.
     fn farewell(&self) -> Option<NodeStatus> {
-        let leadership = self.leadership.borrow();
-        let is_succeeded = leadership.leader().is_some_and(|leader| *leader != self.status.node);
-        let gone = || NodeStatus { state: NodeState::Offline, troubles: Vec::new(), ..self.status.clone() };
+        let leadership = self.setup.leadership.borrow();
+        let is_succeeded = leadership.leader().is_some_and(|leader| *leader != self.setup.status.node);
+        let gone = || NodeStatus { state: NodeState::Offline, troubles: Vec::new(), ..self.setup.status.clone() };
         (!is_succeeded).then(gone)
     }
 
     /// Publishes on a new connection what the region is to know.
     fn introduce(&mut self) {
         self.publish_status();
-        if let (Some(link), Some(description)) = (&mut self.link, &self.description) {
+        if let (Some(link), Some(description)) = (&mut self.link, &self.setup.description) {
             link.publish_description(description);
         }
-        self.pace = MapPace::new(self.config.max_hz);
+        self.pace = MapPace::new(self.setup.config.max_hz);
         self.publish_map();
     }
 
@@ -271,18 +241,19 @@ impl UplinkState {
 
     /// The status of the node as the leader.
     fn own_status(&self) -> NodeStatus {
-        let leadership = self.leadership.borrow();
-        let epoch = leadership.epoch.as_ref().map_or(self.status.epoch, |epoch| epoch.term);
-        let aggregator = Some(self.status.node.clone());
-        NodeStatus { state: NodeState::Aggregating, epoch, aggregator, ..self.status.clone() }
+        let leadership = self.setup.leadership.borrow();
+        let epoch = leadership.epoch.as_ref().map_or(self.setup.status.epoch, |epoch| epoch.term);
+        let aggregator = Some(self.setup.status.node.clone());
+        NodeStatus { state: NodeState::Aggregating, epoch, aggregator, ..self.setup.status.clone() }
     }
 
     /// Looks at the newest map, if it is of this leadership and not old, and publishes it if it is new and due.
     fn publish_map(&mut self) {
         let now = clock::now();
-        let Some(ReceivedMap { received_at, map }) = self.newest.borrow().clone() else { return };
+        let Some(ReceivedMap { received_at, map }) = self.setup.newest.borrow().clone() else { return };
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
-        let is_own = map.aggregator == self.status.node && self.leadership.borrow().present_epoch() == Some(&epoch);
+        let is_own =
+            map.aggregator == self.setup.status.node && self.setup.leadership.borrow().present_epoch() == Some(&epoch);
         if self.link.is_none() || !is_own || now.since(received_at) > MAX_AGE {
             return;
         }
@@ -290,14 +261,14 @@ impl UplinkState {
         if order > std::mem::replace(&mut self.seen, order) {
             self.tell_neighbours(&map, now);
         }
-        let (Some(link), Some(origin)) = (&mut self.link, self.origin) else { return };
+        let (Some(link), Some(origin)) = (&mut self.link, self.setup.origin) else { return };
         if order <= self.published || !self.pace.is_due(now) {
             return;
         }
         self.pace.advance(now);
         // Objects of neighbours are theirs to tell.
         let map = GlobalMap { neighbour_objects: Vec::new(), ..GlobalMap::clone(&map) };
-        let (schema, cell) = (SCHEMA_VERSION, self.cell.clone());
+        let (schema, cell) = (SCHEMA_VERSION, self.setup.cell.clone());
         if link.publish_map(&CellMap { schema, cell, sent_at_us: now, origin, map }, now) {
             self.published = order;
         }
@@ -310,17 +281,17 @@ impl UplinkState {
         description: Option<Arc<CellDescription>>,
         myself: &ActorRef<UplinkMessage>,
     ) {
-        if std::mem::replace(&mut self.origin, origin) != origin {
-            self.neighbours = origin.map(|origin| Neighbours::new(self.cell.clone(), origin));
+        if std::mem::replace(&mut self.setup.origin, origin) != origin {
+            self.neighbours = origin.map(|origin| Neighbours::new(self.setup.cell.clone(), origin));
         }
-        self.description = description;
+        self.setup.description = description;
         let tile = origin.map(|origin| Quadkey::of_cell(&origin));
         match self.link.take() {
             Some(link) if tile == Some(link.tile()) => self.link = Some(link),
             Some(link) => _ = tokio::spawn(link.withdraw()),
             None => {}
         }
-        if let (Some(link), Some(description)) = (&mut self.link, &self.description) {
+        if let (Some(link), Some(description)) = (&mut self.link, &self.setup.description) {
             link.publish_description(description);
         }
         self.look(myself);
@@ -345,12 +316,12 @@ impl UplinkState {
         let before = losses(neighbours);
         match neighbours.accept(topic, map, received_at) {
             Ok(()) => {
-                self.counters.count(Event::CellMapAccepted);
-                self.counters.add(Event::NeighbourRefused, losses(neighbours).saturating_sub(before));
+                self.setup.counters.count(Event::CellMapAccepted);
+                self.setup.counters.add(Event::NeighbourRefused, losses(neighbours).saturating_sub(before));
                 self.pace.note_neighbour(received_at);
                 self.has_news = true;
             }
-            Err(reason) => self.counters.reject_message(reason, &source(&topic.cell), || {
+            Err(reason) => self.setup.counters.reject_message(reason, &source(&topic.cell), || {
                 format!("map of the cell {} not used: {}", topic.cell, reason.in_words())
             }),
         }
@@ -362,7 +333,7 @@ impl UplinkState {
         neighbours.observe_own(map, now);
         if std::mem::take(&mut self.has_news) {
             let objects = neighbours.near(now).into();
-            self.fuser.send(FuserMessage::TakeNeighbours { objects, stated_at: now });
+            self.setup.fuser.send(FuserMessage::TakeNeighbours { objects, stated_at: now });
         }
     }
 }

@@ -46,8 +46,8 @@ fn longest_gap_in_cell(directory: &Path) -> Duration {
     maps.windows(2).map(|pair| pair[1].received_at.since(pair[0].received_at)).max().unwrap()
 }
 
-/// SIGKILL for the leader's process: the region's gap is at most a second longer than the cell's, epochs and rounds are in
-/// order, and the status is the present leader's. When the edge is back, so is the uplink.
+/// SIGKILL for the leader's process: the region's gap is at most a second longer than the cell's. Epochs and rounds
+/// are in order, and the status is the present leader's. When the edge is back, so is the uplink.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_new_leader_goes_on_with_the_uplink() {
     for broker in Broker::both() {

@@ -40,7 +40,7 @@ fn neighbour_objects(node: &NodeHandle) -> Vec<NeighbourObject> {
     node.newest_map().borrow().as_ref().map_or_else(Vec::new, |newest| newest.map.neighbour_objects.clone())
 }
 
-/// An object of one cell is in the other's map, in the other's frame, with cell and age, and maps come faster; the
+/// An object of one cell is in the other's map, in the other's frame, with cell and age. Maps come faster, and the
 /// region's own maps have it once.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_neighbour_sees_nearby_is_in_the_own_map() {

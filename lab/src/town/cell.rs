@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ecod::aggregator::{Aggregator, Command, Fused, FusionConfig};
 use ecod::model::names::NodeName;
-use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
+use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::neighbours::Neighbours;
 use ecod::tracking::HandOvers;
@@ -34,7 +34,7 @@ pub(super) struct TownCell {
 
 impl TownCell {
     pub(super) fn new(name: NodeName, frame: CellFrame, config: FusionConfig, start: Timestamp) -> Self {
-        let tile = Quadkey::of(&frame.origin.to_wgs84(0.0, 0.0, 0.0), CELL_TILE_DIGITS);
+        let tile = Quadkey::of_cell(&frame.origin);
         Self {
             aggregator: Aggregator::new(name.clone(), 1, config, Vec::new(), frame.time(start)),
             neighbours: Neighbours::new(name.clone(), frame.origin),

@@ -40,8 +40,8 @@ impl Cluster {
     pub(crate) fn start(directory: &Path, places: &[Place]) -> anyhow::Result<Self> {
         let directory = directory.join("region");
         fs::create_dir_all(directory.join("cells.d"))?;
-        for Place { cell, position } in places {
-            let account = CellAccount::new(cell.clone(), position);
+        for Place { cell, origin } in places {
+            let account = CellAccount::new(cell.clone(), origin);
             fs::write(directory.join("cells.d").join(format!("{cell}.conf")), account.nats(PASSWORD))?;
         }
         let added = Command::new(Path::new(DEPLOY).join("add-cell")).env("REGION_CONFIG", &directory).status()?;

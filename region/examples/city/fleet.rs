@@ -8,14 +8,13 @@ use std::time::Duration;
 use ecod::leadership::BrokerAddress;
 use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
-use ecod::model::origin::{GeographicOrigin, GeographicPosition};
+use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
     CellMap, Encoding, FusedObject, GlobalMap, NodeState, NodeStatus, RegionTopic, RegionTopicKind, Role,
     SCHEMA_VERSION, encode,
 };
 use ecod_actors::platform::clock;
-use ecod_region::account::CellAccount;
 use ecod_region::broker::BrokerLogin;
 use rumqttc::{AsyncClient, Event, LastWill, NetworkOptions, Packet, QoS};
 use tokio::runtime::Runtime;
@@ -68,8 +67,8 @@ struct SimulatedCell {
 const RETRY_MIN: Duration = Duration::from_millis(50);
 const RETRY_MAX: Duration = Duration::from_secs(5);
 
-/// Time for a login in seconds. Servers that elect a JetStream leader take up to 4 s; who gives up before asks again, and
-/// thousands who do keep the servers from ever answering.
+/// Time for a login in seconds. Servers that elect a JetStream leader take up to 4 s. Thousands of cells that give up
+/// before and ask again keep them from ever answering.
 const LOGIN_TIMEOUT_S: u64 = 10;
 
 /// Silence after which a broker is asked whether it is there, and then given up.
@@ -95,8 +94,8 @@ impl SimulatedCell {
 
     /// One connection until it ends; true if there was one.
     async fn connection(&self, address: SocketAddr, share: f64, round: &mut u64) -> bool {
-        let Place { cell, position } = &self.place;
-        let tile = CellAccount::new(cell.clone(), position).tile;
+        let Place { cell, origin } = &self.place;
+        let tile = Quadkey::of_cell(origin);
         let topic = |kind| RegionTopic { tile, cell: cell.clone(), kind }.path();
         let mut options = BrokerLogin::plain(BrokerAddress::from(address), cell.as_str(), PASSWORD).options();
         options.set_keep_alive(KEEP_ALIVE);
@@ -139,7 +138,6 @@ impl SimulatedCell {
     }
 
     fn map(&self, round: u64, now: Timestamp) -> CellMap {
-        let GeographicPosition { latitude_deg, longitude_deg, height_m } = self.place.position;
         let object = |number: usize| {
             let id = Uuid::from_u128((self.number * 1000 + number) as u128);
             let angle = 0.2 * number as f64;
@@ -167,7 +165,7 @@ impl SimulatedCell {
             pose_corrections: Default::default(),
             neighbour_objects: Vec::new(),
         };
-        let origin = GeographicOrigin { latitude_deg, longitude_deg, height_m, rotation_deg: 0.0 };
+        let origin = self.place.origin;
         CellMap { schema: SCHEMA_VERSION, cell: self.place.cell.clone(), sent_at_us: now, origin, map }
     }
 }

@@ -1,7 +1,8 @@
 //! A city on one machine: three NATS servers, thousands of simulated cells and some real ones, and what happens to them.
 //!
-//! `make city` runs it. Each simulated cell has a connection and an account of its own, as a cell's leader has; each real
-//! one is an `ecod-node` with an uplink and a vehicle that reports to it. Two subscribers on two servers read half of the
+//! `make city` runs it. Each simulated cell has a connection and an account of its own, as a cell's leader has. Each
+//! real one is an `ecod-node` with an uplink, and a vehicle that reports to it. Two subscribers on two servers read
+//! half of the
 //! town each.
 
 mod cluster;

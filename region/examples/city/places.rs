@@ -3,14 +3,14 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use ecod::model::names::NodeName;
-use ecod::model::origin::GeographicPosition;
+use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
 
 /// A cell and the place of its origin.
 #[derive(Debug, Clone)]
 pub(crate) struct Place {
     pub(crate) cell: NodeName,
-    pub(crate) position: GeographicPosition,
+    pub(crate) origin: GeographicOrigin,
 }
 
 /// A half of the town: its tiles, and the cells in them.
@@ -32,13 +32,14 @@ pub(crate) fn places(simulated: usize, real: usize) -> Vec<Place> {
     let side = (count as f64).sqrt().ceil() as usize;
     let place = |number: usize| {
         let (row, column) = (number / side, number % side);
-        let position = GeographicPosition {
+        let origin = GeographicOrigin {
             latitude_deg: 48.7 + row as f64 * STEP_DEG,
             longitude_deg: 2.2 + column as f64 * 1.5 * STEP_DEG,
             height_m: 0.0,
+            rotation_deg: 0.0,
         };
         let name = if number < simulated { format!("cell-{number}") } else { format!("real-{number}") };
-        Some(Place { cell: NodeName::new(name).ok()?, position })
+        Some(Place { cell: NodeName::new(name).ok()?, origin })
     };
     (0..count).filter_map(place).collect()
 }
@@ -46,8 +47,8 @@ pub(crate) fn places(simulated: usize, real: usize) -> Vec<Place> {
 /// Two halves of about as many cells.
 pub(crate) fn halves(places: &[Place]) -> [Half; 2] {
     let mut tiles = BTreeMap::<Quadkey, usize>::new();
-    for Place { position, .. } in places {
-        *tiles.entry(Quadkey::of(position, HALF_DIGITS)).or_default() += 1;
+    for Place { origin, .. } in places {
+        *tiles.entry(Quadkey::of_cell(origin).outer(HALF_DIGITS)).or_default() += 1;
     }
     let mut halves = [Half::default(), Half::default()];
     for (tile, cells) in tiles {

@@ -46,14 +46,14 @@ impl RealCells {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
         let mut cells = Self { nodes: Vec::new(), lines: Vec::new(), _runtime: runtime };
         let Some(node) = node else { return Ok(cells) };
-        for Place { cell, position } in places {
+        for Place { cell, origin } in places {
             let [line, listen, gossip] = [free_address()?, free_address()?, free_address()?];
             let config = format!(
                 "name = \"edge\"\ncell = \"{cell}\"\nrole = \"edge\"\nlisten = \"{listen}\"\n\
                  [fusion]\nalgorithms = \"pace\"\n[membership]\nbind = \"{gossip}\"\nmulticast.enabled = false\n\
                  [dashboard]\nenabled = false\n[origin]\nlatitude_deg = {}\nlongitude_deg = {}\n\
                  [uplink]\nbroker = \"{line}\"\nuser = \"{cell}\"\npassword = \"{PASSWORD}\"\n",
-                position.latitude_deg, position.longitude_deg
+                origin.latitude_deg, origin.longitude_deg
             );
             let file = directory.join(format!("{cell}.toml"));
             fs::write(&file, config)?;

@@ -101,7 +101,7 @@ impl Watch {
         lock(&self.figures).too_old
     }
 
-    /// What is wrong with the connection, and the messages so far.
+    /// The trouble of the connection, and the messages so far.
     pub(crate) fn trouble(&self) -> String {
         format!("{:?}, {:?}", self.state.link(), self.state.town().counts())
     }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::anyhow;
 use clap::{Args, ValueEnum};
 use ecod::model::names::NodeName;
-use ecod::model::origin::{GeographicOrigin, GeographicPosition};
+use ecod::model::origin::GeographicOrigin;
 use ecod_actors::cli::{Failure, print};
 
 use crate::account::CellAccount;
@@ -44,8 +44,7 @@ pub(super) fn run(arguments: &AccountArguments) -> Result<(), Failure> {
     let AccountArguments { latitude: latitude_deg, longitude: longitude_deg, .. } = *arguments;
     let origin = GeographicOrigin { latitude_deg, longitude_deg, height_m: 0.0, rotation_deg: 0.0 };
     origin.validate().map_err(Failure::usage)?;
-    let account =
-        CellAccount::new(arguments.cell.clone(), &GeographicPosition { latitude_deg, longitude_deg, height_m: 0.0 });
+    let account = CellAccount::new(arguments.cell.clone(), &origin);
     let text = match (arguments.engine, &arguments.password_file) {
         (Engine::Mosquitto, _) => account.mosquitto(),
         (Engine::Nats, Some(file)) => {

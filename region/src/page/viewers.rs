@@ -42,9 +42,8 @@ impl Viewers {
     pub(super) fn tiles(&mut self, now: Timestamp) -> BTreeSet<Quadkey> {
         self.until.retain(|_, until| *until > now);
         let all: BTreeSet<_> = self.watched.iter().chain(self.until.keys()).copied().collect();
-        let keys: Vec<_> = all.iter().map(Quadkey::to_string).collect();
-        let is_in_another = |key: &String| keys.iter().any(|other| other != key && key.starts_with(other));
-        all.into_iter().zip(&keys).filter(|(_, key)| !is_in_another(key)).map(|(tile, _)| tile).collect()
+        let is_in_another = |tile: &Quadkey| all.iter().any(|other| other != tile && other.contains(*tile));
+        all.iter().filter(|tile| !is_in_another(tile)).copied().collect()
     }
 }
 

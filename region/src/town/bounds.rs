@@ -65,25 +65,18 @@ impl GeographicBounds {
 
     /// The smallest tiles that cover the bounds, at most so many, none smaller than a cell's.
     pub fn tiles(&self, max: usize) -> Vec<Quadkey> {
-        if !self.meets(&bounds("")) {
-            return Vec::new();
-        }
-        let mut tiles = vec![String::new()];
+        let mut tiles = vec![Quadkey::default()];
+        tiles.retain(|tile| self.meets(&Self::of(*tile)));
         for _ in 0..CELL_TILE_DIGITS {
-            let parts = tiles.iter().flat_map(|tile| (0..4).map(move |digit| format!("{tile}{digit}")));
-            let smaller: Vec<_> = parts.filter(|part| self.meets(&bounds(part))).collect();
+            let parts = tiles.iter().flat_map(|tile| tile.quarters());
+            let smaller: Vec<_> = parts.filter(|part| self.meets(&Self::of(*part))).collect();
             if smaller.is_empty() || smaller.len() > max {
                 break;
             }
             tiles = smaller;
         }
-        tiles.iter().filter_map(|tile| tile.parse().ok()).collect()
+        tiles
     }
-}
-
-fn bounds(tile: &str) -> GeographicBounds {
-    let nowhere = GeographicBounds { west: 0.0, south: 0.0, east: 0.0, north: 0.0 };
-    tile.parse().map_or(nowhere, GeographicBounds::of)
 }
 
 #[cfg(test)]
@@ -96,10 +89,11 @@ mod tests {
             let view: GeographicBounds = text.parse().unwrap();
             let tiles = view.tiles(16);
             assert!((1..=16).contains(&tiles.len()), "{text}: {}", tiles.len());
-            assert!(tiles.iter().all(|tile| tile.to_string().len() <= max_digits), "{text}: {}", tiles[0]);
+            assert!(tiles.iter().all(|tile| tile.digits() <= max_digits), "{text}: {}", tiles[0]);
             let all = tiles.iter().map(|tile| GeographicBounds::of(*tile)).reduce(GeographicBounds::with).unwrap();
             assert!(all.west <= view.west && all.east >= view.east && all.north >= view.north, "{all:?}");
         }
+        assert_eq!("0,86,1,87".parse::<GeographicBounds>().unwrap().tiles(16), [], "beyond the map");
         for stranger in ["", "1,2,3", "2,1,1,2", "a,b,c,d", "NaN,0,1,1"] {
             assert_eq!(stranger.parse::<GeographicBounds>(), Err(InvalidBounds), "{stranger}");
         }

@@ -59,7 +59,7 @@ pub struct TileView {
     pub key: String,
     /// Where it is.
     pub bounds: GeographicBounds,
-    /// What is in it.
+    /// The cells in it.
     pub totals: TownTotals,
     /// Age in seconds of the oldest of the newest maps in it.
     pub oldest_s: Option<f64>,
@@ -133,18 +133,16 @@ pub(super) const MAX_OBJECTS_SHOWN: usize = 4096;
 impl RegionTown {
     /// Number of cells in each state; `asked` are the tiles whose maps are asked for.
     pub fn states(&self, asked: &BTreeSet<Quadkey>, now: Timestamp) -> BTreeMap<CellState, usize> {
-        let asked: Vec<_> = asked.iter().map(Quadkey::to_string).collect();
         let mut states: BTreeMap<_, _> = CellState::ALL.into_iter().map(|state| (state, 0)).collect();
         for ((tile, _), cell) in self.cells() {
-            *states.entry(cell.state(now, is_within(*tile, &asked))).or_default() += 1;
+            *states.entry(cell.state(now, is_within(*tile, asked))).or_default() += 1;
         }
         states
     }
 
     /// Number of cells within tiles.
     pub fn count_within(&self, tiles: &[Quadkey]) -> usize {
-        let tiles: Vec<_> = tiles.iter().map(Quadkey::to_string).collect();
-        self.cells().keys().filter(|(tile, _)| is_within(*tile, &tiles)).count()
+        self.cells().keys().filter(|(tile, _)| is_within(*tile, tiles)).count()
     }
 
     /// The town within bounds; `asked` are the tiles whose maps are asked for.
@@ -165,8 +163,7 @@ impl RegionTown {
         asked: &BTreeSet<Quadkey>,
         now: Timestamp,
     ) -> TownView {
-        let asked: Vec<_> = asked.iter().map(Quadkey::to_string).collect();
-        let is_asked = |tile: &Quadkey| is_within(*tile, &asked);
+        let is_asked = |tile: &Quadkey| is_within(*tile, asked);
         let (mut region, mut known) = (TownTotals::default(), None::<GeographicBounds>);
         let mut shown = Vec::new();
         for ((tile, name), cell) in self.cells() {
@@ -201,25 +198,26 @@ type Shown<'a> = (Quadkey, &'a NodeName, &'a RegionCell, CellState);
 
 /// Tiles of one size with the cells in them.
 fn tiles(bounds: &GeographicBounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<TileView> {
-    let digits = bounds.tiles(MAX_TILES_SHOWN).first().map_or(0, |tile| tile.to_string().len());
-    let mut tiles = BTreeMap::<String, (TownTotals, Option<f64>)>::new();
+    let digits = bounds.tiles(MAX_TILES_SHOWN).first().map_or(0, |tile| tile.digits());
+    let mut tiles = BTreeMap::<Quadkey, (TownTotals, Option<f64>)>::new();
     for (tile, _, cell, state) in shown {
-        let key = tile.to_string().chars().take(digits).collect();
-        let (totals, oldest_s) = tiles.entry(key).or_default();
+        let (totals, oldest_s) = tiles.entry(tile.outer(digits)).or_default();
         totals.add(cell, *state);
         let age_s = cell.map.as_ref().map(|map| map.age_s(now));
         *oldest_s = [*oldest_s, age_s].into_iter().flatten().reduce(f64::max);
     }
-    let view = |(key, (totals, oldest_s)): (String, (TownTotals, Option<f64>))| {
-        Some(TileView { bounds: GeographicBounds::of(key.parse().ok()?), key, totals, oldest_s })
+    let view = |(tile, (totals, oldest_s)): (Quadkey, (TownTotals, Option<f64>))| TileView {
+        key: tile.to_string(),
+        bounds: GeographicBounds::of(tile),
+        totals,
+        oldest_s,
     };
-    tiles.into_iter().filter_map(view).collect()
+    tiles.into_iter().map(view).collect()
 }
 
 /// True if a tile is one of these or in one.
-fn is_within(tile: Quadkey, tiles: &[String]) -> bool {
-    let key = tile.to_string();
-    tiles.iter().any(|outer| key.starts_with(outer))
+fn is_within<'a>(tile: Quadkey, tiles: impl IntoIterator<Item = &'a Quadkey>) -> bool {
+    tiles.into_iter().any(|outer| outer.contains(tile))
 }
 
 impl TownTotals {

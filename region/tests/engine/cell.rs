@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
-use ecod::model::origin::{GeographicOrigin, GeographicPosition};
+use ecod::model::origin::GeographicOrigin;
 use ecod::wire::{
     CellMap, Encoding, FusedObject, GlobalMap, NodeState, NodeStatus, RegionTopic, RegionTopicKind, Role,
     SCHEMA_VERSION, encode,
@@ -40,7 +40,6 @@ impl Cell {
     /// Connects as this user.
     pub(crate) fn connect(broker: &Broker, (name, latitude_deg, longitude_deg): (&'static str, f64, f64)) -> Self {
         let origin = GeographicOrigin { latitude_deg, longitude_deg, height_m: 0.0, rotation_deg: 0.0 };
-        let place = GeographicPosition { latitude_deg, longitude_deg, height_m: 0.0 };
         let (client, mut events) = AsyncClient::new(broker.login(name).options(), 4096);
         let heard = Arc::new(Mutex::new(Heard::default()));
         let noted = Arc::clone(&heard);
@@ -67,7 +66,7 @@ impl Cell {
                 }
             }
         });
-        Self { account: CellAccount::new(NodeName::from_static(name), &place), origin, client, heard, polling }
+        Self { account: CellAccount::new(NodeName::from_static(name), &origin), origin, client, heard, polling }
     }
 
     pub(crate) fn heard(&self) -> Heard {

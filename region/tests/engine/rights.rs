@@ -1,4 +1,4 @@
-//! What a cell's credentials allow.
+//! Rights of a cell's credentials.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
@@ -71,7 +71,7 @@ async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
         "$SYS/#".to_owned(),
     ];
     assert_eq!(lot.subscribe(&foreign).await, [false; 9]);
-    // What a cell says of vehicles goes under its own name.
+    // A cell speaks of vehicles under its own name.
     assert_eq!(lot.subscribe(&["ecod/v1/rep/+/+".to_owned()]).await, [true]);
     far.publish("ecod/v1/rep/euclid/lot-1", true, b"forged".to_vec());
     far.publish("ecod/v1/rep/euclid/far-1", true, b"counts".to_vec());

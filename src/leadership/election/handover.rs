@@ -5,23 +5,13 @@
 //! are lost for a period, the old leader publishes that round too, and yields again after it.
 
 use crate::leadership::election::interface::ElectionEffect;
-use crate::leadership::election::leading::Leading;
+use crate::leadership::election::leading::{Handover, Leading};
 use crate::leadership::election::message::Body;
 use crate::leadership::election::{Election, State};
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::Role;
-
-/// A handover as the old leader sees it.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(super) struct Handover {
-    pub(super) to: NodeName,
-    pub(super) retry_at: Timestamp,
-    started_at: Timestamp,
-    ready_at: Option<Timestamp>,
-    pub(super) yielded: bool,
-}
 
 impl Election {
     /// Starts a handover when a better candidate has been there long enough.

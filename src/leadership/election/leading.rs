@@ -2,7 +2,6 @@
 
 use std::time::Duration;
 
-use crate::leadership::election::handover::Handover;
 use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
 use crate::leadership::election::{Election, State};
 use crate::leadership::timers::RENEWAL_PAUSE;
@@ -10,6 +9,16 @@ use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::Role;
+
+/// A handover as the old leader sees it.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct Handover {
+    pub(super) to: NodeName,
+    pub(super) retry_at: Timestamp,
+    pub(super) started_at: Timestamp,
+    pub(super) ready_at: Option<Timestamp>,
+    pub(super) yielded: bool,
+}
 
 /// A node that leads.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

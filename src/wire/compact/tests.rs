@@ -1,10 +1,11 @@
 use super::*;
 use crate::model::geometry::Covariance;
+use crate::model::origin::GeographicOrigin;
 use crate::wire::{
-    CellDescription, ContentHash, DescriptionStatus, Encoding, FieldOfView, FusedObject, GlobalMap, LabelReading,
-    LandmarkState, Limits, NeighbourObject, NodeState, NodeStatus, ObjectReport, Payload, PerceivedObject,
-    PoseCorrection, Reputation, Reputations, Role, SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose, decode,
-    encode,
+    CellDescription, CellMap, ContentHash, DescriptionStatus, Encoding, FieldOfView, FusedObject, GlobalMap,
+    LabelReading, LandmarkState, Limits, NeighbourObject, NodeState, NodeStatus, ObjectReport, Payload,
+    PerceivedObject, PoseCorrection, Reputation, Reputations, Role, SCHEMA_VERSION, Trouble, Verdict, Verdicts,
+    WirePose, decode, encode,
 };
 
 fn report() -> ObjectReport {
@@ -55,7 +56,7 @@ fn every_field_of_every_payload_survives() {
         ..report_without_rounding()
     });
     let fused_at_us = Timestamp(1_732_154_400_123_456);
-    survives(&GlobalMap {
+    let map = GlobalMap {
         schema: SCHEMA_VERSION,
         aggregator: node("edge"),
         epoch: 3,
@@ -111,6 +112,14 @@ fn every_field_of_every_payload_survives() {
             age_s: 0.125,
             object: FusedObject::new(Uuid::max(), "car", 0.5, 7.5, -1.25, Covariance { xx: 0.25, xy: 0.0, yy: 0.5 }),
         }],
+    };
+    survives(&map);
+    survives(&CellMap {
+        schema: SCHEMA_VERSION,
+        cell: node("lot-1"),
+        sent_at_us: fused_at_us,
+        origin: GeographicOrigin { latitude_deg: 48.8584, longitude_deg: 2.2945, height_m: 30.5, rotation_deg: -5.0 },
+        map,
     });
     survives(&Verdicts {
         schema: SCHEMA_VERSION,

@@ -148,7 +148,8 @@ impl RegionLink {
         self.link.leave(LEAVE_TIMEOUT).await;
     }
 
-    /// Ends the connection of a cell that is not in its tile any more, and removes what the tile has of it, if it is connected.
+    /// Ends the connection of a cell that is not in its tile any more. Removes what the tile has of it, if it is
+    /// connected.
     pub(super) async fn withdraw(mut self) {
         self.retain(RegionTopicKind::Status, Bytes::new());
         self.retain(RegionTopicKind::Cell, Bytes::new());

@@ -1,4 +1,4 @@
-//! What the uplink is given at its start.
+//! Arguments and settings of the uplink.
 
 use ractor::ActorProcessingErr;
 

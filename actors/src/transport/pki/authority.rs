@@ -85,7 +85,7 @@ pub enum AuthorityError {
         directory: PathBuf,
         /// `cell` or `city`.
         found: &'static str,
-        /// What to do.
+        /// The remedy.
         remedy: &'static str,
     },
     /// The register cannot be read.

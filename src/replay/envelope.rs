@@ -1,0 +1,14 @@
+//! The fields of a recorded line beside its report.
+
+use serde::Deserialize;
+
+use crate::model::time::Timestamp;
+
+/// The optional fields of a line beside its report.
+#[derive(Debug, Deserialize)]
+pub(super) struct Envelope {
+    #[serde(default)]
+    pub(super) topic: Option<String>,
+    #[serde(default)]
+    pub(super) received_at_us: Option<Timestamp>,
+}
