@@ -20,6 +20,7 @@ pub mod pace;
 pub mod perception;
 pub mod replay;
 pub mod reputation;
+pub mod roaming;
 pub mod tracking;
 pub mod vote;
 pub mod wire;

@@ -10,6 +10,7 @@ pub mod fuser;
 pub mod gateway;
 pub mod leader_election;
 pub mod membership;
+pub mod pose_receiver;
 #[cfg(feature = "camera")]
 pub mod projector;
 pub mod recorder;

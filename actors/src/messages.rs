@@ -12,6 +12,7 @@ pub mod gateway;
 pub mod leader_election;
 pub mod membership;
 pub mod newest;
+pub mod pose_receiver;
 #[cfg(feature = "camera")]
 pub mod projector;
 pub mod recorder;

@@ -14,7 +14,8 @@
 //! ├─ LeaderElection    who leads, and what follows        always
 //! ├─ Dashboard         page, metrics and health           unless switched off
 //! ├─ Projector         detections -> report               with a camera
-//! └─ Detector          frames -> detections               with a camera
+//! ├─ Detector          frames -> detections               with a camera
+//! └─ PoseReceiver      where the vehicle is               if it moves
 //! ```
 //!
 //! A part that ends is started anew, and the others go on: they reach each other through slots. A node whose parts end
@@ -25,7 +26,9 @@ mod builder;
 pub mod camera;
 pub mod config;
 mod description;
+mod presence;
 mod restarts;
+pub mod roaming;
 pub mod service;
 mod slots;
 
@@ -38,7 +41,7 @@ use ecod::leadership::Leadership;
 use ecod::leadership::readiness::Readiness;
 use ecod::model::names::NodeName;
 use ecod::wire::{CellDescription, Reputations, Trouble, Verdicts};
-use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, SupervisionEvent};
+use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, RpcReplyPort, SupervisionEvent};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::MissedTickBehavior;
@@ -56,6 +59,8 @@ use crate::telemetry::counters::Counters;
 use crate::transport::gossip::Member;
 use builder::{NodeBuilder, cause};
 use description::HeldDescription;
+pub use presence::MoveStep;
+use presence::{Presence, VehicleParts};
 use restarts::Restarts;
 
 /// Messages to the supervisor; it stops by [`NodeHandle::stop`].
@@ -77,6 +82,13 @@ pub enum NodeMessage {
     NoteReadiness {
         /// Readiness for its task.
         readiness: Readiness,
+    },
+    /// Change what this node does for the vehicle, which moves from cell to cell.
+    Move {
+        /// The change.
+        step: MoveStep,
+        /// Gets word when it is done.
+        done: RpcReplyPort<()>,
     },
 }
 
@@ -136,6 +148,12 @@ const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 /// # Errors
 /// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
 pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
+    let vehicle = VehicleParts::new(&config);
+    start_with((vehicle, Presence::Whole), config).await
+}
+
+/// Starts a node of a vehicle as far as its presence goes.
+async fn start_with(vehicle: (VehicleParts, Presence), config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let security = config.security().map_err(|error| NodeError::Failed(error.to_string()))?;
     if let Some(credentials) = &security.credentials {
         let checked = credentials.check_rights(config.role, config.election.priority);
@@ -144,7 +162,7 @@ pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
     let (failed, failure) = watch::channel(None);
     let held = HeldDescription::at_start(&config)?;
     let floor_plan = config.dashboard.load_floor_plan().map_err(|error| NodeError::Failed(error.to_string()))?;
-    let builder = NodeBuilder::new(config, security, held, failed).with_floor_plan(floor_plan);
+    let builder = NodeBuilder::new(vehicle, config, security, held, failed).with_floor_plan(floor_plan);
     let (newest, broker, gossip) = (builder.newest(), builder.broker_address(), builder.gossip_address());
     let (members, leadership) = (builder.members(), builder.leadership());
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
@@ -291,11 +309,12 @@ impl Actor for Supervisor {
             NodeMessage::Describe { description } => {
                 state.builder.describe(&description);
                 // Settings may want a part that there was no use for.
-                for part in state.builder.parts() {
-                    if !state.running.values().any(|running| *running == part) {
-                        state.start(part, &myself.get_cell()).await?;
-                    }
-                }
+                state.start_missing(&myself.get_cell()).await?;
+            }
+            NodeMessage::Move { step, done } => {
+                state.take_step(step, &myself.get_cell()).await?;
+                // Who has stopped waiting needs no word.
+                let _ = done.send(());
             }
             NodeMessage::NoteReadiness { readiness } => {
                 if let Some(manager) = &mut state.manager {

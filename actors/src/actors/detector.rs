@@ -15,7 +15,7 @@ use std::time::Duration;
 use ecod::diagnostics::TroubleKind;
 use ecod::model::detection::Detection;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, watch};
 use tokio::task::{JoinSet, spawn_blocking};
 use tokio::time::timeout;
 
@@ -75,6 +75,7 @@ pub struct DetectorState {
     troubles: CameraTroubles,
     counters: Arc<Counters>,
     pump: JoinSet<()>,
+    spans: watch::Sender<Spans>,
     readers: Readers,
 }
 
@@ -110,8 +111,9 @@ impl Actor for Detector {
         } = arguments;
         let capture = Capture::start(open, capture)?;
         let readers = capture.readers();
+        let spans = watch::Sender::new(spans);
         let mut pumping = JoinSet::new();
-        pumping.spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans));
+        pumping.spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans.subscribe()));
         let detect = Some(detect);
         Ok(DetectorState {
             detect,
@@ -124,6 +126,7 @@ impl Actor for Detector {
             troubles,
             counters,
             pump: pumping,
+            spans,
             readers,
         })
     }
@@ -141,7 +144,14 @@ impl Actor for Detector {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let DetectorMessage::Detect { frame, permit } = message;
+        let (frame, permit) = match message {
+            DetectorMessage::Detect { frame, permit } => (frame, permit),
+            DetectorMessage::Move { images, spans } => {
+                state.images = images;
+                state.spans.send_replace(spans);
+                return Ok(());
+            }
+        };
         let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
         let (mut images, lens) = (state.images.take(), state.lens);
@@ -200,7 +210,7 @@ async fn pump(
     capture: Capture,
     detector: ActorRef<DetectorMessage>,
     (troubles, counters): (CameraTroubles, Arc<Counters>),
-    spans: Spans,
+    spans: watch::Receiver<Spans>,
 ) {
     let permits = Arc::new(Semaphore::new(1));
     let mut status = capture.status();
@@ -251,7 +261,7 @@ async fn pump(
             );
             return;
         };
-        let span = spans.frame(frame.captured_at);
+        let span = spans.borrow().frame(frame.captured_at);
         if span.in_scope(|| detector.cast(DetectorMessage::Detect { frame, permit })).is_err() {
             return;
         }

@@ -1,14 +1,12 @@
 //! The actor that places detections in the world and publishes them as reports.
 //!
 //! ```text
-//! localisation ── UDP ──> pose feed ── TakePose ──┐
+//! PoseReceiver ── TakePose ─────────────────────┐
 //! Detector ── Report ────────────────────────> Projector ── PublishReport ──> Gateway
 //!                                                    └─ frame with boxes ─> CameraFeed, while a browser looks
 //! ```
 
-mod pose_feed;
-
-use std::net::SocketAddr;
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 use ecod::aggregator::Algorithms;
@@ -21,7 +19,7 @@ use ecod::model::time::Timestamp;
 use ecod::perception::pose_history::PoseHistory;
 use ecod::wire::{ObjectReport, ReportKind};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
-use tokio::task::{JoinSet, spawn_blocking};
+use tokio::task::spawn_blocking;
 
 use crate::camera::frame::CameraFrame;
 use crate::camera::image_size::ImageSize;
@@ -45,10 +43,10 @@ pub struct ProjectorArguments {
     pub origin: Option<GeographicOrigin>,
     /// True for a moving vehicle, whose poses are received.
     pub is_moving: bool,
+    /// Its poses of the last moments.
+    pub recent_poses: VecDeque<(Timestamp, StatedPose)>,
     /// True for a fixed camera.
     pub is_fixed: bool,
-    /// UDP address for these poses, with the projectors of all cameras; for one of the cameras.
-    pub poses: Option<(SocketAddr, Vec<ActorSlot<ProjectorMessage>>)>,
     /// Algorithms to report for.
     pub algorithms: Algorithms,
     /// Dates the reports.
@@ -83,8 +81,6 @@ pub struct ProjectorState {
     camera_feed: Option<Arc<CameraFeed>>,
     troubles: CameraTroubles,
     counters: Arc<Counters>,
-    /// Ends with the actor.
-    _feed: JoinSet<()>,
 }
 
 impl Actor for Projector {
@@ -102,8 +98,8 @@ impl Actor for Projector {
             standing,
             origin,
             is_moving,
+            recent_poses,
             is_fixed,
-            poses,
             algorithms,
             clock,
             gateway,
@@ -111,11 +107,7 @@ impl Actor for Projector {
             troubles,
             counters,
         } = arguments;
-        let mut feed = JoinSet::new();
-        if let Some(poses) = poses {
-            feed.spawn(pose_feed::listen(poses, Arc::clone(&counters)));
-        }
-        Ok(ProjectorState {
+        let mut state = ProjectorState {
             perception,
             standing,
             origin,
@@ -128,8 +120,11 @@ impl Actor for Projector {
             camera_feed,
             troubles,
             counters,
-            _feed: feed,
-        })
+        };
+        for (at, pose) in recent_poses {
+            state.take_pose(at, &pose);
+        }
+        Ok(state)
     }
 
     async fn handle(

@@ -20,9 +20,10 @@ use tokio::sync::oneshot;
 use super::{Failure, print};
 #[cfg(feature = "camera")]
 use crate::camera::frame_source::capture::Readers;
+use crate::node::NodeError;
 use crate::node::config::NodeConfig;
+use crate::node::roaming::Roamer;
 use crate::node::service::ServiceManager;
-use crate::node::{self, NodeError};
 #[cfg(feature = "camera")]
 use crate::platform::installed;
 use crate::transport::mqtt::BrokerAddress;
@@ -181,18 +182,18 @@ async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
     if config.role == Role::Cav && !config.has_camera() && config.record.is_none() {
         tracing::warn!("no [camera] is configured: of this vehicle, only programs beside it report");
     }
-    let mut node = node::start(config).await?;
+    let mut vehicle = Roamer::start(config).await?;
     if let Some(manager) = ServiceManager::from_environment() {
-        node.report_to(manager);
+        vehicle.present().report_to(manager);
     }
     tokio::select! {
         _ = interrupt.recv() => {}
         _ = terminate.recv() => {}
         () = input_ended(), if stop_at_eof => {}
-        failed = node.failed() => failed?,
+        Err(failed) = vehicle.drive() => return Err(failed.into()),
     }
     tracing::info!("stopping");
-    node.stop().await;
+    vehicle.stop().await;
     Ok(())
 }
 

@@ -2,31 +2,31 @@
 
 mod arguments;
 #[cfg(feature = "camera")]
-mod cameras;
+pub(super) mod cameras;
 mod describe;
+mod listening;
 mod uplink;
 
 use std::fs::File;
 use std::io;
 use std::net::SocketAddr;
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::node::Input;
-use ecod::leadership::round_filter::PublisherFilter;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{CellDescription, ContentHash, SCHEMA_VERSION, Topics};
+use ecod::wire::{CellDescription, ContentHash, SCHEMA_VERSION};
 use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, Message, SpawnErr};
 use tokio::sync::watch;
 use uuid::Uuid;
 
 use super::NodeError;
 use super::description::{HeldDescription, rates_by_evidence, shared_facts};
+use super::presence::{Presence, VehicleParts};
 use super::slots::{ActorKind, ActorSlots};
-use crate::actors::broker::Broker;
 use crate::actors::dashboard::Dashboard;
 use crate::actors::description_keeper::DescriptionKeeper;
 #[cfg(feature = "camera")]
@@ -35,19 +35,17 @@ use crate::actors::follower::Follower;
 use crate::actors::fuser::{Fuser, LatestReportQueue};
 use crate::actors::gateway::Gateway;
 use crate::actors::leader_election::LeaderElection;
-use crate::actors::membership::Membership;
+use crate::actors::pose_receiver::{PoseReceiver, PoseReceiverArguments};
 #[cfg(feature = "camera")]
 use crate::actors::projector::Projector;
 use crate::actors::recorder::Recorder;
 use crate::actors::reputation_keeper::{ReputationKeeper, SharedReputations};
 use crate::actors::uplink::Uplink;
 use crate::messages::actor_slot::ActorSlot;
-use crate::messages::broker::BrokerMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
-use crate::messages::membership::MembershipMessage;
 use crate::messages::newest::Newest;
 use crate::node::config::NodeConfig;
-use crate::observe::dashboard::{FloorPlan, LiveState, ShownCamera};
+use crate::observe::dashboard::{FloorPlan, LiveState};
 use crate::observe::readiness::SharedFacts;
 use crate::observe::recorder::LogSender;
 use crate::platform::cell_clock::CellClock;
@@ -55,8 +53,8 @@ use crate::platform::clock;
 use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
 use crate::telemetry::spans::Spans;
-use crate::transport::broker::{AccessPolicy, BrokerError, Door, EmbeddedBroker, LeaderCheck};
-use crate::transport::gossip::{BindError, FrameCounters, Member};
+use crate::transport::broker::Door;
+use crate::transport::gossip::{FrameCounters, Member};
 use crate::transport::mqtt::Security;
 
 /// Materials of the parts; kept to make them again.
@@ -65,6 +63,8 @@ pub(super) struct NodeBuilder {
     own_config: NodeConfig,
     /// The same with the cell's description, as it is used.
     config: NodeConfig,
+    presence: Presence,
+    vehicle: VehicleParts,
     held: HeldDescription,
     shared: watch::Sender<SharedFacts>,
     security: Security,
@@ -73,7 +73,6 @@ pub(super) struct NodeBuilder {
     started_at: Timestamp,
     clock: CellClock,
     slots: ActorSlots,
-    counters: Arc<Counters>,
     newest: Newest,
     reputations: SharedReputations,
     /// Keeps `ecod-node reset` away while the node runs.
@@ -82,18 +81,13 @@ pub(super) struct NodeBuilder {
     report_queue: LatestReportQueue,
     /// Address of the broker that other nodes may use.
     broker_address: watch::Sender<Option<SocketAddr>>,
-    /// Address of the broker, whoever may use it.
-    listens_at: watch::Sender<Option<SocketAddr>>,
     door: Door,
     gossip_address: watch::Sender<Option<SocketAddr>>,
     frames: Arc<FrameCounters>,
     members: watch::Sender<Vec<Member>>,
     leadership: watch::Sender<Leadership>,
     live_state: Arc<LiveState>,
-    /// The cameras, if browsers are to see their pictures.
-    shown_cameras: Vec<ShownCamera>,
     floor_plan: Option<FloorPlan>,
-    dashboard_address: watch::Sender<Option<SocketAddr>>,
     failed: watch::Sender<Option<NodeError>>,
 }
 
@@ -112,26 +106,18 @@ fn lock_state(directory: &Path, cell: &NodeName, name: &NodeName) -> Option<File
     lock.ok()
 }
 
-/// Number of attempts, and time between them, by which a broker or membership started anew gets its address back.
-const REBIND_ATTEMPTS: usize = 40;
-const REBIND_WAIT: Duration = Duration::from_millis(50);
-
 impl NodeBuilder {
     /// Arguments of all parts, under the settings of `held`, if the node can use them.
     pub(super) fn new(
+        (vehicle, presence): (VehicleParts, Presence),
         own_config: NodeConfig,
         security: Security,
         mut held: HeldDescription,
         failed: watch::Sender<Option<NodeError>>,
     ) -> Self {
         let config = held.lay_over(&own_config).unwrap_or_else(|| own_config.clone());
-        let counters = Arc::<Counters>::default();
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
-        #[cfg(feature = "camera")]
-        let (slots, shown_cameras) = (ActorSlots::with_cameras(&config), cameras::shown(&config, &name));
-        #[cfg(not(feature = "camera"))]
-        let (slots, shown_cameras) = (ActorSlots::default(), Vec::new());
         let mut builder = Self {
             _state_lock: directory.and_then(|directory| lock_state(directory, &config.cell, &name)),
             name,
@@ -144,22 +130,20 @@ impl NodeBuilder {
             run: Uuid::now_v7(),
             started_at: clock::now(),
             clock: CellClock::default(),
-            slots,
-            recording: LogSender::new(Arc::clone(&counters)),
-            counters,
+            slots: vehicle.slots(),
+            recording: LogSender::new(Arc::clone(&vehicle.counters)),
+            presence,
+            vehicle,
             newest: Newest::default(),
             report_queue: LatestReportQueue::default(),
             broker_address: watch::Sender::new(None),
-            listens_at: watch::Sender::new(None),
             door: Door::default(),
             gossip_address: watch::Sender::new(None),
             frames: Arc::default(),
             members: watch::Sender::new(Vec::new()),
             leadership: watch::Sender::default(),
             live_state: Arc::default(),
-            shown_cameras,
             floor_plan: None,
-            dashboard_address: watch::Sender::new(None),
             failed,
         };
         builder.note_units();
@@ -179,7 +163,25 @@ impl NodeBuilder {
     }
 
     pub(super) fn counters(&self) -> Arc<Counters> {
-        Arc::clone(&self.counters)
+        Arc::clone(&self.vehicle.counters)
+    }
+
+    pub(super) fn vehicle(&self) -> &VehicleParts {
+        &self.vehicle
+    }
+
+    pub(super) fn set_presence(&mut self, presence: Presence) {
+        self.presence = presence;
+    }
+
+    /// Lets the vehicle's parts go: they are stopped with another node of the vehicle.
+    pub(super) fn release_vehicle(&mut self) -> &VehicleParts {
+        self.slots.pose_receiver = ActorSlot::default();
+        #[cfg(feature = "camera")]
+        {
+            (self.slots.projectors, self.slots.detectors) = (Vec::new(), Vec::new());
+        }
+        &self.vehicle
     }
 
     /// Longest time between two rounds.
@@ -212,7 +214,7 @@ impl NodeBuilder {
     }
 
     pub(super) fn listens_at(&self) -> watch::Receiver<Option<SocketAddr>> {
-        self.listens_at.subscribe()
+        self.vehicle.listens_at.subscribe()
     }
 
     pub(super) fn gossip_address(&self) -> watch::Receiver<Option<SocketAddr>> {
@@ -220,7 +222,7 @@ impl NodeBuilder {
     }
 
     pub(super) fn dashboard_address(&self) -> watch::Receiver<Option<SocketAddr>> {
-        self.dashboard_address.subscribe()
+        self.vehicle.dashboard_address.subscribe()
     }
 
     pub(super) fn frames(&self) -> Arc<FrameCounters> {
@@ -250,9 +252,11 @@ impl NodeBuilder {
     /// The parts that this node has, in the order of starting.
     pub(super) fn parts(&self) -> Vec<ActorKind> {
         let leads = self.config.may_lead();
+        let (is_whole, reports) = (self.presence == Presence::Whole, self.presence >= Presence::Reporting);
+        let has_broker = self.config.has_broker() && (is_whole || self.config.serves_nodes());
         let mut parts = Vec::new();
-        parts.extend(self.config.record.is_some().then_some(ActorKind::Recorder));
-        parts.extend(self.config.has_broker().then_some(ActorKind::Broker));
+        parts.extend((is_whole && self.config.record.is_some()).then_some(ActorKind::Recorder));
+        parts.extend(has_broker.then_some(ActorKind::Broker));
         parts.extend([ActorKind::Membership, ActorKind::DescriptionKeeper, ActorKind::Gateway, ActorKind::Follower]);
         if leads {
             let rates = self.config.fusion.rates_vehicles(!self.config.landmarks.is_empty());
@@ -261,11 +265,13 @@ impl NodeBuilder {
         }
         parts.extend(self.config.has_uplink().then_some(ActorKind::Uplink));
         parts.push(ActorKind::LeaderElection);
-        parts.extend(self.config.dashboard.enabled.then_some(ActorKind::Dashboard));
+        parts.extend((is_whole && self.config.dashboard.enabled).then_some(ActorKind::Dashboard));
+        let takes_poses = reports && self.config.takes_poses();
         #[cfg(feature = "camera")]
-        for camera in 0..self.config.all_cameras().count() {
+        for camera in (0..self.config.all_cameras().count()).filter(|_| reports) {
             parts.extend([ActorKind::Projector(camera), ActorKind::Detector(camera)]);
         }
+        parts.extend(takes_poses.then_some(ActorKind::PoseReceiver));
         parts
     }
 
@@ -316,6 +322,16 @@ impl NodeBuilder {
                 let arguments = self.dashboard_arguments();
                 slot(&self.slots.dashboard, Actor::spawn_linked(None, Dashboard, arguments, supervisor).await)
             }
+            ActorKind::PoseReceiver => {
+                let arguments = PoseReceiverArguments {
+                    address: self.config.pose.listen.ok_or("no `pose.listen` is configured")?,
+                    #[cfg(feature = "camera")]
+                    projectors: self.slots.projectors.clone(),
+                    poses: self.vehicle.poses.clone(),
+                    counters: self.counters(),
+                };
+                slot(&self.slots.pose_receiver, Actor::spawn_linked(None, PoseReceiver, arguments, supervisor).await)
+            }
             #[cfg(feature = "camera")]
             ActorKind::Projector(camera) => {
                 let arguments = self.projector_arguments(camera).map_err(in_full)?;
@@ -333,6 +349,7 @@ impl NodeBuilder {
 
     /// Stops all parts, the last started first.
     pub(super) async fn stop_all(&self) {
+        stop(&self.slots.pose_receiver).await;
         #[cfg(feature = "camera")]
         {
             for detector in &self.slots.detectors {
@@ -351,8 +368,12 @@ impl NodeBuilder {
         stop(&self.slots.gateway).await;
         stop(&self.slots.description).await;
         stop(&self.slots.membership).await;
-        stop(&self.slots.broker).await;
+        self.stop_broker().await;
         stop(&self.slots.recorder).await;
+    }
+
+    pub(super) async fn stop_broker(&self) {
+        stop(&self.slots.broker).await;
     }
 
     async fn start_recorder(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
@@ -361,76 +382,6 @@ impl NodeBuilder {
             tracing::info!("reports of other vehicles are not recorded, key `record.reports` is false");
         }
         slot(&self.slots.recorder, Actor::spawn_linked(None, Recorder, arguments, supervisor).await)
-    }
-
-    /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
-    /// leave it.
-    async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let (broker, _) =
-            Actor::spawn_linked(None, Broker, Box::new(self.embedded_broker()), supervisor).await.map_err(cause)?;
-        let before = *self.listens_at.borrow();
-        let mut address = before.unwrap_or(self.config.broker_listen());
-        let takes_any_port = before.is_none() && self.config.may_listen_at_any_port();
-        let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
-        let bound = loop {
-            attempts -= 1;
-            match ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })? {
-                Err(BrokerError::Bind { .. }) if takes_any_port && address.port() != 0 => {
-                    tracing::info!(%address, "the door takes a free port, key `listen` is not set and the usual one is in use");
-                    address.set_port(0);
-                    attempts += 1;
-                }
-                Err(BrokerError::Bind { .. }) if attempts > 0 => tokio::time::sleep(REBIND_WAIT).await,
-                outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
-            }
-        };
-        self.listens_at.send_replace(Some(bound));
-        if self.config.serves_nodes() {
-            self.broker_address.send_replace(Some(bound));
-        }
-        let id = broker.get_id();
-        self.slots.broker.set(broker);
-        Ok(id)
-    }
-
-    /// The broker behind its gate: also where only this machine reaches it, who connects and says nothing would hold
-    /// the node's file descriptors.
-    fn embedded_broker(&self) -> EmbeddedBroker {
-        let (config, listen) = (self.config.broker(), self.config.broker_listen());
-        let credentials = self.security.credentials.clone();
-        match (&credentials, listen.ip().is_loopback()) {
-            _ if !self.config.serves_nodes() => tracing::info!(%listen, "broker for programs of this node"),
-            (None, true) if self.config.data_plane().external.is_some() => tracing::warn!(
-                "mqtt.fallback_to_embedded serves this machine only: without certificates in [tls] or \
-                 broker.allow_plaintext other machines are without maps when the external broker is gone"
-            ),
-            (None, true) => tracing::info!("broker for this machine only: no certificates are configured"),
-            (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
-            (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
-        }
-        let (topics, elected) = (Topics::new(&self.config.cell), publish_rule(self.leadership()));
-        let (limits, counters) = (self.config.mqtt.limits(), self.counters());
-        let policy = AccessPolicy { credentials, topics, limits, elected, counters };
-        EmbeddedBroker::protected(config, policy).with_door(self.door.clone())
-    }
-
-    /// The membership comes back at the address it had, as the broker does.
-    async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let mut attempts = if self.gossip_address.borrow().is_some() { REBIND_ATTEMPTS } else { 1 };
-        let actor = loop {
-            attempts -= 1;
-            let arguments = self.membership_arguments();
-            match Actor::spawn_linked(None, Membership, arguments, supervisor.clone()).await.map_err(cause) {
-                Ok((actor, _)) => break actor,
-                Err(error) if attempts > 0 && error.is::<BindError>() => tokio::time::sleep(REBIND_WAIT).await,
-                Err(error) => return Err(error),
-            }
-        };
-        let address = ractor::call!(actor, |reply| MembershipMessage::Address { reply })?;
-        self.gossip_address.send_replace(Some(address));
-        let id = actor.get_id();
-        self.slots.membership.set(actor);
-        Ok(id)
     }
 }
 
@@ -453,15 +404,6 @@ fn camera_slot<M: Message>(
     spawned: Result<(ActorRef<M>, tokio::task::JoinHandle<()>), SpawnErr>,
 ) -> Result<ActorId, ActorProcessingErr> {
     slot(slots.get(camera).ok_or("there is no such camera")?, spawned)
-}
-
-/// The rule of the node's own broker: who may publish for all.
-fn publish_rule(leadership: watch::Receiver<Leadership>) -> LeaderCheck {
-    let filter = Mutex::<PublisherFilter>::default();
-    Arc::new(move |name| {
-        let mut filter = filter.lock().unwrap_or_else(PoisonError::into_inner);
-        filter.may_publish(name, &leadership.borrow(), clock::now())
-    })
 }
 
 /// Why an actor did not start, without the framework's own words around it.

@@ -3,6 +3,7 @@
 //! Environment variables name a key with two underscores between its levels: `ECOD_MQTT__BROKER=10.0.0.2:1883`.
 
 mod cameras;
+mod cells;
 mod extraction;
 mod observer;
 mod printed;
@@ -23,6 +24,7 @@ use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
 use serde::{Deserialize, Serialize};
 
+pub use self::cells::CellEntry;
 use self::extraction::{environment, extract};
 pub use self::shared::{DescriptionError, SharedConfig, StatedKeys};
 use crate::actors::reputation_keeper::ReputationKeeperConfig;
@@ -63,6 +65,9 @@ pub struct NodeConfig {
     pub map_log: Option<PathBuf>,
     /// Where the vehicle is. Default at the origin, looking east.
     pub pose: PoseConfig,
+    /// A file with the cells between which the vehicle moves by its position. Default none: it stays in `cell`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cells: Option<PathBuf>,
     /// Settings by which the nodes of the cell find and watch each other.
     pub membership: MembershipConfig,
     /// Election of the leader.
@@ -113,6 +118,7 @@ impl Default for NodeConfig {
             description: None,
             map_log: None,
             pose: PoseConfig::default(),
+            cells: None,
             membership: MembershipConfig::default(),
             election: ElectionConfig::default(),
             mqtt: MqttConfig::default(),
@@ -223,6 +229,11 @@ impl NodeConfig {
             ));
         }
         self.pose.validate().map_err(|error| error.within("pose"))?;
+        if self.cells.is_some() && self.pose.listen.is_none() {
+            let allowed =
+                "an address that receives the vehicle's poses, beside `cells`: it moves between them by its position";
+            return Err(ConfigError::new("pose.listen", "nothing", allowed));
+        }
         self.membership.validate().map_err(|error| error.within("membership"))?;
         self.election.validate().map_err(|error| error.within("election"))?;
         let (hello, join) = (self.membership.hello_ms, self.election.join_ms);

@@ -11,13 +11,12 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::membership::MembershipMessage;
+use crate::messages::pose_receiver::PoseReceiverMessage;
 #[cfg(feature = "camera")]
 use crate::messages::projector::ProjectorMessage;
 use crate::messages::recorder::RecorderMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::messages::uplink::UplinkMessage;
-#[cfg(feature = "camera")]
-use crate::node::config::NodeConfig;
 
 /// A part of a node, in the order of starting.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -44,7 +43,9 @@ pub enum ActorKind {
     LeaderElection,
     /// The node's page.
     Dashboard,
-    /// The maker of the reports of a camera, by its place in [`NodeConfig::all_cameras`].
+    /// The receiver of a moving vehicle's poses.
+    PoseReceiver,
+    /// The maker of the reports of a camera, by its place in [`NodeConfig::all_cameras`](super::config::NodeConfig::all_cameras).
     #[cfg(feature = "camera")]
     Projector(usize),
     /// The finder of objects in a camera's frames.
@@ -52,12 +53,15 @@ pub enum ActorKind {
     Detector(usize),
 }
 
-#[cfg(feature = "camera")]
-impl ActorSlots {
-    /// Slots of a node with this many cameras.
-    pub(super) fn with_cameras(config: &NodeConfig) -> Self {
-        let (projectors, detectors) = config.all_cameras().map(|_| Default::default()).unzip();
-        Self { projectors, detectors, ..Self::default() }
+impl ActorKind {
+    /// True for what a vehicle has in one cell only.
+    pub(super) fn is_of_vehicle(self) -> bool {
+        match self {
+            Self::PoseReceiver => true,
+            #[cfg(feature = "camera")]
+            Self::Projector(_) | Self::Detector(_) => true,
+            _ => false,
+        }
     }
 }
 
@@ -86,6 +90,8 @@ pub struct ActorSlots {
     pub election: ActorSlot<LeaderElectionMessage>,
     /// The dashboard's.
     pub dashboard: ActorSlot<DashboardMessage>,
+    /// The pose receiver's.
+    pub pose_receiver: ActorSlot<PoseReceiverMessage>,
     /// The projectors', one for each camera.
     #[cfg(feature = "camera")]
     pub projectors: Vec<ActorSlot<ProjectorMessage>>,

@@ -313,8 +313,8 @@ impl NodeBuilder {
             name: self.name.clone(),
             cell: self.config.cell.clone(),
             role: self.config.role,
-            camera: !self.shown_cameras.is_empty(),
-            cameras: self.shown_cameras.iter().map(|camera| camera.name.clone()).collect(),
+            camera: !self.vehicle.shown_cameras.is_empty(),
+            cameras: self.vehicle.shown_cameras.iter().map(|camera| camera.name.clone()).collect(),
             floor_plan: self.floor_plan.as_ref().map(|plan| plan.facts.clone()),
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
@@ -327,10 +327,14 @@ impl NodeBuilder {
             counters: self.counters(),
             frames: self.frames(),
             live_state: Arc::clone(&self.live_state),
-            cameras: self.shown_cameras.clone(),
+            cameras: self.vehicle.shown_cameras.clone(),
             floor_plan: self.floor_plan.clone(),
         };
-        DashboardArguments { config: self.config.dashboard.clone(), sources, bound: self.dashboard_address.clone() }
+        DashboardArguments {
+            config: self.config.dashboard.clone(),
+            sources,
+            bound: self.vehicle.dashboard_address.clone(),
+        }
     }
 
     /// Facts on which the node's readiness is judged.

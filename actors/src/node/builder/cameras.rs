@@ -9,6 +9,7 @@ use super::NodeBuilder;
 use crate::actors::detector::DetectorArguments;
 use crate::actors::projector::ProjectorArguments;
 use crate::camera::config::CameraConfig;
+use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
 use crate::node::camera;
 use crate::node::config::NodeConfig;
@@ -17,7 +18,7 @@ use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::camera_troubles::CameraTroubles;
 
 /// The cameras of a node whose pictures browsers may see.
-pub(super) fn shown(config: &NodeConfig, node: &NodeName) -> Vec<ShownCamera> {
+pub(in crate::node) fn shown(config: &NodeConfig, node: &NodeName) -> Vec<ShownCamera> {
     if !(config.dashboard.enabled && config.dashboard.camera) {
         return Vec::new();
     }
@@ -35,8 +36,7 @@ pub(super) fn shown(config: &NodeConfig, node: &NodeName) -> Vec<ShownCamera> {
 }
 
 impl NodeBuilder {
-    /// Arguments of the projector of a camera, by its place. That of the first camera receives the poses of a moving
-    /// vehicle for all.
+    /// Arguments of the projector of a camera, by its place.
     pub(super) fn projector_arguments(&self, place: usize) -> anyhow::Result<ProjectorArguments> {
         let camera = self.camera(place)?;
         Ok(ProjectorArguments {
@@ -44,8 +44,8 @@ impl NodeBuilder {
             standing: self.standing_pose(),
             origin: self.config.origin,
             is_moving: self.config.pose.listen.is_some(),
+            recent_poses: self.vehicle.poses.borrow().clone(),
             is_fixed: self.config.pose.is_fixed(),
-            poses: self.config.pose.listen.filter(|_| place == 0).zip(Some(self.slots.projectors.clone())),
             algorithms: camera::algorithms(&self.config, camera),
             clock: self.clock.clone(),
             gateway: self.slots.gateway.clone(),
@@ -66,7 +66,7 @@ impl NodeBuilder {
             detect: camera.detector.build().context("key `camera.detector`")?,
             lens: camera::lens(camera)?,
             projector: self.slots.projectors.get(place).cloned().unwrap_or_default(),
-            images: ImageRecorder::new(self.config.record.as_ref(), &self.name, camera, self.recording.clone()),
+            images: self.image_recorder(camera),
             camera_feed: self.camera_feed(place),
             troubles: self.camera_troubles(camera),
             counters: self.counters(),
@@ -91,12 +91,24 @@ impl NodeBuilder {
         }
     }
 
+    /// Has running detectors record to this node's log, and trace their frames in its cell.
+    pub(in crate::node) fn move_detectors(&self) {
+        for (camera, detector) in self.config.all_cameras().zip(&self.slots.detectors) {
+            let (images, spans) = (self.image_recorder(camera), self.spans());
+            detector.send(DetectorMessage::Move { images, spans });
+        }
+    }
+
+    fn image_recorder(&self, camera: &CameraConfig) -> Option<ImageRecorder> {
+        ImageRecorder::new(self.config.record.as_ref(), &self.name, camera, self.recording.clone())
+    }
+
     fn camera(&self, place: usize) -> anyhow::Result<&CameraConfig> {
         self.config.all_cameras().nth(place).context("this node has no such camera")
     }
 
     fn camera_feed(&self, place: usize) -> Option<Arc<CameraFeed>> {
-        self.shown_cameras.get(place).map(|camera| Arc::clone(&camera.feed))
+        self.vehicle.shown_cameras.get(place).map(|camera| Arc::clone(&camera.feed))
     }
 
     fn camera_troubles(&self, camera: &CameraConfig) -> CameraTroubles {

@@ -37,7 +37,7 @@ impl NodeBuilder {
 
     /// Notes values that look as if they were in another unit.
     pub(super) fn note_units(&self) {
-        let troubles = self.counters.troubles();
+        let troubles = self.vehicle.counters.troubles();
         for (kind, cause) in self.config.doubtful_units() {
             match cause {
                 Some(cause) => troubles.note(kind, &cause),

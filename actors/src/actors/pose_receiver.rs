@@ -1,0 +1,134 @@
+//! The actor that receives a moving vehicle's poses from its localisation, one in each datagram.
+//!
+//! ```text
+//! localisation ── UDP ──> PoseReceiver ── TakePose ──> Projector of each camera
+//!                              └─ latest poses ──> choice of the cell
+//! ```
+
+use std::collections::VecDeque;
+use std::convert::Infallible;
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ecod::model::origin::StatedPose;
+use ecod::model::time::Timestamp;
+use ractor::{Actor, ActorProcessingErr, ActorRef};
+use tokio::net::UdpSocket;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+
+use crate::camera::vehicle_pose::read_pose;
+#[cfg(feature = "camera")]
+use crate::messages::actor_slot::ActorSlot;
+use crate::messages::pose_receiver::PoseReceiverMessage;
+#[cfg(feature = "camera")]
+use crate::messages::projector::ProjectorMessage;
+use crate::platform::clock;
+use crate::telemetry::counters::{Counters, Event};
+
+/// Wait before the address is tried again.
+const RETRY: Duration = Duration::from_secs(1);
+
+/// Number of kept poses, for projectors that start: half a second of them at 30 Hz.
+const KEPT_POSES: usize = 16;
+
+/// Maximum length of a datagram in bytes.
+const MAX_BYTES: usize = 1024;
+
+/// Arguments of the receiver's start.
+pub struct PoseReceiverArguments {
+    /// UDP address for the poses.
+    pub address: SocketAddr,
+    /// The projectors of all cameras.
+    #[cfg(feature = "camera")]
+    pub projectors: Vec<ActorSlot<ProjectorMessage>>,
+    /// Keeps the latest poses, the newest last.
+    pub poses: watch::Sender<VecDeque<(Timestamp, StatedPose)>>,
+    /// Counters of the node.
+    pub counters: Arc<Counters>,
+}
+
+/// The only owner of the address for poses.
+#[derive(Debug, Default)]
+pub struct PoseReceiver;
+
+/// Receivers of the poses.
+pub struct PoseReceiverState {
+    arguments: PoseReceiverArguments,
+    /// True once the log has said why a datagram is no pose.
+    is_logged: bool,
+    /// Ends with the actor.
+    _listener: JoinSet<()>,
+}
+
+impl Actor for PoseReceiver {
+    type Msg = PoseReceiverMessage;
+    type State = PoseReceiverState;
+    type Arguments = PoseReceiverArguments;
+
+    async fn pre_start(
+        &self,
+        myself: ActorRef<Self::Msg>,
+        arguments: Self::Arguments,
+    ) -> Result<Self::State, ActorProcessingErr> {
+        let mut listener = JoinSet::new();
+        listener.spawn(listen(arguments.address, myself));
+        Ok(PoseReceiverState { arguments, is_logged: false, _listener: listener })
+    }
+
+    async fn handle(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        PoseReceiverMessage::Take { pose }: Self::Msg,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        match pose {
+            Ok((at, pose)) => {
+                #[cfg(feature = "camera")]
+                for projector in &state.arguments.projectors {
+                    projector.send(ProjectorMessage::TakePose { at, pose });
+                }
+                state.arguments.poses.send_modify(|poses| {
+                    if poses.len() == KEPT_POSES {
+                        poses.pop_front();
+                    }
+                    poses.push_back((at, pose));
+                });
+            }
+            Err(reason) => {
+                state.arguments.counters.count(Event::PoseRejected);
+                if !std::mem::replace(&mut state.is_logged, true) {
+                    tracing::warn!(reason, "pose rejected, further ones are only counted");
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Takes poses until the receiver ends. An address that cannot be bound is tried again.
+async fn listen(address: SocketAddr, receiver: ActorRef<PoseReceiverMessage>) {
+    let mut is_logged = false;
+    loop {
+        let Err(error) = receive(address, &receiver).await;
+        if !std::mem::replace(&mut is_logged, true) {
+            tracing::warn!(%error, %address, "cannot receive poses, trying again");
+        }
+        tokio::time::sleep(RETRY).await;
+    }
+}
+
+async fn receive(address: SocketAddr, receiver: &ActorRef<PoseReceiverMessage>) -> io::Result<Infallible> {
+    let socket = UdpSocket::bind(address).await?;
+    tracing::info!(%address, "receiving poses");
+    let mut datagram = [0; MAX_BYTES];
+    loop {
+        let length = socket.recv(&mut datagram).await?;
+        let datagram = datagram.get(..length).unwrap_or_default();
+        let pose = read_pose(datagram, clock::now(), clock::wall_offset_us());
+        // The listener ends with the receiver.
+        let _ = receiver.cast(PoseReceiverMessage::Take { pose });
+    }
+}

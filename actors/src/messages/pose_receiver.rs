@@ -1,0 +1,14 @@
+//! Messages to the receiver of poses.
+
+use ecod::model::origin::StatedPose;
+use ecod::model::time::Timestamp;
+
+/// Requests to the receiver of poses.
+#[derive(Debug)]
+pub enum PoseReceiverMessage {
+    /// Take a pose of the vehicle, or the reason why a datagram is none.
+    Take {
+        /// Time of the pose by the clock that stamps frames, and the pose.
+        pose: Result<(Timestamp, StatedPose), String>,
+    },
+}

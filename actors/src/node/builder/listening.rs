@@ -1,0 +1,104 @@
+//! Parts with an address, broker and membership: they come back at the one that they had.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use ecod::leadership::Leadership;
+use ecod::leadership::round_filter::PublisherFilter;
+use ecod::wire::Topics;
+use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr};
+use tokio::sync::watch;
+
+use super::{NodeBuilder, cause};
+use crate::actors::broker::Broker;
+use crate::actors::membership::Membership;
+use crate::messages::broker::BrokerMessage;
+use crate::messages::membership::MembershipMessage;
+use crate::platform::clock;
+use crate::transport::broker::{AccessPolicy, BrokerError, EmbeddedBroker, LeaderCheck};
+use crate::transport::gossip::BindError;
+
+/// Number of attempts, and time between them, by which a broker or membership started anew gets its address back.
+const REBIND_ATTEMPTS: usize = 40;
+const REBIND_WAIT: Duration = Duration::from_millis(50);
+
+impl NodeBuilder {
+    /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
+    /// leave it.
+    pub(super) async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let (broker, _) =
+            Actor::spawn_linked(None, Broker, Box::new(self.embedded_broker()), supervisor).await.map_err(cause)?;
+        let before = *self.vehicle.listens_at.borrow();
+        let mut address = before.unwrap_or(self.config.broker_listen());
+        let takes_any_port = before.is_none() && self.config.may_listen_at_any_port();
+        let mut attempts = if before.is_some() { REBIND_ATTEMPTS } else { 1 };
+        let bound = loop {
+            attempts -= 1;
+            match ractor::call!(broker, |reply| BrokerMessage::Start { address, reply })? {
+                Err(BrokerError::Bind { .. }) if takes_any_port && address.port() != 0 => {
+                    tracing::info!(%address, "the door takes a free port, key `listen` is not set and the usual one is in use");
+                    address.set_port(0);
+                    attempts += 1;
+                }
+                Err(BrokerError::Bind { .. }) if attempts > 0 => tokio::time::sleep(REBIND_WAIT).await,
+                outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
+            }
+        };
+        self.vehicle.listens_at.send_replace(Some(bound));
+        if self.config.serves_nodes() {
+            self.broker_address.send_replace(Some(bound));
+        }
+        let id = broker.get_id();
+        self.slots.broker.set(broker);
+        Ok(id)
+    }
+
+    /// The broker behind its gate: also where only this machine reaches it, who connects and says nothing would hold
+    /// the node's file descriptors.
+    fn embedded_broker(&self) -> EmbeddedBroker {
+        let (config, listen) = (self.config.broker(), self.config.broker_listen());
+        let credentials = self.security.credentials.clone();
+        match (&credentials, listen.ip().is_loopback()) {
+            _ if !self.config.serves_nodes() => tracing::info!(%listen, "broker for programs of this node"),
+            (None, true) if self.config.data_plane().external.is_some() => tracing::warn!(
+                "mqtt.fallback_to_embedded serves this machine only: without certificates in [tls] or \
+                 broker.allow_plaintext other machines are without maps when the external broker is gone"
+            ),
+            (None, true) => tracing::info!("broker for this machine only: no certificates are configured"),
+            (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
+            (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
+        }
+        let (topics, elected) = (Topics::new(&self.config.cell), publish_rule(self.leadership()));
+        let (limits, counters) = (self.config.mqtt.limits(), self.counters());
+        let policy = AccessPolicy { credentials, topics, limits, elected, counters };
+        EmbeddedBroker::protected(config, policy).with_door(self.door.clone())
+    }
+
+    /// The membership comes back at the address it had, as the broker does.
+    pub(super) async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+        let mut attempts = if self.gossip_address.borrow().is_some() { REBIND_ATTEMPTS } else { 1 };
+        let actor = loop {
+            attempts -= 1;
+            let arguments = self.membership_arguments();
+            match Actor::spawn_linked(None, Membership, arguments, supervisor.clone()).await.map_err(cause) {
+                Ok((actor, _)) => break actor,
+                Err(error) if attempts > 0 && error.is::<BindError>() => tokio::time::sleep(REBIND_WAIT).await,
+                Err(error) => return Err(error),
+            }
+        };
+        let address = ractor::call!(actor, |reply| MembershipMessage::Address { reply })?;
+        self.gossip_address.send_replace(Some(address));
+        let id = actor.get_id();
+        self.slots.membership.set(actor);
+        Ok(id)
+    }
+}
+
+/// The rule of the node's own broker: who may publish for all.
+fn publish_rule(leadership: watch::Receiver<Leadership>) -> LeaderCheck {
+    let filter = Mutex::<PublisherFilter>::default();
+    Arc::new(move |name| {
+        let mut filter = filter.lock().unwrap_or_else(PoisonError::into_inner);
+        filter.may_publish(name, &leadership.borrow(), clock::now())
+    })
+}

@@ -1,0 +1,185 @@
+//! How far a node has come into its cell, and what goes along when a vehicle moves to another cell.
+//!
+//! A moving vehicle has two nodes for a moment: the present one, and one beside it that gets ready in the next cell. Cameras,
+//! poses, counters and addresses are the vehicle's, and both know them. Detectors run on; the next node's projectors take
+//! the place of the present ones. So a frame is reported in one cell only.
+
+use std::collections::VecDeque;
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use ecod::diagnostics::TroubleKind;
+use ecod::model::names::NodeName;
+use ecod::model::origin::StatedPose;
+use ecod::model::time::Timestamp;
+use ractor::{ActorCell, ActorProcessingErr, ActorStatus};
+use tokio::sync::watch;
+
+#[cfg(feature = "camera")]
+use super::builder::cameras;
+use super::config::NodeConfig;
+use super::slots::{ActorKind, ActorSlots};
+use super::{NodeError, SupervisorState};
+use crate::messages::actor_slot::ActorSlot;
+#[cfg(feature = "camera")]
+use crate::messages::detector::DetectorMessage;
+use crate::messages::pose_receiver::PoseReceiverMessage;
+#[cfg(feature = "camera")]
+use crate::messages::projector::ProjectorMessage;
+use crate::observe::dashboard::ShownCamera;
+use crate::telemetry::counters::Counters;
+
+/// How far a node has come into its cell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Presence {
+    /// It follows, while another node of the vehicle is present in another cell.
+    Beside,
+    /// It reports, too.
+    Reporting,
+    /// It has page, door and log, too.
+    Whole,
+}
+
+/// What a vehicle has once, in whatever cell it is.
+#[derive(Clone)]
+pub(super) struct VehicleParts {
+    pub(super) counters: Arc<Counters>,
+    /// Poses of the last moments, the newest last.
+    pub(super) poses: watch::Sender<VecDeque<(Timestamp, StatedPose)>>,
+    pub(super) pose_receiver: ActorSlot<PoseReceiverMessage>,
+    #[cfg(feature = "camera")]
+    pub(super) projectors: Vec<ActorSlot<ProjectorMessage>>,
+    #[cfg(feature = "camera")]
+    pub(super) detectors: Vec<ActorSlot<DetectorMessage>>,
+    /// The cameras, if browsers are to see their pictures.
+    pub(super) shown_cameras: Vec<ShownCamera>,
+    /// Address of the broker, whoever may use it.
+    pub(super) listens_at: watch::Sender<Option<SocketAddr>>,
+    pub(super) dashboard_address: watch::Sender<Option<SocketAddr>>,
+}
+
+impl VehicleParts {
+    /// Those of a vehicle with this configuration.
+    pub(super) fn new(config: &NodeConfig) -> Self {
+        #[cfg(feature = "camera")]
+        let (projectors, detectors) = config.all_cameras().map(|_| Default::default()).unzip();
+        #[cfg(feature = "camera")]
+        let shown_cameras = cameras::shown(config, config.name.as_ref().unwrap_or(&NodeName::from_static("node")));
+        #[cfg(not(feature = "camera"))]
+        let shown_cameras = Vec::new();
+        Self {
+            counters: Arc::default(),
+            poses: watch::Sender::default(),
+            pose_receiver: ActorSlot::default(),
+            #[cfg(feature = "camera")]
+            projectors,
+            #[cfg(feature = "camera")]
+            detectors,
+            shown_cameras,
+            listens_at: watch::Sender::new(None),
+            dashboard_address: watch::Sender::new(None),
+        }
+    }
+
+    /// Slots of a node of the vehicle.
+    pub(super) fn slots(&self) -> ActorSlots {
+        ActorSlots {
+            pose_receiver: self.pose_receiver.clone(),
+            #[cfg(feature = "camera")]
+            projectors: self.projectors.clone(),
+            #[cfg(feature = "camera")]
+            detectors: self.detectors.clone(),
+            ..ActorSlots::default()
+        }
+    }
+
+    /// Running parts that go along with the vehicle.
+    fn running(&self) -> Vec<(ActorKind, ActorCell)> {
+        let poses = self.pose_receiver.get().map(|actor| (ActorKind::PoseReceiver, actor.get_cell()));
+        #[cfg_attr(not(feature = "camera"), expect(unused_mut, reason = "there is no more without cameras"))]
+        let mut running = Vec::from_iter(poses);
+        #[cfg(feature = "camera")]
+        for (camera, detector) in self.detectors.iter().enumerate() {
+            running.extend(detector.get().map(|actor| (ActorKind::Detector(camera), actor.get_cell())));
+        }
+        running
+    }
+}
+
+/// A step of a vehicle's way to another cell, for one of its two nodes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MoveStep {
+    /// Stop the door, so that another node of the vehicle has its address.
+    CloseDoor,
+    /// Let the vehicle's running parts go. The projectors run until the next node's take their place.
+    HandOver,
+    /// Take the vehicle's running parts, and report from now on.
+    TakeOver,
+    /// Have page, door and log again.
+    Settle,
+}
+
+impl SupervisorState {
+    /// Takes a step of the vehicle's way to another cell.
+    pub(super) async fn take_step(&mut self, step: MoveStep, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+        let started = match step {
+            MoveStep::CloseDoor => {
+                self.close_door().await;
+                Ok(())
+            }
+            MoveStep::HandOver => {
+                self.hand_over(supervisor);
+                Ok(())
+            }
+            MoveStep::TakeOver => self.take_over(supervisor).await,
+            MoveStep::Settle => self.advance(Presence::Whole, supervisor).await,
+        };
+        started.inspect_err(|error| self.builder.give_up(NodeError::Failed(error.to_string())))
+    }
+
+    /// Goes on to this presence: starts the parts that it adds.
+    async fn advance(&mut self, presence: Presence, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+        self.builder.set_presence(presence);
+        self.start_missing(supervisor).await
+    }
+
+    /// Starts the parts that the node has by now and that do not run.
+    pub(super) async fn start_missing(&mut self, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+        for part in self.builder.parts() {
+            if !self.running.values().any(|running| *running == part) {
+                self.start(part, supervisor).await?;
+            }
+        }
+        Ok(())
+    }
+
+    fn hand_over(&mut self, supervisor: &ActorCell) {
+        self.builder.set_presence(Presence::Beside);
+        self.running.retain(|_, part| !part.is_of_vehicle());
+        for (_, part) in self.builder.release_vehicle().running() {
+            part.unlink(supervisor.clone());
+        }
+        self.manager = None;
+        self.builder.counters().troubles().settle(TroubleKind::Description, None);
+    }
+
+    async fn take_over(&mut self, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+        for (kind, part) in self.builder.vehicle().running() {
+            part.link(supervisor.clone());
+            // One that has just ended is started anew.
+            if part.get_status() <= ActorStatus::Upgrading {
+                self.running.insert(part.get_id(), kind);
+            }
+        }
+        self.advance(Presence::Reporting, supervisor).await?;
+        #[cfg(feature = "camera")]
+        self.builder.move_detectors();
+        Ok(())
+    }
+
+    async fn close_door(&mut self) {
+        self.builder.set_presence(Presence::Reporting);
+        self.running.retain(|_, part| *part != ActorKind::Broker);
+        self.builder.stop_broker().await;
+    }
+}

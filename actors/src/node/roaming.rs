@@ -1,0 +1,205 @@
+//! A vehicle that moves from cell to cell by its position, without a restart.
+//!
+//! ```text
+//! PoseReceiver ── latest poses ──> Roamer ── observe ──> CellChoice
+//!                                    ├─ present node: cameras, page, door, log
+//!                                    └─ next node: gets ready beside it, then takes them over
+//! ```
+//!
+//! The next node follows its cell's leader before the present one is left, so the vehicle has maps all the time.
+
+use std::convert::Infallible;
+use std::time::Duration;
+
+use ecod::model::names::NodeName;
+use ecod::model::origin::{GeographicPosition, StatedPose};
+use ecod::roaming::{CellChoice, Step};
+use tokio::time::{MissedTickBehavior, interval, timeout};
+
+use super::config::{CellEntry, NodeConfig};
+use super::presence::{MoveStep, Presence, VehicleParts};
+use super::service::ServiceManager;
+use super::{NodeError, NodeHandle, NodeMessage, start_with};
+use crate::platform::clock;
+
+/// Time between two looks at the position.
+const LOOK_PERIOD: Duration = Duration::from_millis(200);
+
+/// Age of a position that is no longer gone by.
+const MAX_AGE: Duration = Duration::from_secs(2);
+
+/// Longest time for a step of a node.
+const STEP_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// A running vehicle: its present node, and the next one while it changes to another cell.
+pub struct Roamer {
+    config: NodeConfig,
+    cells: Vec<CellEntry>,
+    vehicle: VehicleParts,
+    choice: CellChoice,
+    present: NodeHandle,
+    next: Option<(NodeName, NodeHandle)>,
+}
+
+impl Roamer {
+    /// Starts the vehicle in its own cell; `config` is taken as valid. Without `cells` it stays there.
+    ///
+    /// # Errors
+    /// [`NodeError`] when a part cannot start, or the file of cells cannot be used.
+    pub async fn start(config: NodeConfig) -> Result<Self, NodeError> {
+        let cells = config.load_cells().map_err(|error| NodeError::Failed(format!("key `cells`: {error}")))?;
+        for cell in &cells {
+            let name = &cell.name;
+            let guest =
+                config.in_cell(cell).map_err(|error| NodeError::Failed(format!("in the cell {name}: {error}")))?;
+            guest.security().map_err(|error| NodeError::Failed(format!("in the cell {name}: {error}")))?;
+        }
+        let vehicle = VehicleParts::new(&config);
+        let choice = CellChoice::new(cells.iter().map(CellEntry::known).collect(), config.cell.clone());
+        let present = start_with((vehicle.clone(), Presence::Whole), config.clone()).await?;
+        Ok(Self { config, cells, vehicle, choice, present, next: None })
+    }
+
+    /// The node of the vehicle's present cell.
+    pub fn present(&self) -> &NodeHandle {
+        &self.present
+    }
+
+    /// The vehicle's present cell.
+    pub fn cell(&self) -> &NodeName {
+        self.choice.present()
+    }
+
+    /// Moves from cell to cell until a node gives up.
+    ///
+    /// # Errors
+    /// [`NodeError`] always says why; a vehicle never ends well by itself.
+    pub async fn drive(&mut self) -> Result<Infallible, NodeError> {
+        let mut looks = interval(LOOK_PERIOD);
+        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                failed = self.present.failed() => failed?,
+                change = next_change(&mut self.next) => self.change(change).await?,
+                _ = looks.tick() => self.look().await?,
+            }
+        }
+    }
+
+    /// Stops the vehicle, the node that is not yet present first.
+    pub async fn stop(self) {
+        if let Some((_, next)) = self.next {
+            next.stop().await;
+        }
+        self.present.stop().await;
+    }
+
+    /// Goes by the latest position, if there is one.
+    async fn look(&mut self) -> Result<(), NodeError> {
+        let now = clock::now();
+        let Some(place) = self.place() else { return Ok(()) };
+        match self.choice.observe(&place, now) {
+            Some(Step::Join(cell)) => self.join(cell).await,
+            Some(Step::GiveUp(cell)) => {
+                self.stay(&cell, "its leader was not heard in time, or the vehicle turned back").await
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Where the vehicle is, on Earth.
+    fn place(&self) -> Option<GeographicPosition> {
+        let (at, pose) = self.vehicle.poses.borrow().back().copied()?;
+        let StatedPose::OnEarth(pose) = pose else { return None };
+        let is_fresh = clock::now().since(at) <= MAX_AGE;
+        let (latitude_deg, longitude_deg) = (pose.latitude_deg, pose.longitude_deg);
+        is_fresh.then(|| GeographicPosition { latitude_deg, longitude_deg, height_m: pose.height_m.unwrap_or(0.0) })
+    }
+
+    /// Starts a node beside the present one.
+    async fn join(&mut self, cell: NodeName) -> Result<(), NodeError> {
+        let Some(entry) = self.cells.iter().find(|entry| entry.name == cell) else { return Ok(()) };
+        let Ok(config) = self.config.in_cell(entry) else { return Ok(()) };
+        tracing::info!(from = %self.choice.present(), %cell, "getting ready in the next cell");
+        // Nodes of the cell, and no programs alone, will connect to it.
+        if config.serves_nodes() {
+            step(&self.present, MoveStep::CloseDoor).await?;
+        }
+        match start_with((self.vehicle.clone(), Presence::Beside), config).await {
+            Ok(node) => {
+                self.next = Some((cell, node));
+                Ok(())
+            }
+            Err(error) => self.fail(&cell, &error).await,
+        }
+    }
+
+    async fn change(&mut self, (cell, change): (NodeName, Change)) -> Result<(), NodeError> {
+        match change {
+            Change::Follows => self.enter(&cell).await,
+            Change::Failed(error) => self.fail(&cell, &error).await,
+        }
+    }
+
+    /// Reports in the next cell from now on, and leaves the present one.
+    async fn enter(&mut self, cell: &NodeName) -> Result<(), NodeError> {
+        let Some((_, next)) = self.next.take_if(|_| self.choice.enter(cell)) else { return Ok(()) };
+        let former = std::mem::replace(&mut self.present, next);
+        step(&former, MoveStep::HandOver).await?;
+        step(&self.present, MoveStep::TakeOver).await?;
+        former.stop().await;
+        step(&self.present, MoveStep::Settle).await?;
+        if let Some(manager) = ServiceManager::from_environment() {
+            self.present.report_to(manager);
+        }
+        tracing::info!(%cell, "the vehicle is in another cell now");
+        Ok(())
+    }
+
+    /// Stays in the present cell, as no node can be had in the next one.
+    async fn fail(&mut self, cell: &NodeName, error: &NodeError) -> Result<(), NodeError> {
+        self.choice.fail(cell, clock::now());
+        self.stay(cell, &error.to_string()).await
+    }
+
+    /// Stays in the present cell, without the node that was getting ready in another.
+    async fn stay(&mut self, cell: &NodeName, why: &str) -> Result<(), NodeError> {
+        tracing::warn!(%cell, why, present = %self.choice.present(), "the vehicle stays in its cell");
+        if let Some((_, next)) = self.next.take() {
+            next.stop().await;
+        }
+        step(&self.present, MoveStep::Settle).await
+    }
+}
+
+/// News of the next node.
+enum Change {
+    /// It follows its cell's leader.
+    Follows,
+    /// It has given up.
+    Failed(NodeError),
+}
+
+/// Waits for news of the next node; for ever if there is none.
+async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Change) {
+    let Some((cell, node)) = next else { return std::future::pending().await };
+    let (mut maps, mut verdicts) = (node.newest_map(), node.newest_verdicts());
+    let has_map = async { maps.wait_for(Option::is_some).await.is_ok() };
+    let has_verdicts = async { verdicts.wait_for(Option::is_some).await.is_ok() };
+    let change = tokio::select! {
+        true = has_map => Change::Follows,
+        true = has_verdicts => Change::Follows,
+        Err(error) = node.failed() => Change::Failed(error),
+        else => return std::future::pending().await,
+    };
+    (cell.clone(), change)
+}
+
+/// Has a node take a step.
+async fn step(node: &NodeHandle, step: MoveStep) -> Result<(), NodeError> {
+    let taken = node.supervisor.call(|done| NodeMessage::Move { step, done }, Some(STEP_TIMEOUT));
+    match timeout(STEP_TIMEOUT, taken).await {
+        Ok(Ok(ractor::rpc::CallResult::Success(()))) => Ok(()),
+        _ => Err(NodeError::Failed(format!("the node did not take the step {step:?} of its way to another cell"))),
+    }
+}

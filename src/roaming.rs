@@ -1,0 +1,242 @@
+//! Cells that a vehicle drives through: in which of them it takes part, by its position.
+//!
+//! ```text
+//! position ── observe ──> CellChoice ──> Step::Join    get ready in the next cell, and go on in the present one
+//!       the next follows ── enter ──┘└─> Step::GiveUp  stay in the present one
+//! ```
+//!
+//! A cell is a circle around its origin. A vehicle changes to a cell that it is in, and that is nearer than the present one by
+//! [`MARGIN_M`]. Distances are to the circles' edges, negative inside. Where circles overlap, the border is in the middle.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use crate::model::names::NodeName;
+use crate::model::origin::{GeographicOrigin, GeographicPosition};
+use crate::model::time::Timestamp;
+
+/// Distance in metres by which the next cell must be nearer: more than localisation by satellites jumps on a road.
+pub const MARGIN_M: f64 = 20.0;
+
+/// Longest time in which a vehicle gets ready in the next cell.
+pub const JOIN_TIMEOUT: Duration = Duration::from_secs(15);
+
+/// Time for which a cell that could not be joined is not tried again.
+pub const RETRY_AFTER: Duration = Duration::from_secs(30);
+
+/// A cell as a vehicle knows it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct KnownCell {
+    /// Its name.
+    pub name: NodeName,
+    /// Its middle.
+    pub origin: GeographicOrigin,
+    /// Distance in metres from the middle up to which it reaches.
+    pub radius_m: f64,
+}
+
+impl KnownCell {
+    /// Distance in metres to the edge; negative inside.
+    fn outside_m(&self, place: &GeographicPosition) -> f64 {
+        self.origin.to_map(place).coords.norm() - self.radius_m
+    }
+}
+
+/// What a vehicle is to do.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Step {
+    /// Get ready in this cell, and go on in the present one until then.
+    Join(NodeName),
+    /// Leave this cell again, and stay in the present one.
+    GiveUp(NodeName),
+}
+
+/// The choice of a vehicle's cell; see the [module](self).
+#[derive(Debug, Clone)]
+pub struct CellChoice {
+    cells: Vec<KnownCell>,
+    present: NodeName,
+    /// The cell in which the vehicle gets ready, and since when.
+    next: Option<(NodeName, Timestamp)>,
+    /// Cells that could not be joined, and until when they are left alone.
+    failed: BTreeMap<NodeName, Timestamp>,
+}
+
+impl CellChoice {
+    /// The choice among `cells` of a vehicle that is in `present`.
+    pub fn new(cells: Vec<KnownCell>, present: NodeName) -> Self {
+        Self { cells, present, next: None, failed: BTreeMap::new() }
+    }
+
+    /// The cell in which the vehicle takes part.
+    pub fn present(&self) -> &NodeName {
+        &self.present
+    }
+
+    /// Takes the vehicle's position at `now`. The same one again lets time pass.
+    pub fn observe(&mut self, place: &GeographicPosition, now: Timestamp) -> Option<Step> {
+        self.failed.retain(|_, until| *until > now);
+        let outside_m = |name: &NodeName| {
+            let cell = self.cells.iter().find(|cell| cell.name == *name);
+            cell.map_or(f64::INFINITY, |cell| cell.outside_m(place))
+        };
+        let present_m = outside_m(&self.present);
+        if let Some((next, since)) = &self.next {
+            let (next, is_late) = (next.clone(), now.since(*since) > JOIN_TIMEOUT);
+            let has_turned = outside_m(&next) >= present_m;
+            if is_late {
+                self.fail(&next, now);
+            }
+            self.next = self.next.take().filter(|_| !is_late && !has_turned);
+            return self.next.is_none().then_some(Step::GiveUp(next));
+        }
+        let others =
+            self.cells.iter().filter(|cell| cell.name != self.present && !self.failed.contains_key(&cell.name));
+        let nearest = others.map(|cell| (cell.outside_m(place), &cell.name)).min_by(|a, b| a.0.total_cmp(&b.0))?;
+        let (nearest_m, name) = (nearest.0, nearest.1.clone());
+        if nearest_m > 0.0 || nearest_m + MARGIN_M >= present_m {
+            return None;
+        }
+        self.next = Some((name.clone(), now));
+        Some(Step::Join(name))
+    }
+
+    /// Notes that the vehicle follows in the next cell; true if that is its cell from now on.
+    pub fn enter(&mut self, cell: &NodeName) -> bool {
+        let Some((next, _)) = self.next.take_if(|(next, _)| next == cell) else { return false };
+        self.present = next;
+        true
+    }
+
+    /// Notes that a cell could not be joined: it is left alone for [`RETRY_AFTER`].
+    pub fn fail(&mut self, cell: &NodeName, now: Timestamp) {
+        self.next.take_if(|(next, _)| next == cell);
+        self.failed.insert(cell.clone(), now + RETRY_AFTER);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const LATITUDE_DEG: f64 = 52.2;
+    const LONGITUDE_DEG: f64 = 21.0;
+    /// Distance between the middles of two cells in metres.
+    const SPACING_M: f64 = 300.0;
+
+    fn name(number: usize) -> NodeName {
+        NodeName::new(format!("lot-{number}")).unwrap()
+    }
+
+    fn middle() -> GeographicOrigin {
+        GeographicOrigin { latitude_deg: LATITUDE_DEG, longitude_deg: LONGITUDE_DEG, height_m: 0.0, rotation_deg: 0.0 }
+    }
+
+    /// A place on a road through the middles of all cells.
+    fn at(x_m: f64, y_m: f64) -> GeographicPosition {
+        middle().to_wgs84(x_m, y_m, 0.0)
+    }
+
+    /// Three cells in a row, each with a radius of 200 m.
+    fn cells() -> Vec<KnownCell> {
+        let cell = |number| {
+            let GeographicPosition { latitude_deg, longitude_deg, .. } = at(SPACING_M * number as f64, 0.0);
+            let origin = GeographicOrigin { latitude_deg, longitude_deg, ..middle() };
+            KnownCell { name: name(number), origin, radius_m: 200.0 }
+        };
+        (0..3).map(cell).collect()
+    }
+
+    fn s(seconds: f64) -> Timestamp {
+        Timestamp::default() + Duration::from_secs_f64(seconds)
+    }
+
+    /// Drives at 50 km/h; each cell follows 2 s after it is joined. Places and cells of all changes.
+    fn drive(path: impl Fn(f64) -> (f64, f64), seconds: f64) -> Vec<(f64, NodeName)> {
+        let mut choice = CellChoice::new(cells(), name(0));
+        let (mut changes, mut joined) = (Vec::new(), None);
+        for tick in 0..(10.0 * seconds) as usize {
+            let now_s = 0.1 * tick as f64;
+            let (x_m, y_m) = path(now_s);
+            match choice.observe(&at(x_m, y_m), s(now_s)) {
+                Some(Step::Join(cell)) => joined = Some((cell, now_s + 2.0)),
+                Some(Step::GiveUp(_)) => joined = None,
+                None => {}
+            }
+            if let Some((cell, _)) = joined.take_if(|(_, ready_s)| *ready_s <= now_s) {
+                assert!(choice.enter(&cell));
+                changes.push((x_m, cell));
+            }
+        }
+        changes
+    }
+
+    #[test]
+    fn a_vehicle_that_drives_on_changes_once_at_each_border() {
+        let changes = drive(|s| (13.9 * s, 5.0), 43.0);
+        let cells: Vec<_> = changes.iter().map(|(_, cell)| cell.clone()).collect();
+        assert_eq!(cells, [name(1), name(2)]);
+        for ((x_m, _), border_m) in changes.iter().zip([150.0, 450.0]) {
+            // Half the margin, and 2 s of driving.
+            assert!((10.0..45.0).contains(&(x_m - border_m)), "{changes:?}");
+        }
+    }
+
+    #[test]
+    fn a_vehicle_that_stands_at_a_border_stays_for_an_hour_although_its_position_jumps() {
+        let jumping = |s: f64| (150.0 + 9.0 * (s * 7.3).sin(), 9.0 * (s * 3.1).cos());
+        assert_eq!(drive(jumping, 3600.0), []);
+    }
+
+    #[test]
+    fn a_vehicle_that_turns_back_stays_and_one_outside_of_all_cells_too() {
+        assert_eq!(drive(|s| (if s < 11.7 { 13.9 * s } else { 13.9 * (23.4 - s) }, 0.0), 20.0), []);
+        assert_eq!(drive(|s| (0.0, 13.9 * s), 60.0), []);
+    }
+
+    #[test]
+    fn a_cell_that_does_not_answer_is_given_up_and_tried_again_later() {
+        let mut choice = CellChoice::new(cells(), name(0));
+        let place = at(SPACING_M, 0.0);
+        assert_eq!(choice.observe(&place, s(0.0)), Some(Step::Join(name(1))));
+        assert_eq!(choice.observe(&place, s(14.0)), None);
+        assert_eq!(choice.observe(&place, s(15.5)), Some(Step::GiveUp(name(1))));
+        assert_eq!(choice.present(), &name(0));
+        assert_eq!(choice.observe(&place, s(40.0)), None, "it is left alone");
+        assert_eq!(choice.observe(&place, s(46.0)), Some(Step::Join(name(1))));
+        assert!(!choice.enter(&name(2)), "only the next cell is entered");
+        choice.fail(&name(1), s(47.0));
+        assert!(!choice.enter(&name(1)));
+    }
+
+    #[test]
+    fn the_other_side_of_the_earth_is_far_away() {
+        let mut choice = CellChoice::new(cells(), name(2));
+        let place = GeographicPosition { latitude_deg: -52.2, longitude_deg: -159.0, height_m: 0.0 };
+        assert_eq!(choice.observe(&place, s(0.0)), None);
+    }
+
+    proptest! {
+        #[test]
+        fn one_cell_at_a_time_is_joined(places in prop::collection::vec((-400.0..1000.0, -300.0..300.0, 0.0..20.0), 1..60)) {
+            let mut choice = CellChoice::new(cells(), name(0));
+            let (mut now_s, mut joined) = (0.0, None);
+            for (x_m, y_m, passed_s) in places {
+                now_s += passed_s;
+                match choice.observe(&at(x_m, y_m), s(now_s)) {
+                    Some(Step::Join(cell)) => {
+                        prop_assert!(joined.is_none() && cell != *choice.present());
+                        joined = Some(cell);
+                    }
+                    Some(Step::GiveUp(cell)) => prop_assert_eq!(joined.take(), Some(cell)),
+                    None => {}
+                }
+                if let Some(cell) = joined.take_if(|_| passed_s < 5.0) {
+                    prop_assert!(choice.enter(&cell) && *choice.present() == cell);
+                }
+            }
+        }
+    }
+}
