@@ -8,6 +8,7 @@
 //! - Maps count in the order of epoch and round, and no older than [`MAX_AGE`]. [`CellMapFilter`] says how age is known.
 //! - Objects are put into this cell's frame through their place on Earth.
 
+mod area;
 mod extent;
 mod filter;
 mod frame;
@@ -19,6 +20,7 @@ use std::time::Duration;
 
 use nalgebra::Point2;
 
+pub use area::CoveredArea;
 pub use filter::{AdmittedMap, CellMapFilter, MAX_AGE};
 
 use crate::model::names::NodeName;
@@ -32,6 +34,9 @@ use frame::FrameChange;
 /// Distance in metres from its tile up to which a cell may tell of objects. An origin in the middle of its cell leaves
 /// room for a cell 600 m across, wherever in the tile it is.
 pub const COVER_M: f64 = 300.0;
+
+/// Maximum maps per second of one cell that a receiver decodes, twice as many as a neighbour sends by default.
+pub const MAX_MAP_HZ: u32 = 20;
 
 /// Distance in metres from what this cell knows up to which objects of others are handed on: 7 s at 50 km/h.
 const MARGIN_M: f64 = 100.0;
@@ -116,12 +121,12 @@ impl Neighbours {
         let CellMap { cell, origin, map, .. } = message;
         let fused_at = received_at - age;
         let clock_us = fused_at.micros_from(map.fused_at_us);
-        let change = FrameChange::new(&origin, &self.origin);
+        let (change, area) = (FrameChange::new(&origin, &self.origin), CoveredArea::of(topic.tile));
         let losses = self.losses.entry(cell.clone()).or_default();
         let mut near = Vec::new();
         for mut object in map.objects {
             let place = origin.to_wgs84(object.x_m, object.y_m, 0.0);
-            if !change.is_covered(&place) {
+            if !area.covers(&place) {
                 losses.outside += 1;
                 continue;
             }

@@ -9,4 +9,4 @@ pub mod latest_slot;
 pub mod secret;
 pub mod state_file;
 pub mod state_writer;
-pub(crate) mod throttle;
+pub mod throttle;

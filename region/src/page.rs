@@ -79,7 +79,7 @@ impl RegionPage {
 async fn upkeep(api: &RegionApi) {
     loop {
         let now: Timestamp = clock::now();
-        api.ask(None, now);
+        api.ask(now);
         api.state.town().forget_old_maps(now);
         tokio::time::sleep(UPKEEP_PERIOD).await;
     }

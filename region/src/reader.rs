@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
-use ecod::wire::{RegionTopic, RegionTopicKind, RejectReason};
+use ecod::wire::{RegionTopic, RegionTopicKind};
 use ecod_actors::platform::clock;
 use rumqttc::{
     AsyncClient, Event, EventLoop, NetworkOptions, Outgoing, Packet, QoS, SubscribeFilter, SubscribeReasonCode,
@@ -14,7 +14,7 @@ use rumqttc::{
 use tokio::sync::watch;
 
 use crate::broker::BrokerLogin;
-use crate::town::{Accepted, RegionTown};
+use crate::town::{Accepted, ReadTiles, Refusal, RegionTown};
 
 /// Town and connection, for page, metrics and exports.
 #[derive(Debug, Default)]
@@ -22,6 +22,7 @@ pub struct RegionState {
     town: Mutex<RegionTown>,
     link: Mutex<BrokerLink>,
     tiles: watch::Sender<BTreeSet<Quadkey>>,
+    read: Mutex<ReadTiles>,
 }
 
 /// The connection, as an operator sees it.
@@ -45,7 +46,7 @@ pub struct Reading<'a> {
     /// When it was read.
     pub at: Timestamp,
     /// Its content if it counts, otherwise the reason.
-    pub outcome: Result<Accepted, RejectReason>,
+    pub outcome: Result<Accepted, Refusal>,
 }
 
 /// Requests that wait for the network at most.
@@ -69,9 +70,9 @@ impl RegionState {
         lock(&self.link).clone()
     }
 
-    /// The tiles whose maps are asked for.
-    pub fn tiles(&self) -> BTreeSet<Quadkey> {
-        self.tiles.borrow().clone()
+    /// The tiles whose maps are read; none while there is no connection.
+    pub fn tiles(&self) -> ReadTiles {
+        lock(&self.read).clone()
     }
 
     /// Asks for the maps of these tiles and of no others. None of them may be in another.
@@ -123,10 +124,9 @@ async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watc
         if *logged_in.borrow() == 0 {
             continue;
         }
-        let of_tiles =
-            tiles.borrow_and_update().iter().map(|tile| RegionTopic::filter_within(*tile)).collect::<Vec<_>>();
-        let wanted: BTreeSet<_> =
-            of_tiles.into_iter().chain([RegionTopic::filter_everywhere(RegionTopicKind::Status)]).collect();
+        let asked_tiles = tiles.borrow_and_update().clone();
+        let of_tiles = asked_tiles.iter().map(|tile| RegionTopic::filter_within(*tile));
+        let wanted: BTreeSet<_> = of_tiles.chain([RegionTopic::filter_everywhere(RegionTopicKind::Status)]).collect();
         let (new, old) = (&wanted - &present, &present - &wanted);
         for filter in old {
             // The next login subscribes anew if the connection has ended.
@@ -139,6 +139,11 @@ async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watc
             let _ = client.subscribe_many(filters).await;
         }
         present = wanted;
+        // A connection that ended meanwhile reads nothing.
+        let link = lock(&state.link);
+        if link.is_up {
+            lock(&state.read).replace(asked_tiles.into_iter(), clock::now());
+        }
     }
 }
 
@@ -156,6 +161,7 @@ async fn poll(
             Ok(Event::Incoming(Packet::ConnAck(_))) => {
                 wait = RETRY_MIN;
                 let mut link = lock(&state.link);
+                lock(&state.read).clear();
                 *link = BrokerLink { is_up: true, logins: link.logins + 1, trouble: None };
                 logins.send_replace(link.logins);
             }
@@ -181,6 +187,7 @@ async fn poll(
                 let trouble = format!("no connection to {}: {error}", login.address());
                 {
                     let mut link = lock(&state.link);
+                    lock(&state.read).clear();
                     if link.is_up || link.trouble.is_none() {
                         tracing::warn!(broker = %login.address(), %error, "no connection to the region's broker");
                     }

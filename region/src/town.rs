@@ -1,7 +1,10 @@
 //! The latest of each cell of a region.
 
 mod bounds;
+mod read_tiles;
 mod snapshot;
+#[cfg(test)]
+mod tests;
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -11,11 +14,13 @@ use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
 use ecod::model::time::Timestamp;
-use ecod::neighbours::{CellMapFilter, MAX_AGE};
+use ecod::neighbours::{CellMapFilter, CoveredArea, MAX_AGE, MAX_MAP_HZ};
 use ecod::wire::{
-    CellDescription, CellMap, GlobalMap, Limits, NodeState, NodeStatus, Payload, RegionTopic, RegionTopicKind,
-    RejectReason, decode,
+    CellDescription, CellMap, FusedObject, GlobalMap, Limits, NodeState, NodeStatus, Payload, RegionTopic,
+    RegionTopicKind, RejectReason, decode,
 };
+use ecod_actors::platform::throttle::KeyedThrottle;
+pub use read_tiles::ReadTiles;
 pub use snapshot::{ObjectView, TileView, TownCellView, TownTotals, TownView};
 
 /// Cells by tile and name, and what came of them.
@@ -23,6 +28,7 @@ pub use snapshot::{ObjectView, TileView, TownCellView, TownTotals, TownView};
 pub struct RegionTown {
     cells: BTreeMap<(Quadkey, NodeName), RegionCell>,
     filter: CellMapFilter,
+    throttle: KeyedThrottle<RegionTopic>,
     counts: TownCounts,
 }
 
@@ -31,19 +37,42 @@ pub struct RegionTown {
 pub struct RegionCell {
     /// The status of its leader.
     pub status: Option<NodeStatus>,
-    /// The settings that its nodes share.
-    pub description: Option<CellDescription>,
+    /// Since when it says that it is not offline.
+    pub leads_since: Timestamp,
+    /// Version of the settings that its nodes share.
+    pub description: Option<u64>,
     /// Its newest map that counts.
     pub map: Option<TownMap>,
+    /// What of it was not used.
+    pub losses: CellLosses,
 }
 
-/// A map that counts.
+/// Messages and objects of one cell that were not used, so far.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct CellLosses {
+    /// Messages beyond [`MAX_MAP_HZ`].
+    pub throttled: u64,
+    /// Objects outside of what the cell may tell of.
+    pub outside: u64,
+    /// Objects beyond the maximum number.
+    pub too_many: u64,
+}
+
+/// A map that counts, as far as it is shown.
 #[derive(Debug)]
 pub struct TownMap {
     /// The place on Earth of its frame.
     pub origin: GeographicOrigin,
-    /// The map itself.
-    pub map: GlobalMap,
+    /// The leader.
+    pub aggregator: NodeName,
+    /// Term of the leadership.
+    pub epoch: u64,
+    /// Number of the map in it.
+    pub round: u64,
+    /// The objects of which the cell may tell, without contributors and scores.
+    pub objects: Vec<FusedObject>,
+    /// When it was fused, by the cell's time.
+    pub fused_at: Timestamp,
     /// When it was sent, by this program's clock: the time of receipt less what delayed it.
     pub sent_at: Timestamp,
 }
@@ -59,6 +88,23 @@ pub struct TownCounts {
     pub maps: u64,
     /// Messages that do not count, by reason; maps that are too old are `Stale`.
     pub rejected: BTreeMap<RejectReason, u64>,
+    /// Messages and objects of all cells that were not used.
+    pub losses: CellLosses,
+}
+
+/// The reason why a message does not count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// It cannot be used.
+    Rejected(RejectReason),
+    /// Its cell sends more than [`MAX_MAP_HZ`] of its kind.
+    CellThrottled,
+}
+
+impl From<RejectReason> for Refusal {
+    fn from(reason: RejectReason) -> Self {
+        Self::Rejected(reason)
+    }
 }
 
 /// A message that counts.
@@ -75,9 +121,9 @@ pub enum Accepted {
 pub enum CellState {
     /// Its newest map is no older than [`MAX_AGE`].
     Live,
-    /// It says that it leads, and its maps are not asked for.
+    /// It says that it leads. Its maps are not read, or not for long enough to know more.
     Told,
-    /// It says that it leads, and no map comes.
+    /// It says that it leads, and no map comes although one is due.
     Silent,
     /// It says that it is offline.
     Offline,
@@ -104,9 +150,25 @@ pub const MAX_CELLS: usize = 100_000;
 /// Maximum size of a map in bytes: a cell of some thousand objects.
 const MAX_MAP_BYTES: usize = 1 << 20;
 
+/// Maximum size of a status in bytes, as at a cell's broker.
+const MAX_STATUS_BYTES: usize = 16 << 10;
+
+/// Maximum number of objects of a cell that are kept: 0.6 MB.
+const MAX_OBJECTS: usize = 2048;
+
+/// Time for which maps are read before a cell without any is silent. A map counts 2 s after the subscription at the latest: the
+/// first ones show how long maps of the cell take.
+const DUE_AFTER: Duration = Duration::from_secs(3);
+
 impl Default for RegionTown {
     fn default() -> Self {
-        Self { cells: BTreeMap::new(), filter: CellMapFilter::new(MAX_CELLS), counts: TownCounts::default() }
+        let kinds = RegionTopicKind::ALL.len();
+        Self {
+            cells: BTreeMap::new(),
+            filter: CellMapFilter::new(MAX_CELLS),
+            throttle: KeyedThrottle::per_second(MAX_MAP_HZ).with_max_sources(kinds * MAX_CELLS),
+            counts: TownCounts::default(),
+        }
     }
 }
 
@@ -115,20 +177,24 @@ impl RegionTown {
     ///
     /// # Errors
     /// The reason why it does not count; it is counted.
-    pub fn accept(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, RejectReason> {
+    pub fn accept(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, Refusal> {
         self.counts.messages += 1;
         self.counts.bytes += payload.len() as u64;
         let accepted = self.take(path, payload, now);
-        if let Err(reason) = accepted {
+        if let Err(Refusal::Rejected(reason)) = accepted {
             *self.counts.rejected.entry(reason).or_default() += 1;
         }
         accepted
     }
 
-    fn take(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, RejectReason> {
+    fn take(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, Refusal> {
         let topic = RegionTopic::parse(path).filter(|topic| topic.tile.digits() == CELL_TILE_DIGITS);
         let topic = topic.ok_or(RejectReason::UnknownTopic)?;
         let key = (topic.tile, topic.cell.clone());
+        if !self.throttle.allow(&topic, now) {
+            self.lose(&key, CellLosses { throttled: 1, ..CellLosses::default() });
+            return Err(Refusal::CellThrottled);
+        }
         // A cell that clears what it retained has left for good.
         if payload.is_empty() && topic.kind != RegionTopicKind::Map {
             if topic.kind == RegionTopicKind::Status {
@@ -139,21 +205,40 @@ impl RegionTown {
             return Ok(Accepted::Other(topic));
         }
         if self.cells.len() >= MAX_CELLS && !self.cells.contains_key(&key) {
-            return Err(RejectReason::TooManyCells);
+            return Err(RejectReason::TooManyCells.into());
         }
         match topic.kind {
             RegionTopicKind::Map => {
                 let message: CellMap = read(payload)?;
                 let age = self.filter.admit(&topic, &message, now)?.age;
                 self.counts.maps += 1;
-                let CellMap { origin, map, .. } = message;
-                self.cells.entry(key).or_default().map = Some(TownMap { origin, map, sent_at: now - age });
+                let (map, losses) = TownMap::new(topic.tile, message, now - age);
+                self.cells.entry(key.clone()).or_default().map = Some(map);
+                self.lose(&key, losses);
                 return Ok(Accepted::Map(topic, age));
             }
-            RegionTopicKind::Cell => self.cells.entry(key).or_default().description = Some(read(payload)?),
-            RegionTopicKind::Status => self.cells.entry(key).or_default().status = Some(read(payload)?),
+            RegionTopicKind::Cell => {
+                let CellDescription { version, .. } = read(payload)?;
+                self.cells.entry(key).or_default().description = Some(version);
+            }
+            RegionTopicKind::Status => {
+                let status: NodeStatus = read(payload)?;
+                let cell = self.cells.entry(key).or_default();
+                if !cell.status.as_ref().is_some_and(leads) && leads(&status) {
+                    cell.leads_since = now;
+                }
+                cell.status = Some(status);
+            }
         }
         Ok(Accepted::Other(topic))
+    }
+
+    /// Counts what is not used, for its cell and for all.
+    fn lose(&mut self, key: &(Quadkey, NodeName), losses: CellLosses) {
+        self.counts.losses.add(losses);
+        if let Some(cell) = self.cells.get_mut(key) {
+            cell.losses.add(losses);
+        }
     }
 
     /// All cells, by tile and name.
@@ -179,20 +264,52 @@ impl RegionTown {
 /// Maximum age of a map that is shown, as an old one.
 const KEPT_FOR: Duration = Duration::from_secs(60);
 
+impl TownMap {
+    /// What of a map of a cell in `tile` is shown, and what is not.
+    fn new(tile: Quadkey, message: CellMap, sent_at: Timestamp) -> (Self, CellLosses) {
+        let CellMap { origin, map, .. } = message;
+        let GlobalMap { aggregator, epoch, round, fused_at_us: fused_at, mut objects, .. } = map;
+        let (area, told) = (CoveredArea::of(tile), objects.len());
+        objects.retain(|object| area.covers(&origin.to_wgs84(object.x_m, object.y_m, 0.0)));
+        let covered = objects.len();
+        objects.truncate(MAX_OBJECTS);
+        let losses =
+            CellLosses { throttled: 0, outside: (told - covered) as u64, too_many: (covered - objects.len()) as u64 };
+        for object in &mut objects {
+            (object.contributors, object.scores) = (Vec::new(), BTreeMap::new());
+        }
+        objects.shrink_to_fit();
+        (Self { origin, aggregator, epoch, round, objects, fused_at, sent_at }, losses)
+    }
+}
+
+impl CellLosses {
+    fn add(&mut self, more: Self) {
+        self.throttled += more.throttled;
+        self.outside += more.outside;
+        self.too_many += more.too_many;
+    }
+}
+
 impl RegionCell {
-    /// The cell's state at `now`; `is_asked` if its maps are asked for.
-    pub fn state(&self, now: Timestamp, is_asked: bool) -> CellState {
+    /// The cell's state at `now`; its maps are read since `read_since`, if they are.
+    pub fn state(&self, now: Timestamp, read_since: Option<Timestamp>) -> CellState {
         let age = self.map.as_ref().map(|map| now.since(map.sent_at));
-        let is_offline = self.status.as_ref().is_some_and(|status| status.state == NodeState::Offline);
         match age {
             Some(age) if age <= MAX_AGE => CellState::Live,
-            _ if is_offline => CellState::Offline,
-            _ if is_asked => CellState::Silent,
+            _ if self.status.as_ref().is_some_and(|status| !leads(status)) => CellState::Offline,
+            _ if read_since.is_some_and(|since| now.since(since.max(self.leads_since)) >= DUE_AFTER) => {
+                CellState::Silent
+            }
             _ => CellState::Told,
         }
     }
 }
 
+fn leads(status: &NodeStatus) -> bool {
+    status.state != NodeState::Offline
+}
+
 fn read<T: Payload>(payload: &[u8]) -> Result<T, RejectReason> {
-    decode(payload, &Limits { map_bytes: MAX_MAP_BYTES, ..Limits::default() })
+    decode(payload, &Limits { map_bytes: MAX_MAP_BYTES, payload_bytes: MAX_STATUS_BYTES, ..Limits::default() })
 }

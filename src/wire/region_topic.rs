@@ -7,7 +7,7 @@ use crate::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
 const ROOT: &str = "ecod/v1/geo";
 
 /// A topic of a cell in its region, such as `ecod/v1/geo/1/2/0/…/0/lot-1/map`.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct RegionTopic {
     /// The tile of the cell's origin.
     pub tile: Quadkey,

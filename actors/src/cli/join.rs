@@ -24,7 +24,7 @@ use super::{Failure, print, run};
 use crate::node::config::NodeConfig;
 use crate::platform::clock;
 use crate::transport::gossip::DEFAULT_PORT;
-use crate::transport::invitation::{Host, Token, Visit, Welcome, redeem};
+use crate::transport::invitation::{CityFiles, Host, Token, Visit, Welcome, redeem};
 use crate::transport::pki::{Authority, AuthorityError, DEFAULT_DAYS, check_name};
 use files::NodeDirectory;
 
@@ -38,6 +38,9 @@ pub(super) struct InitArguments {
     /// Role of the node: `edge` leads whenever it can, `auto` without a better candidate
     #[arg(long, default_value = "auto", value_parser = ["auto", "edge"])]
     role: String,
+    /// Directory of the CA of the city that the cell belongs to; by default the cell stands alone
+    #[arg(long, value_name = "DIR")]
+    city: Option<PathBuf>,
     #[command(flatten)]
     node: NodeArguments,
 }
@@ -109,12 +112,17 @@ impl JoinArguments {
 
 /// Makes a cell's CA and key, and the files of its first node.
 pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
-    let InitArguments { cell, name, role, .. } = arguments;
+    let InitArguments { cell, name, role, city, .. } = arguments;
     // Before anything is written: a directory with a CA is no place for another.
     check_name(name).map_err(Failure::usage)?;
     let directory = arguments.node.directory.vacant()?;
     let (role, now) = (role_named(role), clock::now());
-    let mut authority = Authority::init(&directory.pki(), cell, now).map_err(|error| anyhow!(error))?;
+    let mut city = city.as_deref().map(Authority::open).transpose().map_err(Failure::usage)?;
+    let authority = match &mut city {
+        Some(city) => city.init_cell(&directory.pki(), cell, now),
+        None => Authority::init(&directory.pki(), cell, now),
+    };
+    let mut authority = authority.map_err(|error| anyhow!(error))?;
     let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
     authority.issue(name, rights(role), valid, now).map_err(|error| anyhow!(error))?;
     let (certificate, key) = authority.files_of(name);
@@ -129,6 +137,9 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
         revocation_list: read(authority.revocation_list())?,
         cell_key: new_cell_key()?,
         seeds: Vec::new(),
+        city: city
+            .map(|city| anyhow::Ok(CityFiles { ca: read(city.ca())?, revocation_list: read(city.revocation_list())? }))
+            .transpose()?,
     };
     directory.write(name, &welcome, &key_text)?;
     // It is in the node's own file.
@@ -158,6 +169,7 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
     for name in arguments.names.iter().filter(|name| authority.has_certificate(name, clock::now())) {
         eprintln!("{name} has a certificate already, which stays valid; `ecod-node pki revoke` ends it");
     }
+    let city = directory.city(authority.is_of_city().map_err(|error| anyhow!(error))?)?;
     let unspecified = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
     let left = runtime.block_on(async {
@@ -170,7 +182,7 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
         } else {
             arguments.seeds.clone()
         };
-        let mut host = Host::new(authority, directory.cell_key()?, seeds)?;
+        let mut host = Host::new(authority, directory.cell_key()?, seeds, city)?;
         let role = role_named(&arguments.role);
         for name in &arguments.names {
             let token = host.invite(name, rights(role), addresses.clone())?;

@@ -8,4 +8,4 @@ mod listener;
 pub use access::PageAccess;
 pub use connection_limit::ConnectionLimit;
 pub use guard::{HttpRefusal, PageGuard, with_headers};
-pub use listener::accept;
+pub use listener::{BrowserHost, accept};

@@ -43,34 +43,41 @@ impl TokenBucket {
 
 /// Token buckets by source, all with the same rate.
 #[derive(Debug)]
-pub(crate) struct KeyedThrottle<K> {
+pub struct KeyedThrottle<K> {
     burst: u32,
     interval: Duration,
+    max_sources: usize,
     sources: BTreeMap<K, TokenBucket>,
 }
 
-/// Maximum sources with a bucket. While as many are busy, further sources are allowed nothing.
+/// Default maximum of sources with a bucket. While as many are busy, further sources are allowed nothing.
 const MAX_SOURCES: usize = 8192;
 
 impl<K: Ord + Clone> KeyedThrottle<K> {
     pub(crate) fn new(burst: u32, interval: Duration) -> Self {
-        Self { burst, interval, sources: BTreeMap::new() }
+        Self { burst, interval, max_sources: MAX_SOURCES, sources: BTreeMap::new() }
     }
 
     /// As many messages per second as in a burst.
-    pub(crate) fn per_second(count: u32) -> Self {
+    pub fn per_second(count: u32) -> Self {
         Self::new(count.max(1), Duration::from_secs(1) / count.max(1))
     }
 
+    /// The same with buckets for so many sources.
+    #[must_use]
+    pub fn with_max_sources(self, max_sources: usize) -> Self {
+        Self { max_sources, ..self }
+    }
+
     /// Takes a token of a source; false when there is none.
-    pub(crate) fn allow(&mut self, source: &K, now: Timestamp) -> bool {
+    pub fn allow(&mut self, source: &K, now: Timestamp) -> bool {
         if let Some(throttle) = self.sources.get_mut(source) {
             return throttle.allow(now);
         }
-        if self.sources.len() >= MAX_SOURCES {
+        if self.sources.len() >= self.max_sources {
             self.sources.retain(|_, throttle| !throttle.is_full(now));
         }
-        if self.sources.len() >= MAX_SOURCES {
+        if self.sources.len() >= self.max_sources {
             return false;
         }
         let mut throttle = TokenBucket::new(self.burst, self.interval, now);
@@ -103,10 +110,10 @@ mod tests {
 
     #[test]
     fn sources_that_rest_make_room() {
-        let mut throttles = KeyedThrottle::per_second(10);
-        assert!((0..MAX_SOURCES).all(|source| throttles.allow(&source, Timestamp(0))));
-        assert!(!throttles.allow(&MAX_SOURCES, Timestamp(0)));
-        assert!(throttles.allow(&MAX_SOURCES, Timestamp(1_000_000)));
+        let mut throttles = KeyedThrottle::per_second(10).with_max_sources(100);
+        assert!((0..100).all(|source| throttles.allow(&source, Timestamp(0))));
+        assert!(!throttles.allow(&100, Timestamp(0)));
+        assert!(throttles.allow(&100, Timestamp(1_000_000)));
     }
 
     #[test]

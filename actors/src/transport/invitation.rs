@@ -83,6 +83,18 @@ pub struct Welcome {
     pub cell_key: String,
     /// Nodes to ask for the cell, as `host:port`.
     pub seeds: Vec<String>,
+    /// The city above the cell, whose vehicles take part in it; absent for a cell that stands alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub city: Option<CityFiles>,
+}
+
+/// The files of a city that all nodes of its cells have.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CityFiles {
+    /// The certificate of the city's CA in PEM.
+    pub ca: String,
+    /// The city's revocation list in PEM.
+    pub revocation_list: String,
 }
 
 /// Writes one message, a line of JSON.
@@ -136,7 +148,7 @@ mod tests {
         let authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let addresses = vec![listener.local_addr().unwrap()];
-        let mut host = Host::new(authority, "a key of the cell".into(), vec!["10.0.0.1:1".into()]).unwrap();
+        let mut host = Host::new(authority, "a key of the cell".into(), vec!["10.0.0.1:1".into()], None).unwrap();
         for other in others {
             host.invite(&NodeName::from_static(other), Role::Cav, addresses.clone()).unwrap();
         }

@@ -131,6 +131,48 @@ fn three_machines_are_a_cell_after_five_commands_and_a_token_works_once() {
 }
 
 #[test]
+fn a_node_that_joins_a_cell_of_a_city_takes_the_citys_vehicles() {
+    let machines = ["city", "edge", "gauss"].map(|_| tempfile::tempdir().unwrap());
+    let [city, edge, gauss] = machines.each_ref().map(|machine| machine.path().to_str().unwrap());
+    let gossip = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
+    succeeds(&["pki", "city", "init", "--city", "town", "--dir", city]);
+    succeeds(&["pki", "city", "issue", "euclid", "--dir", city]);
+    succeeds(&["init", "lot-1", "edge", "--role", "edge", "--city", city, "--dir", edge]);
+    let list = Path::new(edge).join("city-revoked.pem");
+    let kept = fs::read_to_string(&list).unwrap();
+    fs::remove_file(&list).unwrap();
+    let incomplete = fails(&["invite", "gauss", "--dir", edge, "--listen", "127.0.0.1:0"]);
+    assert!(incomplete.contains("city-revoked.pem is missing: a city has signed the cell's CA"), "{incomplete}");
+    fs::write(&list, kept).unwrap();
+    let (mut host, tokens) = invite(edge, &gossip, &["gauss"]);
+    succeeds(&["join", &tokens[0], "--dir", gauss]);
+    assert!(host.0.wait().unwrap().success(), "it has joined");
+    for file in ["city.pem", "city-revoked.pem"] {
+        let [given, has] = [edge, gauss].map(|directory| fs::read_to_string(Path::new(directory).join(file)).unwrap());
+        assert_eq!(given, has, "{file}");
+    }
+    // The vehicle of the city, by the files of the city and the cell's key.
+    let euclid = tempfile::tempdir().unwrap();
+    let at = |directory: &str, file: &str| Path::new(directory).join(file).display().to_string();
+    let [ca, cell_list] = ["ca.pem", "revoked.pem"].map(|file| at(gauss, file));
+    let [city_ca, city_list] = ["ca.pem", "revoked.pem"].map(|file| at(city, file));
+    let [certificate, key] = ["nodes/euclid.pem", "nodes/euclid.key"].map(|file| at(city, file));
+    let configuration = format!(
+        "name = \"euclid\"\ncell = \"lot-1\"\nrole = \"cav\"\n[membership]\nkey_file = {:?}\nseeds = [{gossip:?}]\n\
+         [tls]\nca = {ca:?}\ncertificate = {certificate:?}\nkey = {key:?}\nrevocation_list = {cell_list:?}\n\
+         [tls.city]\nca = {city_ca:?}\nrevocation_list = {city_list:?}\n",
+        at(gauss, "cell.key")
+    );
+    fs::write(euclid.path().join("node.toml"), configuration).unwrap();
+    // The node that joined leads alone: the vehicle takes its maps if both trust the other.
+    let _nodes = [run(Path::new(gauss), &gossip), run(euclid.path(), "127.0.0.1:0")];
+    until("maps of the node that joined at the vehicle", || {
+        let maps = fs::read_to_string(euclid.path().join("maps")).unwrap_or_default();
+        maps.contains("\"aggregator\":\"gauss\"")
+    });
+}
+
+#[test]
 fn init_and_invite_say_why_they_refuse() {
     let machine = tempfile::tempdir().unwrap();
     let missing = fails(&["invite", "gauss", "--dir", machine.path().to_str().unwrap()]);

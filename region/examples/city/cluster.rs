@@ -51,6 +51,7 @@ impl Cluster {
         }
         // Without certificates: what is measured is the engine, not this machine's cryptography.
         fs::write(directory.join("mqtt.conf"), "mqtt { listen: $REGION_MQTT }\n")?;
+        fs::write(directory.join("cluster-tls.conf"), "")?;
         let addresses: Vec<[SocketAddr; 4]> = (0..SERVERS)
             .map(|_| Ok([free_address()?, free_address()?, free_address()?, free_address()?]))
             .collect::<anyhow::Result<_>>()?;

@@ -10,7 +10,7 @@ use ecod::neighbours::MAX_AGE;
 use ecod::wire::RejectReason;
 use ecod_region::broker::BrokerLogin;
 use ecod_region::reader::{self, RegionState};
-use ecod_region::town::Accepted;
+use ecod_region::town::{Accepted, Refusal};
 use hdrhistogram::Histogram;
 
 use crate::places::Half;
@@ -59,16 +59,16 @@ impl Watch {
                     Ok(Accepted::Map(topic, _)) => {
                         let town = read.town();
                         let cell = town.cells().get(&(topic.tile, topic.cell.clone()));
-                        let map = cell.and_then(|cell| cell.map.as_ref()).map(|map| &map.map);
+                        let map = cell.and_then(|cell| cell.map.as_ref());
                         // Simulated cells send a map as it is fused, real ones a moment later.
-                        let taken = map.map(|map| (map.round, map.fused_at_us));
+                        let taken = map.map(|map| (map.round, map.fused_at));
                         drop(town);
                         if let Some((round, sent_at)) = taken {
                             figures.take(&topic.cell, round, sent_at, reading.at);
                         }
                     }
                     Ok(Accepted::Other(_)) => {}
-                    Err(RejectReason::Stale) => figures.stale += 1,
+                    Err(Refusal::Rejected(RejectReason::Stale)) => figures.stale += 1,
                     Err(_) => figures.other += 1,
                 }
             })

@@ -49,9 +49,9 @@ pub(super) fn metrics(state: &RegionState, page: &PageCounts, started_at: Timest
     for (state, number) in cells {
         states.get_or_create(&vec![("state", state.as_str().to_owned())]).set(count(number));
     }
-    let help = "Cells by state; live and silent are told apart where maps are read, offline by their own word";
+    let help = "Cells by state; live and silent are told apart where maps are read, the others lead or are offline by their own word";
     registry.register("cells", help, states);
-    gauge(&mut registry, "tiles_read", "Tiles whose maps are read", count(tiles.len()));
+    gauge(&mut registry, "tiles_read", "Tiles whose maps are read", count(tiles.count()));
     counter(&mut registry, "messages", "Messages received", counts.messages);
     let bytes = Counter::<u64>::default();
     bytes.inc_by(counts.bytes);
@@ -61,7 +61,15 @@ pub(super) fn metrics(state: &RegionState, page: &PageCounts, started_at: Timest
     for (reason, number) in counts.rejected {
         rejected.get_or_create(&vec![("reason", reason.as_str().to_owned())]).inc_by(number);
     }
-    registry.register("rejected", "Messages that do not count; stale are maps that came too late", rejected);
+    rejected.get_or_create(&vec![("reason", "cell_throttled".to_owned())]).inc_by(counts.losses.throttled);
+    let help =
+        "Messages that do not count; stale are maps that came too late, cell_throttled those beyond 20/s of a cell";
+    registry.register("rejected", help, rejected);
+    let objects = Family::<RegionLabels, Counter>::default();
+    for (reason, number) in [("outside", counts.losses.outside), ("too_many", counts.losses.too_many)] {
+        objects.get_or_create(&vec![("reason", reason.to_owned())]).inc_by(number);
+    }
+    registry.register("objects_refused", "Objects outside of their cell's area, or beyond 2048 of a cell", objects);
     let [refused, throttled] = [&page.refused, &page.throttled].map(|counter| counter.load(Ordering::Relaxed));
     counter(&mut registry, "browsers_refused", "Requests without access, and connections beyond the limit", refused);
     counter(&mut registry, "browsers_throttled", "Requests beyond the rate", throttled);

@@ -7,6 +7,9 @@ const PERIOD_MS = 1000;
 const MOVED_MS = 150;
 const PATIENCE_MS = 5000;
 
+// Tells this page from others of the same host: each looks at one place.
+const VIEWER = Math.random().toString(36).slice(2);
+
 let latest = null;
 let timer = 0;
 let asking = false;
@@ -17,8 +20,8 @@ async function ask() {
   asking = true;
   try {
     const seen = bounds();
-    const query = seen ? `?bounds=${seen.map((degrees) => degrees.toFixed(7)).join(",")}` : "";
-    const answer = await fetch(`/api/view${query}`, { signal: AbortSignal.timeout(PATIENCE_MS) });
+    const query = seen ? `&bounds=${seen.map((degrees) => degrees.toFixed(7)).join(",")}` : "";
+    const answer = await fetch(`/api/view?viewer=${VIEWER}${query}`, { signal: AbortSignal.timeout(PATIENCE_MS) });
     if (!answer.ok) throw new Error(`the region answers ${answer.status}`);
     latest = await answer.json();
     if (!hasView()) open(latest.known);
@@ -49,16 +52,16 @@ function show(town) {
   text(byId("notice"), town.trouble ?? "");
   const { region, view } = town;
   text(byId("cells-total"), String(region.cells));
-  const parts = { live: "live", told: "not read", silent: "silent", offline: "offline" };
+  const parts = { live: "live", told: "leading", silent: "silent", offline: "offline" };
   const told = (totals) => Object.entries(parts).filter(([key]) => totals[key]).map(([key, word]) => `${totals[key]} ${word}`).join(", ");
   text(byId("cells-more"), told(region) || "in the region");
   text(byId("view-total"), counted(view.cells, "cell"));
   text(byId("view-more"), told(view) || "move the map, or press Fit");
   text(byId("objects-total"), view.live ? String(view.objects) : "–");
-  text(byId("objects-more"), view.live ? `${counted(view.vehicles, "vehicle")} among them` : "zoom in to read maps");
+  text(byId("objects-more"), view.live ? `${counted(view.vehicles, "vehicle")} among them` : town.maps_withheld ? "maps are not read" : "of maps that are read");
   const ages = town.tiles.map((tile) => tile.oldest_s).filter((age) => age !== null);
   text(byId("age-total"), ages.length ? span(Math.max(...ages)) : "–");
-  text(byId("age-more"), town.has_maps ? "of the newest of each cell" : view.cells > town.max_cells_read ? `maps are read up to ${town.max_cells_read} cells in view` : "maps are asked for");
+  text(byId("age-more"), town.maps_withheld ?? (town.has_maps ? "of the newest of each cell" : "maps are asked for"));
   byId("map-empty").hidden = region.cells > 0;
   draw(town);
   list(town);

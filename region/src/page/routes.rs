@@ -1,21 +1,22 @@
 //! HTTP routes of a region.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::{StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use axum::{Json, Router};
+use axum::{Extension, Json, Router};
 use ecod::model::time::Timestamp;
-use ecod_actors::observe::http::{HttpRefusal, PageAccess, PageGuard, with_headers};
+use ecod_actors::observe::http::{BrowserHost, HttpRefusal, PageAccess, PageGuard, with_headers};
 use ecod_actors::platform::clock;
 use serde::Serialize;
 
 use super::assets;
 use super::metrics::{self, PageCounts};
-use super::viewers::Viewers;
+use super::viewers::{MapsWithheld, ViewerId, Viewers};
 use crate::reader::RegionState;
 use crate::town::{GeographicBounds, TownView};
 
@@ -35,8 +36,8 @@ struct ViewAnswer {
     broker_up: bool,
     /// The reason why it does not, or filters that it refuses.
     trouble: Option<String>,
-    /// Number of cells in a view above which their maps are not read.
-    max_cells_read: usize,
+    /// The reason why the maps of the view are not read.
+    maps_withheld: Option<String>,
     #[serde(flatten)]
     town: TownView,
 }
@@ -44,8 +45,8 @@ struct ViewAnswer {
 /// Maximum number of tiles that a view asks for.
 const MAX_TILES_OF_VIEW: usize = 16;
 
-/// Number of cells in a view above which their maps are not read: at 2 Hz and 2 kB, 8 MB/s.
-const MAX_CELLS_READ: usize = 2000;
+/// Maximum length of a viewer's name.
+const MAX_NAME_BYTES: usize = 64;
 
 /// The whole map.
 const EARTH: GeographicBounds = GeographicBounds { west: -180.0, south: -85.06, east: 180.0, north: 85.06 };
@@ -56,16 +57,30 @@ impl RegionApi {
     }
 
     /// Asks for the tiles of all viewers, of whom one looks at `bounds` now.
-    pub(super) fn ask(&self, bounds: Option<&GeographicBounds>, now: Timestamp) {
-        let tiles = bounds.map(|bounds| bounds.tiles(MAX_TILES_OF_VIEW)).unwrap_or_default();
-        let is_read = self.state.town().count_within(&tiles) <= MAX_CELLS_READ;
-        let mut viewers = self.viewers.lock().unwrap_or_else(PoisonError::into_inner);
-        if is_read {
-            viewers.look(&tiles, now);
-        } else {
-            viewers.forget(&tiles);
-        }
-        self.state.ask(viewers.tiles(now));
+    ///
+    /// # Errors
+    /// The reason why its maps are not read.
+    pub(super) fn look(
+        &self,
+        viewer: &ViewerId,
+        bounds: &GeographicBounds,
+        now: Timestamp,
+    ) -> Result<(), MapsWithheld> {
+        self.viewers().look(viewer.clone(), bounds.tiles(MAX_TILES_OF_VIEW), now)?;
+        self.ask(now).remove(viewer).map_or(Ok(()), Err)
+    }
+
+    /// Asks for the tiles of all viewers; returns those whose maps are not read.
+    pub(super) fn ask(&self, now: Timestamp) -> BTreeMap<ViewerId, MapsWithheld> {
+        let mut viewers = self.viewers();
+        let town = self.state.town();
+        let (tiles, withheld) = viewers.tiles(|tiles| town.count_within(tiles), now);
+        self.state.ask(tiles);
+        withheld
+    }
+
+    fn viewers(&self) -> MutexGuard<'_, Viewers> {
+        self.viewers.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -105,21 +120,24 @@ async fn show_metrics(State(api): RegionRequest) -> Response {
 }
 
 /// The town within `?bounds=WEST,SOUTH,EAST,NORTH`, whose maps are read from now on; without bounds, all of it.
-async fn show_view(State(api): RegionRequest, uri: Uri) -> Response {
+/// `viewer=NAME` tells viewers of one host apart: each looks at one place.
+async fn show_view(State(api): RegionRequest, Extension(host): Extension<BrowserHost>, uri: Uri) -> Response {
     let query = uri.query().unwrap_or_default();
-    let bounds = match query.split('&').find_map(|pair| pair.strip_prefix("bounds=")) {
+    let parameter = |name: &str| query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='));
+    let bounds = match parameter("bounds") {
         None => EARTH,
         Some(text) => match text.replace("%2C", ",").parse() {
             Ok(bounds) => bounds,
             Err(error) => return (StatusCode::BAD_REQUEST, format!("{error}\n")).into_response(),
         },
     };
+    let name = parameter("viewer").filter(|name| name.len() <= MAX_NAME_BYTES).unwrap_or_default();
     let now = clock::now();
-    api.ask(Some(&bounds), now);
-    let (link, asked) = (api.state.link(), api.state.tiles());
-    let town = api.state.town().view(&bounds, &asked, now);
-    let answer = ViewAnswer { broker_up: link.is_up, trouble: link.trouble, max_cells_read: MAX_CELLS_READ, town };
-    Json(answer).into_response()
+    let looked = api.look(&ViewerId { host: host.0, name: name.to_owned() }, &bounds, now);
+    let (link, read) = (api.state.link(), api.state.tiles());
+    let town = api.state.town().view(&bounds, &read, now);
+    let maps_withheld = looked.err().map(MapsWithheld::in_words);
+    Json(ViewAnswer { broker_up: link.is_up, trouble: link.trouble, maps_withheld, town }).into_response()
 }
 
 async fn show_asset(uri: Uri) -> Response {

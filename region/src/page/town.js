@@ -163,7 +163,8 @@ function spread(all, key) {
 
 function drawCounts(cells, names, tiles, box) {
   const middle = (tile) => { const { x, y, width, height } = box(tile); return [x + width / 2, y + height / 2, width]; };
-  const worst = ({ totals }) => ["offline", "silent", "live", "told"].find((state) => totals[state] > 0) ?? "told";
+  const most = ({ totals }) => ["live", "told", "silent", "offline"].reduce((a, b) => (totals[b] > totals[a] ? b : a));
+  const worst = ({ totals }) => (totals.offline > 0 ? " some-offline" : totals.silent > 0 ? " some-silent" : "");
   keyed(cells, tiles, (tile) => tile.key, (tile) => {
     const sign = svg("circle");
     sign.append(svg("title"));
@@ -173,9 +174,9 @@ function drawCounts(cells, names, tiles, box) {
     const [cx, cy, width] = middle(tile);
     sign.bounds = tile.bounds;
     const radius = Math.min(6 + 3 * Math.sqrt(tile.totals.cells), Math.max(width * 0.46, 3));
-    set(sign, { class: `cell tile-count ${worst(tile)}`, cx, cy, r: radius });
+    set(sign, { class: `cell tile-count ${most(tile)}${worst(tile)}`, cx, cy, r: radius });
     const { cells, live, told, silent, offline } = tile.totals;
-    text(sign.firstChild, `${cells} cells: ${live} live, ${told} not read, ${silent} silent, ${offline} offline`);
+    text(sign.firstChild, `${cells} cells: ${live} live, ${told} leading, ${silent} silent, ${offline} offline`);
   });
   const wide = tiles.filter((tile) => middle(tile)[2] > 26);
   keyed(names, wide, (tile) => tile.key, () => svg("text"), (label, tile) => {

@@ -1,64 +1,228 @@
-//! The tiles that somebody looks at.
+//! Views of the town: the tiles that somebody looks at, and whose maps are read.
+//!
+//! Addresses share views and cells evenly. One that has more views than another gives way to it, and the small views of each are
+//! read first.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::net::IpAddr;
 use std::time::Duration;
 
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 
-/// Tiles by the time until which they are looked at, and those that always are.
+/// Views that are looked at, and tiles that always are.
 #[derive(Debug)]
 pub(super) struct Viewers {
     watched: Vec<Quadkey>,
-    until: BTreeMap<Quadkey, Timestamp>,
+    views: BTreeMap<ViewerId, TownWindow>,
+}
+
+/// A page, or a program, that looks at the town.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct ViewerId {
+    /// Its host's address, as hosts are counted.
+    pub(super) host: IpAddr,
+    /// Its own name among those of the host.
+    pub(super) name: String,
+}
+
+/// What a viewer looks at.
+#[derive(Debug)]
+struct TownWindow {
+    tiles: Vec<Quadkey>,
+    /// Number of cells in them.
+    cells: usize,
+    looked_at: Timestamp,
+}
+
+/// The reason why the maps of a view are not read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum MapsWithheld {
+    /// It has more than [`MAX_CELLS_OF_VIEW`] cells.
+    LargeView,
+    /// Other views take up all that is read.
+    ManyCells,
+    /// As many views as possible are read, and no host has more of them than this one.
+    ManyViews,
 }
 
 /// Time for which a view is remembered. The page asks once a second.
 const VIEW_LASTS: Duration = Duration::from_secs(10);
 
-/// Maximum number of tiles of all views; later ones are not read.
-const MAX_TILES: usize = 256;
+/// Time after which a view is idle: it is the first to make room.
+const IDLE_AFTER: Duration = Duration::from_secs(3);
+
+/// Maximum number of views.
+const MAX_VIEWS: usize = 64;
+
+/// Number of cells in a view above which their maps are not read: at 2 Hz and 2 kB, 8 MB/s.
+const MAX_CELLS_OF_VIEW: usize = 2000;
+
+/// Number of cells in all views whose maps are read.
+const MAX_CELLS: usize = 10_000;
+
+impl MapsWithheld {
+    /// The reason for a person who looks.
+    pub(super) fn in_words(self) -> String {
+        match self {
+            Self::LargeView => format!("zoom in: over {MAX_CELLS_OF_VIEW} cells in view"),
+            Self::ManyCells => format!("zoom in: others read {MAX_CELLS} cells"),
+            Self::ManyViews => format!("close a view: {MAX_VIEWS} are open"),
+        }
+    }
+}
 
 impl Viewers {
     pub(super) fn new(watched: Vec<Quadkey>) -> Self {
-        Self { watched, until: BTreeMap::new() }
+        Self { watched, views: BTreeMap::new() }
     }
 
-    /// Notes that somebody looks at tiles.
-    pub(super) fn look(&mut self, tiles: &[Quadkey], now: Timestamp) {
-        for tile in tiles {
-            if self.until.len() < MAX_TILES || self.until.contains_key(tile) {
-                self.until.insert(*tile, now + VIEW_LASTS);
+    /// Notes that a viewer looks at tiles and no others.
+    ///
+    /// # Errors
+    /// [`MapsWithheld::ManyViews`]; nothing has changed then.
+    pub(super) fn look(&mut self, viewer: ViewerId, tiles: Vec<Quadkey>, now: Timestamp) -> Result<(), MapsWithheld> {
+        if !self.views.contains_key(&viewer) && self.views.len() >= MAX_VIEWS {
+            let replaced = self.replaced_by(&viewer, now).ok_or(MapsWithheld::ManyViews)?;
+            self.views.remove(&replaced);
+        }
+        self.views.insert(viewer, TownWindow { tiles, cells: 0, looked_at: now });
+        Ok(())
+    }
+
+    /// The view that makes room for a new one: the oldest idle one, or the oldest of the host with the most.
+    fn replaced_by(&self, viewer: &ViewerId, now: Timestamp) -> Option<ViewerId> {
+        let oldest = self.views.iter().min_by_key(|(_, view)| view.looked_at)?;
+        if now.since(oldest.1.looked_at) >= IDLE_AFTER {
+            return Some(oldest.0.clone());
+        }
+        let mut by_host = BTreeMap::<IpAddr, usize>::new();
+        self.views.keys().for_each(|id| *by_host.entry(id.host).or_default() += 1);
+        let own = by_host.get(&viewer.host).copied().unwrap_or(0);
+        let (host, most) = by_host.into_iter().max_by_key(|(_, views)| *views)?;
+        let of_host = self.views.iter().filter(|(id, _)| id.host == host && most > own + 1);
+        of_host.min_by_key(|(_, view)| view.looked_at).map(|(id, _)| id.clone())
+    }
+
+    /// All tiles whose maps are to be read, without those that are in another, and the viewers whose maps are not;
+    /// `count` has the number of cells in tiles.
+    pub(super) fn tiles(
+        &mut self,
+        count: impl Fn(&[Quadkey]) -> usize,
+        now: Timestamp,
+    ) -> (BTreeSet<Quadkey>, BTreeMap<ViewerId, MapsWithheld>) {
+        self.views.retain(|_, view| now.since(view.looked_at) < VIEW_LASTS);
+        self.views.values_mut().for_each(|view| view.cells = count(&view.tiles));
+        let mut by_host = BTreeMap::<IpAddr, Vec<_>>::new();
+        self.views.iter().for_each(|(id, view)| by_host.entry(id.host).or_default().push((id, view)));
+        let mut in_turn = Vec::new();
+        for views in by_host.values_mut() {
+            views.sort_by_key(|(_, view)| view.cells);
+            in_turn.extend(views.iter().enumerate().map(|(turn, (id, view))| (turn, view.cells, *id, *view)));
+        }
+        in_turn.sort_by_key(|(turn, cells, id, _)| (*turn, *cells, *id));
+        let (mut read, mut withheld) = (self.watched.iter().copied().collect::<BTreeSet<_>>(), BTreeMap::new());
+        let mut cells = 0;
+        for (_, _, id, view) in in_turn {
+            let more: Vec<_> = view.tiles.iter().copied().filter(|tile| !is_within(*tile, &read)).collect();
+            let more_cells = count(&more);
+            if view.cells > MAX_CELLS_OF_VIEW {
+                withheld.insert(id.clone(), MapsWithheld::LargeView);
+            } else if cells + more_cells > MAX_CELLS {
+                withheld.insert(id.clone(), MapsWithheld::ManyCells);
+            } else {
+                cells += more_cells;
+                read.extend(more);
             }
         }
+        let outer = read.iter().filter(|tile| tile.digits() == 0 || !is_within(tile.outer(tile.digits() - 1), &read));
+        (outer.copied().collect(), withheld)
     }
+}
 
-    /// Forgets tiles that are too much to read.
-    pub(super) fn forget(&mut self, tiles: &[Quadkey]) {
-        self.until.retain(|tile, _| !tiles.contains(tile));
-    }
-
-    /// All tiles that are looked at, without those that are in another.
-    pub(super) fn tiles(&mut self, now: Timestamp) -> BTreeSet<Quadkey> {
-        self.until.retain(|_, until| *until > now);
-        let all: BTreeSet<_> = self.watched.iter().chain(self.until.keys()).copied().collect();
-        let is_in_another = |tile: &Quadkey| all.iter().any(|other| other != tile && other.contains(*tile));
-        all.iter().filter(|tile| !is_in_another(tile)).copied().collect()
-    }
+/// True if a tile is one of these or in one.
+fn is_within(tile: Quadkey, tiles: &BTreeSet<Quadkey>) -> bool {
+    (0..=tile.digits()).any(|digits| tiles.contains(&tile.outer(digits)))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn tile(key: &str) -> Quadkey {
+        key.parse().unwrap()
+    }
+
+    fn viewer(host: u8, name: usize) -> ViewerId {
+        ViewerId { host: [10, 0, 0, host].into(), name: name.to_string() }
+    }
+
+    /// The tile of four digits with this number.
+    fn numbered(number: usize) -> Quadkey {
+        tile(&[6, 4, 2, 0].map(|bit| char::from(b'0' + (number >> bit & 3) as u8)).iter().collect::<String>())
+    }
+
+    fn at(ms: u64) -> Timestamp {
+        Timestamp(1000 * ms)
+    }
+
     #[test]
     fn a_tile_is_read_while_somebody_looks_and_once_only() {
-        let tile = |key: &str| key.parse::<Quadkey>().unwrap();
         let mut viewers = Viewers::new(vec![tile("0")]);
-        viewers.look(&[tile("12"), tile("123"), tile("013")], Timestamp(0));
-        assert_eq!(viewers.tiles(Timestamp(1)), [tile("0"), tile("12")].into());
-        viewers.look(&[tile("2")], Timestamp(5_000_000));
-        assert_eq!(viewers.tiles(Timestamp(11_000_000)), [tile("0"), tile("2")].into());
-        assert_eq!(viewers.tiles(Timestamp(16_000_000)), [tile("0")].into());
+        let read = |viewers: &mut Viewers, ms| viewers.tiles(|_| 1, at(ms)).0;
+        viewers.look(viewer(1, 1), vec![tile("12"), tile("123"), tile("013")], at(0)).unwrap();
+        assert_eq!(read(&mut viewers, 1), [tile("0"), tile("12")].into());
+        viewers.look(viewer(1, 2), vec![tile("2")], at(5000)).unwrap();
+        assert_eq!(read(&mut viewers, 5000), [tile("0"), tile("12"), tile("2")].into());
+        assert_eq!(read(&mut viewers, 11_000), [tile("0"), tile("2")].into());
+        viewers.look(viewer(1, 2), vec![tile("33")], at(12_000)).unwrap();
+        assert_eq!(read(&mut viewers, 12_000), [tile("0"), tile("33")].into(), "one that moves leaves what it saw");
+        assert_eq!(read(&mut viewers, 30_000), [tile("0")].into());
+    }
+
+    #[test]
+    fn a_host_with_many_views_gives_way_to_others_and_keeps_an_even_share() {
+        let mut viewers = Viewers::new(Vec::new());
+        for number in 0..200 {
+            let looked = viewers.look(viewer(1, number), vec![numbered(number)], at(1000));
+            assert_eq!(looked.is_ok(), number < MAX_VIEWS, "{number}");
+        }
+        for number in 0..40 {
+            let _ = viewers.look(viewer(2, number), vec![numbered(200 + number % 50)], at(1001));
+        }
+        let of = |viewers: &Viewers, host| viewers.views.keys().filter(|id| id.host == viewer(host, 0).host).count();
+        assert_eq!([of(&viewers, 1), of(&viewers, 2)], [32, 32]);
+        viewers.look(viewer(3, 0), vec![tile("3333")], at(1002)).unwrap();
+        assert!(viewers.tiles(|_| 1, at(1002)).0.contains(&tile("3333")));
+        assert_eq!(viewers.views.len(), MAX_VIEWS);
+    }
+
+    #[test]
+    fn an_idle_view_makes_room_first() {
+        let mut viewers = Viewers::new(Vec::new());
+        viewers.look(viewer(2, 0), vec![tile("3")], at(0)).unwrap();
+        for number in 1..MAX_VIEWS {
+            viewers.look(viewer(1, number), vec![numbered(number)], at(3000)).unwrap();
+        }
+        viewers.look(viewer(1, 100), vec![tile("2")], at(3000)).unwrap();
+        assert!(!viewers.views.contains_key(&viewer(2, 0)) && viewers.views.contains_key(&viewer(1, 1)));
+    }
+
+    #[test]
+    fn small_views_are_read_before_large_ones_and_a_host_is_no_better_for_having_many() {
+        let mut viewers = Viewers::new(Vec::new());
+        // Each tile of four digits has 100 cells.
+        let count = |tiles: &[Quadkey]| 100 * tiles.len();
+        for number in 0..12 {
+            let tiles = (0..20).map(|tile| numbered(20 * number + tile)).collect();
+            viewers.look(viewer(1, number), tiles, at(0)).unwrap();
+        }
+        viewers.look(viewer(2, 0), (240..256).map(numbered).collect(), at(0)).unwrap();
+        viewers.look(viewer(3, 0), (0..21).map(numbered).collect(), at(0)).unwrap();
+        let (read, withheld) = viewers.tiles(count, at(0));
+        assert!((240..256).all(|number| read.contains(&numbered(number))), "the other host's");
+        assert_eq!(withheld.get(&viewer(3, 0)), Some(&MapsWithheld::LargeView));
+        let of_many = withheld.values().filter(|reason| **reason == MapsWithheld::ManyCells).count();
+        assert_eq!((read.len(), of_many), (16 + 4 * 20, 8), "10,000 cells at most");
     }
 }

@@ -1,6 +1,6 @@
 //! The town within a view, as the page and programs get it.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use ecod::model::names::{Label, NodeName};
 use ecod::model::origin::GeographicOrigin;
@@ -10,7 +10,7 @@ use ecod::wire::{FusedObject, Trouble};
 use serde::Serialize;
 use uuid::Uuid;
 
-use super::{CellState, GeographicBounds, RegionCell, RegionTown, TownMap};
+use super::{CellState, GeographicBounds, ReadTiles, RegionCell, RegionTown, TownMap};
 
 /// The town within a view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -21,13 +21,13 @@ pub struct TownView {
     pub region: TownTotals,
     /// Numbers of the view.
     pub view: TownTotals,
-    /// True if the maps of the view are asked for.
+    /// True if the maps of all cells in the view are read.
     pub has_maps: bool,
     /// Tiles with cells in the view, in one size.
     pub tiles: Vec<TileView>,
     /// Cells in the view; none if there are more than `MAX_CELLS_SHOWN`.
     pub cells: Vec<TownCellView>,
-    /// Objects in the view; none if there are more than `MAX_OBJECTS_SHOWN`.
+    /// Objects of live cells in the view; none if there are more than `MAX_OBJECTS_SHOWN`.
     pub objects: Vec<ObjectView>,
 }
 
@@ -38,7 +38,7 @@ pub struct TownTotals {
     pub cells: usize,
     /// Cells whose newest map is not old.
     pub live: usize,
-    /// Cells that say that they lead, and whose maps are not asked for.
+    /// Cells that say that they lead, and whose maps are not read for long enough to know more.
     pub told: usize,
     /// Cells that say that they lead, and of which no map comes.
     pub silent: usize,
@@ -46,9 +46,9 @@ pub struct TownTotals {
     pub offline: usize,
     /// Cells whose leader tells of troubles.
     pub troubled: usize,
-    /// Objects of the maps.
+    /// Objects of live cells.
     pub objects: usize,
-    /// Vehicles in the maps.
+    /// Vehicles among them.
     pub vehicles: usize,
 }
 
@@ -61,7 +61,7 @@ pub struct TileView {
     pub bounds: GeographicBounds,
     /// The cells in it.
     pub totals: TownTotals,
-    /// Age in seconds of the oldest of the newest maps in it.
+    /// Age in seconds of the oldest of the newest maps of cells in it that are read.
     pub oldest_s: Option<f64>,
 }
 
@@ -98,6 +98,10 @@ pub struct TownCellView {
     pub description: Option<u64>,
     /// Address of its leader's page.
     pub page: Option<String>,
+    /// Messages beyond the rate, so far.
+    pub messages_refused: u64,
+    /// Objects outside of its area or beyond the maximum number, so far.
+    pub objects_refused: u64,
 }
 
 /// An object of a cell's map.
@@ -131,65 +135,70 @@ pub(super) const MAX_CELLS_SHOWN: usize = 512;
 pub(super) const MAX_OBJECTS_SHOWN: usize = 4096;
 
 impl RegionTown {
-    /// Number of cells in each state; `asked` are the tiles whose maps are asked for.
-    pub fn states(&self, asked: &BTreeSet<Quadkey>, now: Timestamp) -> BTreeMap<CellState, usize> {
+    /// Number of cells in each state.
+    pub fn states(&self, tiles: &ReadTiles, now: Timestamp) -> BTreeMap<CellState, usize> {
         let mut states: BTreeMap<_, _> = CellState::ALL.into_iter().map(|state| (state, 0)).collect();
         for ((tile, _), cell) in self.cells() {
-            *states.entry(cell.state(now, is_within(*tile, asked))).or_default() += 1;
+            *states.entry(cell.state(now, tiles.since(*tile))).or_default() += 1;
         }
         states
     }
 
     /// Number of cells within tiles.
     pub fn count_within(&self, tiles: &[Quadkey]) -> usize {
-        self.cells().keys().filter(|(tile, _)| is_within(*tile, tiles)).count()
+        self.cells().keys().filter(|(tile, _)| tiles.iter().any(|outer| outer.contains(*tile))).count()
     }
 
-    /// The town within bounds; `asked` are the tiles whose maps are asked for.
-    pub fn view(&self, bounds: &GeographicBounds, asked: &BTreeSet<Quadkey>, now: Timestamp) -> TownView {
-        self.view_up_to([MAX_CELLS_SHOWN, MAX_OBJECTS_SHOWN], bounds, asked, now)
+    /// The town within bounds.
+    pub fn view(&self, bounds: &GeographicBounds, tiles: &ReadTiles, now: Timestamp) -> TownView {
+        self.view_up_to([MAX_CELLS_SHOWN, MAX_OBJECTS_SHOWN], bounds, tiles, now)
     }
 
-    /// The town within bounds with all its cells and objects, of which all maps are asked for.
+    /// The town within bounds with all its cells and objects. All maps were read.
     pub fn view_whole(&self, bounds: &GeographicBounds, now: Timestamp) -> TownView {
-        let asked = bounds.tiles(1).into_iter().collect();
-        self.view_up_to([usize::MAX; 2], bounds, &asked, now)
+        let tiles = ReadTiles::one(Quadkey::default(), Timestamp(0));
+        self.view_up_to([usize::MAX; 2], bounds, &tiles, now)
     }
 
     fn view_up_to(
         &self,
         [max_cells, max_objects]: [usize; 2],
         bounds: &GeographicBounds,
-        asked: &BTreeSet<Quadkey>,
+        read: &ReadTiles,
         now: Timestamp,
     ) -> TownView {
-        let is_asked = |tile: &Quadkey| is_within(*tile, asked);
         let (mut region, mut known) = (TownTotals::default(), None::<GeographicBounds>);
         let mut shown = Vec::new();
+        let mut has_maps = true;
         for ((tile, name), cell) in self.cells() {
-            let (state, at) = (cell.state(now, is_asked(tile)), GeographicBounds::of(*tile));
+            let (read_since, at) = (read.since(*tile), GeographicBounds::of(*tile));
+            let state = cell.state(now, read_since);
             region.add(cell, state);
             known = Some(known.map_or(at, |known| known.with(at)));
             if at.meets(bounds) {
+                has_maps &= read_since.is_some();
                 shown.push((*tile, name, cell, state));
             }
         }
         let mut view = TownTotals::default();
         shown.iter().for_each(|(_, _, cell, state)| view.add(cell, *state));
-        let has_maps = !shown.is_empty() && shown.iter().all(|(tile, ..)| is_asked(tile));
         let cells = if shown.len() > max_cells { &[] } else { &*shown };
         let objects = if view.objects > max_objects { &[] } else { &*shown };
         TownView {
             known,
             region,
             view,
-            has_maps,
+            has_maps: has_maps && !shown.is_empty(),
             tiles: tiles(bounds, &shown, now),
             cells: cells
                 .iter()
                 .map(|(tile, name, cell, state)| TownCellView::new(*tile, name, cell, *state, now))
                 .collect(),
-            objects: objects.iter().flat_map(|(_, name, cell, _)| cell.objects(name)).collect(),
+            objects: objects
+                .iter()
+                .filter(|(.., state)| *state == CellState::Live)
+                .flat_map(|(_, name, cell, _)| cell.objects(name))
+                .collect(),
         }
     }
 }
@@ -203,7 +212,8 @@ fn tiles(bounds: &GeographicBounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<
     for (tile, _, cell, state) in shown {
         let (totals, oldest_s) = tiles.entry(tile.outer(digits)).or_default();
         totals.add(cell, *state);
-        let age_s = cell.map.as_ref().map(|map| map.age_s(now));
+        let is_read = [CellState::Live, CellState::Silent].contains(state);
+        let age_s = cell.map.as_ref().filter(|_| is_read).map(|map| map.age_s(now));
         *oldest_s = [*oldest_s, age_s].into_iter().flatten().reduce(f64::max);
     }
     let view = |(tile, (totals, oldest_s)): (Quadkey, (TownTotals, Option<f64>))| TileView {
@@ -213,11 +223,6 @@ fn tiles(bounds: &GeographicBounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<
         oldest_s,
     };
     tiles.into_iter().map(view).collect()
-}
-
-/// True if a tile is one of these or in one.
-fn is_within<'a>(tile: Quadkey, tiles: impl IntoIterator<Item = &'a Quadkey>) -> bool {
-    tiles.into_iter().any(|outer| outer.contains(tile))
 }
 
 impl TownTotals {
@@ -231,9 +236,10 @@ impl TownTotals {
         };
         *number += 1;
         self.troubled += usize::from(cell.status.as_ref().is_some_and(|status| !status.troubles.is_empty()));
-        if let Some(TownMap { map, .. }) = &cell.map {
-            self.objects += map.objects.len();
-            self.vehicles += vehicles(&map.objects);
+        // What an old map had may be gone.
+        if let (CellState::Live, Some(TownMap { objects, .. })) = (state, &cell.map) {
+            self.objects += objects.len();
+            self.vehicles += vehicles(objects);
         }
     }
 }
@@ -252,7 +258,7 @@ impl TownMap {
 impl RegionCell {
     /// The objects of its newest map, on Earth.
     pub fn objects<'a>(&'a self, name: &'a NodeName) -> impl Iterator<Item = ObjectView> + 'a {
-        let placed = self.map.iter().flat_map(|map| map.map.objects.iter().map(|object| (&map.origin, object)));
+        let placed = self.map.iter().flat_map(|map| map.objects.iter().map(|object| (&map.origin, object)));
         placed.map(move |(origin, object)| ObjectView::new(name, origin, object))
     }
 }
@@ -288,16 +294,18 @@ impl TownCellView {
             latitude_deg,
             longitude_deg,
             state: state.as_str(),
-            leader: map.map(|map| map.map.aggregator.clone()).or(led),
-            epoch: map.map(|map| map.map.epoch).or(status.map(|status| status.epoch)),
-            round: map.map(|map| map.map.round),
+            leader: map.map(|map| map.aggregator.clone()).or(led),
+            epoch: map.map(|map| map.epoch).or(status.map(|status| status.epoch)),
+            round: map.map(|map| map.round),
             age_s: map.map(|map| map.age_s(now)),
-            objects: map.map_or(0, |map| map.map.objects.len()),
-            vehicles: map.map_or(0, |map| vehicles(&map.map.objects)),
+            objects: map.map_or(0, |map| map.objects.len()),
+            vehicles: map.map_or(0, |map| vehicles(&map.objects)),
             troubles: status.map(|status| status.troubles.clone()).unwrap_or_default(),
             version: status.map(|status| status.version.clone()),
-            description: cell.description.as_ref().map(|description| description.version),
+            description: cell.description,
             page: status.and_then(|status| status.page.clone()).filter(|page| is_reachable(page)),
+            messages_refused: cell.losses.throttled,
+            objects_refused: cell.losses.outside + cell.losses.too_many,
         }
     }
 }

@@ -18,6 +18,8 @@ pub(crate) struct Broker {
     child: Child,
     directory: TempDir,
     pub(crate) address: SocketAddr,
+    /// Address for other servers.
+    pub(crate) route: Option<SocketAddr>,
 }
 
 /// The place of cell `lot-1`, and of `far-1`, some kilometres off.
@@ -48,18 +50,55 @@ impl Broker {
         Self::start(command, directory, address)
     }
 
-    /// mosquitto with the same accounts and certificates.
+    /// Three servers by `nats-cluster.conf`, with TLS between them and the same accounts.
+    pub(crate) fn cluster() -> [Self; 3] {
+        let directories = [(); 3].map(|()| TempDir::new().unwrap());
+        let [servers, routes] = [(); 2].map(|()| [(); 3].map(|()| free_address()));
+        let first = directories[0].path();
+        make_certificates(&first.join("tls"));
+        add_cell(first, LOT.0, LOT.1, LOT.2);
+        let names = routes.map(|route| format!("\"nats://{route}\""));
+        for directory in &directories {
+            for file in ["common.conf", "nats-cluster.conf", "cluster-tls.conf", "mqtt.conf"] {
+                fs::copy(Path::new(DEPLOY).join(file), directory.path().join(file)).unwrap();
+            }
+            fs::write(directory.path().join("routes.conf"), format!("routes: [{}]\n", names.join(", "))).unwrap();
+        }
+        for directory in &directories[1..] {
+            let copied = ["tls", "passwords", "accounts.conf"].map(|path| first.join(path));
+            let status = Command::new("cp").arg("-r").args(copied).arg(directory.path()).status().unwrap();
+            assert!(status.success());
+        }
+        let mut number = 0;
+        directories.map(|directory| {
+            let mut command = Command::new("nats-server");
+            command
+                .args(["-c", "nats-cluster.conf"])
+                .env("REGION_SERVER", format!("region-{}", number + 1))
+                .env("REGION_MQTT", servers[number].to_string())
+                .env("REGION_CLIENTS", free_address().to_string())
+                .env("REGION_MONITOR", free_address().to_string())
+                .env("REGION_CLUSTER", routes[number].to_string())
+                .env("REGION_DATA", directory.path().join("data"));
+            number += 1;
+            let mut server = Self::start(command, directory, servers[number - 1]);
+            server.route = Some(routes[number - 1]);
+            server
+        })
+    }
+
+    /// mosquitto with the same accounts and certificates, and the user `town`, who may publish for all cells.
     pub(crate) fn mosquitto() -> Self {
         let (directory, address) = (TempDir::new().unwrap(), free_address());
         let at = |file: &str| directory.path().join(file).display().to_string();
         make_certificates(&directory.path().join("tls"));
-        let mut acl = "user region.reader\ntopic read ecod/v1/#\n".to_owned();
+        let mut acl = "user region.reader\ntopic read ecod/v1/#\nuser town\ntopic write ecod/v1/#\n".to_owned();
         for (name, latitude, longitude) in [LOT, FAR] {
             acl += &account(&["--engine", "mosquitto"], name, latitude, longitude);
         }
         fs::write(at("acl"), acl).unwrap();
         fs::create_dir(at("passwords")).unwrap();
-        for user in ["region.reader", LOT.0, FAR.0] {
+        for user in ["region.reader", "town", LOT.0, FAR.0] {
             fs::write(at(&format!("passwords/{user}")), "secret\n").unwrap();
             let (file, made) = (at("passwd"), directory.path().join("passwd").exists());
             let create: &[&str] = if made { &[] } else { &["-c"] };
@@ -81,7 +120,7 @@ impl Broker {
         let log = fs::File::create(directory.path().join("log")).unwrap();
         command.current_dir(directory.path()).stdout(Stdio::null()).stderr(log).process_group(0);
         let child = command.spawn().expect("nats-server and mosquitto are installed by `make test`");
-        let broker = Self { child, directory, address };
+        let broker = Self { child, directory, address, route: None };
         wait_for("the broker listens", || TcpStream::connect(address).is_ok());
         broker
     }

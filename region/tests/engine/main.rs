@@ -2,6 +2,8 @@
 
 mod broker;
 mod cell;
+mod cluster;
+mod many;
 mod page;
 mod rights;
 mod timeliness;

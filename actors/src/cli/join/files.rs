@@ -6,19 +6,23 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, chown};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use ecod::model::names::NodeName;
 use serde::Serialize;
 
 use crate::platform::state_file::replace_file;
 use crate::transport::invitation::Welcome;
-use crate::transport::pki::{Credentials, TlsConfig};
+use crate::transport::pki::{CityTlsConfig, Credentials, TlsConfig};
 
 /// Directory from which the service reads its configuration.
 const SERVICE_DIRECTORY: &str = "/etc/ecod";
 
 /// Directory of the service's state.
 const STATE_DIRECTORY: &str = "/var/lib/ecod";
+
+/// Files of the city that the cell belongs to.
+const CITY_CA: &str = "city.pem";
+const CITY_LIST: &str = "city-revoked.pem";
 
 /// A directory with the files of a node; on the machine that has made the cell, also those of the CA.
 pub(super) struct NodeDirectory {
@@ -80,6 +84,23 @@ impl NodeDirectory {
         self.path.join("pki")
     }
 
+    /// The files of the city, which a cell that belongs to one has here; `None` if it stands alone.
+    pub(super) fn city(&self, is_of_city: bool) -> anyhow::Result<Option<CityTlsConfig>> {
+        let missing = [CITY_CA, CITY_LIST].map(|name| self.path.join(name)).into_iter().find(|path| !path.exists());
+        match missing.filter(|_| is_of_city) {
+            Some(path) => bail!(
+                "{} is missing: a city has signed the cell's CA. Copy the city's ca.pem and revoked.pem to {CITY_CA} and {CITY_LIST} \
+                 in {self}, so that nodes that join take its vehicles",
+                path.display()
+            ),
+            None => Ok(is_of_city.then(|| self.city_files())),
+        }
+    }
+
+    fn city_files(&self) -> CityTlsConfig {
+        CityTlsConfig { ca: self.path.join(CITY_CA), revocation_list: Some(self.path.join(CITY_LIST)) }
+    }
+
     pub(super) fn configuration(&self) -> PathBuf {
         self.path.join("node.toml")
     }
@@ -98,7 +119,7 @@ impl NodeDirectory {
             certificate: file("node.pem"),
             key: file("node.key"),
             revocation_list: Some(file("revoked.pem")),
-            city: None,
+            city: welcome.city.as_ref().map(|_| self.city_files()),
         };
         let state_dir = self.state_of_service.clone().unwrap_or_else(|| file("state"));
         let configuration = toml::to_string(&Configuration {
@@ -117,15 +138,19 @@ impl NodeDirectory {
         }
         // Programs of the service's group speak for the node, and are no members.
         let key_mode = if self.state_of_service.is_some() { 0o640 } else { 0o600 };
+        let of_city = welcome
+            .city
+            .iter()
+            .flat_map(|city| [(CITY_CA, city.ca.as_str(), 0o644), (CITY_LIST, city.revocation_list.as_str(), 0o644)]);
         // The cell's key last: it is what makes the directory a node's.
-        let files = [
+        let files = of_city.chain([
             ("ca.pem", welcome.ca.as_str(), 0o644),
-            ("node.pem", &welcome.certificate, 0o644),
-            ("revoked.pem", &welcome.revocation_list, 0o644),
-            ("node.toml", &configuration, 0o640),
+            ("node.pem", welcome.certificate.as_str(), 0o644),
+            ("revoked.pem", welcome.revocation_list.as_str(), 0o644),
+            ("node.toml", configuration.as_str(), 0o640),
             ("node.key", key, key_mode),
-            ("cell.key", &welcome.cell_key, 0o600),
-        ];
+            ("cell.key", welcome.cell_key.as_str(), 0o600),
+        ]);
         let owner = self.state_of_service.as_ref().and_then(|state| fs::metadata(state).ok());
         for (name, text, mode) in files {
             let path = file(name);
@@ -204,6 +229,7 @@ mod tests {
             revocation_list: read(authority.revocation_list()),
             cell_key: "k".repeat(64),
             seeds: Vec::new(),
+            city: None,
         };
         let key = read(key);
         for (state_of_service, expected) in [(Some(directory.path().into()), 0o640), (None, 0o600)] {

@@ -1,5 +1,6 @@
 //! Connections of browsers: accepted, limited, answered once each.
 
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,6 +15,11 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio_io_timeout::TimeoutStream;
 
 use super::connection_limit::{AdmittedConnection, ConnectionLimit, ConnectionSlot};
+use crate::platform::throttle::host_network;
+
+/// The host of a browser, as hosts are counted: an IPv4 address or an IPv6 /64 network. Every request has it as an extension.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BrowserHost(pub IpAddr);
 
 /// Wait after a connection could not be accepted, most likely for want of file descriptors.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
@@ -46,7 +52,7 @@ pub async fn accept(listener: &TcpListener, limit: &ConnectionLimit, router: &Ro
         let router = router.clone();
         tokio::spawn(async move {
             tokio::select! {
-                answered = answer(stream, Arc::new(slot), router) => if let Err(error) = answered {
+                answered = answer(stream, BrowserHost(host_network(from.ip())), Arc::new(slot), router) => if let Err(error) = answered {
                     tracing::debug!(%error, "connection of a browser failed");
                 },
                 _ = displaced => tracing::debug!(%from, "connection of a browser displaced by another"),
@@ -56,7 +62,7 @@ pub async fn accept(listener: &TcpListener, limit: &ConnectionLimit, router: &Ro
 }
 
 /// Answers one request and closes the connection: an idle one would occupy a slot.
-async fn answer(stream: TcpStream, slot: Arc<ConnectionSlot>, router: Router) -> hyper::Result<()> {
+async fn answer(stream: TcpStream, host: BrowserHost, slot: Arc<ConnectionSlot>, router: Router) -> hyper::Result<()> {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "cannot set TCP_NODELAY, small packets may be delayed");
     }
@@ -65,6 +71,7 @@ async fn answer(stream: TcpStream, slot: Arc<ConnectionSlot>, router: Router) ->
     let routed = TowerToHyperService::new(router);
     let service = service_fn(|mut request: Request<Incoming>| {
         request.extensions_mut().insert(Arc::clone(&slot));
+        request.extensions_mut().insert(host);
         routed.call(request)
     });
     http1::Builder::new()

@@ -34,7 +34,7 @@ use super::relay::RelayLimits;
 use super::{BrokerConfig, connect_packet, websocket};
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
-use crate::transport::pki::{CertificateSubject, Credentials, LoadedCredentials};
+use crate::transport::pki::{Credentials, LoadedCredentials};
 
 /// Public side of a broker.
 pub(super) struct BrokerFrontend {
@@ -207,7 +207,8 @@ impl FrontendState {
             () = slot.evicted() => Err(ClientRejection::Evicted),
         };
         let (stream, certificates, connect) = login?;
-        let identity = certificates.first().map(|certificate| CertificateSubject::of(certificate)).transpose();
+        let own = current.as_ref().zip(certificates.first());
+        let identity = own.map(|(current, own)| current.borrow().subject_of(own)).transpose();
         let identity = identity.map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
         let principal = Principal::new(identity, from.ip(), connect.has_generated_id);
         let is_program = self.door.is_program(&principal, &connect.client_id);

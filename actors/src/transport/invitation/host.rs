@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -20,16 +21,18 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tokio_rustls::TlsAcceptor;
 
 use super::{
-    CONVERSATION_TIME, HOST_NAME, KEPT, MAX_REQUEST_BYTES, Reply, Request, Token, Welcome, read_line, write_line,
+    CONVERSATION_TIME, CityFiles, HOST_NAME, KEPT, MAX_REQUEST_BYTES, Reply, Request, Token, Welcome, read_line,
+    write_line,
 };
 use crate::platform::clock;
-use crate::transport::pki::{Authority, AuthorityError, DEFAULT_DAYS, check_name};
+use crate::transport::pki::{Authority, AuthorityError, CityTlsConfig, DEFAULT_DAYS, check_name};
 
 /// A cell's CA and key, and the nodes that it has invited.
 pub struct Host {
     authority: Authority,
     cell_key: String,
     seeds: Vec<String>,
+    city: Option<CityTlsConfig>,
     guests: BTreeMap<NodeName, Guest>,
     tls: TlsAcceptor,
     fingerprint: [u8; 32],
@@ -69,11 +72,17 @@ type Question = (Request, oneshot::Sender<Answer>);
 type Answer = (Reply, Option<String>);
 
 impl Host {
-    /// A host without guests. `seeds` are `host:port` of nodes that a guest asks for the cell.
+    /// A host without guests. `seeds` are `host:port` of nodes that a guest asks for the cell. Guests get the files of the `city`
+    /// as they are then.
     ///
     /// # Errors
     /// [`AuthorityError`] when the system makes no keys.
-    pub fn new(authority: Authority, cell_key: String, seeds: Vec<String>) -> Result<Self, AuthorityError> {
+    pub fn new(
+        authority: Authority,
+        cell_key: String,
+        seeds: Vec<String>,
+        city: Option<CityTlsConfig>,
+    ) -> Result<Self, AuthorityError> {
         let key = KeyPair::generate()?;
         let certificate = CertificateParams::new([HOST_NAME.to_owned()])?.self_signed(&key)?;
         let mut fingerprint = [0; 32];
@@ -86,7 +95,7 @@ impl Host {
             .and_then(|builder| builder.with_no_client_auth().with_single_cert(chain, private))
             .map_err(|error| AuthorityError::Crypto(error.to_string()))?;
         let tls = TlsAcceptor::from(Arc::new(tls));
-        Ok(Self { authority, cell_key, seeds, guests: BTreeMap::new(), tls, fingerprint })
+        Ok(Self { authority, cell_key, seeds, city, guests: BTreeMap::new(), tls, fingerprint })
     }
 
     /// The token of a node, which finds the host at one of the addresses. A former token of the node does not work
@@ -187,15 +196,20 @@ impl Host {
         let issued = self.authority.certify(node, rights, valid, now, &signing.public_key);
         let (certificate, serial) = issued.map_err(|error| unusable(&error))?;
         guest.issued = Some(serial.clone());
-        let read = |path| std::fs::read_to_string(path).map_err(|error| unusable(&error));
+        let read = |path: &Path| std::fs::read_to_string(path).map_err(|error| unusable(&error));
+        let city = |city: &CityTlsConfig| {
+            let list = city.revocation_list.as_deref().ok_or("the city has no revocation list")?;
+            Ok::<_, String>(CityFiles { ca: read(&city.ca)?, revocation_list: read(list)? })
+        };
         let welcome = Welcome {
             cell: self.authority.cell().clone(),
             role: rights.role,
             certificate,
-            ca: read(self.authority.ca())?,
-            revocation_list: read(self.authority.revocation_list())?,
+            ca: read(&self.authority.ca())?,
+            revocation_list: read(&self.authority.revocation_list())?,
             cell_key: self.cell_key.clone(),
             seeds: self.seeds.clone(),
+            city: self.city.as_ref().map(city).transpose()?,
         };
         Ok((welcome, serial))
     }

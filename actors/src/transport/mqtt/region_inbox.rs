@@ -6,6 +6,7 @@ use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
+use ecod::neighbours::MAX_MAP_HZ;
 use ecod::wire::{CellMap, Limits, NodeState, NodeStatus, RegionTopic, RegionTopicKind, RejectReason, decode};
 use tokio::sync::Semaphore;
 use uuid::Uuid;
@@ -47,9 +48,6 @@ pub(crate) struct RegionInbox {
 
 /// Maximum maps that wait for the uplink: some seconds of all cells around.
 const CAPACITY: usize = 32;
-
-/// Maximum maps per second of one cell that are decoded, twice as many as a neighbour sends by default.
-const MAX_MAP_HZ: u32 = 20;
 
 impl RegionInbox {
     /// Takes what the region tells the cell, whose origin is in the tile, in this run of the node.

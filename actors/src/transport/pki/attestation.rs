@@ -9,6 +9,7 @@ use rustls::sign::Signer;
 use rustls::{CertificateError, SignatureScheme};
 use x509_parser::certificate::X509Certificate;
 use x509_parser::prelude::FromDer;
+use x509_parser::revocation_list::CertificateRevocationList;
 
 use super::{CertificateSubject, InvalidCertificate, LoadedCredentials};
 
@@ -39,7 +40,7 @@ impl LoadedCredentials {
 
     /// Verifies that a certificate is directly signed by the cell's CA, valid at this time and not revoked.
     pub(crate) fn verify_node(&self, certificate: &[u8], wall: UnixTime) -> Result<CertificateSubject, Distrust> {
-        let subject = CertificateSubject::of(certificate)?;
+        let subject = self.subject_of(certificate)?;
         let verified = self.clients.verify_client_cert(&CertificateDer::from(certificate), &[], wall);
         verified.map(|_| subject).map_err(Distrust::Untrusted)
     }
@@ -63,6 +64,16 @@ pub(super) fn is_issued_by(ca: &[u8], certificate: &[u8]) -> bool {
     };
     let (key, signature) = (&ca.public_key().subject_public_key.data, &certificate.signature_value.data);
     certificate.issuer() == ca.subject() && is_signed_with(key, certificate.tbs_certificate.as_ref(), signature)
+}
+
+/// True if a revocation list is one of a CA, which has signed it by ECDSA over P-256 with SHA-256.
+pub(super) fn is_list_of(ca: &[u8], list: &[u8]) -> bool {
+    let (Ok((_, ca)), Ok((_, list))) = (X509Certificate::from_der(ca), CertificateRevocationList::from_der(list))
+    else {
+        return false;
+    };
+    let (key, signature) = (&ca.public_key().subject_public_key.data, &list.signature_value.data);
+    list.issuer() == ca.subject() && is_signed_with(key, list.tbs_cert_list.as_ref(), signature)
 }
 
 /// Time at which a certificate's validity begins.

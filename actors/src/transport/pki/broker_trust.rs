@@ -4,7 +4,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use ecod::model::names::NodeName;
-use rustls::client::WebPkiServerVerifier;
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{ClientConfig, DigitallySignedStruct, SignatureScheme};
@@ -17,7 +16,7 @@ use super::{CertificateSubject, Credentials, DOOR_NAME, LoadedCredentials};
 pub struct BrokerTrust {
     client: Arc<ClientConfig>,
     recorded: Arc<RecordingVerifier>,
-    verifier: Arc<WebPkiServerVerifier>,
+    verifier: Arc<dyn ServerCertVerifier>,
     /// Source of changed revocation lists, for a broker of the cell.
     reloaded_from: Option<(Arc<Credentials>, Arc<LoadedCredentials>)>,
     checked: Instant,
@@ -43,7 +42,7 @@ impl BrokerTrust {
     /// Trust by a verifier, for a certificate with `name`, or else with the host name of the connection.
     pub(super) fn new(
         client: &ClientConfig,
-        verifier: Arc<WebPkiServerVerifier>,
+        verifier: Arc<dyn ServerCertVerifier>,
         name: Option<ServerName<'static>>,
     ) -> Self {
         let recorded = Arc::new(RecordingVerifier::new(Arc::clone(&verifier), name));
@@ -64,7 +63,7 @@ impl BrokerTrust {
     /// The certificate is verified in the handshake alone: programs connect for a moment.
     pub fn of_door(credentials: &Credentials) -> Self {
         let current = credentials.current();
-        Self::new(&current.client, Arc::clone(&current.brokers), ServerName::try_from(DOOR_NAME).ok())
+        Self::new(&current.client, Arc::clone(&current.doors), ServerName::try_from(DOOR_NAME).ok())
     }
 
     /// TLS configuration for one connection.
@@ -102,26 +101,26 @@ impl BrokerTrust {
             return Ok(());
         }
         self.checked = now;
-        self.recorded.check(&self.verifier)
+        self.recorded.check(&*self.verifier)
     }
 }
 
 /// Verifier that records the certificate of the broker.
 #[derive(Debug)]
 pub(super) struct RecordingVerifier {
-    verifier: Arc<WebPkiServerVerifier>,
+    verifier: Arc<dyn ServerCertVerifier>,
     /// Name that the certificate must have; without it, the host name of the connection.
     name: Option<ServerName<'static>>,
     chain: Mutex<Option<(Vec<CertificateDer<'static>>, ServerName<'static>)>>,
 }
 
 impl RecordingVerifier {
-    pub(super) fn new(verifier: Arc<WebPkiServerVerifier>, name: Option<ServerName<'static>>) -> Self {
+    pub(super) fn new(verifier: Arc<dyn ServerCertVerifier>, name: Option<ServerName<'static>>) -> Self {
         Self { verifier, name, chain: Mutex::default() }
     }
 
     /// Verifies again what was shown, if anything was.
-    fn check(&self, verifier: &WebPkiServerVerifier) -> Result<(), rustls::Error> {
+    fn check(&self, verifier: &dyn ServerCertVerifier) -> Result<(), rustls::Error> {
         let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
         let Some((chain, name)) = &*chain else { return Ok(()) };
         let Some((own, intermediates)) = chain.split_first() else { return Ok(()) };

@@ -1,6 +1,7 @@
 //! The certificates of one node, and the verifiers of others' certificates.
 
 mod city_trust;
+mod issuers;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,12 +10,13 @@ use std::time::{Duration, Instant, SystemTime};
 
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
+use rustls::client::danger::ServerCertVerifier;
 use rustls::client::{Resumption, WebPkiServerVerifier};
 use rustls::crypto::{CryptoProvider, ring as provider};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, PrivateKeyDer, ServerName};
+use rustls::server::NoServerSessionStorage;
 use rustls::server::danger::ClientCertVerifier;
-use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::sign::Signer;
 use rustls::version::TLS13;
 use rustls::{ClientConfig, RootCertStore, ServerConfig};
@@ -24,7 +26,9 @@ use tokio::time::timeout;
 use super::attestation::signer;
 use super::broker_trust::RecordingVerifier;
 use super::subject::{rights_uri, role_name};
-use super::{BROKER_NAME, BrokerTrust, CertificateSubject, MAX_CERTIFICATE_BYTES, TlsConfig};
+use super::{BROKER_NAME, BrokerTrust, CertificateSubject, InvalidCertificate, MAX_CERTIFICATE_BYTES, TlsConfig};
+use city_trust::CityAuthorities;
+use issuers::{Issuers, ServingNodes};
 
 /// Certificates of a node, reloaded when their files change.
 #[derive(Debug)]
@@ -55,8 +59,11 @@ pub struct LoadedCredentials {
     /// Verifier of clients' certificates.
     pub clients: Arc<dyn ClientCertVerifier>,
     /// Verifier of certificates of the cell's brokers, which have `broker_name` at any address.
-    pub(super) brokers: Arc<WebPkiServerVerifier>,
+    pub(super) brokers: Arc<dyn ServerCertVerifier>,
     pub(super) broker_name: ServerName<'static>,
+    /// Verifier of certificates of nodes' doors.
+    pub(super) doors: Arc<dyn ServerCertVerifier>,
+    issuers: Arc<Issuers>,
     pub(super) certificates: Vec<CertificateDer<'static>>,
     /// CAs of the cell that the city has revoked.
     pub(super) revoked_cas: Vec<CertificateDer<'static>>,
@@ -112,6 +119,16 @@ pub enum CredentialsError {
 
 /// Minimum time between two checks of the files.
 const RELOAD_INTERVAL: Duration = Duration::from_millis(500);
+
+impl LoadedCredentials {
+    /// The node that a certificate names, and its rights if the cell has issued it. Its validity is verified elsewhere.
+    ///
+    /// # Errors
+    /// [`InvalidCertificate`] when it names no node.
+    pub(crate) fn subject_of(&self, certificate: &[u8]) -> Result<CertificateSubject, InvalidCertificate> {
+        subject_of(&self.issuers, certificate)
+    }
+}
 
 impl Credentials {
     /// Reads a node's files.
@@ -185,7 +202,8 @@ pub fn external_broker(
     own: Option<&LoadedCredentials>,
 ) -> Result<BrokerTrust, CredentialsError> {
     let roots = Arc::new(roots(key, ca)?);
-    let verifier = server_verifier(Arc::clone(&roots), Vec::new())?;
+    let verifier = WebPkiServerVerifier::builder_with_provider(Arc::clone(&roots), crypto()).build();
+    let verifier = verifier.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
     let builder = ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
     let builder = builder.map_err(unusable)?.with_root_certificates(roots);
     let client = match own {
@@ -202,18 +220,22 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .map(|path| lists("tls.revocation_list", path))
         .transpose()?
         .unwrap_or_default();
-    let (roots, revoked_cas) = match &files.city {
-        Some(city) => city_trust::roots(&files.ca, city, &mut lists)?,
-        None => (roots("tls.ca", &files.ca)?, Vec::new()),
+    let (issuers, revoked_cas) = match &files.city {
+        Some(city) => {
+            let CityAuthorities { of_cell, revoked, of_city } =
+                city_trust::authorities_of(&files.ca, city, &mut lists)?;
+            (Issuers::new(of_cell, Some(of_city), &lists)?, revoked)
+        }
+        None => (Issuers::new(authorities("tls.ca", &files.ca)?, None, &lists)?, Vec::new()),
     };
-    let roots = Arc::new(roots);
+    let issuers = Arc::new(issuers);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
     let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
     let key = key.map_err(|error| file_error("tls.key", &files.key, &error))?;
     let own =
         certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
     let identity =
-        CertificateSubject::of(own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
+        subject_of(&issuers, own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
     if !identity.may_act_as(node.as_str()) {
         let (path, found) = (files.certificate.clone(), identity.name().clone());
         return Err(CredentialsError::WrongName { path, found, node: node.clone() });
@@ -223,7 +245,7 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         return Err(file_error("tls.certificate", &files.certificate, &reason));
     }
     let signer = signer(&key).ok_or_else(|| file_error("tls.key", &files.key, "not an ECDSA P-256 key"))?;
-    let clients = client_verifier(&roots, &lists)?;
+    let clients = Arc::clone(&issuers) as Arc<dyn ClientCertVerifier>;
     let mut server = ServerConfig::builder_with_provider(crypto())
         .with_protocol_versions(&[&TLS13])
         .map_err(unusable)?
@@ -232,7 +254,7 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .map_err(unusable)?;
     server.session_storage = Arc::new(NoServerSessionStorage {});
     server.send_tls13_tickets = 0;
-    let brokers = server_verifier(roots, lists)?;
+    let (brokers, doors) = (ServingNodes::brokers(&issuers), ServingNodes::doors(&issuers));
     let broker_name = ServerName::try_from(BROKER_NAME);
     let broker_name = broker_name.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
     let mut client = ClientConfig::builder_with_provider(crypto())
@@ -254,6 +276,8 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         clients,
         brokers,
         broker_name,
+        doors,
+        issuers,
         certificates,
         revoked_cas,
         key,
@@ -261,27 +285,10 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
     })
 }
 
-fn client_verifier(
-    roots: &Arc<RootCertStore>,
-    lists: &[CertificateRevocationListDer<'static>],
-) -> Result<Arc<dyn ClientCertVerifier>, CredentialsError> {
-    let mut builder = WebPkiClientVerifier::builder_with_provider(Arc::clone(roots), crypto());
-    if !lists.is_empty() {
-        builder = builder.with_crls(lists.iter().cloned()).only_check_end_entity_revocation();
-    }
-    let verifier = builder.build().map_err(|error| CredentialsError::Unusable(error.to_string()))?;
-    Ok(Arc::new(city_trust::DirectVerifier(verifier)))
-}
-
-fn server_verifier(
-    roots: Arc<RootCertStore>,
-    lists: Vec<CertificateRevocationListDer<'static>>,
-) -> Result<Arc<WebPkiServerVerifier>, CredentialsError> {
-    let mut builder = WebPkiServerVerifier::builder_with_provider(roots, crypto());
-    if !lists.is_empty() {
-        builder = builder.with_crls(lists).only_check_end_entity_revocation();
-    }
-    builder.build().map_err(|error| CredentialsError::Unusable(error.to_string()))
+/// The node that a certificate names, and the rights that count.
+fn subject_of(issuers: &Issuers, certificate: &[u8]) -> Result<CertificateSubject, InvalidCertificate> {
+    let subject = CertificateSubject::of(certificate)?;
+    Ok(if issuers.give_rights(certificate) { subject } else { subject.without_rights() })
 }
 
 fn crypto() -> Arc<CryptoProvider> {

@@ -147,7 +147,7 @@ impl EvidenceSigner {
 /// expired.
 fn signatory(certificate: &str, loaded: &LoadedCredentials) -> Option<Signatory> {
     let certificate = CertificateDer::from(BASE64.decode(certificate).ok()?);
-    let subject = CertificateSubject::of(&certificate).ok()?;
+    let subject = loaded.subject_of(&certificate).ok()?;
     let (_, parsed) = X509Certificate::from_der(&certificate).ok()?;
     loaded.clients.verify_client_cert(&certificate, &[], began(&certificate)?).ok()?;
     Some(Signatory { subject, public_key: parsed.public_key().subject_public_key.data.to_vec() })

@@ -85,6 +85,12 @@ impl CertificateSubject {
         self.rights
     }
 
+    /// The same node as one that neither leads nor serves a broker.
+    #[must_use]
+    pub(super) fn without_rights(self) -> Self {
+        Self { may_serve: false, rights: Rights::NONE, ..self }
+    }
+
     /// Rights of a node or observer that uses the certificate. An observer never leads.
     pub fn rights_of(&self, name: &NodeName) -> Rights {
         if *name == self.name { self.rights } else { Rights::NONE }

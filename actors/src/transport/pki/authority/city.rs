@@ -5,7 +5,11 @@ use std::path::Path;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 
-use super::{Authority, AuthorityError, CA_DAYS, IssuedCertificate, ca_parameters, days};
+use rustls::pki_types::CertificateDer;
+use rustls::pki_types::pem::PemObject;
+
+use super::super::attestation::is_issued_by;
+use super::{Authority, AuthorityError, CA_DAYS, IssuedCertificate, ca_parameters, days, read};
 
 impl Authority {
     /// Makes a CA for a city, as [`Authority::init`] makes one for a cell. It certifies vehicles, which hold in all cells of
@@ -46,6 +50,16 @@ impl Authority {
             0 => Err(AuthorityError::NotIssued(cell.clone())),
             revoked => Ok(revoked),
         }
+    }
+
+    /// True if this is the CA of a cell that a city has signed.
+    ///
+    /// # Errors
+    /// [`AuthorityError`] when its certificate cannot be read.
+    pub(crate) fn is_of_city(&self) -> Result<bool, AuthorityError> {
+        let unusable = |error: &dyn std::fmt::Display| AuthorityError::Crypto(error.to_string());
+        let own = CertificateDer::from_pem_slice(read(&self.ca())?.as_bytes()).map_err(|error| unusable(&error))?;
+        Ok(!is_issued_by(&own, &own))
     }
 
     /// Checks that this is the CA of a city, or else that of a cell.

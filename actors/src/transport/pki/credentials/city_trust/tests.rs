@@ -1,16 +1,19 @@
 use std::fs;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
+use rustls::client::danger::ServerCertVerifier;
 use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use tempfile::TempDir;
 
 use super::*;
 use crate::platform::clock;
-use crate::transport::pki::{Authority, Credentials, LoadedCredentials, TlsConfig};
+use crate::transport::pki::{Authority, BROKER_NAME, Credentials, DOOR_NAME, LoadedCredentials, TlsConfig};
 
 const DAY: Duration = Duration::from_secs(86_400);
 
@@ -93,18 +96,87 @@ fn refuses_the_other_cell(city: &City, of_north: &LoadedCredentials, edge: &Node
     let name = of_north.broker_name.clone();
     let trusts = |broker: &CertificateDer<'_>| {
         let verifier = super::super::RecordingVerifier::new(Arc::clone(&of_north.brokers), Some(name.clone()));
-        rustls::client::danger::ServerCertVerifier::verify_server_cert(
-            &verifier,
-            broker,
-            &chain,
-            &name,
-            &[],
-            UnixTime::now(),
-        )
-        .is_ok()
+        verifier.verify_server_cert(broker, &chain, &name, &[], UnixTime::now()).is_ok()
     };
     assert!(!trusts(&stolen), "the foreign cell's");
     assert!(trusts(&certificate(city.cells[0].files_of(edge).0)), "the own cell's");
+}
+
+/// Replaces the certificate of a city's vehicle by one of the city's CA that claims all that a leader's has.
+fn overstate(city: &City, node: &NodeName) {
+    let directory = city.city.ca();
+    let (certificate, key) = city.city.files_of(node);
+    let ca_key = rcgen::KeyPair::from_pem(&fs::read_to_string(directory.with_file_name("ca.key")).unwrap()).unwrap();
+    let issuer = rcgen::Issuer::from_ca_cert_pem(&fs::read_to_string(&directory).unwrap(), ca_key).unwrap();
+    let mut claims = rcgen::CertificateParams::new([BROKER_NAME.to_owned(), DOOR_NAME.to_owned()]).unwrap();
+    claims.distinguished_name = rcgen::DistinguishedName::new();
+    claims.distinguished_name.push(rcgen::DnType::CommonName, node.as_str());
+    claims.subject_alt_names.push(rcgen::SanType::URI("ecod:role=edge;priority=255".try_into().unwrap()));
+    claims.use_authority_key_identifier_extension = true;
+    let own = rcgen::KeyPair::from_pem(&fs::read_to_string(key).unwrap()).unwrap();
+    fs::write(certificate, claims.signed_by(&own, &issuer).unwrap().pem()).unwrap();
+}
+
+#[test]
+fn a_vehicle_of_the_city_leads_nowhere_whatever_its_certificate_says() {
+    let mut city = City::new();
+    let [euclid, edge] = ["euclid", "edge"].map(NodeName::from_static);
+    city.city.issue(&euclid, Role::Cav, DAY, clock::now()).unwrap();
+    city.cells[0].issue(&edge, Role::Edge, DAY, clock::now()).unwrap();
+    overstate(&city, &euclid);
+    let shown = certificate(city.city.files_of(&euclid).0);
+    let claimed = crate::transport::pki::CertificateSubject::of(&shown).unwrap();
+    assert!(claimed.may_serve() && claimed.rights().may_lead(), "it claims to");
+    let of_edge = city.load(&city.cells[0], &edge, 0);
+    let subject = of_edge.verify_node(&shown, UnixTime::now()).unwrap();
+    assert_eq!((subject.rights(), subject.may_serve()), (Rights::NONE, false), "in the election and in evidence");
+    let subject = of_edge.subject_of(&shown).unwrap();
+    assert_eq!((subject.rights(), subject.may_serve()), (Rights::NONE, false), "as a client of the broker");
+    let verify = |verifier: &Arc<dyn ServerCertVerifier>, name: &'static str| {
+        let name = ServerName::try_from(name).unwrap();
+        verifier.verify_server_cert(&shown, &[], &name, &[], UnixTime::now()).is_ok()
+    };
+    assert!(!verify(&of_edge.brokers, BROKER_NAME), "as a broker");
+    assert!(verify(&of_edge.doors, DOOR_NAME), "its door is its own");
+    let own = Credentials::load(&city.files(&city.city, &euclid, 0), &euclid).unwrap();
+    own.check_rights(Role::Edge, 255).unwrap_err();
+    own.check_rights(Role::Cav, 0).unwrap();
+    let leader = of_edge.verify_node(of_edge.certificate(), UnixTime::now()).unwrap();
+    assert!(leader.may_serve() && leader.rights().may_lead());
+}
+
+#[test]
+fn authorities_of_one_name_are_told_apart_with_their_lists() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = |name: &str| directory.path().join(name);
+    let town = NodeName::from_static("town");
+    let mut city = Authority::init_city(&at("city"), &town, clock::now()).unwrap();
+    // The cell has the city's name, and a second CA of the same name, as while the CA is changed.
+    let mut cells = ["former", "present"].map(|path| city.init_cell(&at(path), &town, clock::now()).unwrap());
+    let [edge, gauss, euclid] = ["edge", "gauss", "euclid"].map(NodeName::from_static);
+    cells[0].issue(&edge, Role::Edge, DAY, clock::now()).unwrap();
+    cells[0].issue(&gauss, Role::Edge, DAY, clock::now()).unwrap();
+    cells[1].issue(&edge, Role::Edge, DAY, clock::now()).unwrap();
+    city.issue(&euclid, Role::Cav, DAY, clock::now()).unwrap();
+    cells[0].revoke(&gauss, clock::now()).unwrap();
+    let (ca, list) = (at("ca.pem"), at("revoked.pem"));
+    let both = |paths: [PathBuf; 2]| paths.map(|path| fs::read_to_string(path).unwrap()).concat();
+    for order in [[0, 1], [1, 0]] {
+        fs::write(&ca, both(order.map(|cell: usize| cells[cell].ca()))).unwrap();
+        fs::write(&list, both(order.map(|cell: usize| cells[cell].revocation_list()))).unwrap();
+        let (certificate_file, key) = cells[1].files_of(&edge);
+        let city_files = CityTlsConfig { ca: city.ca(), revocation_list: Some(city.revocation_list()) };
+        let (ca, revocation_list) = (ca.clone(), Some(list.clone()));
+        let files = TlsConfig { ca, certificate: certificate_file, key, revocation_list, city: Some(city_files) };
+        let of_edge = Credentials::load(&files, &edge).unwrap().current();
+        let verify = |authority: &Authority, node| {
+            of_edge.verify_node(&certificate(authority.files_of(node).0), UnixTime::now()).map(|node| node.may_serve())
+        };
+        assert_eq!(verify(&cells[0], &edge), Ok(true), "{order:?}");
+        assert_eq!(verify(&cells[1], &edge), Ok(true), "{order:?}");
+        assert_eq!(verify(&city, &euclid), Ok(false), "{order:?}");
+        assert!(verify(&cells[0], &gauss).is_err() && of_edge.has_revoked(&certificate(cells[0].files_of(&gauss).0)));
+    }
 }
 
 #[test]
