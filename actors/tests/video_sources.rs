@@ -172,7 +172,9 @@ fn what_cannot_be_opened_is_named_with_its_reason() {
     let directory = tempfile::tempdir().unwrap();
     let text = directory.path().join("clip.avi");
     fs::write(&text, "not a video").unwrap();
-    for (path, reason) in [(Path::new("no/such.avi"), "No such file"), (&text, "no video"), (directory.path(), "directory")] {
+    for (path, reason) in
+        [(Path::new("no/such.avi"), "No such file"), (&text, "no video"), (directory.path(), "directory")]
+    {
         let error = open(&format!("kind = 'video'\npath = {path:?}")).err().expect("cannot be opened").to_string();
         assert!(error.starts_with(&format!("cannot open {}", path.display())) && error.contains(reason), "{error}");
     }

@@ -133,7 +133,9 @@ impl SourceConfig {
     /// Device, pipeline, address or path, as it may be shown: without user and password.
     fn origin(&self) -> String {
         match self {
-            Self::V4l2 { device: path, .. } | Self::Video { path, .. } | Self::Images { path, .. } => path.display().to_string(),
+            Self::V4l2 { device: path, .. } | Self::Video { path, .. } | Self::Images { path, .. } => {
+                path.display().to_string()
+            }
             Self::Gstreamer { pipeline } => video::without_credentials(pipeline),
             // Without a scheme it is refused, but its secret must not be shown with the error.
             Self::Url { url } if !url.contains("://") => url.rsplit('@').next().unwrap_or_default().to_owned(),

@@ -62,7 +62,8 @@ impl VideoProcess {
         let mut command = Command::new(&program);
         let started = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
         let mut child = started.map_err(|e| failed(format!("cannot start {}: {e}", program.display())))?;
-        let (Some(stdin), Some(stdout), Some(stderr)) = (&mut child.stdin, child.stdout.take(), child.stderr.take()) else {
+        let (Some(stdin), Some(stdout), Some(stderr)) = (&mut child.stdin, child.stdout.take(), child.stderr.take())
+        else {
             return Err(failed(format!("no pipes to {PROGRAM}")));
         };
         // If the program is gone already, its end says why.
@@ -86,7 +87,9 @@ impl VideoProcess {
         let mut line = String::new();
         match self.output.read_line(&mut line) {
             Ok(0) => Err(self.end()),
-            Ok(_) => serde_json::from_str(&line).map_err(|e| self.lost(format!("{PROGRAM} is of another version: {e}"))),
+            Ok(_) => {
+                serde_json::from_str(&line).map_err(|e| self.lost(format!("{PROGRAM} is of another version: {e}")))
+            }
             Err(error) => Err(self.broken(&error, time)),
         }
     }
@@ -214,7 +217,9 @@ mod tests {
         assert_eq!(without_credentials("rtsp://user:p@ss@camera:554/1"), "rtsp://camera:554/1");
         assert_eq!(without_credentials("http://camera/a@b"), "http://camera/a@b");
         assert_eq!(
-            without_credentials("rtspsrc location=\"rtsp://user:secret@camera\" ! tee name=a@b ! udpsink uri=udp://x@host"),
+            without_credentials(
+                "rtspsrc location=\"rtsp://user:secret@camera\" ! tee name=a@b ! udpsink uri=udp://x@host"
+            ),
             "rtspsrc location=\"rtsp://camera\" ! tee name=a@b ! udpsink uri=udp://host"
         );
     }

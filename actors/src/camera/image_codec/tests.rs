@@ -64,7 +64,8 @@ fn every_format_is_read_by_its_content_as_bgr() {
         assert_eq!((image.rows(), image.cols(), image.typ()), (2, 3, CV_8UC3), "{format:?}");
         assert!(is_near(color_at(&image, 1, 2), [50, 100, 200]), "{format:?}: {:?}", color_at(&image, 1, 2));
     }
-    for (pixels, kind) in [(vec![90; 6], ExtendedColorType::L8), ([90, 90, 90, 0].repeat(6), ExtendedColorType::Rgba8)] {
+    for (pixels, kind) in [(vec![90; 6], ExtendedColorType::L8), ([90, 90, 90, 0].repeat(6), ExtendedColorType::Rgba8)]
+    {
         image::save_buffer_with_format(&path, &pixels, 3, 2, kind, ImageFormat::Png).unwrap();
         let image = read(&path).unwrap();
         assert_eq!((image.typ(), color_at(&image, 0, 0)), (CV_8UC3, [90; 3]), "{kind:?}");
@@ -75,8 +76,15 @@ fn every_format_is_read_by_its_content_as_bgr() {
 fn what_is_no_whole_image_is_refused() {
     let jpeg = encode_jpeg(&flag(), 95).unwrap();
     let mut png = Cursor::new(Vec::new());
-    image::write_buffer_with_format(&mut png, &[7; 300], 10, 10, image::ExtendedColorType::Rgb8, image::ImageFormat::Png)
-        .unwrap();
+    image::write_buffer_with_format(
+        &mut png,
+        &[7; 300],
+        10,
+        10,
+        image::ExtendedColorType::Rgb8,
+        image::ImageFormat::Png,
+    )
+    .unwrap();
     let png = png.into_inner();
     for bytes in [b"".as_slice(), b"half a fi", &jpeg[..100], &png[..png.len() / 2]] {
         let error = decode(bytes).expect_err("refused").to_string();

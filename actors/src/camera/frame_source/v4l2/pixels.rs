@@ -87,7 +87,8 @@ impl FrameLayout {
     }
 
     fn of(way: Way, [width, height]: [u32; 2], bytes_per_line: u32) -> Result<Self, String> {
-        let unfit = || format!("its pictures of {width}x{height} pixels with {bytes_per_line} bytes in a row cannot be read");
+        let unfit =
+            || format!("its pictures of {width}x{height} pixels with {bytes_per_line} bytes in a row cannot be read");
         let [width, height] = [width, height].map(|side| i32::try_from(side).map_err(|_| unfit()));
         let (layout, pixel) = (Self { way, width: width?, height: height?, stride: 0 }, way.bytes_of_pixel());
         let row = layout.width as usize * pixel;

@@ -36,8 +36,8 @@ fn serve() -> anyhow::Result<()> {
     let mut output = frames_output().context("standard output cannot be used")?;
     let mut request = String::new();
     io::stdin().lock().read_line(&mut request)?;
-    let VideoRequest { source, timeout } =
-        serde_json::from_str(&request).context("ecod-node starts this program, and tells it on standard input what to open")?;
+    let VideoRequest { source, timeout } = serde_json::from_str(&request)
+        .context("ecod-node starts this program, and tells it on standard input what to open")?;
     thread::spawn(end_with_input);
     let mut video = match Video::open(&source, timeout) {
         Ok(video) => video,
