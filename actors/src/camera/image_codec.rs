@@ -4,7 +4,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 use image::{DynamicImage, ImageDecoder, ImageReader};
-use jpeg_encoder::{ColorType, Encoder, EncodingError, SamplingFactor};
+use jpeg_encoder::{Encoder, EncodingError, ImageBuffer, JpegColorType, SamplingFactor};
 use opencv::core::{Mat, Vec3b};
 use opencv::imgproc;
 use opencv::prelude::*;
@@ -58,16 +58,55 @@ pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
 /// JPEG of an 8-bit image, BGR or gray. `quality` is 1 to 100. Colours have half the resolution, as in OpenCV's files.
 ///
 /// # Errors
-/// [`ImageError::TooLarge`], [`ImageError::Encoding`], or [`ImageError::OpenCv`] for an image with gaps between its rows.
+/// [`ImageError::TooLarge`], [`ImageError::Encoding`], or [`ImageError::OpenCv`] for an image of another type.
 pub fn encode_jpeg(image: &Mat, quality: u8) -> Result<Vec<u8>, ImageError> {
     let size = ImageSize::of(image);
     let side = |pixels| u16::try_from(pixels).map_err(|_| ImageError::TooLarge(size));
-    let colors = if image.channels() == 1 { ColorType::Luma } else { ColorType::Bgr };
+    let mut colors = Mat::default();
+    let is_gray = image.channels() == 1;
+    if !is_gray {
+        imgproc::cvt_color_def(image, &mut colors, imgproc::COLOR_BGR2YCrCb)?;
+    }
+    let pixels = if is_gray { image.data_bytes()? } else { colors.data_bytes()? };
     let mut jpeg = Vec::new();
     let mut encoder = Encoder::new(&mut jpeg, quality);
     encoder.set_sampling_factor(SamplingFactor::F_2_2);
-    encoder.encode(image.data_bytes()?, side(size.width)?, side(size.height)?, colors)?;
+    encoder.encode_image(Pixels { pixels, width: side(size.width)?, height: side(size.height)?, is_gray })?;
     Ok(jpeg)
+}
+
+/// An image in JPEG's own colours. Of the encoder's many kinds of images, programs then have only this one.
+struct Pixels<'a> {
+    /// Rows of brightness, with Cr and Cb unless it is gray.
+    pixels: &'a [u8],
+    width: u16,
+    height: u16,
+    is_gray: bool,
+}
+
+impl ImageBuffer for Pixels<'_> {
+    fn get_jpeg_color_type(&self) -> JpegColorType {
+        if self.is_gray { JpegColorType::Luma } else { JpegColorType::Ycbcr }
+    }
+
+    fn width(&self) -> u16 {
+        self.width
+    }
+
+    fn height(&self) -> u16 {
+        self.height
+    }
+
+    fn fill_buffers(&self, y: u16, [brightness, cb, cr, _]: &mut [Vec<u8>; 4]) {
+        let (row, width) = (usize::from(y), usize::from(self.width));
+        if self.is_gray {
+            return brightness.extend_from_slice(&self.pixels[row * width..][..width]);
+        }
+        let (pixels, _) = self.pixels[row * width * 3..][..width * 3].as_chunks::<3>();
+        brightness.extend(pixels.iter().map(|pixel| pixel[0]));
+        cr.extend(pixels.iter().map(|pixel| pixel[1]));
+        cb.extend(pixels.iter().map(|pixel| pixel[2]));
+    }
 }
 
 #[cfg(test)]
