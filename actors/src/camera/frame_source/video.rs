@@ -25,7 +25,7 @@ use opencv::core::{Mat, Scalar};
 use opencv::prelude::*;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use self::protocol::{FrameHeader, VideoMessage, VideoRequest};
+use self::protocol::{ImageHeader, VideoMessage, VideoRequest};
 use super::{FrameError, FrameSource, SourceConfig};
 use crate::camera::frame::CameraFrame;
 use crate::platform::{clock, installed};
@@ -94,8 +94,8 @@ impl VideoProcess {
         }
     }
 
-    fn receive_pixels(&mut self, header: &FrameHeader) -> Result<CameraFrame, FrameError> {
-        let FrameHeader { rows, columns, kind, since_boot } = *header;
+    fn receive_pixels(&mut self, header: &ImageHeader) -> Result<CameraFrame, FrameError> {
+        let ImageHeader { rows, columns, kind, since_boot } = *header;
         let image = Mat::new_rows_cols_with_default(rows, columns, kind, Scalar::all(0.0));
         let mut image = image.map_err(|e| self.lost(e.message))?;
         let pixels = image.data_bytes_mut().map_err(|e| self.lost(e.message))?;

@@ -13,7 +13,7 @@ use opencv::prelude::*;
 use opencv::videoio::{self, VideoCapture};
 use rustix::process::{Signal, getpid, kill_process};
 
-use super::protocol::{self, FrameHeader, VideoMessage, VideoRequest};
+use super::protocol::{self, ImageHeader, VideoMessage, VideoRequest};
 use crate::camera::frame::CameraFrame;
 use crate::camera::frame_source::{FrameError, FramePacer, FrameSource, SourceConfig};
 use crate::platform::clock;
@@ -70,7 +70,7 @@ fn end_with_input() {
 fn write_frame(output: &mut File, frame: &CameraFrame) -> anyhow::Result<()> {
     let CameraFrame { image, captured_at, .. } = frame;
     let since_boot = clock::since_boot().saturating_sub(clock::now().since(*captured_at));
-    let header = FrameHeader { rows: image.rows(), columns: image.cols(), kind: image.typ(), since_boot };
+    let header = ImageHeader { rows: image.rows(), columns: image.cols(), kind: image.typ(), since_boot };
     protocol::write_line(output, &VideoMessage::Frame(header))?;
     Ok(output.write_all(image.data_bytes()?)?)
 }

@@ -21,13 +21,13 @@ pub(super) enum VideoMessage {
     /// The source is open; frames follow.
     Opened,
     /// A frame, whose pixels follow row by row.
-    Frame(FrameHeader),
+    Frame(ImageHeader),
     /// The last line, except after [`FrameError::Unusable`].
     Failed(FrameError),
 }
 
 #[derive(Debug, Serialize, Deserialize)]
-pub(super) struct FrameHeader {
+pub(super) struct ImageHeader {
     pub(super) rows: i32,
     pub(super) columns: i32,
     /// OpenCV's type of a pixel, such as `CV_8UC3`.
