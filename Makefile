@@ -28,11 +28,11 @@ setup: ## install the system packages that are missing
 	fi
 
 demo: setup ## run a whole cell as separate processes on this machine and print what it saw
-	cargo build --release --locked --bin ecod-node --bin ecod-lab
+	cargo build --release --locked --bin ecod-node --bin ecod-video --bin ecod-lab
 	$(BUILD)/release/ecod-lab demo --seconds $(SECONDS_PER_SCENE) --out target/demo
 
 demo-picture: setup ## the animation in README.md: the street of the demo, run live
-	cargo build --profile $(PROFILE) --locked --bin ecod-node --bin ecod-lab
+	cargo build --profile $(PROFILE) --locked --bin ecod-node --bin ecod-video --bin ecod-lab
 	$(PROGRAMS)/ecod-lab demo --scene street --seconds 25 --out target/demo
 	cp target/demo/street.svg docs/street.svg
 

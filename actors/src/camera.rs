@@ -13,6 +13,8 @@ pub mod frame;
 #[cfg(feature = "camera")]
 pub mod frame_source;
 #[cfg(feature = "camera")]
+pub mod image_codec;
+#[cfg(feature = "camera")]
 pub mod image_size;
 #[cfg(feature = "camera")]
 pub mod lens;

@@ -9,6 +9,7 @@ use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::geometry::Pose;
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::view::PosedCamera;
+use ecod_actors::camera::image_codec::encode_jpeg;
 use nalgebra::Point2;
 use opencv::core::{CV_8UC1, Mat, Scalar};
 
@@ -151,7 +152,7 @@ fn people_who_walk_give_height_and_tilt_and_what_is_not_there_is_told() {
     let mut lines = String::new();
     for number in 0..300 {
         if number < 100 {
-            opencv::imgcodecs::imwrite_def(frames.join(format!("{number:03}.png")), &blank).unwrap();
+            std::fs::write(frames.join(format!("{number:03}.jpg")), encode_jpeg(&blank, 95).unwrap()).unwrap();
         }
         lines += &(serde_json::to_string(&people(f64::from(number) * 0.3)).unwrap() + "\n");
     }
@@ -180,10 +181,10 @@ fn people_who_walk_give_height_and_tilt_and_what_is_not_there_is_told() {
 fn a_photograph_without_the_board_is_named() {
     let directory = workplace();
     let blank = Mat::new_rows_cols_with_default(720, 1280, CV_8UC1, Scalar::all(90.0)).unwrap();
-    opencv::imgcodecs::imwrite_def(directory.path().join("ground.png"), &blank).unwrap();
-    let output = calibrate(directory.path(), &["board", "--qr-side-mm", "400", "ground.png"]);
+    std::fs::write(directory.path().join("ground.jpg"), encode_jpeg(&blank, 95).unwrap()).unwrap();
+    let output = calibrate(directory.path(), &["board", "--qr-side-mm", "400", "ground.jpg"]);
     let error = stderr(&output);
-    assert!(output.status.code() == Some(1) && error.contains("ground.png") && error.contains("no QR code"), "{error}");
-    let neither = calibrate(directory.path(), &["board", "ground.png"]);
+    assert!(output.status.code() == Some(1) && error.contains("ground.jpg") && error.contains("no QR code"), "{error}");
+    let neither = calibrate(directory.path(), &["board", "ground.jpg"]);
     assert!(neither.status.code() == Some(2) && stderr(&neither).contains("--qr-side-mm"), "{}", stderr(&neither));
 }

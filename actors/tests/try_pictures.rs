@@ -8,10 +8,10 @@ use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
+use ecod_actors::camera::image_codec;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use opencv::core::{BORDER_CONSTANT, Mat, Scalar, copy_make_border};
-use opencv::imgcodecs;
 use serde_json::Value;
 
 /// Maximum time for anything.
@@ -32,9 +32,9 @@ fn album(directory: &Path, photograph: &str) -> String {
     let album = directory.join(photograph);
     fs::create_dir(&album).unwrap();
     let path = format!("{}/tests/data/photos/{photograph}.jpg", env!("CARGO_MANIFEST_DIR"));
-    let (image, mut framed) = (imgcodecs::imread(&path, imgcodecs::IMREAD_COLOR).unwrap(), Mat::default());
+    let (image, mut framed) = (image_codec::read(path.as_ref()).unwrap(), Mat::default());
     copy_make_border(&image, &mut framed, 120, 120, 160, 160, BORDER_CONSTANT, Scalar::all(128.0)).unwrap();
-    assert!(imgcodecs::imwrite_def(&*album.join("0.png").to_string_lossy(), &framed).unwrap());
+    fs::write(album.join("0.jpg"), image_codec::encode_jpeg(&framed, 95).unwrap()).unwrap();
     album.to_str().unwrap().to_owned()
 }
 

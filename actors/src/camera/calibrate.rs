@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 
 use ecod::perception::camera::Intrinsics;
 use opencv::core::{Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, TermCriteria_Type, Vector};
-use opencv::{calib3d, imgcodecs, imgproc};
+use opencv::{calib3d, imgproc};
 use serde::{Deserialize, Serialize};
 
 use crate::camera::frame_source::images;
+use crate::camera::image_codec;
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
 
@@ -125,8 +126,11 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
 /// # Errors
 /// [`CalibrationError::UnreadableImage`].
 pub fn read_gray(path: &Path) -> Result<Mat, CalibrationError> {
-    let image = imgcodecs::imread(path, imgcodecs::IMREAD_GRAYSCALE).ok().filter(|image| !image.empty());
-    image.ok_or_else(|| CalibrationError::UnreadableImage(path.to_owned()))
+    let unreadable = |_| CalibrationError::UnreadableImage(path.to_owned());
+    let mut gray = Mat::default();
+    imgproc::cvt_color_def(&image_codec::read(path).map_err(unreadable)?, &mut gray, imgproc::COLOR_BGR2GRAY)
+        .map_err(|error| CalibrationError::OpenCv(format!("image {path:?}"), error))?;
+    Ok(gray)
 }
 
 /// Calibrates a camera (Zhang 2000). The photographs should show the board at different angles and all over the image.

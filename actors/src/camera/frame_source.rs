@@ -2,7 +2,8 @@
 
 pub mod capture;
 pub(crate) mod images;
-mod video;
+mod v4l2;
+pub mod video;
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -11,7 +12,8 @@ use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
 
 use self::images::ImageSequence;
-use self::video::Video;
+use self::v4l2::V4l2Camera;
+use self::video::VideoProcess;
 use crate::camera::frame::CameraFrame;
 
 /// Source of successive frames.
@@ -24,7 +26,7 @@ pub trait FrameSource: Send {
 }
 
 /// Error of a frame source.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
 pub enum FrameError {
     /// The source cannot be opened.
     #[error("cannot open {origin}: {reason}")]
@@ -34,10 +36,10 @@ pub enum FrameError {
         /// The problem.
         reason: String,
     },
-    /// One frame of a recording is not an image; the source continues.
+    /// One frame is not an image; the source continues.
     #[error("cannot use {origin}: {reason}")]
     Unusable {
-        /// Path of the frame.
+        /// Path of the frame, or the device.
         origin: String,
         /// The problem.
         reason: String,
@@ -70,13 +72,13 @@ pub enum SourceConfig {
         /// Device file. Default `/dev/video0`.
         #[serde(default = "default_device")]
         device: PathBuf,
-        /// Requested image width in pixels. Default the camera's own.
+        /// Requested image width in pixels. Default 640. The camera takes the nearest size that it has.
         #[serde(default)]
         width: Option<u32>,
-        /// Requested image height in pixels. Default the camera's own.
+        /// Requested image height in pixels. Default 480.
         #[serde(default)]
         height: Option<u32>,
-        /// Requested frames per second. Default the camera's own.
+        /// Requested frames per second. Default 30.
         #[serde(default)]
         fps: Option<f64>,
     },
@@ -112,24 +114,39 @@ pub enum SourceConfig {
 }
 
 impl SourceConfig {
-    /// Opens the source; may block as long as the camera does. `timeout` applies to network cameras.
+    /// Opens the source; may block as long as the camera does. `timeout` applies to all but files.
     ///
     /// # Errors
     /// [`FrameError::Open`] naming the source and what is wrong.
     pub fn open(&self, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
         match self {
-            Self::V4l2 { device, width, height, fps } => Ok(Box::new(Video::device(device, *width, *height, *fps)?)),
-            Self::Gstreamer { pipeline } => Ok(Box::new(Video::pipeline(pipeline)?)),
-            Self::Url { url } => Ok(Box::new(Video::url(url, timeout)?)),
-            Self::Video { path, looping } => Ok(Box::new(Video::file(path, *looping)?)),
+            Self::V4l2 { device, width, height, fps } => {
+                Ok(Box::new(V4l2Camera::open(device, [*width, *height], *fps, timeout)?))
+            }
             Self::Images { path, fps, looping } => Ok(Box::new(ImageSequence::open(path, *fps, *looping)?)),
+            Self::Gstreamer { .. } | Self::Url { .. } | Self::Video { .. } => {
+                Ok(Box::new(VideoProcess::open(self, timeout)?))
+            }
+        }
+    }
+
+    /// Device, pipeline, address or path, as it may be shown: without user and password.
+    fn origin(&self) -> String {
+        match self {
+            Self::V4l2 { device: path, .. } | Self::Video { path, .. } | Self::Images { path, .. } => {
+                path.display().to_string()
+            }
+            Self::Gstreamer { pipeline } => video::without_credentials(pipeline),
+            // Without a scheme it is refused, but its secret must not be shown with the error.
+            Self::Url { url } if !url.contains("://") => url.rsplit('@').next().unwrap_or_default().to_owned(),
+            Self::Url { url } => video::without_credentials(url),
         }
     }
 
     /// Removes user and password from an address; true if there were any.
     pub(crate) fn forget_credentials(&mut self) -> bool {
+        let bare = self.origin();
         let Self::Url { url } = self else { return false };
-        let bare = video::without_credentials(url);
         let had = bare != *url;
         *url = bare;
         had
@@ -153,7 +170,7 @@ impl SourceConfig {
             }
             Self::Url { url } if !has_known_scheme(url) => Err(ConfigError::new(
                 "url",
-                video::without_credentials(url),
+                self.origin(),
                 "an address that begins with rtsp://, rtsps://, http:// or https://",
             )),
             _ => Ok(()),

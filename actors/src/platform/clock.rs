@@ -12,9 +12,14 @@ use rustix::time::{ClockId, Timespec, clock_gettime};
 /// All durations, timers and times of arrival are by this clock. Messages that leave the node are dated by
 /// [`CellClock`](super::cell_clock::CellClock).
 pub fn now() -> Timestamp {
+    at(since_boot())
+}
+
+/// The steady clock's time in microseconds when the machine had run for `since_boot`. All processes share that time.
+pub fn at(since_boot: Duration) -> Timestamp {
     static ANCHOR: OnceLock<(Duration, Timestamp)> = OnceLock::new();
-    let (started, wall) = ANCHOR.get_or_init(|| (since_boot(), wall()));
-    *wall + since_boot().saturating_sub(*started)
+    let (started, wall) = ANCHOR.get_or_init(|| (self::since_boot(), wall()));
+    *wall + since_boot.saturating_sub(*started)
 }
 
 /// The wall clock less the steady clock in microseconds. It changes when the wall clock steps.
@@ -27,7 +32,8 @@ pub fn wall() -> Timestamp {
     Timestamp::default() + SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
 }
 
-fn since_boot() -> Duration {
+/// Time since the machine started, including suspension.
+pub fn since_boot() -> Duration {
     let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Boottime);
     Duration::new(u64::try_from(tv_sec).unwrap_or_default(), u32::try_from(tv_nsec).unwrap_or_default())
 }

@@ -1,4 +1,4 @@
-//! Files that a package has put beside the program.
+//! Files that a package or a build has put beside the program.
 
 use std::path::PathBuf;
 
@@ -7,4 +7,11 @@ use std::path::PathBuf;
 pub(crate) fn path(below_prefix: &str) -> Option<PathBuf> {
     let program = std::env::current_exe().ok()?;
     Some(program.parent()?.parent()?.join(below_prefix)).filter(|path| path.exists())
+}
+
+/// Another program of this project: where a package puts it, beside this program, or above the directory of tests and examples.
+pub(crate) fn program(name: &str) -> Option<PathBuf> {
+    let here = std::env::current_exe().ok()?;
+    let beside = here.ancestors().skip(1).take(2).map(|directory| directory.join(name)).find(|path| path.is_file());
+    beside.or_else(|| path(&format!("lib/ecod-node/{name}")))
 }

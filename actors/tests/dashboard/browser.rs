@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use ecod::wire::Role;
 use ecod_actors::platform::secret::Secret;
 #[cfg(feature = "camera")]
+use opencv::core::Vec3b;
 use opencv::prelude::MatTraitConst;
 
 use crate::cell::{self, Stray, Vehicles, config};
@@ -197,8 +198,9 @@ async fn every_table_that_goes_on_shows_it_by_a_shadow() {
     let lightest = async |name: &str| {
         let file = directory.path().join(name);
         browser.screenshot(&file).await;
-        let picture = opencv::imgcodecs::imread(file.to_str().unwrap(), opencv::imgcodecs::IMREAD_GRAYSCALE).unwrap();
-        let pixel = |x: f64, y: f64| *picture.at_2d::<u8>(y as i32, x as i32).unwrap();
+        let picture = ecod_actors::camera::image_codec::read(&file).unwrap();
+        // The borders are gray: any colour does.
+        let pixel = |x: f64, y: f64| picture.at_2d::<Vec3b>(y as i32, x as i32).unwrap()[1];
         let of = |[left, top, right, bottom]: &[f64; 4]| {
             let steps = || (40..60).map(|step| f64::from(step) / 100.0);
             let below = steps().map(|share| pixel(left + share * (right - left), bottom - 2.0)).max();

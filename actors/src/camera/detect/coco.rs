@@ -118,14 +118,15 @@ impl CocoDetector {
         // OpenCV tells more in further lines.
         let first_line = |reason: String| reason.lines().next().unwrap_or_default().to_owned();
         let unusable = |reason: String| ModelError::Unusable { path: name.clone(), reason: first_line(reason) };
-        let weights = match file {
-            Some(path) => match std::fs::read(&path) {
-                Ok(bytes) => Vector::from_slice(&bytes),
+        // Through a buffer of ours the heap would stay larger by the whole file.
+        let net = match file {
+            Some(path) => match std::fs::File::open(&path) {
+                Ok(_) => dnn::read_net_from_onnx(&path),
                 Err(source) => return Err(ModelError::Unreadable { path, source }),
             },
-            None => Vector::from_slice(BUILT_IN.ok_or(ModelError::NoWeights)?),
+            None => dnn::read_net_from_onnx_buffer(&Vector::from_slice(BUILT_IN.ok_or(ModelError::NoWeights)?)),
         };
-        let net = dnn::read_net_from_onnx_buffer(&weights).map_err(|e| unusable(e.message))?;
+        let net = net.map_err(|e| unusable(e.message))?;
         let mut detector = Self { config, net, anchors: anchors::all() };
         let black = Mat::new_rows_cols_with_default(INPUT_PX, INPUT_PX, CV_8UC3, Scalar::all(0.0));
         black.and_then(|image| detector.run_network(&image)).map_err(|e| unusable(e.message))?;

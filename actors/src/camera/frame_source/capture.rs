@@ -4,8 +4,8 @@
 //! reader thread (one per opening) --frames, errors--> capture thread --latest frame--> slot --> detector
 //! ```
 //!
-//! OpenCV may block forever. The capture thread then abandons the reader, which ends when OpenCV returns, and reopens
-//! the source on a new one.
+//! A driver or a file system may block forever. The capture thread then abandons the reader, which ends when that returns, and
+//! reopens the source on a new one.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender};

@@ -2,11 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use opencv::core::MatTraitConst;
-use opencv::imgcodecs;
-
 use super::{FrameError, FramePacer, FrameSource};
 use crate::camera::frame::CameraFrame;
+use crate::camera::image_codec;
 use crate::platform::clock;
 
 const EXTENSIONS: [&str; 7] = ["bmp", "jpeg", "jpg", "pgm", "png", "ppm", "webp"];
@@ -49,11 +47,7 @@ impl FrameSource for ImageSequence {
         self.next += 1;
         self.pace.wait();
         let unusable = |reason: String| FrameError::Unusable { origin: file.display().to_string(), reason };
-        let image = imgcodecs::imread(file, imgcodecs::IMREAD_COLOR).map_err(|e| unusable(e.message))?;
-        if image.empty() {
-            let reason = std::fs::File::open(file).map_or_else(|error| error.to_string(), |_| "not an image".into());
-            return Err(unusable(reason));
-        }
+        let image = image_codec::read(file).map_err(|e| unusable(e.to_string()))?;
         Ok(CameraFrame { image, captured_at: clock::now(), seq })
     }
 }

@@ -1,172 +1,211 @@
-//! Frames through OpenCV's `VideoCapture`: devices, pipelines, network cameras and video files.
+//! Videos, network cameras and pipelines: frames of the program `ecod-video`, which alone has OpenCV's `videoio`.
+//!
+//! In Debian `videoio` loads some 200 libraries, 80 MB. In a process of its own it costs nothing where no source needs it, and what
+//! crashes or hangs in it does the node no harm.
+//!
+//! ```text
+//! node --VideoRequest, a line of JSON----------------------------> ecod-video
+//! node <--VideoMessage, a line of JSON; a frame's pixels after it-- ecod-video
+//! ```
+//!
+//! The program ends when its standard input does, so also when the node is killed. What it and its libraries write to standard error
+//! are debug lines of the node's log.
 
-use std::fs::File;
-use std::path::Path;
-use std::process::Command;
-use std::time::Duration;
+pub mod program;
+mod protocol;
 
-use opencv::core::{Mat, Vector};
+use std::io::{self, BufRead, BufReader, Read};
+use std::process::{Child, ChildStderr, ChildStdout, Command, Stdio};
+use std::sync::mpsc::{self, Receiver, Sender};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use opencv::core::{Mat, Scalar};
 use opencv::prelude::*;
-use opencv::videoio::{self, VideoCapture};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::{FrameError, FramePacer, FrameSource};
+use self::protocol::{ImageHeader, VideoMessage, VideoRequest};
+use super::{FrameError, FrameSource, SourceConfig};
 use crate::camera::frame::CameraFrame;
-use crate::platform::clock;
+use crate::platform::{clock, installed};
 
-/// Rate of a video file without one.
-const FALLBACK_FPS: f64 = 25.0;
+/// Name of the program.
+const PROGRAM: &str = "ecod-video";
 
-/// An open capture.
-pub(super) struct Video {
+/// Minimum time for opening a source: GStreamer may first look through all of its plugins, once on a machine.
+const MIN_OPEN_TIME: Duration = Duration::from_secs(30);
+
+/// Time for a program that is gone to hand over its last words.
+const LAST_WORDS_TIME: Duration = Duration::from_millis(200);
+
+/// A running `ecod-video` and the frames that it writes. The program is killed when this is dropped.
+pub(super) struct VideoProcess {
     origin: String,
-    capture: VideoCapture,
-    playback: Option<Playback>,
+    child: Child,
+    output: BufReader<DeadlineReader>,
+    last_words: LastWords,
+    frame_time: Duration,
     seq: u64,
 }
 
-/// Playback of a file.
-struct Playback {
-    pace: FramePacer,
-    looping: bool,
-}
-
-impl Video {
-    pub(super) fn device(
-        device: &Path,
-        width: Option<u32>,
-        height: Option<u32>,
-        fps: Option<f64>,
-    ) -> Result<Self, FrameError> {
-        let origin = device.display().to_string();
-        readable(device, &origin)?;
-        let wishes = [
-            (videoio::CAP_PROP_FRAME_WIDTH, width.map(f64::from)),
-            (videoio::CAP_PROP_FRAME_HEIGHT, height.map(f64::from)),
-            (videoio::CAP_PROP_FPS, fps),
-            (videoio::CAP_PROP_BUFFERSIZE, Some(1.0)),
-        ];
-        let mut video = Self::live(origin, || VideoCapture::from_file(device, videoio::CAP_V4L2))?;
-        for (property, wish) in wishes {
-            if let Some(value) = wish
-                && !video.capture.set(property, value).unwrap_or(false)
-            {
-                tracing::debug!(camera = video.origin, property, value, "camera rejects a setting");
-            }
-        }
-        Ok(video)
-    }
-
-    pub(super) fn pipeline(pipeline: &str) -> Result<Self, FrameError> {
-        if let Some(element) = elements(pipeline).find(|element| is_missing(element)) {
-            let reason = format!("GStreamer has no element `{element}` here: install the package that has it");
-            return Err(FrameError::Open { origin: pipeline.into(), reason });
-        }
-        let opened = Self::live(pipeline.into(), || VideoCapture::from_file(pipeline, videoio::CAP_GSTREAMER));
-        opened.map_err(|error| match error {
-            FrameError::Open { origin, reason } if Command::new(INSPECTOR).arg("--version").output().is_err() => {
-                let remedy = "install gstreamer1.0-tools, so that a missing element is named";
-                FrameError::Open { origin, reason: format!("{reason}; {remedy}") }
-            }
-            error => error,
-        })
-    }
-
-    /// A network camera with a timeout for opening it and for each frame.
-    pub(super) fn url(url: &str, timeout: Duration) -> Result<Self, FrameError> {
-        let timeout_ms = i32::try_from(timeout.as_millis()).unwrap_or(i32::MAX);
-        let properties = [videoio::CAP_PROP_OPEN_TIMEOUT_MSEC, videoio::CAP_PROP_READ_TIMEOUT_MSEC];
-        let timeouts: Vec<i32> = properties.into_iter().flat_map(|property| [property, timeout_ms]).collect();
-        Self::live(without_credentials(url), || {
-            VideoCapture::from_file_with_params(url, videoio::CAP_FFMPEG, &Vector::from_slice(&timeouts))
-        })
-    }
-
-    pub(super) fn file(path: &Path, looping: bool) -> Result<Self, FrameError> {
-        let origin = path.display().to_string();
-        readable(path, &origin)?;
-        let mut video = Self::live(origin, || VideoCapture::from_file(path, videoio::CAP_ANY))?;
-        let fps = video.capture.get(videoio::CAP_PROP_FPS).ok().filter(|fps| fps.is_finite() && *fps > 0.0);
-        video.playback = Some(Playback { pace: FramePacer::new(fps.unwrap_or(FALLBACK_FPS)), looping });
-        Ok(video)
-    }
-
-    fn live(origin: String, open: impl FnOnce() -> opencv::Result<VideoCapture>) -> Result<Self, FrameError> {
-        let failed = |reason: String| FrameError::Open { origin: origin.clone(), reason };
-        let capture = open().map_err(|e| failed(e.message))?;
-        if !capture.is_opened().map_err(|e| failed(e.message))? {
-            return Err(failed("opencv finds no video there: see whether a player shows it".into()));
-        }
-        Ok(Self { origin, capture, playback: None, seq: 0 })
-    }
-
-    /// The next image, if there is one.
-    fn read(&mut self) -> Result<Option<Mat>, FrameError> {
-        let mut image = Mat::default();
-        let read = self.capture.read(&mut image);
-        let read = read.map_err(|e| FrameError::Lost { origin: self.origin.clone(), reason: e.message })?;
-        Ok((read && !image.empty()).then_some(image))
-    }
-}
-
-impl FrameSource for Video {
-    fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
-        if let Some(playback) = &mut self.playback {
-            playback.pace.wait();
-        }
-        let mut image = self.read()?;
-        if image.is_none() && self.playback.as_ref().is_some_and(|p| p.looping) && self.seq > 0 {
-            let reopened = VideoCapture::from_file(&self.origin, videoio::CAP_ANY);
-            self.capture = reopened.map_err(|e| FrameError::Lost { origin: self.origin.clone(), reason: e.message })?;
-            image = self.read()?;
-        }
-        let origin = || self.origin.clone();
-        let image = image.ok_or_else(|| match self.playback {
-            Some(_) => FrameError::Ended { origin: origin() },
-            None => FrameError::Lost { origin: origin(), reason: "no further frame".into() },
+impl VideoProcess {
+    /// Starts the program and waits until it has opened the source. After `timeout` it gives up a network camera by itself; here
+    /// twice that time without a frame is an error.
+    pub(super) fn open(source: &SourceConfig, timeout: Duration) -> Result<Self, FrameError> {
+        let origin = source.origin();
+        let failed = |reason: String| FrameError::Open { origin: source.origin(), reason };
+        let program = installed::program(PROGRAM).ok_or_else(|| {
+            let remedy = "install the package ecod-node, or build it by `cargo build --bin ecod-video` and keep it beside this program";
+            failed(format!("the program {PROGRAM}, which reads such sources, is missing: {remedy}"))
         })?;
-        let frame = CameraFrame { image, captured_at: clock::now(), seq: self.seq };
+        let mut command = Command::new(&program);
+        let started = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
+        let mut child = started.map_err(|e| failed(format!("cannot start {}: {e}", program.display())))?;
+        let (Some(stdin), Some(stdout), Some(stderr)) = (&mut child.stdin, child.stdout.take(), child.stderr.take())
+        else {
+            return Err(failed(format!("no pipes to {PROGRAM}")));
+        };
+        // If the program is gone already, its end says why.
+        let _ = protocol::write_line(stdin, &VideoRequest { source: source.clone(), timeout });
+        let last_words = LastWords::collect(&origin, stderr).map_err(|e| failed(e.to_string()))?;
+        let frame_time = 2 * timeout;
+        let output = BufReader::new(DeadlineReader { stdout, deadline: Instant::now() });
+        let mut process = Self { origin, child, output, last_words, frame_time, seq: 0 };
+        match process.receive(MIN_OPEN_TIME.max(frame_time)) {
+            Ok(VideoMessage::Opened) => Ok(process),
+            Ok(VideoMessage::Failed(error)) => Err(error),
+            Ok(VideoMessage::Frame(_)) => Err(failed(format!("{PROGRAM} is of another version"))),
+            Err(FrameError::Lost { reason, .. }) => Err(failed(reason)),
+            Err(error) => Err(failed(error.to_string())),
+        }
+    }
+
+    /// The program's next message; a frame's pixels are still to be read.
+    fn receive(&mut self, time: Duration) -> Result<VideoMessage, FrameError> {
+        self.output.get_mut().deadline = Instant::now() + time;
+        let mut line = String::new();
+        match self.output.read_line(&mut line) {
+            Ok(0) => Err(self.end()),
+            Ok(_) => {
+                serde_json::from_str(&line).map_err(|e| self.lost(format!("{PROGRAM} is of another version: {e}")))
+            }
+            Err(error) => Err(self.broken(&error, time)),
+        }
+    }
+
+    fn receive_pixels(&mut self, header: &ImageHeader) -> Result<CameraFrame, FrameError> {
+        let ImageHeader { rows, columns, kind, since_boot } = *header;
+        let image = Mat::new_rows_cols_with_default(rows, columns, kind, Scalar::all(0.0));
+        let mut image = image.map_err(|e| self.lost(e.message))?;
+        let pixels = image.data_bytes_mut().map_err(|e| self.lost(e.message))?;
+        self.output.read_exact(pixels).map_err(|e| self.broken(&e, self.frame_time))?;
+        let frame = CameraFrame { image, captured_at: clock::at(since_boot), seq: self.seq };
         self.seq += 1;
         Ok(frame)
     }
-}
 
-/// An address that may be logged: `rtsp://user:secret@camera/1` without user and secret.
-pub(super) fn without_credentials(url: &str) -> String {
-    match url.split_once("://") {
-        Some((scheme, rest)) => {
-            let (login_and_host, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
-            let host = login_and_host.rsplit('@').next().unwrap_or_default();
-            format!("{scheme}://{host}{path}")
+    fn broken(&mut self, error: &io::Error, time: Duration) -> FrameError {
+        match error.kind() {
+            io::ErrorKind::TimedOut => FrameError::Stalled(time),
+            io::ErrorKind::UnexpectedEof => self.end(),
+            _ => self.lost(error.to_string()),
         }
-        None => url.rsplit('@').next().unwrap_or_default().to_owned(),
+    }
+
+    /// The end of the program, with its status and last words.
+    fn end(&mut self) -> FrameError {
+        // It may have closed its output and go on; of a program that is gone, the status stays.
+        let _ = self.child.kill();
+        let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
+        let words = self.last_words.wait();
+        let words = if words.is_empty() { words } else { format!(": {words}") };
+        self.lost(format!("{PROGRAM} ended, {status}{words}"))
+    }
+
+    fn lost(&self, reason: String) -> FrameError {
+        FrameError::Lost { origin: self.origin.clone(), reason }
     }
 }
 
-/// Names of the elements of a GStreamer pipeline; caps, references and properties are none.
-fn elements(pipeline: &str) -> impl Iterator<Item = &str> {
-    pipeline
-        .split('!')
-        .filter_map(|part| part.split_whitespace().next())
-        .filter(|word| word.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-'))
-}
-
-/// GStreamer's program that knows its elements.
-const INSPECTOR: &str = "gst-inspect-1.0";
-
-/// True if GStreamer says that it does not know an element; OpenCV only waits for frames then.
-fn is_missing(element: &str) -> bool {
-    let answer = Command::new(INSPECTOR).args(["--exists", element]).output();
-    answer.is_ok_and(|answer| answer.status.code() == Some(1))
-}
-
-/// The operating system's error for a missing or forbidden file, since OpenCV reports none.
-fn readable(path: &Path, origin: &str) -> Result<(), FrameError> {
-    let failed = |e: std::io::Error| FrameError::Open { origin: origin.to_owned(), reason: e.to_string() };
-    let file = File::open(path).map_err(failed)?;
-    if file.metadata().map_err(failed)?.is_dir() {
-        return Err(failed(std::io::Error::other("it is a directory: for images use kind `images`, or `--images`")));
+impl FrameSource for VideoProcess {
+    fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
+        match self.receive(self.frame_time)? {
+            VideoMessage::Frame(header) => self.receive_pixels(&header),
+            VideoMessage::Failed(error) => Err(error),
+            VideoMessage::Opened => Err(self.lost(format!("{PROGRAM} is of another version"))),
+        }
     }
-    Ok(())
+}
+
+impl Drop for VideoProcess {
+    fn drop(&mut self) {
+        if let Err(error) = self.child.kill().and_then(|()| self.child.wait()) {
+            tracing::warn!(camera = self.origin, %error, "cannot end {PROGRAM}");
+        }
+    }
+}
+
+/// Standard output of the program, of which each read ends at a deadline.
+struct DeadlineReader {
+    stdout: ChildStdout,
+    deadline: Instant,
+}
+
+impl Read for DeadlineReader {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let left = Timespec::try_from(self.deadline.saturating_duration_since(Instant::now()));
+        let left = left.map_err(io::Error::other)?;
+        match poll(&mut [PollFd::new(&self.stdout, PollFlags::IN)], Some(&left))? {
+            0 => Err(io::ErrorKind::TimedOut.into()),
+            _ => self.stdout.read(buffer),
+        }
+    }
+}
+
+/// Standard error of the program: logged line by line, and the last line kept.
+struct LastWords {
+    line: Arc<Mutex<String>>,
+    ended: Receiver<()>,
+}
+
+impl LastWords {
+    fn collect(origin: &str, stderr: ChildStderr) -> io::Result<Self> {
+        let (line, (until, ended)) = (Arc::<Mutex<String>>::default(), mpsc::channel());
+        let (camera, last) = (origin.to_owned(), Arc::clone(&line));
+        thread::Builder::new().name("video-log".into()).spawn(move || log(&camera, stderr, &last, &until))?;
+        Ok(Self { line, ended })
+    }
+
+    /// The last line, once there is no more or time is up.
+    fn wait(&self) -> String {
+        // Nothing is ever sent.
+        let _ = self.ended.recv_timeout(LAST_WORDS_TIME);
+        self.line.lock().map(|line| line.clone()).unwrap_or_default()
+    }
+}
+
+fn log(camera: &str, stderr: ChildStderr, last: &Mutex<String>, _until: &Sender<()>) {
+    for line in BufReader::new(stderr).split(b'\n').map_while(Result::ok) {
+        let line = without_credentials(String::from_utf8_lossy(&line).trim_end());
+        tracing::debug!(camera, "{line}");
+        if let Ok(mut last) = last.lock() {
+            *last = line;
+        }
+    }
+}
+
+/// A text that may be logged: of each address in it, `rtsp://user:secret@camera/1`, without user and secret.
+pub(super) fn without_credentials(text: &str) -> String {
+    let mut parts = text.split("://");
+    let mut bare = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let end = part.find(|c: char| c == '/' || c == '"' || c == '\'' || c.is_whitespace()).unwrap_or(part.len());
+        let (login_and_host, rest) = part.split_at(end);
+        let host = login_and_host.rsplit('@').next().unwrap_or_default();
+        bare = format!("{bare}://{host}{rest}");
+    }
+    bare
 }
 
 #[cfg(test)]
@@ -174,15 +213,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn secrets_of_an_address_are_not_shown() {
+    fn secrets_of_addresses_are_not_shown() {
         assert_eq!(without_credentials("rtsp://user:p@ss@camera:554/1"), "rtsp://camera:554/1");
         assert_eq!(without_credentials("http://camera/a@b"), "http://camera/a@b");
-    }
-
-    #[test]
-    fn the_elements_of_a_pipeline_are_told_from_caps_and_properties() {
-        let pipeline =
-            "libcamerasrc camera-name=x ! video/x-raw,width=640 ! videoconvert ! tee name=t ! appsink drop=true";
-        assert_eq!(elements(pipeline).collect::<Vec<_>>(), ["libcamerasrc", "videoconvert", "tee", "appsink"]);
+        assert_eq!(
+            without_credentials(
+                "rtspsrc location=\"rtsp://user:secret@camera\" ! tee name=a@b ! udpsink uri=udp://x@host"
+            ),
+            "rtspsrc location=\"rtsp://camera\" ! tee name=a@b ! udpsink uri=udp://host"
+        );
     }
 }

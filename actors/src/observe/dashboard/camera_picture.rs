@@ -6,12 +6,13 @@ use ecod::model::detection::Detection;
 use ecod::model::names::Label;
 use ecod::model::time::Timestamp;
 use ecod::wire::PerceivedObject;
-use opencv::core::{Mat, MatTraitConst, Size, Vector};
-use opencv::{imgcodecs, imgproc};
+use opencv::core::{Mat, MatTraitConst, Size};
+use opencv::imgproc;
 use serde::Serialize;
 
 use super::snapshot::json;
 use crate::camera::frame::CameraFrame;
+use crate::camera::image_codec::{self, ImageError};
 use crate::camera::image_size::ImageSize;
 
 /// A detection in a picture.
@@ -38,7 +39,7 @@ struct CameraPicture<'a> {
 /// Maximum width of a picture in pixels; wider frames are scaled down.
 const MAX_WIDTH: i32 = 640;
 
-const JPEG_QUALITY: i32 = 75;
+const JPEG_QUALITY: u8 = 75;
 
 impl PictureBox {
     /// A detection in an image of this size, without a place so far.
@@ -57,15 +58,15 @@ impl PictureBox {
 /// The picture as a server-sent event named `camera`.
 ///
 /// # Errors
-/// OpenCV's.
-pub fn camera_event(frame: &CameraFrame, boxes: &[PictureBox]) -> opencv::Result<Bytes> {
+/// [`ImageError`] of the JPEG.
+pub fn camera_event(frame: &CameraFrame, boxes: &[PictureBox]) -> Result<Bytes, ImageError> {
     let jpeg = BASE64_STANDARD.encode(jpeg(&frame.image)?);
     let ImageSize { width: width_px, height: height_px } = ImageSize::of(&frame.image);
     let picture = json(&CameraPicture { captured_at_us: frame.captured_at, width_px, height_px, jpeg, boxes });
     Ok([b"event: camera\ndata: ", &*picture, b"\n\n"].concat().into())
 }
 
-fn jpeg(image: &Mat) -> opencv::Result<Vector<u8>> {
+fn jpeg(image: &Mat) -> Result<Vec<u8>, ImageError> {
     let mut scaled = Mat::default();
     let image = if image.cols() > MAX_WIDTH {
         let size = Size::new(MAX_WIDTH, (image.rows() * MAX_WIDTH / image.cols()).max(1));
@@ -74,10 +75,7 @@ fn jpeg(image: &Mat) -> opencv::Result<Vector<u8>> {
     } else {
         image
     };
-    let mut jpeg = Vector::new();
-    let quality = Vector::from_slice(&[imgcodecs::IMWRITE_JPEG_QUALITY, JPEG_QUALITY]);
-    imgcodecs::imencode(".jpg", image, &mut jpeg, &quality)?;
-    Ok(jpeg)
+    image_codec::encode_jpeg(image, JPEG_QUALITY)
 }
 
 #[cfg(test)]
@@ -101,7 +99,7 @@ mod tests {
         assert_eq!((&picture["width_px"], &picture["height_px"]), (&1920.into(), &1080.into()));
         assert_eq!(picture["boxes"][0]["edges"], serde_json::json!([0.25, 0.25, 0.5, 1.0]));
         let jpeg = BASE64_STANDARD.decode(picture["jpeg"].as_str().unwrap()).unwrap();
-        let shown = imgcodecs::imdecode(&Vector::from_slice(&jpeg), imgcodecs::IMREAD_COLOR).unwrap();
+        let shown = image_codec::decode(&jpeg).unwrap();
         assert_eq!((shown.cols(), shown.rows()), (640, 360));
     }
 }

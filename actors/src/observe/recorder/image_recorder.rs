@@ -5,14 +5,16 @@ use std::time::Duration;
 use ecod::model::detection::Detection;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use opencv::core::Vector;
-use opencv::imgcodecs;
 
 use super::{CapturedPicture, LogItem, LogSender, RecordConfig};
 use crate::camera::config::CameraConfig;
 use crate::camera::frame::CameraFrame;
+use crate::camera::image_codec;
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
+
+/// Quality of recorded pictures, from which detectors are judged later: 1 to 100.
+const JPEG_QUALITY: u8 = 95;
 
 /// Records frames as JPEG at a fixed rate.
 #[derive(Debug, Clone)]
@@ -43,9 +45,8 @@ impl ImageRecorder {
             return;
         }
         self.due = frame.captured_at + self.period;
-        let mut jpeg = Vector::<u8>::new();
-        match imgcodecs::imencode_def(".jpg", &frame.image, &mut jpeg) {
-            Ok(true) => {
+        match image_codec::encode_jpeg(&frame.image, JPEG_QUALITY) {
+            Ok(jpeg) => {
                 let size = ImageSize::of(&frame.image);
                 let picture = CapturedPicture {
                     camera: self.camera.clone(),
@@ -57,7 +58,7 @@ impl ImageRecorder {
                 };
                 self.log.send(frame.captured_at, LogItem::Picture(Box::new(picture)));
             }
-            encoded => tracing::debug!(?encoded, "cannot encode frame as JPEG"),
+            Err(error) => tracing::debug!(%error, "cannot encode frame as JPEG"),
         }
     }
 }

@@ -2,15 +2,13 @@
 #![cfg(feature = "coco-weights")]
 
 use ecod::model::time::Timestamp;
-use opencv::{imgcodecs, imgproc};
+use opencv::imgproc;
 
 use super::*;
+use crate::camera::image_codec;
 
-fn photograph(name: &str, flags: i32) -> Mat {
-    let path = format!("{}/tests/data/photos/{name}.jpg", env!("CARGO_MANIFEST_DIR"));
-    let image = imgcodecs::imread(&path, flags).unwrap();
-    assert!(!image.empty(), "{path}");
-    image
+fn photograph(name: &str) -> Mat {
+    image_codec::read(format!("{}/tests/data/photos/{name}.jpg", env!("CARGO_MANIFEST_DIR")).as_ref()).unwrap()
 }
 
 fn frame(image: Mat) -> CameraFrame {
@@ -29,14 +27,16 @@ fn photographs_show_what_they_show() {
         ("chelsea", "cat", 0.9, (240.0, 150.0)),
         ("astronaut", "person", 0.5, (250.0, 260.0)),
     ] {
-        let found = detector.detect(&frame(photograph(name, imgcodecs::IMREAD_COLOR))).unwrap();
+        let found = detector.detect(&frame(photograph(name))).unwrap();
         let best = best(&found);
         assert_eq!(best.label, label, "{name}: {found:?}");
         assert!(best.confidence > least, "{name}: {best:?}");
         let b = best.bounding_box;
         assert!(b.x_min < middle.0 && middle.0 < b.x_max && b.y_min < middle.1 && middle.1 < b.y_max, "{name}: {b:?}");
     }
-    let gray = detector.detect(&frame(photograph("chelsea", imgcodecs::IMREAD_GRAYSCALE))).unwrap();
+    let mut gray = Mat::default();
+    imgproc::cvt_color_def(&photograph("chelsea"), &mut gray, imgproc::COLOR_BGR2GRAY).unwrap();
+    let gray = detector.detect(&frame(gray)).unwrap();
     assert_eq!(best(&gray).label, "cat", "{gray:?}");
 }
 
@@ -45,7 +45,7 @@ fn distant_cat() -> Mat {
     let mut image = Mat::new_rows_cols_with_default(960, 1280, CV_8UC3, Scalar::all(128.0)).unwrap();
     let mut small = Mat::default();
     let size = Size::new(220, 147);
-    let cat = photograph("chelsea", imgcodecs::IMREAD_COLOR);
+    let cat = photograph("chelsea");
     imgproc::resize(&cat, &mut small, size, 0.0, 0.0, imgproc::INTER_AREA).unwrap();
     let mut place = Mat::roi_mut(&mut image, Rect::new(900, 650, size.width, size.height)).unwrap();
     small.copy_to(&mut place).unwrap();
@@ -70,7 +70,7 @@ fn tiles_raise_the_confidence_in_a_small_object_and_keep_its_place() {
 #[test]
 fn one_object_is_found_once_with_tiles() {
     let mut detector = CocoDetector::new(CocoConfig { tiling: true, ..CocoConfig::default() }).unwrap();
-    let found = detector.detect(&frame(photograph("coffee", imgcodecs::IMREAD_COLOR))).unwrap();
+    let found = detector.detect(&frame(photograph("coffee"))).unwrap();
     assert_eq!(found.iter().filter(|d| d.label == "cup").count(), 1, "{found:?}");
 }
 
@@ -96,7 +96,7 @@ fn an_unusable_image_is_an_error_and_the_detector_stays_usable() {
     assert!(error.contains("frame 7 has no pixels"), "{error}");
     let deep = Mat::new_rows_cols_with_default(10, 10, CV_32F, Scalar::all(0.0)).unwrap();
     assert!(detector.detect(&frame(deep)).is_err());
-    assert!(!detector.detect(&frame(photograph("chelsea", imgcodecs::IMREAD_COLOR))).unwrap().is_empty());
+    assert!(!detector.detect(&frame(photograph("chelsea"))).unwrap().is_empty());
 }
 
 #[test]

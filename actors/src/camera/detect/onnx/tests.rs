@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use ecod::model::detection::BoundingBox;
 use ecod::model::time::Timestamp;
 use opencv::core::{CV_8UC3, Mat, Scalar};
-use opencv::imgcodecs;
 
 use super::*;
+use crate::camera::image_codec;
 
 fn path(name: &str) -> PathBuf {
     PathBuf::from(format!("{}/tests/data/onnx/{name}", env!("CARGO_MANIFEST_DIR")))
@@ -24,7 +24,7 @@ fn labelled(model: &str) -> OnnxConfig {
 }
 
 fn frame() -> CameraFrame {
-    let image = imgcodecs::imread(path("frame.png").to_str().unwrap(), imgcodecs::IMREAD_COLOR).unwrap();
+    let image = image_codec::read(&path("frame.png")).unwrap();
     CameraFrame { image, captured_at: Timestamp(0), seq: 7 }
 }
 
@@ -230,7 +230,7 @@ fn yolox_finds_in_photographs_what_onnx_runtime_finds_with_the_same_weights() {
     let mut detector = OnnxDetector::new(OnnxConfig { threshold: 0.3, ..OnnxConfig::of(file("YOLOX_MODEL")) }).unwrap();
     for (name, expected) in expected {
         let photograph = path(&format!("../photos/{name}.jpg"));
-        let image = imgcodecs::imread(photograph.to_str().unwrap(), imgcodecs::IMREAD_COLOR).unwrap();
+        let image = image_codec::read(&photograph).unwrap();
         let found = detector.detect(&CameraFrame { image, ..frame() }).unwrap();
         assert_eq!(found.len(), expected.len(), "{name}: {found:?}");
         for Photographed { class, score, r#box } in expected {

@@ -1,0 +1,113 @@
+//! Image files and JPEG pictures. OpenCV's `imgcodecs` is left out: with it, Debian loads a hundred libraries into a node.
+
+use std::io::Cursor;
+use std::path::Path;
+
+use image::{DynamicImage, ImageDecoder, ImageReader};
+use jpeg_encoder::{Encoder, EncodingError, ImageBuffer, JpegColorType, SamplingFactor};
+use opencv::core::{Mat, Vec3b};
+use opencv::imgproc;
+use opencv::prelude::*;
+
+use super::image_size::ImageSize;
+
+/// Error of reading or writing an image.
+#[derive(Debug, thiserror::Error)]
+pub enum ImageError {
+    /// The file cannot be read.
+    #[error(transparent)]
+    File(#[from] std::io::Error),
+    /// The bytes are no whole image of a known format.
+    #[error("not an image in BMP, JPEG, PNG, PNM or WebP: {0}")]
+    Malformed(#[from] image::ImageError),
+    /// The image is wider or higher than JPEG allows.
+    #[error("{0} pixels are too many for JPEG, at most 65535 in a line")]
+    TooLarge(ImageSize),
+    /// The image has no pixels.
+    #[error("cannot encode as JPEG")]
+    Encoding(#[from] EncodingError),
+    /// OpenCV failed.
+    #[error("opencv failed on an image")]
+    OpenCv(#[from] opencv::Error),
+}
+
+/// Reads an image file as [`decode`] does.
+///
+/// # Errors
+/// [`ImageError::File`] or those of [`decode`].
+pub fn read(path: &Path) -> Result<Mat, ImageError> {
+    decode(&std::fs::read(path)?)
+}
+
+/// Image in BMP, JPEG, PNG, PNM or WebP as 8-bit BGR without transparency, turned upright as its EXIF data says.
+///
+/// # Errors
+/// [`ImageError::Malformed`] or [`ImageError::OpenCv`].
+pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
+    let mut decoder = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.into_decoder()?;
+    let orientation = decoder.orientation()?;
+    let mut image = DynamicImage::from_decoder(decoder)?;
+    image.apply_orientation(orientation);
+    let rgb = image.into_rgb8();
+    let pixels = Mat::new_rows_cols_with_bytes::<Vec3b>(rgb.height() as i32, rgb.width() as i32, rgb.as_raw())?;
+    let mut bgr = Mat::default();
+    imgproc::cvt_color_def(&pixels, &mut bgr, imgproc::COLOR_RGB2BGR)?;
+    Ok(bgr)
+}
+
+/// JPEG of an 8-bit image, BGR or gray. `quality` is 1 to 100. Colours have half the resolution, as in OpenCV's files.
+///
+/// # Errors
+/// [`ImageError::TooLarge`], [`ImageError::Encoding`], or [`ImageError::OpenCv`] for an image of another type.
+pub fn encode_jpeg(image: &Mat, quality: u8) -> Result<Vec<u8>, ImageError> {
+    let size = ImageSize::of(image);
+    let side = |pixels| u16::try_from(pixels).map_err(|_| ImageError::TooLarge(size));
+    let mut colors = Mat::default();
+    let is_gray = image.channels() == 1;
+    if !is_gray {
+        imgproc::cvt_color_def(image, &mut colors, imgproc::COLOR_BGR2YCrCb)?;
+    }
+    let pixels = if is_gray { image.data_bytes()? } else { colors.data_bytes()? };
+    let mut jpeg = Vec::new();
+    let mut encoder = Encoder::new(&mut jpeg, quality);
+    encoder.set_sampling_factor(SamplingFactor::F_2_2);
+    encoder.encode_image(Pixels { pixels, width: side(size.width)?, height: side(size.height)?, is_gray })?;
+    Ok(jpeg)
+}
+
+/// An image in JPEG's own colours. Of the encoder's many kinds of images, programs then have only this one.
+struct Pixels<'a> {
+    /// Rows of brightness, with Cr and Cb unless it is gray.
+    pixels: &'a [u8],
+    width: u16,
+    height: u16,
+    is_gray: bool,
+}
+
+impl ImageBuffer for Pixels<'_> {
+    fn get_jpeg_color_type(&self) -> JpegColorType {
+        if self.is_gray { JpegColorType::Luma } else { JpegColorType::Ycbcr }
+    }
+
+    fn width(&self) -> u16 {
+        self.width
+    }
+
+    fn height(&self) -> u16 {
+        self.height
+    }
+
+    fn fill_buffers(&self, y: u16, [brightness, cb, cr, _]: &mut [Vec<u8>; 4]) {
+        let (row, width) = (usize::from(y), usize::from(self.width));
+        if self.is_gray {
+            return brightness.extend_from_slice(&self.pixels[row * width..][..width]);
+        }
+        let (pixels, _) = self.pixels[row * width * 3..][..width * 3].as_chunks::<3>();
+        brightness.extend(pixels.iter().map(|pixel| pixel[0]));
+        cr.extend(pixels.iter().map(|pixel| pixel[1]));
+        cb.extend(pixels.iter().map(|pixel| pixel[2]));
+    }
+}
+
+#[cfg(test)]
+mod tests;
