@@ -15,6 +15,7 @@ pub mod round;
 mod answer;
 mod command;
 mod config;
+mod foreign_view;
 mod neighbouring;
 mod report_doubt;
 #[cfg(test)]
@@ -28,6 +29,7 @@ pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
 pub use report_doubt::ReportDoubt;
 
+use foreign_view::ForeignView;
 use nalgebra::Point2;
 use neighbouring::NeighbourView;
 use report_doubt::{MAX_AWAY_M, MIN_MISPLACED};
@@ -91,6 +93,9 @@ pub struct Aggregator {
     overtaken: u64,
     placements: Placements,
     neighbours: NeighbourView,
+    foreign: ForeignView,
+    /// Weight of the initial score in published reputations, in votes.
+    initial_votes: f64,
     vote: Option<Vote>,
     by_packets: bool,
     /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
@@ -102,7 +107,7 @@ impl Aggregator {
     pub fn new_standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
         let is_tracking = config.tracks_objects(!landmarks.is_empty());
         let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
-        let by_packets = vote.mode == VoteMode::Paper;
+        let (by_packets, initial_votes) = (vote.mode == VoteMode::Paper, reputation.initial_votes);
         let vote = algorithms.vote().then(|| Vote::new(vote, landmarks.clone()));
         let tracks_open_cell = tracks.mode == TracksMode::Auto;
         let tracks = is_tracking.then(|| Tracker::new(tracks, reputation));
@@ -120,6 +125,8 @@ impl Aggregator {
             overtaken: 0,
             placements: Placements::default(),
             neighbours: NeighbourView::default(),
+            foreign: ForeignView::default(),
+            initial_votes,
             vote,
             by_packets,
             voted: false,
@@ -140,7 +147,8 @@ impl Aggregator {
         let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
         self.windows.iter_mut().for_each(|known| known.configure(window.clone()));
         self.rounds.configure(round);
-        self.by_packets = vote.mode == VoteMode::Paper;
+        (self.by_packets, self.initial_votes) = (vote.mode == VoteMode::Paper, reputation.initial_votes);
+        self.foreign.repeat();
         self.vote = algorithms.vote().then(|| match self.vote.take() {
             Some(known) => known.configured(vote, landmarks.clone()),
             None => Vote::new(vote, landmarks.clone()),
@@ -417,6 +425,7 @@ impl Aggregator {
     }
 
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
+        self.foreign.weigh(self.vote.as_mut(), self.tracks.as_mut());
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
         let tracks = self.tracks.as_mut().map(|tracks| tracks.close(now)).unwrap_or_default();
         let by_packets = self.by_packets;

@@ -7,11 +7,14 @@
 //! - A cell tells of its own tile and of [`COVER_M`] around it. Objects elsewhere are refused and counted.
 //! - Maps count in the order of epoch and round, and no older than [`MAX_AGE`]. [`CellMapFilter`] says how age is known.
 //! - Objects are put into this cell's frame through their place on Earth.
+//!
+//! [`ReputationExchange`] says what cells tell each other of vehicles.
 
 mod area;
 mod extent;
 mod filter;
 mod frame;
+mod reputation_exchange;
 #[cfg(test)]
 mod tests;
 
@@ -22,6 +25,7 @@ use nalgebra::Point2;
 
 pub use area::CoveredArea;
 pub use filter::{AdmittedMap, CellMapFilter, MAX_AGE};
+pub use reputation_exchange::{ExchangeStep, ReputationExchange};
 
 use crate::model::names::NodeName;
 use crate::model::origin::GeographicOrigin;

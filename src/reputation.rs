@@ -6,7 +6,10 @@
 //!
 //! Marks let old votes be forgotten: a mark holds a vehicle's counts at an earlier number of votes. It is written once.
 //! The latest mark alone decides which marks are kept, so that merging them is a join too.
+//!
+//! Counts of other cells ([`ForeignReputations`]) are no part of the ledger: they move the score from which a vehicle starts.
 
+mod foreign;
 mod ledger;
 mod marks;
 mod replication;
@@ -16,11 +19,13 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+pub use foreign::{CellCounts, ForeignReputations, MAX_FOREIGN_VEHICLES};
 pub use ledger::ReputationLedger;
 pub use replication::{EntryKey, MAX_ENTRIES, MAX_LANES};
 
 use crate::config::config_section;
 use crate::model::names::{Label, NodeName};
+use crate::wire::ForeignVotes;
 
 /// A settled vote: whether it agreed with the verdict is known and final.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -85,7 +90,13 @@ impl ReputationConfig {
     /// The reputation of a vehicle with these numbers of votes: the mean of a Beta distribution (Jøsang & Ismail 2002).
     /// Unlike there, the prior is not uniform but [`Self::initial`] with the weight [`Self::initial_votes`].
     pub fn mean(&self, correct: f64, incorrect: f64) -> f64 {
-        (correct + self.initial * self.initial_votes) / (correct + incorrect + self.initial_votes)
+        self.mean_with(correct, incorrect, ForeignVotes::default())
+    }
+
+    /// The same of a vehicle of which other cells say something.
+    pub fn mean_with(&self, correct: f64, incorrect: f64, foreign: ForeignVotes) -> f64 {
+        let prior = self.initial * self.initial_votes + foreign.correct;
+        (correct + prior) / (correct + incorrect + self.initial_votes + foreign.total())
     }
 }
 

@@ -42,7 +42,9 @@ use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::perception::landmark::Landmark;
 use crate::reputation::{Evidence, ReputationLedger};
-use crate::wire::{LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict};
+use crate::wire::{
+    ForeignVotes, LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict,
+};
 use configured_method::ConfiguredMethod;
 use method::NewVote;
 
@@ -386,6 +388,12 @@ impl Vote {
     /// Starts from a ledger, after a restart or a change of aggregator; without effect in `paper` mode.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
         self.method.get_mut().adopt(ledger, &self.config);
+    }
+
+    /// Takes the votes of other cells, by the weight in votes of the prior beside which they count; without effect in
+    /// `paper` mode.
+    pub fn set_foreign(&mut self, votes_beside: impl Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {
+        self.method.get_mut().set_foreign(&votes_beside);
     }
 
     /// Continues from published reputations, after a restart or a change of aggregator; without effect in `weighted`

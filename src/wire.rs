@@ -14,13 +14,14 @@
 //! broker      -> nodes/<node>/clients     ClientRefusals retained, at that node's broker alone
 //! ```
 //!
-//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`]).
+//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`], [`ReputationTopic`]).
 //!
 //! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
 
 #![deny(clippy::indexing_slicing)]
 
 mod cell_map;
+mod cell_reputation;
 mod client_refusals;
 mod codec;
 mod compact;
@@ -30,6 +31,7 @@ mod ledger;
 mod object;
 mod region_topic;
 mod reject;
+mod reputation_topic;
 mod topic;
 mod trouble;
 mod validation;
@@ -42,6 +44,7 @@ use serde::{Deserialize, Serialize};
 use uuid::Uuid;
 
 pub use cell_map::{CellMap, NeighbourObject};
+pub use cell_reputation::{CellReputation, ForeignVotes};
 pub use client_refusals::{ClientRefusal, ClientRefusals};
 pub use codec::{Encoding, decode, decode_report, decode_share, encode};
 pub use description::{CellDescription, ContentHash, DescriptionStamp, DescriptionStatus, InvalidHash};
@@ -50,6 +53,7 @@ pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
 pub use region_topic::{RegionTopic, RegionTopicKind};
 pub use reject::RejectReason;
+pub use reputation_topic::ReputationTopic;
 pub use topic::{ReportKind, Topic, Topics};
 pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
@@ -349,6 +353,10 @@ pub struct Reputation {
     /// Number of votes that did not.
     #[n(2)]
     pub incorrect: u64,
+    /// What other cells say, as far as it is in the score; absent if they say nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(3)]
+    pub foreign: Option<ForeignVotes>,
 }
 
 /// A node's status, published by itself; the broker publishes the last will when the node goes silent.
@@ -456,6 +464,7 @@ pub fn schemas() -> BTreeMap<&'static str, schemars::Schema> {
         ("ObjectReport", schemars::schema_for!(ObjectReport)),
         ("GlobalMap", schemars::schema_for!(GlobalMap)),
         ("CellMap", schemars::schema_for!(CellMap)),
+        ("CellReputation", schemars::schema_for!(CellReputation)),
         ("Verdicts", schemars::schema_for!(Verdicts)),
         ("CellDescription", schemars::schema_for!(CellDescription)),
         ("Reputations", schemars::schema_for!(Reputations)),

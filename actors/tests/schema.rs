@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
-use ecod::wire::{RegionTopic, RegionTopicKind, Topic, Topics};
+use ecod::wire::{RegionTopic, RegionTopicKind, ReputationTopic, Topic, Topics};
 
 const REGENERATE: &str = "regenerate with: ECOD_WRITE_SCHEMAS=1 cargo test -p ecod-actors --test schema";
 
@@ -57,7 +57,8 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
         spoken.chain(["map", "vehicles/node", "received/{receiver}"].map(|level| topics.cpm(level))).collect();
     let tile: Quadkey = "0".parse().unwrap();
     let of_region = RegionTopicKind::ALL.map(|kind| RegionTopic { tile, cell: NodeName::from_static("cell"), kind });
-    let spoken = &spoken | &of_region.iter().map(RegionTopic::path).collect();
+    let of_vehicle = ReputationTopic { vehicle: node, cell: NodeName::from_static("cell") };
+    let spoken = &spoken | &of_region.iter().map(RegionTopic::path).chain([of_vehicle.path()]).collect();
     let addresses = values(&document, "address: ", '\n');
     let documented: BTreeSet<_> = addresses
         .iter()

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
-use ecod::wire::{RegionTopic, RegionTopicKind};
+use ecod::wire::{RegionTopic, RegionTopicKind, ReputationTopic};
 
 /// The account of a cell. All nodes of the cell that may lead share it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -15,9 +15,6 @@ pub struct CellAccount {
     /// The tile of the cell's origin.
     pub tile: Quadkey,
 }
-
-/// Topics on which cells publish what they know of vehicles: `ecod/v1/rep/<vehicle>/<cell>`.
-const REPUTATIONS: &str = "ecod/v1/rep";
 
 impl CellAccount {
     /// The account of a cell.
@@ -30,7 +27,7 @@ impl CellAccount {
         let Self { cell, tile } = self;
         let (tile, cell) = (*tile, cell.clone());
         let own = RegionTopicKind::ALL.map(|kind| RegionTopic { tile, cell: cell.clone(), kind }.path());
-        own.into_iter().chain([format!("{REPUTATIONS}/+/{cell}")]).collect()
+        own.into_iter().chain([ReputationTopic::filter_of_cell(&cell)]).collect()
     }
 
     /// MQTT filters of what the cell may read: its own, maps and descriptions of the tiles around, and reputations.
@@ -41,7 +38,7 @@ impl CellAccount {
         let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
         let around = tile.with_neighbours().into_iter();
         let around = around.flat_map(|tile| kinds.map(|kind| RegionTopic::filter(tile, kind)));
-        let own = [RegionTopic::filter_of_cell(*tile, cell), format!("{REPUTATIONS}/+/+")];
+        let own = [RegionTopic::filter_of_cell(*tile, cell), ReputationTopic::filter_everywhere()];
         own.into_iter().chain(around).collect()
     }
 

@@ -155,6 +155,12 @@ impl ReportWindow {
         Timeliness { timely, untimely: vehicles.len() - timely }
     }
 
+    /// The vehicles that were heard lately, once for each part.
+    pub(crate) fn present(&self, now: Timestamp) -> impl Iterator<Item = NodeName> {
+        let present = self.vehicles.iter().filter(move |(_, vehicle)| now.since(vehicle.last_received) < RETENTION);
+        present.map(|(name, _)| name.vehicle())
+    }
+
     /// Makes room for a vehicle or a part of one, if there is any.
     fn make_room(&mut self, name: &NodeName, now: Timestamp) -> Result<(), RejectReason> {
         let is_full = |vehicles: &BTreeMap<NodeName, VehicleClock>| {
@@ -184,7 +190,7 @@ fn parts_beside(vehicles: &BTreeMap<NodeName, VehicleClock>, name: &NodeName) ->
 /// Maximum parts of a vehicle at a time: a vehicle that invents names takes nobody else's room.
 pub const MAX_PARTS: usize = 16;
 
-/// Time after which a silent vehicle's clock is forgotten when room is short.
+/// Time after which a silent vehicle has left: its clock is forgotten when room is short.
 const RETENTION: Duration = Duration::from_secs(10);
 
 /// Time for which a vehicle's reports are rejected before it counts as untimely; a clock that stepped takes one second.

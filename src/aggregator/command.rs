@@ -13,7 +13,7 @@ use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::perception::landmark::{Landmark, LandmarkConfig};
-use crate::reputation::ReputationLedger;
+use crate::reputation::{ForeignReputations, ReputationLedger};
 use crate::wire::{GlobalMap, NeighbourObject, Reputation};
 
 /// A call of an aggregator's method of the same name.
@@ -56,6 +56,12 @@ pub enum Command {
         /// When they were of the age that they state.
         stated_at: Timestamp,
     },
+    /// [`Aggregator::take_foreign`].
+    TakeForeign {
+        /// All that other cells say of the vehicles that are present.
+        #[schemars(with = "serde_json::Value")]
+        reputations: Arc<ForeignReputations>,
+    },
     /// [`Aggregator::resume`].
     Resume {
         /// The reputations.
@@ -88,6 +94,7 @@ impl Aggregator {
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::TakeNeighbours { objects, stated_at } => self.take_neighbours(objects, *stated_at),
+            Command::TakeForeign { reputations } => self.take_foreign(reputations),
             Command::Resume { reputations } => self.resume(reputations),
             Command::Configure { fusion, landmarks } => {
                 self.configure(FusionConfig::clone(fusion), landmarks.iter().map(Landmark::from).collect());

@@ -139,3 +139,124 @@ fn what_is_remembered_before_ones_own_votes_is_the_others() {
     let (correct, incorrect) = remembered(1500);
     assert!(incorrect < 1.0 && (correct - 500.0).abs() < 1.0, "{correct} {incorrect}");
 }
+
+fn name(name: &str) -> NodeName {
+    NodeName::new(name).unwrap()
+}
+
+fn counts(correct: u64, incorrect: u64) -> CellCounts {
+    CellCounts { all: Counts { correct, incorrect }, ..CellCounts::default() }
+}
+
+/// What some cells say of a vehicle, and the score from which it starts.
+fn start_score(said: &[CellCounts], trust: f64) -> f64 {
+    let config = ReputationConfig::default();
+    let mut foreign = ForeignReputations::default();
+    for (number, counts) in said.iter().enumerate() {
+        foreign.merge(&name(&format!("cell-{number}")), &name("v"), *counts);
+    }
+    let votes = foreign.votes(config.initial_votes, |_| trust).remove(&name("v")).unwrap_or_default();
+    config.mean_with(0.0, 0.0, votes)
+}
+
+prop_compose! {
+    fn cell_counts()(
+        (second, correct, incorrect) in (0u64..3, 0u64..9, 0u64..9),
+        (old_correct, old_incorrect) in (0u64..9, 0u64..9),
+    ) -> CellCounts {
+        let old = Counts { correct: old_correct, incorrect: old_incorrect };
+        CellCounts { reset_at: crate::model::time::Timestamp(second), old, ..counts(correct, incorrect) }
+    }
+}
+
+proptest! {
+    /// Messages come late, twice, or in any order, and more cells speak than are kept.
+    #[test]
+    fn what_cells_say_is_the_same_in_any_order(
+        said in proptest::collection::vec((0u64..24, 0u64..3, 1u64..6), 0..80),
+        split in 0usize..80,
+    ) {
+        // The counts of a cell only grow.
+        let message = |&(cell, vehicle, time): &(u64, u64, u64)| {
+            let old = Counts { correct: time, incorrect: 0 };
+            (name(&format!("cell-{cell}")), name(&format!("v{vehicle}")), CellCounts { old, ..counts(time * cell, 3 * time) })
+        };
+        let said: Vec<_> = said.iter().map(message).collect();
+        let merged = |order: &mut dyn Iterator<Item = &(NodeName, NodeName, CellCounts)>| {
+            let mut foreign = ForeignReputations::default();
+            order.for_each(|(cell, vehicle, counts)| _ = foreign.merge(cell, vehicle, *counts));
+            foreign
+        };
+        let split = split.min(said.len());
+        let forward = merged(&mut said.iter());
+        prop_assert_eq!(&forward, &merged(&mut said.iter().rev()));
+        prop_assert_eq!(&forward, &merged(&mut said[split..].iter().chain(&said).chain(&said[..split])));
+    }
+
+    #[test]
+    fn counts_of_one_cell_are_a_join_over_resets(a in cell_counts(), b in cell_counts(), c in cell_counts()) {
+        let merged = |counts: &[CellCounts]| {
+            let mut merged = CellCounts::default();
+            counts.iter().for_each(|counts| _ = merged.merge(*counts));
+            merged
+        };
+        prop_assert_eq!(merged(&[a, a]), merged(&[a]));
+        prop_assert_eq!(merged(&[a, b, c]), merged(&[c, b, a]));
+        prop_assert_eq!(merged(&[a, merged(&[b, c])]), merged(&[merged(&[a, b]), c]));
+    }
+
+    /// Whatever one cell says, and however often: a newcomer's score moves by a sixth at most, and is above that of a vehicle
+    /// whose evidence tracking takes for worthless.
+    #[test]
+    fn one_cell_alone_moves_a_start_by_a_bounded_amount(correct in 0..=crate::wire::MAX_INTEGER, incorrect in 0..=crate::wire::MAX_INTEGER) {
+        let score = start_score(&[counts(correct, incorrect)], 1.0);
+        prop_assert!((1.0 / 3.0 - 1e-9..=2.0 / 3.0 + 1e-9).contains(&score), "{}", score);
+    }
+}
+
+#[test]
+fn a_liar_that_moves_on_starts_below_a_newcomer_and_a_proven_vehicle_above() {
+    let liar = start_score(&[counts(10, 90)], 1.0);
+    let known_to_four = start_score(&[counts(10, 90); 4], 1.0);
+    let proven = start_score(&[counts(450, 10)], 1.0);
+    let hardly_known = start_score(&[counts(0, 2)], 1.0);
+    let disputed = start_score(&[counts(400, 4), counts(0, 1_000_000)], 1.0);
+    println!(
+        "starts: liar {liar:.2}, of four cells {known_to_four:.2}, proven {proven:.2}, two wrong votes {hardly_known:.2}, \
+         proven and slandered {disputed:.2}"
+    );
+    assert!(liar < 0.4 && known_to_four < 0.3 && proven > 0.65);
+    assert!((0.45..0.5).contains(&hardly_known));
+    assert!((disputed - 0.5).abs() < 0.01);
+    assert_eq!(start_score(&[counts(10, 90)], 0.0), 0.5, "a cell that nobody believes says nothing");
+    // It was right for long and turned, and the cell remembers the latest votes.
+    let turned = CellCounts { old: Counts { correct: 9_900, incorrect: 0 }, ..counts(10_000, 400) };
+    assert!(start_score(&[turned], 1.0) < 0.45);
+}
+
+#[test]
+fn own_evidence_soon_outweighs_what_all_others_say() {
+    let config = ReputationConfig::default();
+    let mut foreign = ForeignReputations::default();
+    (0..16).for_each(|cell| _ = foreign.merge(&name(&format!("cell-{cell}")), &name("v"), counts(0, 100_000)));
+    let votes = foreign.votes(config.initial_votes, |_| 1.0)[&name("v")];
+    let needed = (0..500).find(|own| config.mean_with(f64::from(*own), 0.0, votes) > 0.5).unwrap();
+    println!("{needed} right votes make up for what sixteen cells say");
+    assert!(needed <= 25, "{needed}");
+    assert!(config.mean_with(200.0, 0.0, votes) > 0.85);
+}
+
+#[test]
+fn cells_are_told_of_votes_that_are_remembered_and_of_older_ones() {
+    let mut ledger = ReputationLedger::default();
+    let vote = |correct| Evidence { node: name("v"), label: "cup".into(), correct };
+    (0..2000).for_each(|_| ledger.record(1, &name("edge"), &vote(true)));
+    (0..300).for_each(|_| ledger.record(2, &name("gauss"), &vote(false)));
+    let told = ledger.cell_counts(500.0)[&name("v")];
+    assert_eq!(told.all, Counts { correct: 2000, incorrect: 300 });
+    assert_eq!(told.remembered(), Counts { correct: 200, incorrect: 300 });
+    let message = told.message(name("lot-1"), name("v"));
+    assert_eq!(CellCounts::from(&message), told);
+    let beside = ledger.reputations_beside(&ReputationConfig::default(), &[(name("w"), Default::default())].into());
+    assert_eq!((beside[&name("w")].score, beside[&name("w")].correct), (0.5, 0), "others' word is enough to be listed");
+}

@@ -16,7 +16,7 @@ use crate::model::geometry::Covariance;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use crate::wire::{ObjectReport, PerceivedObject, WirePose};
+use crate::wire::{ForeignVotes, ObjectReport, PerceivedObject, WirePose};
 
 /// Distance of the median of a vehicle's detections from where it was, as a share of its range, up to which it stays.
 const STAYS: f64 = 0.25;
@@ -47,6 +47,8 @@ pub(super) struct Sensors {
     ids: HashMap<NodeName, SensorId>,
     pub(super) fleet: Fleet,
     pub(super) dormant: DormantCounts,
+    /// Votes of other cells, also about vehicles that are not heard yet.
+    foreign: BTreeMap<NodeName, ForeignVotes>,
 }
 
 impl Sensors {
@@ -57,6 +59,7 @@ impl Sensors {
             ids: HashMap::new(),
             fleet: Fleet::new(reputation),
             dormant: DormantCounts::default(),
+            foreign: BTreeMap::new(),
         }
     }
 
@@ -78,7 +81,7 @@ impl Sensors {
             let id = SensorId(number as u32);
             let counts = self.dormant.of(node);
             self.ids.insert(node.clone(), id);
-            self.fleet.set_counts(id, &counts);
+            self.fleet.set_foreign(id, self.foreign.get(node).copied().unwrap_or_default(), &counts);
             Box::new(SensorModel::new(id, node.clone(), at, counts, config))
         });
         (model, &mut self.fleet)
@@ -131,6 +134,15 @@ impl Sensors {
         }
         self.dormant = DormantCounts::default();
         self.dormant.keep(votes);
+    }
+
+    /// Takes all votes of other cells.
+    pub(super) fn set_foreign(&mut self, votes: BTreeMap<NodeName, ForeignVotes>) {
+        self.foreign = votes;
+        for sensor in self.models.iter().flatten() {
+            let foreign = self.foreign.get(&sensor.node).copied().unwrap_or_default();
+            self.fleet.set_foreign(sensor.id, foreign, &sensor.counts);
+        }
     }
 
     /// Counts evidence about vehicles that are heard.

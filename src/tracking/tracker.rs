@@ -18,7 +18,9 @@ use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::neighbours::MAX_AGE;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
-use crate::wire::{FusedObject, GlobalMap, NeighbourObject, ObjectReport, PerceivedObject, PoseCorrection};
+use crate::wire::{
+    ForeignVotes, FusedObject, GlobalMap, NeighbourObject, ObjectReport, PerceivedObject, PoseCorrection,
+};
 
 /// Tracks objects; see the [module](super).
 #[derive(Debug, Clone)]
@@ -92,6 +94,12 @@ impl Tracker {
     /// Takes evidence of VOTE about vehicles that are heard.
     pub fn learn(&mut self, evidence: &[Evidence]) {
         self.sensors.learn(evidence);
+    }
+
+    /// Takes the votes of other cells, by the weight in votes of the prior beside which they count.
+    pub fn set_foreign(&mut self, votes_beside: impl Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {
+        let votes = votes_beside(self.sensors.fleet.reputation().initial_votes);
+        self.sensors.set_foreign(votes);
     }
 
     /// Takes identities, and objects that are unknown here, from another aggregator's map, received at `now`.

@@ -14,6 +14,7 @@ use super::sensors::SensorId;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::ReputationConfig;
+use crate::wire::ForeignVotes;
 
 /// Time between judgements of a vehicle's statement about an object.
 pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
@@ -127,7 +128,12 @@ impl TrustCounts {
 
     /// Weight of the vehicle's evidence: 1 from a newcomer's reputation up, 0 at that of a proven liar.
     pub(super) fn trust(&self, config: &ReputationConfig) -> f64 {
-        let reputation = config.mean(self.correct, self.incorrect);
+        self.trust_beside(ForeignVotes::default(), config)
+    }
+
+    /// The same beside votes of other cells.
+    fn trust_beside(&self, foreign: ForeignVotes, config: &ReputationConfig) -> f64 {
+        let reputation = config.mean_with(self.correct, self.incorrect, foreign);
         ((reputation / config.initial - WORTHLESS) / (1.0 - WORTHLESS)).clamp(0.0, 1.0)
     }
 }
@@ -165,6 +171,8 @@ pub(super) struct Fleet {
     reputation: ReputationConfig,
     /// Weight of the evidence of each vehicle by its id, 0 to 1.
     trust: Vec<f64>,
+    /// Votes of other cells about each vehicle by its id.
+    foreign: Vec<ForeignVotes>,
     /// By distance, the number of vehicles that detected an object that exists, and of all.
     detections: Vec<(f64, f64)>,
 }
@@ -179,7 +187,7 @@ impl Fleet {
 
     /// A fleet without vehicles.
     pub(super) fn new(reputation: ReputationConfig) -> Self {
-        Self { reputation, trust: Vec::new(), detections: vec![(0.0, 1.0); Self::BINS] }
+        Self { reputation, trust: Vec::new(), foreign: Vec::new(), detections: vec![(0.0, 1.0); Self::BINS] }
     }
 
     /// Goes on with other parameters of reputations.
@@ -199,15 +207,28 @@ impl Fleet {
 
     /// Sets the counts from which a vehicle's trust follows.
     pub(super) fn set_counts(&mut self, sensor: SensorId, counts: &TrustCounts) {
-        if self.trust.len() <= sensor.number() {
-            self.trust.resize(sensor.number() + 1, 0.0);
-        }
-        self.trust[sensor.number()] = counts.trust(&self.reputation);
+        self.make_room(sensor);
+        let number = sensor.number();
+        self.trust[number] = counts.trust_beside(self.foreign[number], &self.reputation);
+    }
+
+    /// Sets the votes of other cells about a vehicle with these counts.
+    pub(super) fn set_foreign(&mut self, sensor: SensorId, foreign: ForeignVotes, counts: &TrustCounts) {
+        self.make_room(sensor);
+        self.foreign[sensor.number()] = foreign;
+        self.set_counts(sensor, counts);
+    }
+
+    fn make_room(&mut self, sensor: SensorId) {
+        let room = self.trust.len().max(sensor.number() + 1);
+        self.trust.resize(room, 0.0);
+        self.foreign.resize(room, ForeignVotes::default());
     }
 
     /// Removes a vehicle.
     pub(super) fn forget(&mut self, sensor: SensorId) {
         self.trust[sensor.number()] = 0.0;
+        self.foreign[sensor.number()] = ForeignVotes::default();
     }
 
     /// Adds a statement to a vehicle's counts.

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use super::config::WeightedConfig;
 use super::confusion::{Confusion, LabelIndex};
 use super::likelihood::{LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability};
+use crate::wire::ForeignVotes;
 
 /// Evidence about one vehicle.
 #[derive(Debug, Clone, Default)]
@@ -15,6 +16,8 @@ pub(super) struct VehicleEvidence {
     pub(super) settled: Confusion,
     /// Fading evidence from the ledger of other aggregators.
     pub(super) inherited: Confusion,
+    /// Votes of other cells. They weigh its statements, and prove nothing about it.
+    pub(super) foreign: ForeignVotes,
     /// Cumulative sum of the drop in the vehicle's rate of right votes.
     shortfall: f64,
     /// Log-odds of being right minus those of the fleet on the same classes, by coupling.
@@ -243,6 +246,7 @@ impl DawidSkene {
             let evidence = &self.vehicles[vehicle];
             let expected = |rows: &Confusion| -> f64 { rows.rows().map(|(t, n)| n * self.fleet(t, t, accuracy)).sum() };
             let (correct, votes) = (evidence.correct(), evidence.votes());
+            let foreign = evidence.foreign;
             let free = if votes > 1e-9 {
                 (expected(&evidence.live) + expected(&evidence.settled) + expected(&evidence.inherited)) / votes
             } else {
@@ -251,7 +255,8 @@ impl DawidSkene {
             let prior = self.config.vehicle_prior_votes;
             let advantage = |fleet: f64, prior: f64| {
                 let fleet = fleet.clamp(1e-6, 1.0 - 1e-6);
-                let own = ((correct + prior * fleet) / (votes + prior)).clamp(1e-6, 1.0 - 1e-6);
+                let (right, all) = (correct + foreign.correct, votes + foreign.total());
+                let own = ((right + prior * fleet) / (all + prior)).clamp(1e-6, 1.0 - 1e-6);
                 log_odds(own) - log_odds(fleet)
             };
             self.vehicles[vehicle].advantage = [advantage(free, prior), advantage(accuracy, TIED_PRIOR_FACTOR * prior)];
@@ -404,6 +409,15 @@ impl DawidSkene {
         let prior = self.config.vehicle_prior_votes;
         let fleet = self.fleet_accuracy().min(self.config.assumed_accuracy);
         (evidence.correct() + prior * fleet) / (evidence.votes() + prior)
+    }
+
+    /// The same beside votes of other cells: a vehicle's weight. What is concluded from evidence rests on
+    /// [`Self::reliability`], so that no cell's word alone voids any.
+    pub(super) fn reliability_beside(&self, vehicle: usize) -> f64 {
+        let evidence = &self.vehicles[vehicle];
+        let prior = self.config.vehicle_prior_votes;
+        let own = evidence.votes() + prior;
+        (own * self.reliability(vehicle) + evidence.foreign.correct) / (own + evidence.foreign.total())
     }
 }
 

@@ -52,7 +52,7 @@ impl PaperVoting {
     }
 
     fn vehicle(&mut self, node: &NodeName) -> &mut VehicleScore {
-        let reputation = Reputation { score: self.config.initial_reputation, correct: 0, incorrect: 0 };
+        let reputation = Reputation { score: self.config.initial_reputation, correct: 0, incorrect: 0, foreign: None };
         self.vehicles.entry(node.clone()).or_insert_with(|| VehicleScore { reputation, votes: Vec::new() })
     }
 }

@@ -8,9 +8,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    CellDescription, CellMap, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare, MAX_TROUBLE_TEXT,
-    MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputations, SCHEMA_VERSION,
-    Trouble, Verdict, Verdicts,
+    CellDescription, CellMap, CellReputation, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare,
+    MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason,
+    Reputations, SCHEMA_VERSION, Trouble, Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, is_label, is_plain_text};
@@ -112,6 +112,7 @@ payloads! {
     ObjectReport: at most payload_bytes, checked by ObjectReport::validate;
     GlobalMap: at most map_bytes, checked by check_map;
     CellMap: at most map_bytes, checked by check_cell_map;
+    CellReputation: at most payload_bytes, checked by check_cell_reputation;
     Verdicts: at most map_bytes, checked by check_verdicts;
     Reputations: at most map_bytes, checked by check_reputations;
     CellDescription: at most map_bytes, checked by check_description;
@@ -242,8 +243,18 @@ fn check_reputations(reputations: &Reputations, _: &Limits) -> Result<(), Reject
     check_integers([reputations.epoch, reputations.round])?;
     reputations.reputations.values().try_for_each(|reputation| {
         check_integers([reputation.correct, reputation.incorrect])?;
+        let foreign = reputation.foreign.unwrap_or_default();
+        check_between(foreign.correct, 0.0, SCORE_BOUND)?;
+        check_between(foreign.incorrect, 0.0, SCORE_BOUND)?;
         check_between(reputation.score, 0.0, 1.0)
     })
+}
+
+fn check_cell_reputation(counts: &CellReputation, _: &Limits) -> Result<(), RejectReason> {
+    let CellReputation { correct, incorrect, old_correct, old_incorrect, reset_at_us, .. } = *counts;
+    check_integers([correct, incorrect].into_iter().chain(reset_at_us.map(Timestamp::micros)))?;
+    let is_possible = old_correct <= correct && old_incorrect <= incorrect;
+    if is_possible { Ok(()) } else { Err(RejectReason::Implausible) }
 }
 
 fn check_share(share: &LedgerShare, _: &Limits) -> Result<(), RejectReason> {

@@ -4,7 +4,7 @@
 //! Gateway ── reports ──> LatestReportQueue ──> Fuser ── PublishMap, PublishVerdicts ──> Gateway
 //! Gateway ── TakeReports ──────────> │ ▲
 //! Follower ── TakeMap ─────────────> │ │
-//! Uplink ── TakeNeighbours ────────> │ │
+//! Uplink ── TakeNeighbours, … ─────> │ │ ── SetPresent ──> Uplink
 //! LeaderElection ── Lead, … ───────> │ │ └── Record ──> ReputationKeeper
 //! ReputationKeeper ── Adopt, … ──> └─┘ CloseRound, at the aggregator's deadline
 //! ```
@@ -15,6 +15,7 @@ mod report_queue;
 #[cfg(test)]
 mod tests;
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -36,6 +37,7 @@ pub use report_queue::{LatestReportQueue, PushOutcome, QueuedReport};
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::gateway::GatewayMessage;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::messages::uplink::UplinkMessage;
 use crate::observe::recorder::{LogItem, LogSender};
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
@@ -59,6 +61,8 @@ pub struct FuserArguments {
     pub gateway: ActorSlot<GatewayMessage>,
     /// Is told what rounds say about vehicles.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
+    /// Is told which vehicles are present, if the node has one.
+    pub uplink: ActorSlot<UplinkMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// The node's spans.
@@ -79,6 +83,9 @@ pub struct FuserState {
     cell_offset_us: i64,
     gateway: ActorSlot<GatewayMessage>,
     keeper: ActorSlot<ReputationKeeperMessage>,
+    uplink: ActorSlot<UplinkMessage>,
+    /// The vehicles that the uplink knows to be present.
+    present: BTreeSet<NodeName>,
     counters: Arc<Counters>,
     /// The newest map of another aggregator or an earlier run, and when it came.
     last_map: Option<(Arc<GlobalMap>, Timestamp)>,
@@ -137,6 +144,8 @@ impl Actor for Fuser {
             FuserMessage::TakeNeighbours { objects, stated_at } => {
                 state.command(Command::TakeNeighbours { objects, stated_at });
             }
+            FuserMessage::TakeForeign { reputations } => state.command(Command::TakeForeign { reputations }),
+            FuserMessage::TellUplink => state.present.clear(),
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
             FuserMessage::Timeliness { reply } => {
@@ -180,8 +189,18 @@ const DAY_S: f64 = 86_400.0;
 
 impl FuserState {
     fn new(arguments: FuserArguments) -> Self {
-        let FuserArguments { aggregator, report_queue, newest, recording, clock, gateway, keeper, counters, spans } =
-            arguments;
+        let FuserArguments {
+            aggregator,
+            report_queue,
+            newest,
+            recording,
+            clock,
+            gateway,
+            keeper,
+            uplink,
+            counters,
+            spans,
+        } = arguments;
         Self {
             aggregator,
             report_queue,
@@ -190,6 +209,8 @@ impl FuserState {
             cell_offset_us: 0,
             gateway,
             keeper,
+            uplink,
+            present: BTreeSet::new(),
             counters,
             last_map: newest,
             alarm: Timestamp(u64::MAX),
@@ -323,6 +344,7 @@ impl FuserState {
 
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
         self.reports = RoundReports::default();
+        self.present.clear();
         self.keeper
             .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
         if let Some((map, received_at)) = self.last_map.take()
@@ -377,6 +399,21 @@ impl FuserState {
         }
         if has_verdicts || !evidence.is_empty() {
             self.keeper.send(ReputationKeeperMessage::Record { epoch, round, evidence, reputations });
+        }
+        if let Some(votes) = self.aggregator.take_foreign_news() {
+            self.keeper.send(ReputationKeeperMessage::SetForeign { round, votes });
+        }
+        self.tell_uplink(now);
+    }
+
+    /// Tells the uplink when a vehicle has come or left.
+    fn tell_uplink(&mut self, now: Timestamp) {
+        if self.uplink.get().is_none() {
+            return;
+        }
+        let present = self.aggregator.present(now);
+        if present != self.present && self.uplink.send(UplinkMessage::SetPresent { vehicles: present.clone() }) {
+            self.present = present;
         }
     }
 

@@ -5,6 +5,8 @@
 //! Gateway ── Merge ────────────────>   │ ▲      │ └──── Adopt, Resume ──> Fuser
 //! LeaderElection ── SendSnapshot ──>   └─┘ Tick └── StateFile
 //!          └ <── EvidenceReceived ──
+//! Fuser ── SetForeign ─────────────>   │
+//! Uplink ── TellUplink ────────────>   └── TellCounts ──> Uplink
 //! ```
 //!
 //! With certificates, this actor signs the counts of its node, and verifies those of others. When a certificate is revoked,
@@ -14,6 +16,7 @@
 //! saved before they are published. The [`ReputationStore`] outlives the actor, and the state directory the node.
 
 mod config;
+mod region;
 mod store;
 
 use std::collections::BTreeMap;
@@ -42,6 +45,7 @@ use crate::messages::gateway::GatewayMessage;
 use crate::messages::leader_election::LeaderElectionMessage;
 use crate::messages::newest::Received;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
+use crate::messages::uplink::UplinkMessage;
 use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::platform::state_file::StateFile;
@@ -50,6 +54,7 @@ use crate::telemetry::counters::{Counters, Event, OTHERS};
 use crate::transport::gossip::Member;
 use crate::transport::mqtt::Delivery;
 use crate::transport::pki::{Credentials, EvidenceSigner};
+use region::ToldCounts;
 use store::Saved;
 
 /// Arguments of a keeper's start.
@@ -80,6 +85,8 @@ pub struct ReputationKeeperArguments {
     pub fuser: ActorSlot<FuserMessage>,
     /// Is told whose evidence was taken.
     pub election: ActorSlot<LeaderElectionMessage>,
+    /// Is told what the region is to know, if the node has one.
+    pub uplink: ActorSlot<UplinkMessage>,
     /// The cell's time, by which resets are judged.
     pub clock: CellClock,
     /// The node's counters.
@@ -101,6 +108,7 @@ pub struct ReputationKeeperState {
     published: Option<(Epoch, u64)>,
     writer: StateWriter,
     unadopted: bool,
+    told: ToldCounts,
     /// Tasks that end with the actor.
     tasks: JoinSet<()>,
 }
@@ -140,7 +148,10 @@ impl Actor for ReputationKeeper {
                 state.save().await;
                 state.publish();
                 state.send_snapshot();
+                state.tell_all();
             }
+            ReputationKeeperMessage::SetForeign { round, votes } => state.set_foreign(round, votes),
+            ReputationKeeperMessage::TellUplink => state.tell_all(),
             ReputationKeeperMessage::Record { epoch, round, evidence, reputations } => {
                 state.record(&epoch, round, &evidence, reputations);
             }
@@ -187,6 +198,7 @@ impl ReputationKeeperState {
             published: None,
             writer,
             unadopted: false,
+            told: ToldCounts::default(),
             tasks: JoinSet::new(),
         }
     }
@@ -219,6 +231,7 @@ impl ReputationKeeperState {
     ) {
         if !evidence.is_empty() || reputations.is_some() {
             self.writer.note_change();
+            self.told.is_due = true;
         }
         let mut store = self.arguments.reputations.open();
         let shares = self.resync.record(epoch, evidence, &mut store.ledger);
@@ -296,6 +309,8 @@ impl ReputationKeeperState {
     async fn settle(&mut self) {
         self.save().await;
         self.publish();
+        self.told.is_due |= self.unadopted;
+        self.tell_uplink();
         if std::mem::take(&mut self.unadopted) {
             let ledger = Arc::new(self.arguments.reputations.open().ledger.clone());
             self.arguments.fuser.send(FuserMessage::Adopt { ledger });

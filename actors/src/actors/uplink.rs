@@ -4,16 +4,19 @@
 //! watches of leadership and newest map ── Look ──> Uplink ── CellMap, CellDescription, NodeStatus ──> region's broker
 //! LeaderElection ── SetStatus ─────────────────────> │ ▲
 //! Node ── Configure ───────────────────────────────> │ └── Take ── RegionInbox ◄── maps of the tiles around ──┘
-//!                                                    └── TakeNeighbours ──> Fuser
+//!                                                    └── TakeNeighbours, TakeForeign ──> Fuser
+//! Fuser ── SetPresent, ReputationKeeper ── TellCounts ──> Uplink ── CellReputation ──> region's broker
 //! ```
 //!
-//! - Nobody in the cell waits for it: without the region the cell goes on, and no map is kept for later.
+//! - Nobody in the cell waits for it: without the region the cell goes on, and no map is kept for later. What it knows of
+//!   vehicles is: the latest counts of each wait until the region has them.
 //! - Only the leader is connected. A new leader connects when it leads, so that a last will is always that of a leader.
 //! - Retained messages of a former leader may come late. The present one then repeats its own.
 
 mod config;
 mod pace;
 mod region_link;
+mod reputations;
 
 use std::sync::Arc;
 
@@ -24,7 +27,7 @@ use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
-use ecod::neighbours::{MAX_AGE, Neighbours};
+use ecod::neighbours::{MAX_AGE, Neighbours, ReputationExchange};
 use ecod::wire::{CellDescription, CellMap, GlobalMap, NodeState, NodeStatus, RegionTopic, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
@@ -34,9 +37,11 @@ pub use config::UplinkConfig;
 
 use self::pace::MapPace;
 use self::region_link::{RegionLink, RegionLinkSetup};
+use self::reputations::EXCHANGE_PERIOD;
 use crate::messages::actor_slot::ActorSlot;
 use crate::messages::fuser::FuserMessage;
 use crate::messages::newest::ReceivedMap;
+use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::messages::uplink::UplinkMessage;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
@@ -66,8 +71,10 @@ pub struct UplinkArguments {
     pub newest: watch::Receiver<Option<ReceivedMap>>,
     /// The present leadership.
     pub leadership: watch::Receiver<Leadership>,
-    /// Receiver of the objects of neighbours.
+    /// Receiver of the objects of neighbours, and of what other cells say of vehicles.
     pub fuser: ActorSlot<FuserMessage>,
+    /// Source of what this cell says of vehicles.
+    pub keeper: ActorSlot<ReputationKeeperMessage>,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// Seed of the jitter between attempts to connect.
@@ -94,6 +101,9 @@ pub struct UplinkState {
     neighbours: Option<Neighbours>,
     /// True if a neighbour's map was accepted since the fuser was told.
     has_news: bool,
+    exchange: ReputationExchange,
+    /// True if other cells said something since the fuser was told.
+    has_foreign_news: bool,
     watcher: JoinHandle<()>,
 }
 
@@ -108,6 +118,7 @@ impl Actor for Uplink {
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         let watcher = tokio::spawn(watch_cell(arguments.leadership.clone(), arguments.newest.clone(), myself.clone()));
+        myself.send_interval(EXCHANGE_PERIOD, || UplinkMessage::Exchange);
         let mut state = UplinkState::new(arguments, watcher);
         state.look(&myself);
         Ok(state)
@@ -129,7 +140,11 @@ impl Actor for Uplink {
             UplinkMessage::Take { delivery } => match delivery.message {
                 FromRegion::Map { topic, map } => state.take_map(&topic, *map, delivery.received_at),
                 FromRegion::Status(status) => state.hear_status(&status),
+                FromRegion::Reputation(message) => state.take_reputation(&message, delivery.received_at, &myself),
             },
+            UplinkMessage::SetPresent { vehicles } => state.set_present(&vehicles),
+            UplinkMessage::TellCounts { counts } => state.count_vehicles(counts),
+            UplinkMessage::Exchange => state.exchange_reputations(),
             UplinkMessage::LinkChanged { event } => {
                 let link = state.link.as_mut().filter(|link| link.id() == event.link);
                 if link.is_some_and(|link| link.change(event.change)) {
@@ -143,7 +158,7 @@ impl Actor for Uplink {
     async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
         state.watcher.abort();
         if let Some(link) = state.link.take() {
-            link.close(state.farewell().as_ref()).await;
+            link.close(state.farewell().as_ref(), state.exchange.farewell(clock::now())).await;
         }
         Ok(())
     }
@@ -154,6 +169,8 @@ impl UplinkState {
         Self {
             neighbours: setup.origin.map(|origin| Neighbours::new(setup.cell.clone(), origin)),
             has_news: false,
+            exchange: ReputationExchange::new(setup.cell.clone()),
+            has_foreign_news: false,
             seen: None,
             connection: setup.config.connection(&setup.mqtt),
             pace: MapPace::new(setup.config.max_hz),
@@ -203,6 +220,8 @@ impl UplinkState {
             counters,
             seed: self.setup.seed,
         };
+        self.setup.fuser.send(FuserMessage::TellUplink);
+        self.setup.keeper.send(ReputationKeeperMessage::TellUplink);
         let id = LinkId(self.next_link);
         self.next_link += 1;
         self.pace = MapPace::new(self.setup.config.max_hz);
@@ -211,7 +230,9 @@ impl UplinkState {
 
     fn leave(&mut self, link: RegionLink) {
         let last = self.farewell();
-        tokio::spawn(async move { link.close(last.as_ref()).await });
+        let reputations = self.exchange.farewell(clock::now());
+        self.exchange = ReputationExchange::new(self.setup.cell.clone());
+        tokio::spawn(async move { link.close(last.as_ref(), reputations).await });
     }
 
     /// The last status of a node that leaves the region; none if another leads, which has told its own.
@@ -224,6 +245,7 @@ impl UplinkState {
 
     /// Publishes on a new connection what the region is to know.
     fn introduce(&mut self) {
+        self.exchange.connect();
         self.publish_status();
         if let (Some(link), Some(description)) = (&mut self.link, &self.setup.description) {
             link.publish_description(description);

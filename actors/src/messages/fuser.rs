@@ -10,7 +10,7 @@ use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
-use ecod::reputation::ReputationLedger;
+use ecod::reputation::{ForeignReputations, ReputationLedger};
 use ecod::wire::{GlobalMap, NeighbourObject, Reputation};
 use ractor::RpcReplyPort;
 
@@ -38,6 +38,13 @@ pub enum FuserMessage {
         /// When they were of the age that they state.
         stated_at: Timestamp,
     },
+    /// Start vehicles from what other cells say of them.
+    TakeForeign {
+        /// All that they say of the vehicles that are present.
+        reputations: Arc<ForeignReputations>,
+    },
+    /// Tell the uplink anew which vehicles are present.
+    TellUplink,
     /// Close the round if it is due.
     CloseRound,
     /// Publish from now on.

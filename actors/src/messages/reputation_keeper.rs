@@ -6,7 +6,7 @@ use std::sync::Arc;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::reputation::{Evidence, ReputationConfig};
-use ecod::wire::{LedgerShare, Reputation};
+use ecod::wire::{ForeignVotes, LedgerShare, Reputation};
 
 use crate::transport::mqtt::Delivery;
 
@@ -31,6 +31,15 @@ pub enum ReputationKeeperMessage {
         /// In VOTE's `paper` mode, the reputations after it.
         reputations: Option<BTreeMap<NodeName, Reputation>>,
     },
+    /// Publish scores beside these votes of other cells.
+    SetForeign {
+        /// The round from which on they count.
+        round: u64,
+        /// All votes of other cells, as they count here.
+        votes: BTreeMap<NodeName, ForeignVotes>,
+    },
+    /// Tell the uplink all counts that other cells are told, and from now on what changes.
+    TellUplink,
     /// Publish nothing more.
     StepDown,
     /// Go on with other parameters of reputations.

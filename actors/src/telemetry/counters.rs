@@ -121,6 +121,12 @@ pub enum Event {
     CellMapAccepted,
     /// An object of a neighbouring cell was not used: outside of what that cell may tell of, or beyond the maximum number.
     NeighbourRefused,
+    /// The cell's counts about a vehicle were handed to the connection to the region's broker.
+    CellReputationPublished,
+    /// Counts of another cell about a vehicle that is present were taken and held something new.
+    CellReputationAccepted,
+    /// The region is not told of a vehicle that has left: too many wait for its broker.
+    CellReputationDropped,
 }
 
 impl Event {

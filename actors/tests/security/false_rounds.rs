@@ -31,7 +31,7 @@ fn false_map(after: &GlobalMap, ahead: u64) -> GlobalMap {
 }
 
 fn false_reputations(after: &GlobalMap, ahead: u64) -> Reputations {
-    let reputations = [(name(FALSE), Reputation { score: 1.0, correct: 9, incorrect: 0 })].into();
+    let reputations = [(name(FALSE), Reputation { score: 1.0, correct: 9, incorrect: 0, foreign: None })].into();
     let (epoch, round) = (after.epoch, after.round + ahead);
     Reputations { schema: SCHEMA_VERSION, aggregator: Some(name("edge")), epoch, round, reputations }
 }

@@ -13,6 +13,7 @@ mod neighbours;
 mod outage;
 mod refusals;
 mod region;
+mod reputations;
 
 use std::time::Duration;
 

@@ -1,12 +1,16 @@
 //! A region: a broker, and a subscriber to all that cells tell there.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{CellDescription, CellMap, Limits, NodeStatus, Payload, RegionTopic, RegionTopicKind, decode};
+use ecod::wire::{
+    CellDescription, CellMap, CellReputation, Limits, NodeStatus, Payload, RegionTopic, RegionTopicKind,
+    ReputationTopic, decode,
+};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::mqtt::BrokerAddress;
 use rumqttc::{AsyncClient, Event, Incoming, MqttOptions, QoS};
@@ -79,6 +83,8 @@ impl Heard {
 /// A subscriber to all topics of the region that connects again after each break.
 pub(crate) struct Subscriber {
     heard: Arc<Mutex<Vec<Heard>>>,
+    /// The last word of each cell on each vehicle, by topic.
+    reputations: Arc<Mutex<BTreeMap<String, CellReputation>>>,
     client: AsyncClient,
     task: JoinHandle<()>,
 }
@@ -89,14 +95,20 @@ impl Subscriber {
         options.set_keep_alive(Duration::from_secs(60));
         let (client, mut events) = AsyncClient::new(options, 64);
         let heard = Arc::<Mutex<Vec<Heard>>>::default();
-        let (list, subscriber) = (Arc::clone(&heard), client.clone());
+        let reputations = Arc::<Mutex<BTreeMap<_, _>>>::default();
+        let (list, words, subscriber) = (Arc::clone(&heard), Arc::clone(&reputations), client.clone());
         let task = tokio::spawn(async move {
             loop {
                 match events.poll().await {
                     Ok(Event::Incoming(Incoming::ConnAck(_))) => {
                         subscriber.try_subscribe("ecod/v1/geo/#", QoS::AtMostOnce).unwrap();
+                        subscriber.try_subscribe("ecod/v1/rep/#", QoS::AtMostOnce).unwrap();
                     }
                     Ok(Event::Incoming(Incoming::Publish(publish))) if !publish.payload.is_empty() => {
+                        if ReputationTopic::parse(&publish.topic).is_some() {
+                            let word = decode(&publish.payload, &Limits::default()).unwrap();
+                            words.lock().unwrap().insert(publish.topic.clone(), word);
+                        }
                         // Junk of a test's own is none of a cell's.
                         let Some(topic) = RegionTopic::parse(&publish.topic) else { continue };
                         let at = clock::now();
@@ -108,11 +120,20 @@ impl Subscriber {
                 }
             }
         });
-        Self { heard, client, task }
+        Self { heard, reputations, client, task }
     }
 
     pub(crate) async fn publish(&self, topic: &RegionTopic, payload: impl Into<Vec<u8>>) {
-        self.client.publish(topic.path(), QoS::AtMostOnce, false, payload.into()).await.unwrap();
+        self.publish_at(&topic.path(), payload).await;
+    }
+
+    pub(crate) async fn publish_at(&self, topic: &str, payload: impl Into<Vec<u8>>) {
+        self.client.publish(topic, QoS::AtMostOnce, false, payload.into()).await.unwrap();
+    }
+
+    /// What a cell last said of a vehicle.
+    pub(crate) fn reputation(&self, vehicle: &str, cell: &str) -> Option<CellReputation> {
+        self.reputations.lock().unwrap().get(&format!("ecod/v1/rep/{vehicle}/{cell}")).cloned()
     }
 
     pub(crate) fn heard(&self) -> Vec<Heard> {

@@ -15,9 +15,9 @@ from test_codec import REPORT
 import ecod
 from ecod import codec, messages
 
-# Names that differ; shares are among candidates only, maps of cells among cells.
+# Names that differ; shares are among candidates only, maps of cells and their word on vehicles among cells.
 CLASS_OF = {"WirePose": "Pose"}
-LEFT_OUT = {"CellMap", "ClientRefusals", "LedgerShare"}
+LEFT_OUT = {"CellMap", "CellReputation", "ClientRefusals", "LedgerShare"}
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ use uuid::Uuid;
 use super::*;
 use crate::aggregator::Command;
 use crate::model::geometry::Covariance;
-use crate::reputation::ReputationLedger;
+use crate::reputation::{CellCounts, Counts, ForeignReputations, ReputationLedger};
 use crate::wire::{FusedObject, GlobalMap, NeighbourObject};
 
 fn at(ms: u64) -> Timestamp {
@@ -29,8 +29,16 @@ fn neighbours(ms: u64) -> Arc<[NeighbourObject]> {
     objects.map(|object| NeighbourObject { cell: cell.clone(), age_s: 0.1, object }).into()
 }
 
+/// A cell says of the only vehicle that it was mostly wrong.
+fn slander() -> Command {
+    let mut reputations = ForeignReputations::default();
+    let counts = CellCounts { all: Counts { correct: 1, incorrect: 30 }, ..CellCounts::default() };
+    reputations.merge(&NodeName::from_static("west"), &NodeName::from_static("euclid"), counts);
+    Command::TakeForeign { reputations: Arc::new(reputations) }
+}
+
 #[test]
-fn a_journal_gives_the_same_maps_with_objects_of_neighbours_and_those_that_came_over() {
+fn a_journal_gives_the_same_maps_with_what_neighbours_see_and_say_and_objects_that_came_over() {
     let fusion = FusionConfig { algorithms: Algorithms::Pace, ..FusionConfig::default() };
     let mut live = Aggregator::new_standby(fusion.clone(), Vec::new(), at(0));
     let mut journal = JournalReplay::new(fusion, Vec::new());
@@ -50,6 +58,7 @@ fn a_journal_gives_the_same_maps_with_objects_of_neighbours_and_those_that_came_
         if ms % 500 == 0 && ms <= 2000 {
             commands.push(Command::TakeNeighbours { objects: neighbours(ms), stated_at: at(ms) });
         }
+        commands.extend((ms == 2500).then(slander));
         commands.push(Command::Tick);
         for command in commands {
             maps.extend(live.command(&command, at(ms)).and_then(|fused| fused.map));
@@ -77,4 +86,6 @@ fn a_journal_gives_the_same_maps_with_objects_of_neighbours_and_those_that_came_
     assert!(at_time(3300).neighbour_objects.iter().all(|near| near.age_s <= 1.5));
     assert_eq!(ids(at_time(3300)), [8]);
     assert_eq!(ids(at_time(3700)), [], "too old");
+    let existence = |ms: u64| at_time(ms).objects.iter().filter_map(|object| object.existence).fold(0.0, f64::max);
+    assert!(existence(2600) < existence(2400) - 0.02, "{} {}", existence(2400), existence(2600));
 }

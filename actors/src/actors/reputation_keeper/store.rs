@@ -10,7 +10,9 @@ use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
-use ecod::wire::{LedgerEntry, LedgerMark, LedgerShare, Limits, Payload, Reputation, Reputations, SCHEMA_VERSION};
+use ecod::wire::{
+    ForeignVotes, LedgerEntry, LedgerMark, LedgerShare, Limits, Payload, Reputation, Reputations, SCHEMA_VERSION,
+};
 use serde::{Deserialize, Serialize};
 
 use super::ReputationKeeperArguments;
@@ -25,13 +27,15 @@ pub struct ReputationStore {
     pub ledger: ReputationLedger,
     /// In VOTE's `paper` mode, the reputations themselves.
     pub standing: BTreeMap<NodeName, Reputation>,
+    /// Votes of other cells, as they count here. They are not saved: the region keeps them.
+    pub(super) foreign: BTreeMap<NodeName, ForeignVotes>,
     pub(super) by_evidence: bool,
     restored: bool,
 }
 
 impl ReputationStore {
     pub(super) fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
-        if self.by_evidence { self.ledger.reputations(config) } else { self.standing.clone() }
+        if self.by_evidence { self.ledger.reputations_beside(config, &self.foreign) } else { self.standing.clone() }
     }
 
     /// Takes over what was saved, within the bounds of what others send. Where evidence is signed, `signer` verifies it.
@@ -92,8 +96,13 @@ pub struct SharedReputations(Arc<Mutex<ReputationStore>>);
 impl SharedReputations {
     /// An empty store; reputations follow `by_evidence` unless VOTE runs in `paper` mode.
     pub fn new(by_evidence: bool) -> Self {
-        let store =
-            ReputationStore { ledger: Default::default(), standing: BTreeMap::new(), by_evidence, restored: false };
+        let store = ReputationStore {
+            ledger: Default::default(),
+            standing: BTreeMap::new(),
+            foreign: BTreeMap::new(),
+            by_evidence,
+            restored: false,
+        };
         Self(Arc::new(Mutex::new(store)))
     }
 

@@ -10,7 +10,9 @@ use ecod::leadership::links::LinkState;
 use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
-use ecod::wire::{CellDescription, CellMap, NodeStatus, RegionTopic, RegionTopicKind, encode};
+use ecod::wire::{
+    CellDescription, CellMap, CellReputation, NodeStatus, RegionTopic, RegionTopicKind, ReputationTopic, encode,
+};
 use uuid::Uuid;
 
 use crate::telemetry::counters::{Counters, Event};
@@ -21,6 +23,9 @@ use crate::transport::mqtt::{MqttConfig, Security};
 
 /// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node that stops waits for it.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Time until a full queue may have room.
+const QUEUE_RETRY: Duration = Duration::from_millis(5);
 
 /// Materials of a link to the region's broker.
 pub(super) struct RegionLinkSetup {
@@ -84,6 +89,32 @@ impl RegionLink {
         self.tile
     }
 
+    /// True if it is connected, and the broker passes messages on.
+    pub(super) fn is_up(&self) -> bool {
+        self.link.state == LinkState::Up
+    }
+
+    /// Subscribes to these filters; false when there is no room.
+    pub(super) fn subscribe(&self, filters: &[String]) -> bool {
+        self.link.client.as_ref().is_some_and(|client| client.subscribe(filters, MaxQos::AtMostOnce))
+    }
+
+    /// Unsubscribes from these filters, as far as there is room: what comes nevertheless is not used.
+    pub(super) fn unsubscribe(&self, filters: &[String]) {
+        if let Some(client) = &self.link.client
+            && !client.unsubscribe(filters)
+        {
+            tracing::debug!(broker = %self.link.broker, "no room to unsubscribe");
+        }
+    }
+
+    /// Publishes what the cell says of a vehicle; false when there is no room.
+    pub(super) fn publish_reputation(&self, message: &CellReputation) -> bool {
+        let topic = ReputationTopic { vehicle: message.vehicle.clone(), cell: message.cell.clone() };
+        let payload = Bytes::from(encode(message, self.setup.config.encoding));
+        self.link.publish(&topic.path(), &payload, Retention::Retained)
+    }
+
     /// Takes in an event of the link; true when it has just been established and nothing is published yet.
     pub(super) fn change(&mut self, change: LinkChange) -> bool {
         let state = match change {
@@ -140,12 +171,26 @@ impl RegionLink {
         self.retain(RegionTopicKind::Cell, encode(description, self.setup.config.encoding).into());
     }
 
-    /// Ends the connection without last will, after `last` as the retained status, if it is given.
-    pub(super) async fn close(mut self, last: Option<&NodeStatus>) {
+    /// Ends the connection without last will, after what is to be said of vehicles, and after `last` as the retained status,
+    /// if it is given.
+    pub(super) async fn close(mut self, last: Option<&NodeStatus>, reputations: Vec<CellReputation>) {
+        let is_said = tokio::time::timeout(LEAVE_TIMEOUT, self.publish_reputations(&reputations)).await;
+        if is_said.is_err() {
+            tracing::debug!(broker = %self.link.broker, "broker did not take all that was to be said of vehicles");
+        }
         if let Some(status) = last {
             self.publish_status(status);
         }
         self.link.leave(LEAVE_TIMEOUT).await;
+    }
+
+    /// Publishes what the cell says of vehicles, as fast as the broker takes it.
+    async fn publish_reputations(&self, messages: &[CellReputation]) {
+        for message in messages.iter().filter(|_| self.is_up()) {
+            while !self.publish_reputation(message) {
+                tokio::time::sleep(QUEUE_RETRY).await;
+            }
+        }
     }
 
     /// Ends the connection of a cell that is not in its tile any more. Removes what the tile has of it, if it is

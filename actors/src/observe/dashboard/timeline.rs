@@ -246,7 +246,7 @@ mod tests {
         };
         let edge = NodeName::from_static("edge");
         let reputations = |score, round| {
-            let reputation = ecod::wire::Reputation { score, correct: 3, incorrect: 12 };
+            let reputation = ecod::wire::Reputation { score, correct: 3, incorrect: 12, foreign: None };
             let reputations = [(NodeName::from_static("liar"), reputation)].into();
             Reputations { schema: 1, aggregator: None, epoch: 1, round, reputations }
         };

@@ -1,4 +1,4 @@
-//! Incoming packets of the region: maps of the cells around, and statuses of the own cell.
+//! Incoming packets of the region: maps of the cells around, statuses of the own cell, and what cells say of vehicles.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -7,7 +7,10 @@ use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::neighbours::MAX_MAP_HZ;
-use ecod::wire::{CellMap, Limits, NodeState, NodeStatus, RegionTopic, RegionTopicKind, RejectReason, decode};
+use ecod::wire::{
+    CellMap, CellReputation, Limits, NodeState, NodeStatus, RegionTopic, RegionTopicKind, RejectReason,
+    ReputationTopic, decode,
+};
 use tokio::sync::Semaphore;
 use uuid::Uuid;
 
@@ -28,6 +31,8 @@ pub enum FromRegion {
     },
     /// The status of another leader of the own cell, or a last will of this one.
     Status(NodeStatus),
+    /// What a cell, perhaps the own one, says of a vehicle.
+    Reputation(CellReputation),
 }
 
 /// Callback that takes messages to the uplink. It runs on the link's task and must not block.
@@ -44,10 +49,19 @@ pub(crate) struct RegionInbox {
     /// Deliveries that the uplink may still hold.
     capacity: Arc<Semaphore>,
     throttle: Mutex<KeyedThrottle<NodeName>>,
+    /// The same for what is said of vehicles.
+    reputation_capacity: Arc<Semaphore>,
+    reputation_throttle: Mutex<KeyedThrottle<NodeName>>,
 }
 
 /// Maximum maps that wait for the uplink: some seconds of all cells around.
 const CAPACITY: usize = 32;
+
+/// Maximum messages about vehicles that wait for the uplink. When a leader connects, all about the present ones come at once.
+const REPUTATION_CAPACITY: usize = 1024;
+
+/// Maximum messages about vehicles per second of one cell that are decoded: one about each vehicle of a large cell.
+const MAX_REPUTATION_HZ: u32 = 512;
 
 impl RegionInbox {
     /// Takes what the region tells the cell, whose origin is in the tile, in this run of the node.
@@ -60,7 +74,20 @@ impl RegionInbox {
     ) -> Self {
         let capacity = Arc::new(Semaphore::new(CAPACITY));
         let throttle = Mutex::new(KeyedThrottle::per_second(MAX_MAP_HZ));
-        Self { cell, tile, run, limits, counters, subscriber, capacity, throttle }
+        let reputation_capacity = Arc::new(Semaphore::new(REPUTATION_CAPACITY));
+        let reputation_throttle = Mutex::new(KeyedThrottle::per_second(MAX_REPUTATION_HZ));
+        Self {
+            cell,
+            tile,
+            run,
+            limits,
+            counters,
+            subscriber,
+            capacity,
+            throttle,
+            reputation_capacity,
+            reputation_throttle,
+        }
     }
 
     fn read(&self, topic: &RegionTopic, payload: &[u8], received_at: Timestamp) -> Result<PacketOutcome, RejectReason> {
@@ -68,12 +95,10 @@ impl RegionInbox {
         match topic.kind {
             RegionTopicKind::Map if is_own => self.counters.count(Event::Echo),
             RegionTopicKind::Map => {
-                if !self.throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(&topic.cell, received_at) {
-                    self.counters.shed(ShedReason::CellThrottled, &source(&topic.cell));
-                    return Ok(PacketOutcome::Done);
+                if self.allows(&self.throttle, &topic.cell, received_at) {
+                    let map = Box::new(decode(payload, &self.limits)?);
+                    self.deliver(&self.capacity, FromRegion::Map { topic: topic.clone(), map }, received_at);
                 }
-                let map = Box::new(decode(payload, &self.limits)?);
-                self.deliver(FromRegion::Map { topic: topic.clone(), map }, received_at);
             }
             RegionTopicKind::Status if is_own && topic.tile == self.tile && !payload.is_empty() => {
                 let status: NodeStatus = decode(payload, &self.limits)?;
@@ -81,7 +106,7 @@ impl RegionInbox {
                     self.counters.count(Event::Echo);
                     return Ok(PacketOutcome::OwnStatus);
                 }
-                self.deliver(FromRegion::Status(status), received_at);
+                self.deliver(&self.capacity, FromRegion::Status(status), received_at);
             }
             RegionTopicKind::Status if is_own && topic.tile == self.tile => {}
             RegionTopicKind::Status | RegionTopicKind::Cell => return Err(RejectReason::UnknownTopic),
@@ -89,8 +114,38 @@ impl RegionInbox {
         Ok(PacketOutcome::Done)
     }
 
-    fn deliver(&self, message: FromRegion, received_at: Timestamp) {
-        match Arc::clone(&self.capacity).try_acquire_owned() {
+    /// Reads what a cell says of a vehicle; one that was deleted says nothing.
+    fn read_reputation(
+        &self,
+        topic: &ReputationTopic,
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> Result<PacketOutcome, RejectReason> {
+        if payload.is_empty() || !self.allows(&self.reputation_throttle, &topic.cell, received_at) {
+            return Ok(PacketOutcome::Done);
+        }
+        let message: CellReputation = decode(payload, &self.limits)?;
+        if (&message.cell, &message.vehicle) != (&topic.cell, &topic.vehicle) {
+            return Err(RejectReason::NodeMismatch);
+        }
+        if message.cell == self.cell {
+            self.counters.count(Event::Echo);
+        }
+        self.deliver(&self.reputation_capacity, FromRegion::Reputation(message), received_at);
+        Ok(PacketOutcome::Done)
+    }
+
+    /// True if one more message of a cell is decoded.
+    fn allows(&self, throttle: &Mutex<KeyedThrottle<NodeName>>, cell: &NodeName, received_at: Timestamp) -> bool {
+        let is_allowed = throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(cell, received_at);
+        if !is_allowed {
+            self.counters.shed(ShedReason::CellThrottled, &source(cell));
+        }
+        is_allowed
+    }
+
+    fn deliver(&self, capacity: &Arc<Semaphore>, message: FromRegion, received_at: Timestamp) {
+        match Arc::clone(capacity).try_acquire_owned() {
             Ok(place) => {
                 let origin = Origin::Claimed;
                 (self.subscriber)(Delivery { message, received_at, origin, broker: None, _place: Some(place) });
@@ -104,10 +159,16 @@ impl PacketSink for RegionInbox {
     /// Processes one packet of the region's broker. A payload that cannot be used is counted by its reason and cell.
     fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome {
         self.counters.count(Event::RegionReceived);
-        let parsed = std::str::from_utf8(topic).ok().and_then(RegionTopic::parse);
-        let outcome = parsed.as_ref().map_or(Err(RejectReason::UnknownTopic), |it| self.read(it, payload, received_at));
+        let path = std::str::from_utf8(topic).unwrap_or_default();
+        let (of_cell, of_vehicle) = (RegionTopic::parse(path), ReputationTopic::parse(path));
+        let outcome = match (&of_cell, &of_vehicle) {
+            (Some(topic), _) => self.read(topic, payload, received_at),
+            (None, Some(topic)) => self.read_reputation(topic, payload, received_at),
+            (None, None) => Err(RejectReason::UnknownTopic),
+        };
         outcome.unwrap_or_else(|reason| {
-            let from = parsed.map_or_else(|| via.address.to_string(), |topic| source(&topic.cell));
+            let cell = of_cell.map(|topic| topic.cell).or(of_vehicle.map(|topic| topic.cell));
+            let from = cell.map_or_else(|| via.address.to_string(), |cell| source(&cell));
             self.counters.reject_message(reason, &from, || {
                 format!("message of the region on {} rejected: {}", topic.escape_ascii(), reason.in_words())
             });

@@ -259,12 +259,21 @@ class Verdicts:
 
 
 @dataclass(frozen=True)
+class ForeignVotes:
+    """Votes of other cells about a vehicle, at the weight that they have in its score."""
+
+    correct: Margin
+    incorrect: Margin
+
+
+@dataclass(frozen=True)
 class Reputation:
-    """The trust in one vehicle and its evidence."""
+    """The trust in one vehicle and its evidence; `foreign` is what other cells say."""
 
     score: Fraction
     correct: Count
     incorrect: Count
+    foreign: Optional[ForeignVotes] = None
 
 
 @dataclass(frozen=True)

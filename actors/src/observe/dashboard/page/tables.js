@@ -91,8 +91,11 @@ export function vehicles(entries, now, { troubles, nodes }) {
 
 export function reputations(received, colour) {
   const all = Object.entries(received?.message.reputations ?? {});
-  fill("reputations", all, ([name]) => name, ([name, { score, correct, incorrect }]) => [
-    { text: name, colour: colour.get(name) ?? 7 }, n(score.toFixed(2)), n(correct), n(incorrect),
+  // Votes of other cells, as they count in the weight.
+  const beside = (count, foreign) => n(foreign ? `${count} + ${foreign.toFixed(1)} elsewhere` : count);
+  fill("reputations", all, ([name]) => name, ([name, { score, correct, incorrect, foreign }]) => [
+    { text: name, colour: colour.get(name) ?? 7 }, n(score.toFixed(2)),
+    beside(correct, foreign?.correct), beside(incorrect, foreign?.incorrect),
   ]);
   byId("reputation-chart").hidden = all.length === 0;
 }

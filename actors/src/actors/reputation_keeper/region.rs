@@ -1,0 +1,68 @@
+//! What the keeper tells the uplink, and what it hears of other cells.
+
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+
+use ecod::model::names::NodeName;
+use ecod::reputation::CellCounts;
+use ecod::wire::ForeignVotes;
+
+use super::ReputationKeeperState;
+use crate::messages::uplink::UplinkMessage;
+
+/// Maximum number of vehicles whose counts a new leader compares with those in the region. A leader before it may not have
+/// come to tell them.
+const MAX_COMPARED: usize = 256;
+
+/// Counts that the uplink knows.
+#[derive(Debug, Default)]
+pub(super) struct ToldCounts {
+    counts: BTreeMap<NodeName, CellCounts>,
+    /// True if the ledger may have others.
+    pub(super) is_due: bool,
+}
+
+impl ReputationKeeperState {
+    /// Publishes from now on beside these votes of other cells.
+    pub(super) fn set_foreign(&mut self, round: u64, votes: BTreeMap<NodeName, ForeignVotes>) {
+        self.arguments.reputations.open().foreign = votes;
+        self.last_round = self.last_round.max(round);
+    }
+
+    /// Tells the uplink the counts of the vehicles that were counted last, also if it knows them.
+    pub(super) fn tell_all(&mut self) {
+        if self.resync.leads().is_none() || self.arguments.uplink.get().is_none() {
+            return;
+        }
+        let store = self.arguments.reputations.open();
+        self.told.counts = store.ledger.cell_counts(self.arguments.reputation.memory_votes);
+        let lanes = store.ledger.latest_lanes();
+        drop(store);
+        let mut latest: Vec<_> = self.told.counts.iter().collect();
+        latest.sort_by_key(|(node, _)| Reverse(lanes.get(*node).copied()));
+        let counts = latest.into_iter().take(MAX_COMPARED).map(|(node, counts)| (node.clone(), *counts)).collect();
+        self.told.is_due = false;
+        self.arguments.uplink.send(UplinkMessage::TellCounts { counts });
+    }
+
+    /// Tells the uplink what has changed, while this node leads.
+    pub(super) fn tell_uplink(&mut self) {
+        let is_wanted = self.resync.leads().is_some() && self.arguments.uplink.get().is_some();
+        if !is_wanted || !std::mem::take(&mut self.told.is_due) {
+            return;
+        }
+        let store = self.arguments.reputations.open();
+        let now = store.ledger.cell_counts(self.arguments.reputation.memory_votes);
+        // Of vehicles that it knew before a reset, nothing counts any more.
+        let nothing = CellCounts { reset_at: store.ledger.reset_at(), ..CellCounts::default() };
+        drop(store);
+        let has_changed = |(node, counts): &(&NodeName, &CellCounts)| self.told.counts.get(*node) != Some(*counts);
+        let changed = now.iter().filter(has_changed).map(|(node, counts)| (node.clone(), *counts));
+        let gone = self.told.counts.keys().filter(|node| !now.contains_key(*node)).map(|node| (node.clone(), nothing));
+        let counts: Vec<_> = changed.chain(gone).collect();
+        self.told.counts = now;
+        if !counts.is_empty() {
+            self.arguments.uplink.send(UplinkMessage::TellCounts { counts });
+        }
+    }
+}

@@ -1,0 +1,89 @@
+//! What cells tell each other of vehicles, as this uplink carries it out.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use ecod::leadership::timers::MAX_RESET_AHEAD;
+use ecod::model::names::NodeName;
+use ecod::model::time::Timestamp;
+use ecod::neighbours::ExchangeStep;
+use ecod::reputation::CellCounts;
+use ecod::wire::{CellReputation, RejectReason};
+use ractor::ActorRef;
+
+use super::UplinkState;
+use crate::messages::fuser::FuserMessage;
+use crate::messages::uplink::UplinkMessage;
+use crate::platform::clock;
+use crate::telemetry::counters::Event;
+use crate::transport::mqtt::region_inbox::source;
+
+/// Time between two looks at what is to be told and asked.
+pub(super) const EXCHANGE_PERIOD: Duration = Duration::from_millis(250);
+
+/// Maximum number of messages about vehicles in that time. Maps share the link's queue.
+const MAX_MESSAGES: usize = 6;
+
+/// Time for which news of other cells is gathered: a vehicle that comes is told of by many at once.
+const GATHER_TIME: Duration = Duration::from_millis(20);
+
+impl UplinkState {
+    /// Takes the vehicles that are present, and tells the fuser what is known of them.
+    pub(super) fn set_present(&mut self, vehicles: &BTreeSet<NodeName>) {
+        self.exchange.set_present(vehicles);
+        self.has_foreign_news = true;
+        self.exchange_reputations();
+    }
+
+    /// Takes what the cell's own evidence says.
+    pub(super) fn count_vehicles(&mut self, counts: Vec<(NodeName, CellCounts)>) {
+        let before = self.exchange.dropped();
+        counts.into_iter().for_each(|(vehicle, counts)| self.exchange.count(&vehicle, counts));
+        self.setup.counters.add(Event::CellReputationDropped, self.exchange.dropped() - before);
+    }
+
+    /// Takes what a cell says of a vehicle; what does not count is counted by its reason and cell.
+    pub(super) fn take_reputation(
+        &mut self,
+        message: &CellReputation,
+        received_at: Timestamp,
+        myself: &ActorRef<UplinkMessage>,
+    ) {
+        if message.reset_at_us.is_some_and(|at| at.since(received_at) >= MAX_RESET_AHEAD) {
+            let reason = RejectReason::FromTheFuture;
+            return self.setup.counters.reject_message(reason, &source(&message.cell), || {
+                format!("what the cell {} says of {} not used: reset in the future", message.cell, message.vehicle)
+            });
+        }
+        if self.exchange.hear(message) {
+            self.setup.counters.count(Event::CellReputationAccepted);
+            if !std::mem::replace(&mut self.has_foreign_news, true) {
+                myself.send_after(GATHER_TIME, || UplinkMessage::Exchange);
+            }
+        }
+    }
+
+    /// Tells the fuser what is new, and carries out the next steps on the link.
+    pub(super) fn exchange_reputations(&mut self) {
+        if std::mem::take(&mut self.has_foreign_news) {
+            let reputations = self.exchange.foreign().clone().into();
+            self.setup.fuser.send(FuserMessage::TakeForeign { reputations });
+        }
+        let Some(link) = self.link.as_mut().filter(|link| link.is_up()) else { return };
+        for step in self.exchange.next(clock::now(), MAX_MESSAGES) {
+            match step {
+                ExchangeStep::Subscribe(filters) if !link.subscribe(&filters) => {
+                    // There is no room. Asked anew, the region tells anew.
+                    self.exchange.connect();
+                    return;
+                }
+                ExchangeStep::Subscribe(_) => {}
+                ExchangeStep::Unsubscribe(filters) => link.unsubscribe(&filters),
+                ExchangeStep::Publish(message) if link.publish_reputation(&message) => {
+                    self.setup.counters.count(Event::CellReputationPublished);
+                }
+                ExchangeStep::Publish(message) => self.exchange.not_sent(&message.vehicle),
+            }
+        }
+    }
+}

@@ -1,0 +1,146 @@
+//! What other cells say of vehicles, and how much of it counts here.
+//!
+//! Each cell states absolute counts, which only grow until it is reset. Merging keeps the later reset, and the larger of every
+//! count after one reset: a join as that of the ledger, so that messages may come late, twice, or in any order. Of the
+//! counts those weigh that the cell still remembers.
+//!
+//! Here they are votes beside those of the prior (Jøsang & Ismail 2002, section 3: discounting), few enough that
+//! - one cell alone moves no vehicle further than half of the prior's weight, so that it cannot ban a newcomer;
+//! - all cells together weigh at most twice the prior, so that own evidence soon outweighs them.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::{Deserialize, Serialize};
+
+use super::Counts;
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
+use crate::wire::{CellReputation, ForeignVotes, SCHEMA_VERSION};
+
+/// Weight of a vote of another cell against an own one.
+const DISCOUNT: f64 = 0.2;
+
+/// Maximum weight of one cell's votes about a vehicle, as a share of the prior's. With a half, the worst word of one cell
+/// leaves a newcomer two thirds of its score, which is above what tracking takes for worthless.
+const MAX_SHARE_EACH: f64 = 0.5;
+
+/// Maximum weight of all cells' votes about a vehicle, as a multiple of the prior's.
+const MAX_SHARE: f64 = 2.0;
+
+/// Maximum number of cells about one vehicle; those with most votes count.
+const MAX_CELLS_EACH: usize = 16;
+
+/// Maximum number of vehicles.
+pub const MAX_FOREIGN_VEHICLES: usize = 1024;
+
+/// A cell's counts about one vehicle.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellCounts {
+    /// Time of the last reset of the cell's evidence; 0 if there was none.
+    #[serde(default)]
+    pub reset_at: Timestamp,
+    /// All votes since.
+    pub all: Counts,
+    /// Those of them that the cell does not remember any more.
+    #[serde(default)]
+    pub old: Counts,
+}
+
+impl CellCounts {
+    /// Takes over what is later or larger; true if that changed anything.
+    pub fn merge(&mut self, other: Self) -> bool {
+        let before = *self;
+        if other.reset_at > self.reset_at {
+            *self = other;
+        } else if other.reset_at == self.reset_at {
+            self.all.merge(other.all);
+            self.old.merge(other.old);
+        }
+        *self != before
+    }
+
+    /// The votes that the cell remembers.
+    pub fn remembered(&self) -> Counts {
+        Counts {
+            correct: self.all.correct.saturating_sub(self.old.correct),
+            incorrect: self.all.incorrect.saturating_sub(self.old.incorrect),
+        }
+    }
+
+    /// The message of a cell about a vehicle.
+    pub fn message(&self, cell: NodeName, vehicle: NodeName) -> CellReputation {
+        let Self { reset_at, all, old } = *self;
+        CellReputation {
+            schema: SCHEMA_VERSION,
+            cell,
+            vehicle,
+            correct: all.correct,
+            incorrect: all.incorrect,
+            old_correct: old.correct,
+            old_incorrect: old.incorrect,
+            reset_at_us: (reset_at > Timestamp::default()).then_some(reset_at),
+        }
+    }
+}
+
+impl From<&CellReputation> for CellCounts {
+    fn from(message: &CellReputation) -> Self {
+        Self {
+            reset_at: message.reset_at_us.unwrap_or_default(),
+            all: Counts { correct: message.correct, incorrect: message.incorrect },
+            old: Counts { correct: message.old_correct, incorrect: message.old_incorrect },
+        }
+    }
+}
+
+/// Counts of other cells, by vehicle and cell.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ForeignReputations(BTreeMap<NodeName, BTreeMap<NodeName, CellCounts>>);
+
+impl ForeignReputations {
+    /// Merges what a cell says of a vehicle; true if that changed anything. What is beyond the maxima is left out.
+    pub fn merge(&mut self, cell: &NodeName, vehicle: &NodeName, counts: CellCounts) -> bool {
+        if self.0.len() >= MAX_FOREIGN_VEHICLES && !self.0.contains_key(vehicle) {
+            return false;
+        }
+        let cells = self.0.entry(vehicle.clone()).or_default();
+        let is_news = cells.entry(cell.clone()).or_default().merge(counts);
+        if cells.len() > MAX_CELLS_EACH {
+            // Totals only grow, so that the result does not depend on the order of messages.
+            let least = cells.iter().min_by_key(|(cell, counts)| (counts.all.total(), (*cell).clone()));
+            if let Some(least) = least.map(|(cell, _)| cell.clone()) {
+                cells.remove(&least);
+                return is_news && least != *cell;
+            }
+        }
+        is_news
+    }
+
+    /// Forgets vehicles that are not wanted.
+    pub fn retain(&mut self, mut is_wanted: impl FnMut(&NodeName) -> bool) {
+        self.0.retain(|vehicle, _| is_wanted(vehicle));
+    }
+
+    /// The cells that say something.
+    pub fn cells(&self) -> BTreeSet<&NodeName> {
+        self.0.values().flat_map(BTreeMap::keys).collect()
+    }
+
+    /// Every vehicle's votes beside a prior of this weight in votes; `trust` in each cell is 0 to 1.
+    pub fn votes(&self, prior_votes: f64, trust: impl Fn(&NodeName) -> f64) -> BTreeMap<NodeName, ForeignVotes> {
+        let of_vehicle = |(vehicle, cells): (&NodeName, &BTreeMap<NodeName, CellCounts>)| {
+            let mut sum = ForeignVotes::default();
+            for (cell, counts) in cells {
+                let Counts { correct, incorrect } = counts.remembered();
+                let votes = (correct as f64 + incorrect as f64).max(1.0);
+                let weight = trust(cell).clamp(0.0, 1.0) * DISCOUNT.min(MAX_SHARE_EACH * prior_votes / votes);
+                sum.correct += weight * correct as f64;
+                sum.incorrect += weight * incorrect as f64;
+            }
+            let kept = (MAX_SHARE * prior_votes / sum.total().max(f64::MIN_POSITIVE)).min(1.0);
+            (vehicle.clone(), ForeignVotes { correct: kept * sum.correct, incorrect: kept * sum.incorrect })
+        };
+        self.0.iter().map(of_vehicle).filter(|(_, votes)| votes.total() > 0.0).collect()
+    }
+}

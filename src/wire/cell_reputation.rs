@@ -1,0 +1,57 @@
+//! What cells tell each other of vehicles.
+
+use minicbor::{Decode, Encode};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::compact::{Form, Half};
+use crate::model::names::NodeName;
+use crate::model::time::Timestamp;
+
+/// A cell's own evidence about one vehicle, for other cells. Receivers keep the larger of every count.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct CellReputation {
+    /// Major version of the payload, [`super::SCHEMA_VERSION`].
+    #[n(0)]
+    pub schema: u32,
+    /// The cell that counted; equals the last level of the topic.
+    #[n(1)]
+    pub cell: NodeName,
+    /// The vehicle; equals the level of the topic before.
+    #[n(2)]
+    pub vehicle: NodeName,
+    /// Number of votes in all leaderships that agreed with the verdict.
+    #[n(3)]
+    pub correct: u64,
+    /// Number of votes that did not.
+    #[n(4)]
+    pub incorrect: u64,
+    /// Number of the votes that agreed and are older than those that the cell remembers.
+    #[n(5)]
+    pub old_correct: u64,
+    /// Number of such votes that did not agree.
+    #[n(6)]
+    pub old_incorrect: u64,
+    /// Time of the last reset of the cell's evidence; absent if there was none. Counts from before do not count.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(7)]
+    pub reset_at_us: Option<Timestamp>,
+}
+
+/// Votes of other cells about a vehicle at the weight that they have here. They are not whole numbers.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct ForeignVotes {
+    /// Votes that agreed with the verdict.
+    #[cbor(n(0), with = "Half")]
+    pub correct: f64,
+    /// Votes that did not.
+    #[cbor(n(1), with = "Half")]
+    pub incorrect: f64,
+}
+
+impl ForeignVotes {
+    /// All votes.
+    pub fn total(self) -> f64 {
+        self.correct + self.incorrect
+    }
+}
