@@ -3,13 +3,14 @@
 //! `make city` runs it. Each simulated cell has a connection and an account of its own, as a cell's leader has. Each
 //! real one is an `ecod-node` with an uplink, and a vehicle that reports to it. Two subscribers on two servers read
 //! half of the
-//! town each.
+//! town each. Vehicles pass through some cells, which tell of them whatever happens.
 
 mod cluster;
 mod fleet;
 mod places;
 mod probe;
 mod real;
+mod vehicles;
 mod watch;
 
 use std::path::PathBuf;
@@ -26,6 +27,7 @@ use cluster::{Cluster, SERVERS};
 use fleet::Fleet;
 use probe::Meter;
 use real::RealCells;
+use vehicles::PassingVehicles;
 use watch::Watch;
 
 /// Flags of the city.
@@ -56,6 +58,9 @@ struct Arguments {
 
 /// Maximum time until a city is whole again.
 const PATIENCE: Duration = Duration::from_secs(120);
+
+/// Maximum number of simulated cells that tell of vehicles.
+const TELLERS: usize = 20;
 
 /// Time before a measurement.
 const SETTLE: Duration = Duration::from_secs(5);
@@ -89,6 +94,7 @@ fn main() -> anyhow::Result<()> {
     // While all log in at once, a backlog of seconds cannot be told from a clock that is as much behind.
     let at_start: u64 = city.watches.iter().map(Watch::too_old).sum();
     println!("  maps that counted though they were too old, while all logged in for the first time: {at_start}");
+    let vehicles = PassingVehicles::start(&simulated[..simulated.len().min(TELLERS)], &city.cluster)?;
 
     println!("\nserver 3 killed");
     let at = clock::now();
@@ -124,9 +130,13 @@ fn main() -> anyhow::Result<()> {
     city.steady(arguments.seconds / 2);
     city.overview()?;
 
+    let (passed, lost) = vehicles.end(&city.cluster.login(0, "region.reader"))?;
+    println!("\nvehicles that passed through cells meanwhile: {passed}, reputations lost: {lost}");
+
     let too_old = city.watches.iter().map(Watch::too_old).sum::<u64>() - at_start;
     println!("\nmaps that counted though they were too old, since then: {too_old}");
     ensure!(too_old == 0, "{too_old} maps were too old");
+    ensure!(lost == 0, "{lost} of {passed} reputations were lost");
     Ok(())
 }
 
