@@ -51,7 +51,7 @@ impl ImageRecorder {
                 let picture = CapturedPicture {
                     camera: self.camera.clone(),
                     reporter: self.reporter.clone(),
-                    jpeg: jpeg.into(),
+                    jpeg,
                     height: size.height,
                     optics: lens.in_pixels_of(size).ok().map(|lens| (lens.intrinsics, lens.distortion)),
                     detections: detections.to_vec(),
