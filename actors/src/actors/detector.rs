@@ -262,7 +262,7 @@ async fn pump(
             return;
         };
         let span = spans.borrow().frame(frame.captured_at);
-        if span.in_scope(|| detector.cast(DetectorMessage::Detect { frame, permit })).is_err() {
+        if span.in_scope(|| detector.cast(DetectorMessage::Detect { frame, permit }).is_err()) {
             return;
         }
     }

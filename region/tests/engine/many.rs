@@ -86,7 +86,7 @@ impl Drop for Reader {
 fn cell(x: usize, y: usize) -> (NodeName, GeographicOrigin) {
     // Tiles are 0.011 degrees wide, and 0.0072 high at this latitude.
     let (latitude_deg, longitude_deg) = (48.5 + 0.0075 * y as f64, 2.0 + 0.011 * x as f64);
-    let name = NodeName::new(&format!("cell-{x}-{y}")).unwrap();
+    let name = NodeName::new(format!("cell-{x}-{y}")).unwrap();
     (name, GeographicOrigin { latitude_deg, longitude_deg, height_m: 0.0, rotation_deg: 0.0 })
 }
 
@@ -113,7 +113,7 @@ fn map(cell: &NodeName, origin: GeographicOrigin, round: u64) -> Vec<u8> {
     let now = clock::now();
     let object = |number: usize| FusedObject {
         velocity_mps: Some([5.0, 1.0]),
-        vehicle: (number < 5).then(|| NodeName::new(&format!("car-{number}")).unwrap()),
+        vehicle: (number < 5).then(|| NodeName::new(format!("car-{number}")).unwrap()),
         ..FusedObject::new(
             Uuid::from_u128(number as u128),
             "car",

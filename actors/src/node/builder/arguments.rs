@@ -437,7 +437,13 @@ mod tests {
     use crate::messages::newest::ReceivedMap;
     use crate::node::config::NodeConfig;
     use crate::node::description::HeldDescription;
+    use crate::node::presence::{Presence, VehicleParts};
     use crate::transport::mqtt::Security;
+
+    fn builder(config: NodeConfig) -> NodeBuilder {
+        let (vehicle, held) = ((VehicleParts::new(&config), Presence::Whole), HeldDescription::default());
+        NodeBuilder::new(vehicle, config, Security::default(), held, watch::Sender::new(None))
+    }
 
     #[test]
     fn a_candidate_keeps_reputations_where_anything_rates_vehicles() {
@@ -452,8 +458,7 @@ mod tests {
         ] {
             let mut config = NodeConfig { role: Role::Edge, landmarks, ..NodeConfig::default() };
             (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
-            let builder =
-                NodeBuilder::new(config, Security::default(), HeldDescription::default(), watch::Sender::new(None));
+            let builder = builder(config);
             let keeps = builder.parts().contains(&crate::node::slots::ActorKind::ReputationKeeper);
             assert_eq!(keeps, expected, "{algorithms:?} {mode:?}");
         }
@@ -462,8 +467,7 @@ mod tests {
     #[test]
     fn a_part_started_anew_still_says_whom_the_node_follows() {
         let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
-        let builder =
-            NodeBuilder::new(config, Security::default(), HeldDescription::default(), watch::Sender::new(None));
+        let builder = builder(config);
         assert_eq!((builder.status().epoch, builder.status().aggregator), (0, None));
         let map = GlobalMap {
             schema: SCHEMA_VERSION,
