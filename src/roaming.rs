@@ -1,8 +1,8 @@
 //! Cells that a vehicle drives through: in which of them it takes part, by its position.
 //!
 //! ```text
-//! position ── observe ──> CellChoice ──> Step::Join    get ready in the next cell, and go on in the present one
-//!       the next follows ── enter ──┘└─> Step::GiveUp  stay in the present one
+//! position ── observe ──> CellChoice ──> CellMove::Join    get ready in the next cell, and go on in the present one
+//!       the next follows ── enter ──┘└─> CellMove::GiveUp  stay in the present one
 //! ```
 //!
 //! A cell is a circle around its origin. A vehicle changes to a cell that it is in, and that is nearer than the present one by
@@ -44,7 +44,7 @@ impl KnownCell {
 
 /// What a vehicle is to do.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Step {
+pub enum CellMove {
     /// Get ready in this cell, and go on in the present one until then.
     Join(NodeName),
     /// Leave this cell again, and stay in the present one.
@@ -74,7 +74,7 @@ impl CellChoice {
     }
 
     /// Takes the vehicle's position at `now`. The same one again lets time pass.
-    pub fn observe(&mut self, place: &GeographicPosition, now: Timestamp) -> Option<Step> {
+    pub fn observe(&mut self, place: &GeographicPosition, now: Timestamp) -> Option<CellMove> {
         self.failed.retain(|_, until| *until > now);
         let outside_m = |name: &NodeName| {
             let cell = self.cells.iter().find(|cell| cell.name == *name);
@@ -88,7 +88,7 @@ impl CellChoice {
                 self.fail(&next, now);
             }
             self.next = self.next.take().filter(|_| !is_late && !has_turned);
-            return self.next.is_none().then_some(Step::GiveUp(next));
+            return self.next.is_none().then_some(CellMove::GiveUp(next));
         }
         let others =
             self.cells.iter().filter(|cell| cell.name != self.present && !self.failed.contains_key(&cell.name));
@@ -98,7 +98,7 @@ impl CellChoice {
             return None;
         }
         self.next = Some((name.clone(), now));
-        Some(Step::Join(name))
+        Some(CellMove::Join(name))
     }
 
     /// Notes that the vehicle follows in the next cell; true if that is its cell from now on.
@@ -161,8 +161,8 @@ mod tests {
             let now_s = 0.1 * tick as f64;
             let (x_m, y_m) = path(now_s);
             match choice.observe(&at(x_m, y_m), s(now_s)) {
-                Some(Step::Join(cell)) => joined = Some((cell, now_s + 2.0)),
-                Some(Step::GiveUp(_)) => joined = None,
+                Some(CellMove::Join(cell)) => joined = Some((cell, now_s + 2.0)),
+                Some(CellMove::GiveUp(_)) => joined = None,
                 None => {}
             }
             if let Some((cell, _)) = joined.take_if(|(_, ready_s)| *ready_s <= now_s) {
@@ -200,12 +200,12 @@ mod tests {
     fn a_cell_that_does_not_answer_is_given_up_and_tried_again_later() {
         let mut choice = CellChoice::new(cells(), name(0));
         let place = at(SPACING_M, 0.0);
-        assert_eq!(choice.observe(&place, s(0.0)), Some(Step::Join(name(1))));
+        assert_eq!(choice.observe(&place, s(0.0)), Some(CellMove::Join(name(1))));
         assert_eq!(choice.observe(&place, s(14.0)), None);
-        assert_eq!(choice.observe(&place, s(15.5)), Some(Step::GiveUp(name(1))));
+        assert_eq!(choice.observe(&place, s(15.5)), Some(CellMove::GiveUp(name(1))));
         assert_eq!(choice.present(), &name(0));
         assert_eq!(choice.observe(&place, s(40.0)), None, "it is left alone");
-        assert_eq!(choice.observe(&place, s(46.0)), Some(Step::Join(name(1))));
+        assert_eq!(choice.observe(&place, s(46.0)), Some(CellMove::Join(name(1))));
         assert!(!choice.enter(&name(2)), "only the next cell is entered");
         choice.fail(&name(1), s(47.0));
         assert!(!choice.enter(&name(1)));
@@ -226,11 +226,11 @@ mod tests {
             for (x_m, y_m, passed_s) in places {
                 now_s += passed_s;
                 match choice.observe(&at(x_m, y_m), s(now_s)) {
-                    Some(Step::Join(cell)) => {
+                    Some(CellMove::Join(cell)) => {
                         prop_assert!(joined.is_none() && cell != *choice.present());
                         joined = Some(cell);
                     }
-                    Some(Step::GiveUp(cell)) => prop_assert_eq!(joined.take(), Some(cell)),
+                    Some(CellMove::GiveUp(cell)) => prop_assert_eq!(joined.take(), Some(cell)),
                     None => {}
                 }
                 if let Some(cell) = joined.take_if(|_| passed_s < 5.0) {

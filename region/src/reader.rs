@@ -14,7 +14,7 @@ use rumqttc::{
 use tokio::sync::watch;
 
 use crate::broker::BrokerLogin;
-use crate::town::{Accepted, ReadTiles, Refusal, RegionTown};
+use crate::town::{Accepted, CellRefusal, ReadTiles, RegionTown};
 
 /// Town and connection, for page, metrics and exports.
 #[derive(Debug, Default)]
@@ -46,7 +46,7 @@ pub struct Reading<'a> {
     /// When it was read.
     pub at: Timestamp,
     /// Its content if it counts, otherwise the reason.
-    pub outcome: Result<Accepted, Refusal>,
+    pub outcome: Result<Accepted, CellRefusal>,
 }
 
 /// Requests that wait for the network at most.

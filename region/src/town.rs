@@ -94,14 +94,14 @@ pub struct TownCounts {
 
 /// The reason why a message does not count.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refusal {
+pub enum CellRefusal {
     /// It cannot be used.
     Rejected(RejectReason),
     /// Its cell sends more than [`MAX_MAP_HZ`] of its kind.
     CellThrottled,
 }
 
-impl From<RejectReason> for Refusal {
+impl From<RejectReason> for CellRefusal {
     fn from(reason: RejectReason) -> Self {
         Self::Rejected(reason)
     }
@@ -177,23 +177,23 @@ impl RegionTown {
     ///
     /// # Errors
     /// The reason why it does not count; it is counted.
-    pub fn accept(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, Refusal> {
+    pub fn accept(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, CellRefusal> {
         self.counts.messages += 1;
         self.counts.bytes += payload.len() as u64;
         let accepted = self.take(path, payload, now);
-        if let Err(Refusal::Rejected(reason)) = accepted {
+        if let Err(CellRefusal::Rejected(reason)) = accepted {
             *self.counts.rejected.entry(reason).or_default() += 1;
         }
         accepted
     }
 
-    fn take(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, Refusal> {
+    fn take(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, CellRefusal> {
         let topic = RegionTopic::parse(path).filter(|topic| topic.tile.digits() == CELL_TILE_DIGITS);
         let topic = topic.ok_or(RejectReason::UnknownTopic)?;
         let key = (topic.tile, topic.cell.clone());
         if !self.throttle.allow(&topic, now) {
             self.lose(&key, CellLosses { throttled: 1, ..CellLosses::default() });
-            return Err(Refusal::CellThrottled);
+            return Err(CellRefusal::CellThrottled);
         }
         // A cell that clears what it retained has left for good.
         if payload.is_empty() && topic.kind != RegionTopicKind::Map {

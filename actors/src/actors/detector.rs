@@ -52,8 +52,8 @@ pub struct DetectorArguments {
     pub troubles: CameraTroubles,
     /// Counters of the node.
     pub counters: Arc<Counters>,
-    /// The node's spans.
-    pub spans: Spans,
+    /// The spans of the vehicle's present node.
+    pub spans: watch::Receiver<Spans>,
 }
 
 /// Runs the detection algorithm on the latest frame, again and again.
@@ -75,7 +75,6 @@ pub struct DetectorState {
     troubles: CameraTroubles,
     counters: Arc<Counters>,
     pump: JoinSet<()>,
-    spans: watch::Sender<Spans>,
     readers: Readers,
 }
 
@@ -111,9 +110,8 @@ impl Actor for Detector {
         } = arguments;
         let capture = Capture::start(open, capture)?;
         let readers = capture.readers();
-        let spans = watch::Sender::new(spans);
         let mut pumping = JoinSet::new();
-        pumping.spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans.subscribe()));
+        pumping.spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans));
         let detect = Some(detect);
         Ok(DetectorState {
             detect,
@@ -126,7 +124,6 @@ impl Actor for Detector {
             troubles,
             counters,
             pump: pumping,
-            spans,
             readers,
         })
     }
@@ -144,14 +141,7 @@ impl Actor for Detector {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let (frame, permit) = match message {
-            DetectorMessage::Detect { frame, permit } => (frame, permit),
-            DetectorMessage::Move { images, spans } => {
-                state.images = images;
-                state.spans.send_replace(spans);
-                return Ok(());
-            }
-        };
+        let DetectorMessage::Detect { frame, permit } = message;
         let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
         let (mut images, lens) = (state.images.take(), state.lens);
@@ -306,7 +296,7 @@ mod tests {
             camera_feed: None,
             troubles: CameraTroubles::new(Arc::clone(&counters), None),
             counters: Arc::clone(&counters),
-            spans: Spans::new(NodeName::from_static("cell"), NodeName::from_static("euclid")),
+            spans: watch::channel(Spans::new(NodeName::from_static("cell"), NodeName::from_static("euclid"))).1,
         };
         let (detector, ended) = Actor::spawn(None, Detector, arguments).await.unwrap();
         let until = async |is_slow: bool| {

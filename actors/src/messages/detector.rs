@@ -3,8 +3,6 @@
 use tokio::sync::OwnedSemaphorePermit;
 
 use crate::camera::frame::CameraFrame;
-use crate::observe::recorder::ImageRecorder;
-use crate::telemetry::spans::Spans;
 
 /// Requests to the detector.
 #[derive(Debug)]
@@ -15,12 +13,5 @@ pub enum DetectorMessage {
         frame: CameraFrame,
         /// Admits the next frame when dropped.
         permit: OwnedSemaphorePermit,
-    },
-    /// Go on for another node of the vehicle, in another cell.
-    Move {
-        /// Records some of the frames.
-        images: Option<ImageRecorder>,
-        /// That node's spans.
-        spans: Spans,
     },
 }

@@ -2,7 +2,7 @@
 
 mod arguments;
 #[cfg(feature = "camera")]
-pub(super) mod cameras;
+mod cameras;
 mod describe;
 mod listening;
 mod uplink;
@@ -147,6 +147,9 @@ impl NodeBuilder {
             failed,
         };
         builder.note_units();
+        if presence == Presence::Whole {
+            builder.take_frames();
+        }
         builder.door = builder.new_door();
         builder.door.publish_description(&builder.present_description());
         builder
@@ -199,6 +202,12 @@ impl NodeBuilder {
             text: String::new(),
         };
         self.held.description.as_deref().cloned().unwrap_or_else(none)
+    }
+
+    /// Has running detectors record to this node's log, and trace their frames in its cell.
+    pub(super) fn take_frames(&self) {
+        self.vehicle.log.send_replace(self.recording.clone());
+        self.vehicle.spans.send_replace(self.spans());
     }
 
     fn spans(&self) -> Spans {

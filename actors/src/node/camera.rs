@@ -13,6 +13,7 @@ use crate::camera::config::CameraConfig;
 use crate::camera::lens::Lens;
 use crate::camera::perception::{Perception, VehicleCamera};
 use crate::node::config::NodeConfig;
+use crate::observe::dashboard::{CameraSetup, ShownCamera};
 
 /// The pose of a vehicle that stands still; none where poses are received.
 ///
@@ -60,4 +61,23 @@ pub fn algorithms(config: &NodeConfig, camera: &CameraConfig) -> Algorithms {
 /// abandoned.
 pub fn open_timeout(camera: &CameraConfig) -> Duration {
     Duration::from_secs_f64(0.8 * camera.capture.stall_timeout_s)
+}
+
+/// The cameras of a node whose pictures browsers may see.
+pub(super) fn shown(config: &NodeConfig) -> Vec<ShownCamera> {
+    if !(config.dashboard.enabled && config.dashboard.camera) {
+        return Vec::new();
+    }
+    let node = config.name.clone().unwrap_or(NodeName::from_static("node"));
+    let shown = |(place, camera): (usize, &CameraConfig)| ShownCamera {
+        name: camera.name.clone(),
+        feed: Arc::default(),
+        reporter: camera.reporter(&node),
+        setup: CameraSetup {
+            optics: camera.optics.clone(),
+            mount: camera.mount,
+            is_one_of_several: place > 0 || config.camera.is_none(),
+        },
+    };
+    config.all_cameras().enumerate().map(shown).collect()
 }

@@ -16,7 +16,7 @@ use ractor::{ActorCell, ActorProcessingErr, ActorStatus};
 use tokio::sync::watch;
 
 #[cfg(feature = "camera")]
-use super::builder::cameras;
+use super::camera;
 use super::config::NodeConfig;
 use super::slots::{ActorKind, ActorSlots};
 use super::{NodeError, SupervisorState};
@@ -27,7 +27,9 @@ use crate::messages::pose_receiver::PoseReceiverMessage;
 #[cfg(feature = "camera")]
 use crate::messages::projector::ProjectorMessage;
 use crate::observe::dashboard::ShownCamera;
+use crate::observe::recorder::LogSender;
 use crate::telemetry::counters::Counters;
+use crate::telemetry::spans::Spans;
 
 /// How far a node has come into its cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -44,6 +46,9 @@ pub(super) enum Presence {
 #[derive(Clone)]
 pub(super) struct VehicleParts {
     pub(super) counters: Arc<Counters>,
+    /// The present node's log and spans.
+    pub(super) log: watch::Sender<LogSender>,
+    pub(super) spans: watch::Sender<Spans>,
     /// Poses of the last moments, the newest last.
     pub(super) poses: watch::Sender<VecDeque<(Timestamp, StatedPose)>>,
     pub(super) pose_receiver: ActorSlot<PoseReceiverMessage>,
@@ -64,11 +69,15 @@ impl VehicleParts {
         #[cfg(feature = "camera")]
         let (projectors, detectors) = config.all_cameras().map(|_| Default::default()).unzip();
         #[cfg(feature = "camera")]
-        let shown_cameras = cameras::shown(config, config.name.as_ref().unwrap_or(&NodeName::from_static("node")));
+        let shown_cameras = camera::shown(config);
         #[cfg(not(feature = "camera"))]
         let shown_cameras = Vec::new();
+        let counters = Arc::<Counters>::default();
+        let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         Self {
-            counters: Arc::default(),
+            log: watch::Sender::new(LogSender::new(Arc::clone(&counters))),
+            spans: watch::Sender::new(Spans::new(config.cell.clone(), name)),
+            counters,
             poses: watch::Sender::default(),
             pose_receiver: ActorSlot::default(),
             #[cfg(feature = "camera")]
@@ -171,10 +180,8 @@ impl SupervisorState {
                 self.running.insert(part.get_id(), kind);
             }
         }
-        self.advance(Presence::Reporting, supervisor).await?;
-        #[cfg(feature = "camera")]
-        self.builder.move_detectors();
-        Ok(())
+        self.builder.take_frames();
+        self.advance(Presence::Reporting, supervisor).await
     }
 
     async fn close_door(&mut self) {

@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::model::origin::{GeographicPosition, StatedPose};
-use ecod::roaming::{CellChoice, Step};
+use ecod::roaming::{CellChoice, CellMove};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use super::config::{CellEntry, NodeConfig};
@@ -99,8 +99,8 @@ impl Roamer {
         let now = clock::now();
         let Some(place) = self.place() else { return Ok(()) };
         match self.choice.observe(&place, now) {
-            Some(Step::Join(cell)) => self.join(cell).await,
-            Some(Step::GiveUp(cell)) => {
+            Some(CellMove::Join(cell)) => self.join(cell).await,
+            Some(CellMove::GiveUp(cell)) => {
                 self.stay(&cell, "its leader was not heard in time, or the vehicle turned back").await
             }
             None => Ok(()),

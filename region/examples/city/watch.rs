@@ -10,7 +10,7 @@ use ecod::neighbours::MAX_AGE;
 use ecod::wire::RejectReason;
 use ecod_region::broker::BrokerLogin;
 use ecod_region::reader::{self, RegionState};
-use ecod_region::town::{Accepted, Refusal};
+use ecod_region::town::{Accepted, CellRefusal};
 use hdrhistogram::Histogram;
 
 use crate::places::Half;
@@ -68,7 +68,7 @@ impl Watch {
                         }
                     }
                     Ok(Accepted::Other(_)) => {}
-                    Err(Refusal::Rejected(RejectReason::Stale)) => figures.stale += 1,
+                    Err(CellRefusal::Rejected(RejectReason::Stale)) => figures.stale += 1,
                     Err(_) => figures.other += 1,
                 }
             })

@@ -20,7 +20,13 @@ fn tile() -> Quadkey {
 }
 
 /// A map of this round, sent at once, with an object so many metres to the east of the origin for each of these.
-fn map(town: &mut RegionTown, cell: &'static str, round: u64, ms: u64, east_m: &[f64]) -> Result<Accepted, Refusal> {
+fn map(
+    town: &mut RegionTown,
+    cell: &'static str,
+    round: u64,
+    ms: u64,
+    east_m: &[f64],
+) -> Result<Accepted, CellRefusal> {
     let object = |x_m: &f64| {
         let contributors = vec![NodeName::from_static("euclid")];
         let scores = [("car".into(), 0.9)].into();
@@ -44,7 +50,7 @@ fn map(town: &mut RegionTown, cell: &'static str, round: u64, ms: u64, east_m: &
     town.accept(&topic(cell, RegionTopicKind::Map).path(), &encode(&message, Encoding::Compact), at(ms))
 }
 
-fn status(town: &mut RegionTown, cell: &'static str, ms: u64, state: NodeState) -> Result<Accepted, Refusal> {
+fn status(town: &mut RegionTown, cell: &'static str, ms: u64, state: NodeState) -> Result<Accepted, CellRefusal> {
     let status = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, "0.1.0");
     let payload = encode(&NodeStatus { state, ..status }, Encoding::Json);
     town.accept(&topic(cell, RegionTopicKind::Status).path(), &payload, at(ms))
@@ -63,7 +69,7 @@ fn a_cell_that_floods_is_held_to_its_rate_and_others_are_heard() {
     assert_eq!(town.counts().losses.throttled, losses.throttled);
     status(&mut town, "quiet", 1000, NodeState::Aggregating).unwrap();
     let _ = map(&mut town, "flood", 2000, 1001, &[]);
-    assert_eq!(map(&mut town, "flood", 2001, 1001, &[]), Err(Refusal::CellThrottled));
+    assert_eq!(map(&mut town, "flood", 2001, 1001, &[]), Err(CellRefusal::CellThrottled));
 }
 
 #[test]
@@ -90,7 +96,7 @@ fn what_is_kept_of_a_cell_is_bounded() {
     let long = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, &"9".repeat(20_000));
     let path = topic("lot", RegionTopicKind::Status).path();
     let refused = town.accept(&path, &encode(&long, Encoding::Json), at(2000));
-    assert_eq!(refused, Err(Refusal::Rejected(RejectReason::TooLarge)));
+    assert_eq!(refused, Err(CellRefusal::Rejected(RejectReason::TooLarge)));
     let cell = &town.cells()[&(tile(), NodeName::from_static("lot"))];
     let objects = &cell.map.as_ref().unwrap().objects;
     assert_eq!((objects.len(), cell.losses.too_many), (MAX_OBJECTS, 10 * town.counts().maps));

@@ -3,37 +3,16 @@
 use std::sync::Arc;
 
 use anyhow::Context;
-use ecod::model::names::NodeName;
 
 use super::NodeBuilder;
 use crate::actors::detector::DetectorArguments;
 use crate::actors::projector::ProjectorArguments;
 use crate::camera::config::CameraConfig;
-use crate::messages::detector::DetectorMessage;
 use crate::messages::projector::ProjectorMessage;
 use crate::node::camera;
-use crate::node::config::NodeConfig;
-use crate::observe::dashboard::{CameraFeed, CameraSetup, ShownCamera};
+use crate::observe::dashboard::CameraFeed;
 use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::camera_troubles::CameraTroubles;
-
-/// The cameras of a node whose pictures browsers may see.
-pub(in crate::node) fn shown(config: &NodeConfig, node: &NodeName) -> Vec<ShownCamera> {
-    if !(config.dashboard.enabled && config.dashboard.camera) {
-        return Vec::new();
-    }
-    let shown = |(place, camera): (usize, &CameraConfig)| ShownCamera {
-        name: camera.name.clone(),
-        feed: Arc::default(),
-        reporter: camera.reporter(node),
-        setup: CameraSetup {
-            optics: camera.optics.clone(),
-            mount: camera.mount,
-            is_one_of_several: place > 0 || config.camera.is_none(),
-        },
-    };
-    config.all_cameras().enumerate().map(shown).collect()
-}
 
 impl NodeBuilder {
     /// Arguments of the projector of a camera, by its place.
@@ -66,11 +45,11 @@ impl NodeBuilder {
             detect: camera.detector.build().context("key `camera.detector`")?,
             lens: camera::lens(camera)?,
             projector: self.slots.projectors.get(place).cloned().unwrap_or_default(),
-            images: self.image_recorder(camera),
+            images: ImageRecorder::new(self.config.record.as_ref(), &self.name, camera, self.vehicle.log.subscribe()),
             camera_feed: self.camera_feed(place),
             troubles: self.camera_troubles(camera),
             counters: self.counters(),
-            spans: self.spans(),
+            spans: self.vehicle.spans.subscribe(),
         })
     }
 
@@ -89,18 +68,6 @@ impl NodeBuilder {
                 }
             }
         }
-    }
-
-    /// Has running detectors record to this node's log, and trace their frames in its cell.
-    pub(in crate::node) fn move_detectors(&self) {
-        for (camera, detector) in self.config.all_cameras().zip(&self.slots.detectors) {
-            let (images, spans) = (self.image_recorder(camera), self.spans());
-            detector.send(DetectorMessage::Move { images, spans });
-        }
-    }
-
-    fn image_recorder(&self, camera: &CameraConfig) -> Option<ImageRecorder> {
-        ImageRecorder::new(self.config.record.as_ref(), &self.name, camera, self.recording.clone())
     }
 
     fn camera(&self, place: usize) -> anyhow::Result<&CameraConfig> {

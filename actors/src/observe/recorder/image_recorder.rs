@@ -5,6 +5,7 @@ use std::time::Duration;
 use ecod::model::detection::Detection;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
+use tokio::sync::watch;
 
 use super::{CapturedPicture, LogItem, LogSender, RecordConfig};
 use crate::camera::config::CameraConfig;
@@ -19,7 +20,8 @@ const JPEG_QUALITY: u8 = 95;
 /// Records frames as JPEG at a fixed rate.
 #[derive(Debug, Clone)]
 pub struct ImageRecorder {
-    log: LogSender,
+    /// The log of the vehicle's present node.
+    log: watch::Receiver<LogSender>,
     camera: Option<String>,
     reporter: NodeName,
     period: Duration,
@@ -32,7 +34,7 @@ impl ImageRecorder {
         config: Option<&RecordConfig>,
         vehicle: &NodeName,
         camera: &CameraConfig,
-        log: LogSender,
+        log: watch::Receiver<LogSender>,
     ) -> Option<Self> {
         let hz = config.map(|record| record.camera_hz).filter(|hz| *hz > 0.0)?;
         let (camera, reporter) = (camera.name.clone(), camera.reporter(vehicle));
@@ -56,7 +58,7 @@ impl ImageRecorder {
                     optics: lens.in_pixels_of(size).ok().map(|lens| (lens.intrinsics, lens.distortion)),
                     detections: detections.to_vec(),
                 };
-                self.log.send(frame.captured_at, LogItem::Picture(Box::new(picture)));
+                self.log.borrow().send(frame.captured_at, LogItem::Picture(Box::new(picture)));
             }
             Err(error) => tracing::debug!(%error, "cannot encode frame as JPEG"),
         }
