@@ -73,6 +73,7 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));
     findings.extend(storage::floor_plan(config));
+    findings.extend(storage::cells(config));
     #[cfg(feature = "foxglove")]
     findings.extend(network::live(config));
     findings.extend(network::multicast(config));
@@ -271,6 +272,15 @@ mod tests {
         config.dashboard.floor_plan = Some(FloorPlanConfig { image, points: [point(0.0), point(1.0)] });
         let finding = finding(&config, "floor plan").await;
         assert!(finding.verdict == CheckResult::Broken && finding.seen.contains("No such file"), "{finding:?}");
+    }
+
+    #[tokio::test]
+    async fn a_file_of_cells_that_cannot_be_used_is_broken() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("cells.toml");
+        std::fs::write(&file, "[[cells]]\nname = \"elsewhere\"\nlatitude_deg = 1\nlongitude_deg = 2\n").unwrap();
+        let finding = finding(&NodeConfig { cells: Some(file), ..config() }, "cells").await;
+        assert!(finding.verdict == CheckResult::Broken && finding.seen.contains("not among"), "{finding:?}");
     }
 
     #[cfg(feature = "foxglove")]

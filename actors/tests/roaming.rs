@@ -139,6 +139,11 @@ impl Reports {
         timeout(PATIENCE, more).await.expect("the vehicle reports");
     }
 
+    /// The vehicle's place in each report, in metres east of the cell's origin.
+    fn places_m(&self) -> Vec<f64> {
+        self.0.lock().unwrap().iter().map(|(_, report)| report.pose.unwrap().x_m).collect()
+    }
+
     fn times(&self) -> Vec<Timestamp> {
         self.0.lock().unwrap().iter().map(|(at, _)| *at).collect()
     }
@@ -173,7 +178,11 @@ impl Town {
         let (mut edges, mut readers) = (BTreeMap::new(), JoinSet::new());
         for &cell in with_edge {
             let edge = format!("edge-{cell}");
-            let config = NodeConfig { origin: Some(middle(cell)), ..config(cell, &edge, Role::Edge) };
+            let description = directory.path().join(format!("{edge}.toml"));
+            let GeographicOrigin { latitude_deg, longitude_deg, .. } = middle(cell);
+            let text = format!("[origin]\nlatitude_deg = {latitude_deg}\nlongitude_deg = {longitude_deg}\n");
+            std::fs::write(&description, text).unwrap();
+            let config = NodeConfig { description: Some(description), ..config(cell, &edge, Role::Edge) };
             let tls = city.as_mut().map(|city| city.edge(cell));
             edges.insert(cell, node::start(NodeConfig { tls, ..config }).await.unwrap());
         }
@@ -300,8 +309,11 @@ async fn a_vehicle_reports_in_the_cell_in_which_it_is_and_never_in_two() {
     let gap = second.times()[0].since(*first.times().last().unwrap());
     println!("reports pause for {} ms", gap.as_millis());
     assert!(first.times().iter().all(|at| *at <= second.times()[0]), "it reports in one cell at a time");
-    let pose = second.0.lock().unwrap()[0].1.pose.unwrap();
-    assert!((pose.x_m + 100.0).abs() < 0.5, "in the frame of the new cell: {pose:?}");
+    // Poses after its jump are extrapolated. In the other cell's frame they would differ by 300 m.
+    for (reports, places_m) in [(&first, -0.5..1000.0), (&second, -100.5..-99.5)] {
+        let reported_m = reports.places_m();
+        assert!(reported_m.iter().all(|x_m| places_m.contains(x_m)), "in the frame of its cell: {reported_m:?}");
+    }
     let maps = [0, 1].map(|cell| town.accepted(cell));
     let [last, next] = [maps[0].last().unwrap().0, maps[1][0].0];
     let seam = next.since(last);
@@ -369,6 +381,21 @@ async fn a_vehicle_leads_at_home_alone_and_follows_elsewhere() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_vehicle_that_cannot_know_where_it_is_says_so() {
+    let mut town = Town::new(&[0]).await;
+    let mut config = town.vehicle(Role::Cav);
+    (config.pose.listen, config.camera) = (Some(loopback()), None);
+    let mut vehicle = Roamer::start(config).await.unwrap();
+    let told = timeout(Duration::from_secs(3), vehicle.drive()).await;
+    assert!(told.is_err(), "it drives on");
+    let troubles = vehicle.present().counters().troubles().present();
+    let trouble = troubles.iter().find(|trouble| trouble.remedy.contains("`latitude_deg`"));
+    assert!(trouble.is_some_and(|trouble| trouble.kind == "no_pose"), "{troubles:?}");
+    vehicle.stop().await;
+    town.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_vehicle_stays_in_its_cell_where_the_next_one_does_not_answer() {
     let mut town = Town::new(&[0]).await;
     let reports = town.reports(0).await;
@@ -383,6 +410,8 @@ async fn a_vehicle_stays_in_its_cell_where_the_next_one_does_not_answer() {
     assert!(longest < Duration::from_secs(2), "it reports all the time: {longest:?}");
     let vehicle = vehicle.stop().await;
     assert_eq!(vehicle.cell().as_str(), "lot-0");
+    let sequence: Vec<_> = reports.0.lock().unwrap().iter().map(|(_, report)| report.seq).collect();
+    assert!(sequence.is_sorted(), "its camera ran on: {sequence:?}");
     vehicle.stop().await;
     town.stop().await;
 }

@@ -177,16 +177,6 @@ impl NodeBuilder {
         self.presence = presence;
     }
 
-    /// Lets the vehicle's parts go: they are stopped with another node of the vehicle.
-    pub(super) fn release_vehicle(&mut self) -> &VehicleParts {
-        self.slots.pose_receiver = ActorSlot::default();
-        #[cfg(feature = "camera")]
-        {
-            (self.slots.projectors, self.slots.detectors) = (Vec::new(), Vec::new());
-        }
-        &self.vehicle
-    }
-
     /// Longest time between two rounds.
     fn round_period(&self) -> Duration {
         Duration::from_secs_f64(self.config.fusion.round.period_s)
@@ -358,15 +348,9 @@ impl NodeBuilder {
 
     /// Stops all parts, the last started first.
     pub(super) async fn stop_all(&self) {
-        stop(&self.slots.pose_receiver).await;
-        #[cfg(feature = "camera")]
-        {
-            for detector in &self.slots.detectors {
-                stop(detector).await;
-            }
-            for projector in &self.slots.projectors {
-                stop(projector).await;
-            }
+        // Those of the vehicle may be another node's.
+        if self.presence >= Presence::Reporting {
+            self.stop_vehicle().await;
         }
         stop(&self.slots.dashboard).await;
         stop(&self.slots.election).await;
@@ -379,6 +363,19 @@ impl NodeBuilder {
         stop(&self.slots.membership).await;
         self.stop_broker().await;
         stop(&self.slots.recorder).await;
+    }
+
+    async fn stop_vehicle(&self) {
+        stop(&self.slots.pose_receiver).await;
+        #[cfg(feature = "camera")]
+        {
+            for detector in &self.slots.detectors {
+                stop(detector).await;
+            }
+            for projector in &self.slots.projectors {
+                stop(projector).await;
+            }
+        }
     }
 
     pub(super) async fn stop_broker(&self) {

@@ -165,7 +165,7 @@ impl SupervisorState {
     fn hand_over(&mut self, supervisor: &ActorCell) {
         self.builder.set_presence(Presence::Beside);
         self.running.retain(|_, part| !part.is_of_vehicle());
-        for (_, part) in self.builder.release_vehicle().running() {
+        for (_, part) in self.builder.vehicle().running() {
             part.unlink(supervisor.clone());
         }
         self.manager = None;

@@ -11,8 +11,10 @@
 use std::convert::Infallible;
 use std::time::Duration;
 
+use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
 use ecod::model::origin::{GeographicPosition, StatedPose};
+use ecod::model::time::Timestamp;
 use ecod::roaming::{CellChoice, CellMove};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
@@ -28,6 +30,9 @@ const LOOK_PERIOD: Duration = Duration::from_millis(200);
 /// Age of a position that is no longer gone by.
 const MAX_AGE: Duration = Duration::from_secs(2);
 
+const NO_PLACE: &str = "no pose on Earth is known: the vehicle stays in its cell, wherever it is";
+const PLACE_REMEDY: &str = "send poses with `latitude_deg` and `longitude_deg` to `pose.listen`";
+
 /// Longest time for a step of a node.
 const STEP_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -39,6 +44,8 @@ pub struct Roamer {
     choice: CellChoice,
     present: NodeHandle,
     next: Option<(NodeName, NodeHandle)>,
+    /// When its place was last known.
+    placed_at: Timestamp,
 }
 
 impl Roamer {
@@ -48,16 +55,10 @@ impl Roamer {
     /// [`NodeError`] when a part cannot start, or the file of cells cannot be used.
     pub async fn start(config: NodeConfig) -> Result<Self, NodeError> {
         let cells = config.load_cells().map_err(|error| NodeError::Failed(format!("key `cells`: {error}")))?;
-        for cell in &cells {
-            let name = &cell.name;
-            let guest =
-                config.in_cell(cell).map_err(|error| NodeError::Failed(format!("in the cell {name}: {error}")))?;
-            guest.security().map_err(|error| NodeError::Failed(format!("in the cell {name}: {error}")))?;
-        }
         let vehicle = VehicleParts::new(&config);
         let choice = CellChoice::new(cells.iter().map(CellEntry::known).collect(), config.cell.clone());
         let present = start_with((vehicle.clone(), Presence::Whole), config.clone()).await?;
-        Ok(Self { config, cells, vehicle, choice, present, next: None })
+        Ok(Self { config, cells, vehicle, choice, present, next: None, placed_at: clock::now() })
     }
 
     /// The node of the vehicle's present cell.
@@ -96,8 +97,14 @@ impl Roamer {
 
     /// Goes by the latest position, if there is one.
     async fn look(&mut self) -> Result<(), NodeError> {
-        let now = clock::now();
-        let Some(place) = self.place() else { return Ok(()) };
+        let (now, troubles) = (clock::now(), self.vehicle.counters.troubles());
+        let Some(place) = self.place() else {
+            if !self.cells.is_empty() && now.since(self.placed_at) > MAX_AGE {
+                troubles.note_with_remedy(None, TroubleKind::NoPose, NO_PLACE, PLACE_REMEDY);
+            }
+            return Ok(());
+        };
+        self.placed_at = now;
         match self.choice.observe(&place, now) {
             Some(CellMove::Join(cell)) => self.join(cell).await,
             Some(CellMove::GiveUp(cell)) => {

@@ -10,6 +10,7 @@ use crate::actors::projector::ProjectorArguments;
 use crate::camera::config::CameraConfig;
 use crate::messages::projector::ProjectorMessage;
 use crate::node::camera;
+use crate::node::presence::Presence;
 use crate::observe::dashboard::CameraFeed;
 use crate::observe::recorder::ImageRecorder;
 use crate::telemetry::camera_troubles::CameraTroubles;
@@ -53,8 +54,11 @@ impl NodeBuilder {
         })
     }
 
-    /// Tells the projectors of changed settings.
+    /// Tells the projectors of changed settings, unless they are those of the vehicle's present node in another cell.
     pub(super) fn configure_cameras(&self) {
+        if self.presence < Presence::Reporting {
+            return;
+        }
         let (standing, origin) = (self.standing_pose(), self.config.origin);
         for (camera, projector) in self.config.all_cameras().zip(&self.slots.projectors) {
             match camera::perception(&self.config, camera) {
