@@ -277,6 +277,12 @@ impl TroubleRegister {
         }
     }
 
+    /// Notes that all troubles of a kind are over, whomever they are about.
+    pub fn settle_all(&mut self, kind: TroubleKind) {
+        let of_kind = self.entries.iter_mut().filter(|((_, noted), _)| *noted == kind);
+        of_kind.for_each(|(_, entry)| entry.is_settled = true);
+    }
+
     /// The present troubles: the node's own first, then by vehicle or host.
     pub fn present(&self, now: Timestamp) -> Vec<Trouble> {
         self.entries

@@ -73,22 +73,22 @@ impl CellChoice {
         &self.present
     }
 
-    /// Takes the vehicle's position at `now`. The same one again lets time pass.
-    pub fn observe(&mut self, place: &GeographicPosition, now: Timestamp) -> Option<CellMove> {
+    /// Takes the vehicle's position at `now`, none if it is not known. The same again lets time pass.
+    pub fn observe(&mut self, place: Option<&GeographicPosition>, now: Timestamp) -> Option<CellMove> {
         self.failed.retain(|_, until| *until > now);
+        if let Some((next, _)) = self.next.clone().filter(|(_, since)| now.since(*since) > JOIN_TIMEOUT) {
+            self.fail(&next, now);
+            return Some(CellMove::GiveUp(next));
+        }
+        let place = place?;
         let outside_m = |name: &NodeName| {
             let cell = self.cells.iter().find(|cell| cell.name == *name);
             cell.map_or(f64::INFINITY, |cell| cell.outside_m(place))
         };
         let present_m = outside_m(&self.present);
-        if let Some((next, since)) = &self.next {
-            let (next, is_late) = (next.clone(), now.since(*since) > JOIN_TIMEOUT);
-            let has_turned = outside_m(&next) >= present_m;
-            if is_late {
-                self.fail(&next, now);
-            }
-            self.next = self.next.take().filter(|_| !is_late && !has_turned);
-            return self.next.is_none().then_some(CellMove::GiveUp(next));
+        if let Some((next, _)) = &self.next {
+            let has_turned = outside_m(next) >= present_m;
+            return self.next.take_if(|_| has_turned).map(|(next, _)| CellMove::GiveUp(next));
         }
         let others =
             self.cells.iter().filter(|cell| cell.name != self.present && !self.failed.contains_key(&cell.name));
@@ -160,7 +160,7 @@ mod tests {
         for tick in 0..(10.0 * seconds) as usize {
             let now_s = 0.1 * tick as f64;
             let (x_m, y_m) = path(now_s);
-            match choice.observe(&at(x_m, y_m), s(now_s)) {
+            match choice.observe(Some(&at(x_m, y_m)), s(now_s)) {
                 Some(CellMove::Join(cell)) => joined = Some((cell, now_s + 2.0)),
                 Some(CellMove::GiveUp(_)) => joined = None,
                 None => {}
@@ -200,12 +200,12 @@ mod tests {
     fn a_cell_that_does_not_answer_is_given_up_and_tried_again_later() {
         let mut choice = CellChoice::new(cells(), name(0));
         let place = at(SPACING_M, 0.0);
-        assert_eq!(choice.observe(&place, s(0.0)), Some(CellMove::Join(name(1))));
-        assert_eq!(choice.observe(&place, s(14.0)), None);
-        assert_eq!(choice.observe(&place, s(15.5)), Some(CellMove::GiveUp(name(1))));
+        assert_eq!(choice.observe(Some(&place), s(0.0)), Some(CellMove::Join(name(1))));
+        assert_eq!(choice.observe(Some(&place), s(14.0)), None);
+        assert_eq!(choice.observe(None, s(15.5)), Some(CellMove::GiveUp(name(1))), "also where no position is known");
         assert_eq!(choice.present(), &name(0));
-        assert_eq!(choice.observe(&place, s(40.0)), None, "it is left alone");
-        assert_eq!(choice.observe(&place, s(46.0)), Some(CellMove::Join(name(1))));
+        assert_eq!(choice.observe(Some(&place), s(40.0)), None, "it is left alone");
+        assert_eq!(choice.observe(Some(&place), s(46.0)), Some(CellMove::Join(name(1))));
         assert!(!choice.enter(&name(2)), "only the next cell is entered");
         choice.fail(&name(1), s(47.0));
         assert!(!choice.enter(&name(1)));
@@ -215,7 +215,7 @@ mod tests {
     fn the_other_side_of_the_earth_is_far_away() {
         let mut choice = CellChoice::new(cells(), name(2));
         let place = GeographicPosition { latitude_deg: -52.2, longitude_deg: -159.0, height_m: 0.0 };
-        assert_eq!(choice.observe(&place, s(0.0)), None);
+        assert_eq!(choice.observe(Some(&place), s(0.0)), None);
     }
 
     proptest! {
@@ -225,7 +225,7 @@ mod tests {
             let (mut now_s, mut joined) = (0.0, None);
             for (x_m, y_m, passed_s) in places {
                 now_s += passed_s;
-                match choice.observe(&at(x_m, y_m), s(now_s)) {
+                match choice.observe(Some(&at(x_m, y_m)), s(now_s)) {
                     Some(CellMove::Join(cell)) => {
                         prop_assert!(joined.is_none() && cell != *choice.present());
                         joined = Some(cell);

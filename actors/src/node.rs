@@ -53,7 +53,7 @@ use crate::messages::newest::{Newest, Received, ReceivedMap};
 use crate::node::config::NodeConfig;
 use crate::node::service::ServiceManager;
 use crate::observe::dashboard::LiveState;
-use crate::observe::readiness::Vitals;
+use crate::observe::readiness::{SharedFacts, Vitals};
 use crate::platform::clock;
 use crate::telemetry::counters::Counters;
 use crate::transport::gossip::Member;
@@ -137,6 +137,7 @@ pub struct NodeHandle {
     slots: ActorSlots,
     counters: Arc<Counters>,
     live_state: Arc<LiveState>,
+    shared: watch::Receiver<SharedFacts>,
     name: NodeName,
 }
 
@@ -167,7 +168,7 @@ async fn start_with(vehicle: (VehicleParts, Presence), config: NodeConfig) -> Re
     let (members, leadership) = (builder.members(), builder.leadership());
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
     let (slots, counters) = (builder.slots().clone(), builder.counters());
-    let (live_state, name) = (builder.live_state(), builder.name().clone());
+    let (live_state, shared, name) = (builder.live_state(), builder.shared(), builder.name().clone());
     let started = Actor::spawn(None, Supervisor, builder).await;
     let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
@@ -185,6 +186,7 @@ async fn start_with(vehicle: (VehicleParts, Presence), config: NodeConfig) -> Re
         slots,
         counters,
         live_state,
+        shared,
         name,
     })
 }
@@ -316,7 +318,9 @@ impl Actor for Supervisor {
                 // Who has stopped waiting needs no word.
                 let _ = done.send(());
             }
-            NodeMessage::NoteReadiness { readiness } => {
+            NodeMessage::NoteReadiness { mut readiness } => {
+                // Between two cells there is no leader, and a start anew would begin at home.
+                readiness.needs_restart &= !state.builder.moves_on();
                 if let Some(manager) = &mut state.manager {
                     manager.beat(readiness);
                 }

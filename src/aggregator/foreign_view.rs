@@ -1,4 +1,4 @@
-//! What other cells say of vehicles, as it counts here.
+//! Counts of other cells about vehicles, as votes and tracks weigh them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;

@@ -1,4 +1,4 @@
-//! What cells tell each other of vehicles: whom a leader asks about, whom it tells about, and when.
+//! The exchange of cells about vehicles: whom a leader asks about, whom it tells about, and when.
 //!
 //! Each cell has one retained message for each vehicle. It states absolute counts of the cell's own evidence, and never what it
 //! heard of others. Nothing is sent here: [`ReputationExchange::next`] returns what is to be done.
@@ -220,6 +220,7 @@ impl ReputationExchange {
     }
 
     fn make_room(&mut self) {
+        self.vehicles.retain(|_, vehicle| vehicle.filter.is_some() || !vehicle.is_done());
         let waiting = self.vehicles.iter().filter(|(_, vehicle)| !vehicle.is_present);
         let mut waiting: Vec<_> = waiting.map(|(name, vehicle)| (vehicle.own.all.total(), name.clone())).collect();
         let excess = waiting.len().saturating_sub(MAX_WAITING);

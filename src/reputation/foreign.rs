@@ -1,4 +1,4 @@
-//! What other cells say of vehicles, and how much of it counts here.
+//! Counts of other cells about vehicles, and their weight here.
 //!
 //! Each cell states absolute counts, which only grow until it is reset. Merging keeps the later reset, and the larger of every
 //! count after one reset: a join as that of the ledger, so that messages may come late, twice, or in any order. Of the

@@ -1,4 +1,4 @@
-//! What cells tell each other of vehicles.
+//! Messages of cells to each other about vehicles.
 
 use minicbor::{Decode, Encode};
 use schemars::JsonSchema;

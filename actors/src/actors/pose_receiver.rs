@@ -26,6 +26,7 @@ use crate::messages::pose_receiver::PoseReceiverMessage;
 #[cfg(feature = "camera")]
 use crate::messages::projector::ProjectorMessage;
 use crate::platform::clock;
+use crate::platform::throttle::TokenBucket;
 use crate::telemetry::counters::{Counters, Event};
 
 /// Wait before the address is tried again.
@@ -33,6 +34,9 @@ const RETRY: Duration = Duration::from_secs(1);
 
 /// Number of kept poses, for projectors that start: half a second of them at 30 Hz.
 const KEPT_POSES: usize = 16;
+
+/// Maximum number of poses a second, more than an inertial unit gives.
+const MAX_POSE_HZ: u32 = 500;
 
 /// Maximum length of a datagram in bytes.
 const MAX_BYTES: usize = 1024;
@@ -57,8 +61,6 @@ pub struct PoseReceiver;
 /// Receivers of the poses.
 pub struct PoseReceiverState {
     arguments: PoseReceiverArguments,
-    /// True once the log has said why a datagram is no pose.
-    is_logged: bool,
     /// Ends with the actor.
     _listener: JoinSet<()>,
 }
@@ -74,45 +76,35 @@ impl Actor for PoseReceiver {
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         let mut listener = JoinSet::new();
-        listener.spawn(listen(arguments.address, myself));
-        Ok(PoseReceiverState { arguments, is_logged: false, _listener: listener })
+        listener.spawn(listen(arguments.address, myself, Arc::clone(&arguments.counters)));
+        Ok(PoseReceiverState { arguments, _listener: listener })
     }
 
     async fn handle(
         &self,
         _myself: ActorRef<Self::Msg>,
-        PoseReceiverMessage::Take { pose }: Self::Msg,
+        PoseReceiverMessage::Take { at, pose }: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        match pose {
-            Ok((at, pose)) => {
-                #[cfg(feature = "camera")]
-                for projector in &state.arguments.projectors {
-                    projector.send(ProjectorMessage::TakePose { at, pose });
-                }
-                state.arguments.poses.send_modify(|poses| {
-                    if poses.len() == KEPT_POSES {
-                        poses.pop_front();
-                    }
-                    poses.push_back((at, pose));
-                });
-            }
-            Err(reason) => {
-                state.arguments.counters.count(Event::PoseRejected);
-                if !std::mem::replace(&mut state.is_logged, true) {
-                    tracing::warn!(reason, "pose rejected, further ones are only counted");
-                }
-            }
+        #[cfg(feature = "camera")]
+        for projector in &state.arguments.projectors {
+            projector.send(ProjectorMessage::TakePose { at, pose });
         }
+        state.arguments.poses.send_modify(|poses| {
+            if poses.len() == KEPT_POSES {
+                poses.pop_front();
+            }
+            poses.push_back((at, pose));
+        });
         Ok(())
     }
 }
 
 /// Takes poses until the receiver ends. An address that cannot be bound is tried again.
-async fn listen(address: SocketAddr, receiver: ActorRef<PoseReceiverMessage>) {
+async fn listen(address: SocketAddr, receiver: ActorRef<PoseReceiverMessage>, counters: Arc<Counters>) {
     let mut is_logged = false;
     loop {
-        let Err(error) = receive(address, &receiver).await;
+        let Err(error) = receive(address, &receiver, &counters).await;
         if !std::mem::replace(&mut is_logged, true) {
             tracing::warn!(%error, %address, "cannot receive poses, trying again");
         }
@@ -120,15 +112,33 @@ async fn listen(address: SocketAddr, receiver: ActorRef<PoseReceiverMessage>) {
     }
 }
 
-async fn receive(address: SocketAddr, receiver: &ActorRef<PoseReceiverMessage>) -> io::Result<Infallible> {
+async fn receive(
+    address: SocketAddr,
+    receiver: &ActorRef<PoseReceiverMessage>,
+    counters: &Counters,
+) -> io::Result<Infallible> {
     let socket = UdpSocket::bind(address).await?;
     tracing::info!(%address, "receiving poses");
     let mut datagram = [0; MAX_BYTES];
+    let mut bucket = TokenBucket::new(MAX_POSE_HZ, Duration::from_secs(1) / MAX_POSE_HZ, clock::now());
+    let mut is_logged = false;
     loop {
         let length = socket.recv(&mut datagram).await?;
         let datagram = datagram.get(..length).unwrap_or_default();
-        let pose = read_pose(datagram, clock::now(), clock::wall_offset_us());
-        // The listener ends with the receiver.
-        let _ = receiver.cast(PoseReceiverMessage::Take { pose });
+        let now = clock::now();
+        let pose = match read_pose(datagram, now, clock::wall_offset_us()) {
+            _ if !bucket.allow(now) => Err(format!("more than {MAX_POSE_HZ} poses a second")),
+            pose => pose,
+        };
+        match pose {
+            // The listener ends with the receiver.
+            Ok((at, pose)) => _ = receiver.cast(PoseReceiverMessage::Take { at, pose }),
+            Err(reason) => {
+                counters.count(Event::PoseRejected);
+                if !std::mem::replace(&mut is_logged, true) {
+                    tracing::warn!(reason, "pose rejected, further ones are only counted");
+                }
+            }
+        }
     }
 }

@@ -43,6 +43,7 @@ use crate::messages::fuser::FuserMessage;
 use crate::messages::newest::ReceivedMap;
 use crate::messages::reputation_keeper::ReputationKeeperMessage;
 use crate::messages::uplink::UplinkMessage;
+use crate::platform::cell_clock::CellClock;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, Event};
 use crate::transport::mqtt::link::{LinkId, LinkSink};
@@ -75,6 +76,8 @@ pub struct UplinkArguments {
     pub fuser: ActorSlot<FuserMessage>,
     /// Source of what this cell says of vehicles.
     pub keeper: ActorSlot<ReputationKeeperMessage>,
+    /// The cell's time, in which resets are dated.
+    pub clock: CellClock,
     /// The node's counters.
     pub counters: Arc<Counters>,
     /// Seed of the jitter between attempts to connect.

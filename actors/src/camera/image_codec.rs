@@ -3,7 +3,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use image::{DynamicImage, ImageDecoder, ImageReader};
+use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
 use jpeg_encoder::{Encoder, EncodingError, ImageBuffer, JpegColorType, SamplingFactor};
 use opencv::core::{Mat, Vec3b};
 use opencv::imgproc;
@@ -31,6 +31,10 @@ pub enum ImageError {
     OpenCv(#[from] opencv::Error),
 }
 
+/// Maximum size in bytes of a decoded image: 10,000 by 8000 pixels with four channels fit. A header of a few bytes may state more
+/// than the machine has.
+const MAX_DECODED_BYTES: u64 = 320_000_000;
+
 /// Reads an image file as [`decode`] does.
 ///
 /// # Errors
@@ -45,6 +49,9 @@ pub fn read(path: &Path) -> Result<Mat, ImageError> {
 /// [`ImageError::Malformed`] or [`ImageError::OpenCv`].
 pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
     let mut decoder = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.into_decoder()?;
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(MAX_DECODED_BYTES);
+    limits.reserve(decoder.total_bytes())?;
     let orientation = decoder.orientation()?;
     let mut image = DynamicImage::from_decoder(decoder)?;
     image.apply_orientation(orientation);

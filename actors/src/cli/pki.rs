@@ -148,7 +148,7 @@ fn run_city(command: &CityCommand, now: Timestamp) -> Result<String, Failure> {
             let [ca, certificate, key, list] =
                 [authority.ca(), certificate, key, authority.revocation_list()].map(|path| shown(&path));
             format!(
-                "# ca and revocation_list of the cell where it takes part\n\
+                "role = \"cav\"\n\n# ca and revocation_list of the cell where it takes part\n\
                  [tls]\nca = \"ca.pem\"\nrevocation_list = \"revoked.pem\"\ncertificate = \"{certificate}\"\nkey = \"{key}\"\n\n\
                  [tls.city]\nca = \"{ca}\"\nrevocation_list = \"{list}\"\n"
             )

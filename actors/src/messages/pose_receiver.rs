@@ -6,9 +6,11 @@ use ecod::model::time::Timestamp;
 /// Requests to the receiver of poses.
 #[derive(Debug)]
 pub enum PoseReceiverMessage {
-    /// Take a pose of the vehicle, or the reason why a datagram is none.
+    /// Take a pose of the vehicle.
     Take {
-        /// Time of the pose by the clock that stamps frames, and the pose.
-        pose: Result<(Timestamp, StatedPose), String>,
+        /// Time of the pose by the clock that stamps frames.
+        at: Timestamp,
+        /// The pose.
+        pose: StatedPose,
     },
 }

@@ -173,6 +173,11 @@ impl NodeBuilder {
         &self.vehicle
     }
 
+    /// True for a vehicle that moves from cell to cell.
+    pub(super) fn moves_on(&self) -> bool {
+        self.own_config.cells.is_some()
+    }
+
     pub(super) fn set_presence(&mut self, presence: Presence) {
         self.presence = presence;
     }
@@ -238,6 +243,10 @@ impl NodeBuilder {
 
     pub(super) fn live_state(&self) -> Arc<LiveState> {
         Arc::clone(&self.live_state)
+    }
+
+    pub(super) fn shared(&self) -> watch::Receiver<SharedFacts> {
+        self.shared.subscribe()
     }
 
     pub(super) fn leadership(&self) -> watch::Receiver<Leadership> {

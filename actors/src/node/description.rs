@@ -96,6 +96,7 @@ pub(super) fn shared_facts(config: &NodeConfig, held: &HeldDescription) -> Share
         round_period_s: config.fusion.round.period_s,
         algorithms: config.fusion.algorithms,
         landmarks: config.landmarks.clone().into(),
+        has_origin: config.origin.is_some(),
         contradicts: held.problem.is_some(),
         problem: held.problem.clone().or_else(|| pose_problem(config)),
     }

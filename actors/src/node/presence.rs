@@ -1,4 +1,4 @@
-//! How far a node has come into its cell, and what goes along when a vehicle moves to another cell.
+//! Presence of a node in its cell, and the parts that go along when a vehicle moves to another cell.
 //!
 //! A moving vehicle has two nodes for a moment: the present one, and one beside it that gets ready in the next cell. Cameras,
 //! poses, counters and addresses are the vehicle's, and both know them. Detectors run on; the next node's projectors take
@@ -8,7 +8,6 @@ use std::collections::VecDeque;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use ecod::diagnostics::TroubleKind;
 use ecod::model::names::NodeName;
 use ecod::model::origin::StatedPose;
 use ecod::model::time::Timestamp;
@@ -169,7 +168,7 @@ impl SupervisorState {
             part.unlink(supervisor.clone());
         }
         self.manager = None;
-        self.builder.counters().troubles().settle(TroubleKind::Description, None);
+        self.builder.counters().troubles().leave_cell();
     }
 
     async fn take_over(&mut self, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {

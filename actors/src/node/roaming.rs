@@ -27,8 +27,8 @@ use crate::platform::clock;
 /// Time between two looks at the position.
 const LOOK_PERIOD: Duration = Duration::from_millis(200);
 
-/// Age of a position that is no longer gone by.
-const MAX_AGE: Duration = Duration::from_secs(2);
+/// Age of a pose that is no longer gone by.
+const MAX_POSE_AGE: Duration = Duration::from_secs(2);
 
 const NO_PLACE: &str = "no pose on Earth is known: the vehicle stays in its cell, wherever it is";
 const PLACE_REMEDY: &str = "send poses with `latitude_deg` and `longitude_deg` to `pose.listen`";
@@ -44,6 +44,8 @@ pub struct Roamer {
     choice: CellChoice,
     present: NodeHandle,
     next: Option<(NodeName, NodeHandle)>,
+    /// The node of the cell that is being left.
+    former: Option<NodeHandle>,
     /// When its place was last known.
     placed_at: Timestamp,
 }
@@ -58,7 +60,7 @@ impl Roamer {
         let vehicle = VehicleParts::new(&config);
         let choice = CellChoice::new(cells.iter().map(CellEntry::known).collect(), config.cell.clone());
         let present = start_with((vehicle.clone(), Presence::Whole), config.clone()).await?;
-        Ok(Self { config, cells, vehicle, choice, present, next: None, placed_at: clock::now() })
+        Ok(Self { config, cells, vehicle, choice, present, next: None, former: None, placed_at: clock::now() })
     }
 
     /// The node of the vehicle's present cell.
@@ -93,22 +95,24 @@ impl Roamer {
             next.stop().await;
         }
         self.present.stop().await;
+        if let Some(former) = self.former {
+            former.stop().await;
+        }
     }
 
     /// Goes by the latest position, if there is one.
     async fn look(&mut self) -> Result<(), NodeError> {
         let (now, troubles) = (clock::now(), self.vehicle.counters.troubles());
-        let Some(place) = self.place() else {
-            if !self.cells.is_empty() && now.since(self.placed_at) > MAX_AGE {
-                troubles.note_with_remedy(None, TroubleKind::NoPose, NO_PLACE, PLACE_REMEDY);
-            }
-            return Ok(());
-        };
-        self.placed_at = now;
-        match self.choice.observe(&place, now) {
+        let place = self.place();
+        if place.is_some() {
+            self.placed_at = now;
+        } else if !self.cells.is_empty() && now.since(self.placed_at) > MAX_POSE_AGE {
+            troubles.note_with_remedy(None, TroubleKind::NoPose, NO_PLACE, PLACE_REMEDY);
+        }
+        match self.choice.observe(place.as_ref(), now) {
             Some(CellMove::Join(cell)) => self.join(cell).await,
             Some(CellMove::GiveUp(cell)) => {
-                self.stay(&cell, "its leader was not heard in time, or the vehicle turned back").await
+                self.stay(&cell, "no map, or no `[origin]` of the cell, came in time; or the vehicle turned back").await
             }
             None => Ok(()),
         }
@@ -118,7 +122,7 @@ impl Roamer {
     fn place(&self) -> Option<GeographicPosition> {
         let (at, pose) = self.vehicle.poses.borrow().back().copied()?;
         let StatedPose::OnEarth(pose) = pose else { return None };
-        let is_fresh = clock::now().since(at) <= MAX_AGE;
+        let is_fresh = clock::now().since(at) <= MAX_POSE_AGE;
         let (latitude_deg, longitude_deg) = (pose.latitude_deg, pose.longitude_deg);
         is_fresh.then(|| GeographicPosition { latitude_deg, longitude_deg, height_m: pose.height_m.unwrap_or(0.0) })
     }
@@ -129,8 +133,10 @@ impl Roamer {
         let Ok(config) = self.config.in_cell(entry) else { return Ok(()) };
         tracing::info!(from = %self.choice.present(), %cell, "getting ready in the next cell");
         // Nodes of the cell, and no programs alone, will connect to it.
-        if config.serves_nodes() {
-            step(&self.present, MoveStep::CloseDoor).await?;
+        if config.serves_nodes()
+            && let Err(error) = step(&self.present, MoveStep::CloseDoor).await
+        {
+            return self.fail(&cell, &error).await;
         }
         match start_with((self.vehicle.clone(), Presence::Beside), config).await {
             Ok(node) => {
@@ -151,10 +157,12 @@ impl Roamer {
     /// Reports in the next cell from now on, and leaves the present one.
     async fn enter(&mut self, cell: &NodeName) -> Result<(), NodeError> {
         let Some((_, next)) = self.next.take_if(|_| self.choice.enter(cell)) else { return Ok(()) };
-        let former = std::mem::replace(&mut self.present, next);
-        step(&former, MoveStep::HandOver).await?;
+        let former = self.former.insert(std::mem::replace(&mut self.present, next));
+        step(former, MoveStep::HandOver).await?;
         step(&self.present, MoveStep::TakeOver).await?;
-        former.stop().await;
+        if let Some(former) = self.former.take() {
+            former.stop().await;
+        }
         step(&self.present, MoveStep::Settle).await?;
         if let Some(manager) = ServiceManager::from_environment() {
             self.present.report_to(manager);
@@ -174,6 +182,7 @@ impl Roamer {
         tracing::warn!(%cell, why, present = %self.choice.present(), "the vehicle stays in its cell");
         if let Some((_, next)) = self.next.take() {
             next.stop().await;
+            self.vehicle.counters.troubles().leave_cell();
         }
         step(&self.present, MoveStep::Settle).await
     }
@@ -181,7 +190,7 @@ impl Roamer {
 
 /// News of the next node.
 enum Change {
-    /// It follows its cell's leader.
+    /// It follows its cell's leader, and knows where on Earth the cell is.
     Follows,
     /// It has given up.
     Failed(NodeError),
@@ -190,12 +199,16 @@ enum Change {
 /// Waits for news of the next node; for ever if there is none.
 async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Change) {
     let Some((cell, node)) = next else { return std::future::pending().await };
-    let (mut maps, mut verdicts) = (node.newest_map(), node.newest_verdicts());
-    let has_map = async { maps.wait_for(Option::is_some).await.is_ok() };
-    let has_verdicts = async { verdicts.wait_for(Option::is_some).await.is_ok() };
+    let (mut maps, mut verdicts, mut shared) = (node.newest_map(), node.newest_verdicts(), node.shared.clone());
+    let follows = async {
+        let has_round = tokio::select! {
+            map = maps.wait_for(Option::is_some) => map.is_ok(),
+            verdicts = verdicts.wait_for(Option::is_some) => verdicts.is_ok(),
+        };
+        has_round && shared.wait_for(|shared| shared.has_origin).await.is_ok()
+    };
     let change = tokio::select! {
-        true = has_map => Change::Follows,
-        true = has_verdicts => Change::Follows,
+        true = follows => Change::Follows,
         Err(error) = node.failed() => Change::Failed(error),
         else => return std::future::pending().await,
     };

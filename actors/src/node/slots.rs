@@ -43,18 +43,18 @@ pub enum ActorKind {
     LeaderElection,
     /// The node's page.
     Dashboard,
-    /// The receiver of a moving vehicle's poses.
-    PoseReceiver,
     /// The maker of the reports of a camera, by its place in [`NodeConfig::all_cameras`](super::config::NodeConfig::all_cameras).
     #[cfg(feature = "camera")]
     Projector(usize),
     /// The finder of objects in a camera's frames.
     #[cfg(feature = "camera")]
     Detector(usize),
+    /// The receiver of a moving vehicle's poses.
+    PoseReceiver,
 }
 
 impl ActorKind {
-    /// True for what a vehicle has in one cell only.
+    /// True for parts that work in one of a vehicle's cells at a time.
     pub(super) fn is_of_vehicle(self) -> bool {
         match self {
             Self::PoseReceiver => true,

@@ -64,6 +64,8 @@ pub struct SharedFacts {
     pub algorithms: Algorithms,
     /// Known locations.
     pub landmarks: Arc<[LandmarkConfig]>,
+    /// True if the place of the cell's frame on Earth is known.
+    pub has_origin: bool,
     /// True if the node does not use the cell's description.
     pub contradicts: bool,
     /// The reason why the node does not use the cell's description, or does not report.

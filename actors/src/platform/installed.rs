@@ -12,6 +12,9 @@ pub(crate) fn path(below_prefix: &str) -> Option<PathBuf> {
 /// Another program of this project: where a package puts it, beside this program, or above the directory of tests and examples.
 pub(crate) fn program(name: &str) -> Option<PathBuf> {
     let here = std::env::current_exe().ok()?;
-    let beside = here.ancestors().skip(1).take(2).map(|directory| directory.join(name)).find(|path| path.is_file());
-    beside.or_else(|| path(&format!("lib/ecod-node/{name}")))
+    let mut directory = here.parent()?;
+    if directory.ends_with("deps") || directory.ends_with("examples") {
+        directory = directory.parent()?;
+    }
+    Some(directory.join(name)).filter(|path| path.is_file()).or_else(|| path(&format!("lib/ecod-node/{name}")))
 }

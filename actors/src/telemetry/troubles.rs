@@ -41,6 +41,13 @@ impl Troubles {
         self.register().settle(kind, about);
     }
 
+    /// Notes that troubles are over that end with a cell: the vehicle has left it.
+    pub fn leave_cell(&self) {
+        use TroubleKind::{BrokerRefuses, Description, NoOrigin};
+        let mut register = self.register();
+        [BrokerRefuses, Description, NoOrigin].into_iter().for_each(|kind| register.settle_all(kind));
+    }
+
     /// The present troubles, the node's own first.
     pub fn present(&self) -> Vec<Trouble> {
         self.register().present(clock::now())

@@ -1,4 +1,4 @@
-//! What the keeper tells the uplink, and what it hears of other cells.
+//! The keeper's part in the exchange with other cells: counts for the uplink, votes from it.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -20,6 +20,8 @@ pub(super) struct ToldCounts {
     counts: BTreeMap<NodeName, CellCounts>,
     /// True if the ledger may have others.
     pub(super) is_due: bool,
+    /// True if the uplink that knew them is gone.
+    is_lost: bool,
 }
 
 impl ReputationKeeperState {
@@ -29,25 +31,29 @@ impl ReputationKeeperState {
         self.last_round = self.last_round.max(round);
     }
 
-    /// Tells the uplink the counts of the vehicles that were counted last, also if it knows them.
+    /// Tells the uplink the counts of the vehicles that were counted last, also if it knows them. One that starts is reached by
+    /// the next look at the latest.
     pub(super) fn tell_all(&mut self) {
-        if self.resync.leads().is_none() || self.arguments.uplink.get().is_none() {
+        if self.resync.leads().is_none() {
             return;
         }
         let store = self.arguments.reputations.open();
-        self.told.counts = store.ledger.cell_counts(self.arguments.reputation.memory_votes);
+        let all = store.ledger.cell_counts(self.arguments.reputation.memory_votes);
         let lanes = store.ledger.latest_lanes();
         drop(store);
-        let mut latest: Vec<_> = self.told.counts.iter().collect();
+        let mut latest: Vec<_> = all.iter().collect();
         latest.sort_by_key(|(node, _)| Reverse(lanes.get(*node).copied()));
         let counts = latest.into_iter().take(MAX_COMPARED).map(|(node, counts)| (node.clone(), *counts)).collect();
-        self.told.is_due = false;
-        self.arguments.uplink.send(UplinkMessage::TellCounts { counts });
+        let is_lost = !self.arguments.uplink.send(UplinkMessage::TellCounts { counts });
+        self.told = ToldCounts { counts: all, is_due: false, is_lost };
     }
 
     /// Tells the uplink what has changed, while this node leads.
     pub(super) fn tell_uplink(&mut self) {
         let is_wanted = self.resync.leads().is_some() && self.arguments.uplink.get().is_some();
+        if is_wanted && self.told.is_lost {
+            return self.tell_all();
+        }
         if !is_wanted || !std::mem::take(&mut self.told.is_due) {
             return;
         }
@@ -61,8 +67,6 @@ impl ReputationKeeperState {
         let gone = self.told.counts.keys().filter(|node| !now.contains_key(*node)).map(|node| (node.clone(), nothing));
         let counts: Vec<_> = changed.chain(gone).collect();
         self.told.counts = now;
-        if !counts.is_empty() {
-            self.arguments.uplink.send(UplinkMessage::TellCounts { counts });
-        }
+        self.told.is_lost = !counts.is_empty() && !self.arguments.uplink.send(UplinkMessage::TellCounts { counts });
     }
 }

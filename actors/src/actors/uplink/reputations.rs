@@ -1,4 +1,4 @@
-//! What cells tell each other of vehicles, as this uplink carries it out.
+//! The exchange of cells about vehicles, as this uplink carries it out.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -49,7 +49,8 @@ impl UplinkState {
         received_at: Timestamp,
         myself: &ActorRef<UplinkMessage>,
     ) {
-        if message.reset_at_us.is_some_and(|at| at.since(received_at) >= MAX_RESET_AHEAD) {
+        let now = self.setup.clock.date(received_at);
+        if message.reset_at_us.is_some_and(|at| at.since(now) >= MAX_RESET_AHEAD) {
             let reason = RejectReason::FromTheFuture;
             return self.setup.counters.reject_message(reason, &source(&message.cell), || {
                 format!("what the cell {} says of {} not used: reset in the future", message.cell, message.vehicle)

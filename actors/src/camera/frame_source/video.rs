@@ -36,6 +36,9 @@ const PROGRAM: &str = "ecod-video";
 /// Minimum time for opening a source: GStreamer may first look through all of its plugins, once on a machine.
 const MIN_OPEN_TIME: Duration = Duration::from_secs(30);
 
+/// Maximum number of pixels of a frame: 8K.
+const MAX_PIXELS: i64 = 7680 * 4320;
+
 /// Time for a program that is gone to hand over its last words.
 const LAST_WORDS_TIME: Duration = Duration::from_millis(200);
 
@@ -96,6 +99,9 @@ impl VideoProcess {
 
     fn receive_pixels(&mut self, header: &ImageHeader) -> Result<CameraFrame, FrameError> {
         let ImageHeader { rows, columns, kind, since_boot } = *header;
+        if i64::from(rows) * i64::from(columns) > MAX_PIXELS {
+            return Err(self.lost(format!("{columns} by {rows} pixels are too many")));
+        }
         let image = Mat::new_rows_cols_with_default(rows, columns, kind, Scalar::all(0.0));
         let mut image = image.map_err(|e| self.lost(e.message))?;
         let pixels = image.data_bytes_mut().map_err(|e| self.lost(e.message))?;

@@ -103,3 +103,9 @@ fn gray_and_color_pictures_survive_jpeg() {
     let long = Mat::new_rows_cols_with_default(1, 70_000, CV_8UC1, Scalar::all(0.0)).unwrap();
     assert!(encode_jpeg(&long, 95).expect_err("too long").to_string().contains("70000x1"));
 }
+
+#[test]
+fn a_header_that_states_more_than_a_machine_has_is_an_error() {
+    let error = decode(b"P6\n65000 65000\n255\n").unwrap_err();
+    assert!(matches!(error, ImageError::Malformed(image::ImageError::Limits(_))), "{error:?}");
+}

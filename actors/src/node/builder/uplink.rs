@@ -26,6 +26,7 @@ impl NodeBuilder {
             leadership: self.leadership(),
             fuser: self.slots.fuser.clone(),
             keeper: self.slots.keeper.clone(),
+            clock: self.clock.clone(),
             counters: self.counters(),
             seed: self.run.as_u64_pair().0,
         })

@@ -46,7 +46,7 @@ pub struct CellEntry {
     /// The revocation list of that CA. Default none.
     #[serde(default)]
     pub revocation_list: Option<PathBuf>,
-    /// The cell's MQTT broker, as `mqtt.broker`. Default none: its nodes have their own.
+    /// The cell's MQTT broker, as `mqtt.broker`; one that wants no login. Default none: its nodes have their own.
     #[serde(default)]
     pub broker: Option<BrokerAddress>,
 }
@@ -63,6 +63,9 @@ impl CellEntry {
 
     fn validate(&self) -> Result<(), ConfigError> {
         self.origin().validate()?;
+        if self.revocation_list.is_some() && self.ca.is_none() {
+            return Err(ConfigError::new("revocation_list", "set", "set together with `ca`"));
+        }
         check_range("radius_m", self.radius_m, 1.0, 1e5)
     }
 
@@ -128,9 +131,10 @@ impl NodeConfig {
         }
         let mut guest = Self { cell: cell.name.clone(), role: Role::Cav, ..self.clone() };
         SharedConfig::default().put_into(&mut guest);
-        (guest.origin, guest.stated) = (Some(cell.origin()), StatedKeys::default());
-        guest.description = None;
+        (guest.stated, guest.description) = (StatedKeys::default(), None);
         guest.mqtt.broker.clone_from(&cell.broker);
+        // They are for the own cell's broker.
+        (guest.mqtt.user, guest.mqtt.password, guest.mqtt.ca) = (None, None, None);
         guest.membership.seeds.clone_from(&cell.seeds);
         guest.membership.advertise = None;
         if let Some(bind) = &mut guest.membership.bind {
@@ -180,13 +184,14 @@ mod tests {
     #[test]
     fn a_guest_never_leads_and_has_nothing_of_its_own_cell() {
         let directory = tempfile::tempdir().unwrap();
-        let own = "[origin]\nlatitude_deg = 52.2\nlongitude_deg = 21\n[fusion.pace]\ngate_m = 2.0\n[membership]\nkey = \"a long enough key\"\nbind = \"0.0.0.0:17884\"\n";
+        let own = "[origin]\nlatitude_deg = 52.2\nlongitude_deg = 21\n[mqtt]\nuser = \"euclid\"\npassword = \"hush\"\n[fusion.pace]\ngate_m = 2.0\n[membership]\nkey = \"a long enough key\"\nbind = \"0.0.0.0:17884\"\n";
         let config = vehicle(directory.path(), CELLS, own).unwrap();
         let cells = config.read_cells().unwrap();
         assert_eq!(config.in_cell(&cells[0]).unwrap(), config);
         let guest = config.in_cell(&cells[1]).unwrap();
         assert_eq!((guest.cell.as_str(), guest.role), ("lot-2", Role::Cav));
-        assert_eq!((guest.origin.unwrap().longitude_deg, guest.fusion.pace.gate_m), (21.01, 0.5));
+        assert_eq!((guest.origin, guest.fusion.pace.gate_m), (None, 0.5));
+        assert_eq!((guest.mqtt.user, guest.mqtt.password), (None, None), "no other cell's broker gets the password");
         assert_eq!((guest.membership.seeds, guest.membership.bind.unwrap().port()), (vec!["10.0.2.1:17884".into()], 0));
         assert_eq!(guest.membership.key_file, Some(directory.path().join("lot-2.key")));
         assert!(guest.membership.key.is_none());
@@ -201,6 +206,7 @@ mod tests {
             (CELLS.replace("lot-2\"", "lot-1\""), ["cells.toml", "`cells[1].name`", "unique"]),
             (CELLS.replace("radius_m = 150", "radius_m = 0"), ["cells.toml", "`cells[1].radius_m`", "0"]),
             (CELLS.replace("radius_m", "radius"), ["cells.toml", "unknown field", "radius_m"]),
+            (CELLS.replace("key_file", "revocation_list"), ["cells.toml", "`cells[1].revocation_list`", "`ca`"]),
         ] {
             let error = error(&cells);
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");

@@ -132,6 +132,7 @@ const DROPS = {
   client_throttled: "client refused: connects too often", client_timed_out: "client refused: login too late", client_untrusted: "client refused: no valid certificate",
   client_malformed: "client refused: malformed login", clients_full: "client refused: broker full", client_denied: "client request denied: no permission", client_stalled: "client disconnected: reads too slowly", client_expelled: "client disconnected: certificate revoked or expired",
   region_withheld: "map not sent to the region: link down or stalled", neighbour_refused: "neighbouring cell's object not used: elsewhere, or too many",
+  cell_reputation_dropped: "region not told of a vehicle: too many have left while its broker is away",
   overreached: "node declares more than its certificate allows",
   record_failed: "log cannot be written", record_dropped: "entry missing in the log",
   vote_ignored: "vote ignored: no usable location", report_late: "report too late for tracking", object_refused: "new object not tracked: too many", reputations_not_saved: "reputations cannot be saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
