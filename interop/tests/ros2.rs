@@ -75,8 +75,11 @@ fn a_log_has_detections_markers_and_poses_for_ros() {
             ("/tf", "tf2_msgs/msg/TFMessage"),
         ]
     );
-    let cut = convert(&log[..log.len() / 4], Cursor::new(Vec::new())).unwrap();
-    assert!(cut.is_cut && cut.written < done.written && cut.unusable == 0, "{cut:?} {done:?}");
+    // Of a short log, most bytes may be the schemas at its end: in a quarter are all messages, or few. In the first bytes is none.
+    for (bytes, most) in [(log.len() / 4, done.written), (100, 0)] {
+        let cut = convert(&log[..bytes], Cursor::new(Vec::new())).unwrap();
+        assert!(cut.is_cut && cut.written <= most && cut.unusable == 0, "{bytes} {cut:?} {done:?}");
+    }
 }
 
 /// A log with the optics of a camera, a picture, and one that is none.

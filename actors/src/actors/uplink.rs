@@ -257,9 +257,11 @@ impl UplinkState {
         self.publish_map();
     }
 
+    /// Publishes the own status, unless the lead has just been lost: it would have the epoch of the next leader.
     fn publish_status(&mut self) {
         let status = self.own_status();
-        if let Some(link) = &mut self.link {
+        let leads = self.setup.leadership.borrow().is_leading();
+        if let Some(link) = self.link.as_mut().filter(|_| leads) {
             link.publish_status(&status);
         }
     }
