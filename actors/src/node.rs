@@ -315,7 +315,7 @@ impl Actor for Supervisor {
             }
             NodeMessage::Move { step, done } => {
                 state.take_step(step, &myself.get_cell()).await?;
-                // Who has stopped waiting needs no word.
+                // A caller that has stopped waiting needs no word.
                 let _ = done.send(());
             }
             NodeMessage::NoteReadiness { mut readiness } => {

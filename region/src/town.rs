@@ -43,7 +43,7 @@ pub struct RegionCell {
     pub description: Option<u64>,
     /// Its newest map that counts.
     pub map: Option<TownMap>,
-    /// What of it was not used.
+    /// Its messages and objects that were not used.
     pub losses: CellLosses,
 }
 
@@ -265,7 +265,7 @@ impl RegionTown {
 const KEPT_FOR: Duration = Duration::from_secs(60);
 
 impl TownMap {
-    /// What of a map of a cell in `tile` is shown, and what is not.
+    /// The part of a map of a cell in `tile` that is shown, and the number of objects that are not.
     fn new(tile: Quadkey, message: CellMap, sent_at: Timestamp) -> (Self, CellLosses) {
         let CellMap { origin, map, .. } = message;
         let GlobalMap { aggregator, epoch, round, fused_at_us: fused_at, mut objects, .. } = map;

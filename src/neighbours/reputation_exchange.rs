@@ -51,9 +51,9 @@ pub enum ExchangeStep {
 #[derive(Debug, Clone, Default)]
 struct KnownVehicle {
     is_present: bool,
-    /// What the ledger says.
+    /// The counts of the ledger.
     own: CellCounts,
-    /// What the region has of this cell.
+    /// The counts that the region has of this cell.
     told: CellCounts,
     /// The filter on this connection, and since when.
     filter: Option<(VehicleFilter, Timestamp)>,

@@ -41,7 +41,7 @@ pub(super) enum Presence {
     Whole,
 }
 
-/// What a vehicle has once, in whatever cell it is.
+/// Parts and addresses that a vehicle has once, in whatever cell it is.
 #[derive(Clone)]
 pub(super) struct VehicleParts {
     pub(super) counters: Arc<Counters>,

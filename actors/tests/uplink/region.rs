@@ -131,7 +131,7 @@ impl Subscriber {
         self.client.publish(topic, QoS::AtMostOnce, false, payload.into()).await.unwrap();
     }
 
-    /// What a cell last said of a vehicle.
+    /// The last counts of a cell about a vehicle.
     pub(crate) fn reputation(&self, vehicle: &str, cell: &str) -> Option<CellReputation> {
         self.reputations.lock().unwrap().get(&format!("ecod/v1/rep/{vehicle}/{cell}")).cloned()
     }

@@ -26,7 +26,7 @@ pub(super) struct ViewerId {
     pub(super) name: String,
 }
 
-/// What a viewer looks at.
+/// The view of one viewer.
 #[derive(Debug)]
 struct TownWindow {
     tiles: Vec<Quadkey>,

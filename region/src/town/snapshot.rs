@@ -236,7 +236,7 @@ impl TownTotals {
         };
         *number += 1;
         self.troubled += usize::from(cell.status.as_ref().is_some_and(|status| !status.troubles.is_empty()));
-        // What an old map had may be gone.
+        // Objects of an old map may be gone.
         if let (CellState::Live, Some(TownMap { objects, .. })) = (state, &cell.map) {
             self.objects += objects.len();
             self.vehicles += vehicles(objects);

@@ -37,7 +37,7 @@ async fn servers_of_a_cluster_know_each_other_by_certificates_and_pass_maps_on()
     assert!(refused.contains("Certificate"), "{refused}");
 }
 
-/// What a stranger reads at a server's address for other servers.
+/// The answer to a stranger at a server's address for other servers.
 fn connect_without_certificate(server: &Broker) -> std::io::Result<usize> {
     let mut roots = RootCertStore::empty();
     roots.add(CertificateDer::from_pem_file(server.directory().join("tls/ca.pem")).unwrap()).unwrap();

@@ -31,7 +31,7 @@ pub enum FromRegion {
     },
     /// The status of another leader of the own cell, or a last will of this one.
     Status(NodeStatus),
-    /// What a cell, perhaps the own one, says of a vehicle.
+    /// Counts of a cell, perhaps the own one, about a vehicle.
     Reputation(CellReputation),
 }
 
