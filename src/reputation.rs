@@ -54,6 +54,11 @@ impl Counts {
         self.correct.saturating_add(self.incorrect)
     }
 
+    /// Share of votes that agreed, beside one of each kind.
+    pub(crate) fn share(self) -> f64 {
+        (self.correct as f64 + 1.0) / (self.total() as f64 + 2.0)
+    }
+
     /// Counts one vote.
     pub(crate) fn add(&mut self, correct: bool) {
         let count = if correct { &mut self.correct } else { &mut self.incorrect };
@@ -64,6 +69,13 @@ impl Counts {
         Self {
             correct: self.correct.saturating_add(other.correct),
             incorrect: self.incorrect.saturating_add(other.incorrect),
+        }
+    }
+
+    fn minus(self, other: Self) -> Self {
+        Self {
+            correct: self.correct.saturating_sub(other.correct),
+            incorrect: self.incorrect.saturating_sub(other.incorrect),
         }
     }
 

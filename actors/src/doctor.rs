@@ -73,12 +73,12 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     findings.extend(network::poses(config));
     findings.extend(network::dashboard(config));
     findings.extend(storage::floor_plan(config));
-    findings.extend(storage::cells(config));
     #[cfg(feature = "foxglove")]
     findings.extend(network::live(config));
     findings.extend(network::multicast(config));
     findings.push(storage::key(config));
     findings.extend(certificates::examine(config));
+    findings.extend(certificates::cells(config));
     findings.push(clock::synchronised());
     findings.extend(storage::directories(config));
     findings.extend(storage::service(config, file));
@@ -281,6 +281,16 @@ mod tests {
         std::fs::write(&file, "[[cells]]\nname = \"elsewhere\"\nlatitude_deg = 1\nlongitude_deg = 2\n").unwrap();
         let finding = finding(&NodeConfig { cells: Some(file), ..config() }, "cells").await;
         assert!(finding.verdict == CheckResult::Broken && finding.seen.contains("not among"), "{finding:?}");
+    }
+
+    #[tokio::test]
+    async fn a_cell_whose_files_are_missing_is_doubtful() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("cells.toml");
+        let cell = |name, more| format!("[[cells]]\nname = \"{name}\"\nlatitude_deg = 1\nlongitude_deg = 2\n{more}");
+        std::fs::write(&file, cell("cell", "") + &cell("elsewhere", "key_file = \"gone.key\"\n")).unwrap();
+        let finding = finding(&NodeConfig { cells: Some(file), ..config() }, "cells").await;
+        assert!(finding.verdict == CheckResult::Doubtful && finding.seen.contains("gone.key"), "{finding:?}");
     }
 
     #[cfg(feature = "foxglove")]

@@ -13,8 +13,9 @@ use std::time::Duration;
 
 use ecod::aggregator::{Algorithms, FusionConfig};
 use ecod::model::names::NodeName;
-use ecod::model::origin::GeographicOrigin;
+use ecod::model::origin::{GeographicOrigin, GeographicPosition};
 use ecod::model::time::Timestamp;
+use ecod::roaming::{CellChoice, CellMove, KnownCell};
 use ecod::tracking::HandOvers;
 use ecod::wire::{FusedObject, ObjectReport};
 use hashbrown::HashMap;
@@ -37,8 +38,8 @@ pub const CELLS_A_SIDE: usize = 3;
 /// Distance in metres of a border of cells up to which a place is at the border.
 pub const BORDER_M: f64 = 25.0;
 
-/// Metres by which a vehicle is in the next cell before it reports there.
-const HYSTERESIS_M: f64 = 5.0;
+/// Time that a vehicle takes to get ready in the next cell.
+const JOIN_TIME: Duration = Duration::from_secs(1);
 
 /// Time of a map from the moment for which it counts, at most.
 const MOMENT: Duration = Duration::from_millis(75);
@@ -130,14 +131,14 @@ pub fn run(
     let mut cells: Vec<TownCell> =
         plan.frames(uniform).map(|(name, frame)| TownCell::new(name, frame, config.clone(), start)).collect();
     let mut links = TownLinks::new(link, uniform);
-    let mut cell_of: BTreeMap<NodeName, usize> = BTreeMap::new();
+    let mut vehicles: BTreeMap<NodeName, TownVehicle> = BTreeMap::new();
     for arrived in &recording.reports {
         let now = arrived.received_at_us.unwrap_or(arrived.report.captured_at_us);
         single.close_until(now);
         advance(&mut cells, &mut links, now);
         single.report(&arrived.report, now);
-        let number = plan.cell_of(&arrived.report, &cell_of);
-        cell_of.insert(arrived.report.node.clone(), number);
+        let node = arrived.report.node.clone();
+        let number = vehicles.entry(node).or_insert_with(|| plan.vehicle(&arrived.report)).drive(&arrived.report, now);
         cells[number].report(&arrived.report, now);
         links.send_from(&mut cells, number, now);
     }
@@ -189,14 +190,7 @@ impl TownPlan {
     /// Names and frames: each with a direction and a clock of its own, up to 2 s fast or slow.
     fn frames<'a>(&'a self, uniform: &'a mut dyn FnMut() -> f64) -> impl Iterator<Item = (NodeName, CellFrame)> + 'a {
         (0..CELLS_A_SIDE * CELLS_A_SIDE).map(move |number| {
-            let middle = |place: usize| self.from_m + (place as f64 + 0.5) * self.side_m;
-            let place = TOWN.to_wgs84(middle(number % CELLS_A_SIDE), middle(number / CELLS_A_SIDE), 0.0);
-            let origin = GeographicOrigin {
-                latitude_deg: place.latitude_deg,
-                longitude_deg: place.longitude_deg,
-                height_m: place.height_m,
-                rotation_deg: 360.0 * uniform(),
-            };
+            let origin = GeographicOrigin { rotation_deg: 360.0 * uniform(), ..self.middle(number) };
             let clock_us = ((4.0 * uniform() - 2.0) * 1e6) as i64;
             (cell_name(number), CellFrame::new(&TOWN, origin, clock_us))
         })
@@ -206,14 +200,24 @@ impl TownPlan {
         (((coordinate_m - self.from_m) / self.side_m).max(0.0) as usize).min(CELLS_A_SIDE - 1)
     }
 
-    /// The cell to which a vehicle reports: where it is, or where it was until it is well inside another.
-    fn cell_of(&self, report: &ObjectReport, before: &BTreeMap<NodeName, usize>) -> usize {
-        let place = report.pose.map_or(Point2::origin(), |pose| Point2::new(pose.x_m, pose.y_m));
+    /// A vehicle in the cell in which its report is made.
+    fn vehicle(&self, report: &ObjectReport) -> TownVehicle {
+        let place = place_of(report);
         let here = self.index(place.x) + CELLS_A_SIDE * self.index(place.y);
-        match before.get(&report.node) {
-            Some(before) if self.border_m(&place) < HYSTERESIS_M => *before,
-            _ => here,
-        }
+        let cells = (0..CELLS_A_SIDE * CELLS_A_SIDE).map(|number| {
+            let middle = self.middle(number);
+            // A circle that has the corners in it.
+            KnownCell { name: cell_name(number), origin: middle, radius_m: 0.75 * self.side_m }
+        });
+        TownVehicle { cell: here, choice: CellChoice::new(cells.collect(), cell_name(here)), joined_at: None }
+    }
+
+    /// Place on Earth of the middle of a cell; its frame looks east.
+    fn middle(&self, number: usize) -> GeographicOrigin {
+        let middle = |place: usize| self.from_m + (place as f64 + 0.5) * self.side_m;
+        let place = TOWN.to_wgs84(middle(number % CELLS_A_SIDE), middle(number / CELLS_A_SIDE), 0.0);
+        let GeographicPosition { latitude_deg, longitude_deg, height_m } = place;
+        GeographicOrigin { latitude_deg, longitude_deg, height_m, rotation_deg: 0.0 }
     }
 
     /// Distance to the next border between cells, metres.
@@ -230,6 +234,38 @@ impl TownPlan {
         let middles = (0..CELLS_A_SIDE).map(|number| self.from_m + (number as f64 + 0.5) * self.side_m);
         distance_m(place, middles) < BORDER_M && !self.is_at_border(place)
     }
+}
+
+/// A vehicle that reports to one cell at a time.
+struct TownVehicle {
+    cell: usize,
+    choice: CellChoice,
+    /// The next cell and when it was joined.
+    joined_at: Option<(NodeName, Timestamp)>,
+}
+
+impl TownVehicle {
+    /// The cell to which it reports from where it is at `now`.
+    fn drive(&mut self, report: &ObjectReport, now: Timestamp) -> usize {
+        let place = place_of(report);
+        match self.choice.observe(Some(&TOWN.to_wgs84(place.x, place.y, 0.0)), now) {
+            Some(CellMove::Join(cell)) => self.joined_at = Some((cell, now)),
+            Some(CellMove::GiveUp(_)) => self.joined_at = None,
+            None => {}
+        }
+        if let Some((cell, _)) = self.joined_at.take_if(|(_, at)| now.since(*at) >= JOIN_TIME)
+            && self.choice.enter(&cell)
+        {
+            self.cell =
+                (0..CELLS_A_SIDE * CELLS_A_SIDE).position(|number| cell_name(number) == cell).unwrap_or(self.cell);
+        }
+        self.cell
+    }
+}
+
+/// Place in the town's frame of whoever reports, metres.
+fn place_of(report: &ObjectReport) -> Point2<f64> {
+    report.pose.map_or(Point2::origin(), |pose| Point2::new(pose.x_m, pose.y_m))
 }
 
 /// Distance of a place to the next of lines along both axes.

@@ -1,4 +1,5 @@
 mod configure;
+mod foreign;
 mod one_answer;
 
 use ReportKind::{Detections, VoteDetections};

@@ -22,14 +22,28 @@ const JITTER_US: i64 = 100_000;
 /// Silence after which a cell is forgotten, with its epoch.
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(60);
 
+/// Span over which delays are remembered, to tell a backlog that lasts from clocks.
+const BACKLOG_SPAN: Duration = Duration::from_secs(120);
+
+/// Time between two looks for a backlog.
+const BACKLOG_PERIOD: Duration = Duration::from_secs(1);
+
+/// Minimum number of cells that show a backlog.
+const MIN_BACKLOG_CELLS: usize = 3;
+
 /// Admits maps of cells: each newer than the one before by epoch and round, and none older than [`MAX_AGE`].
 ///
 /// The clocks of cells differ. A map's age is therefore its delay beyond the least that maps of this cell take. It goes by
 /// the sender's clock or by the cell's time, whichever makes it younger: the one may be new, the other may jump. While
 /// neither is known, no map counts: for a second from the first map of a cell on.
+///
+/// A backlog that lasts looks like a clock that is as much behind. But the clocks of cells do not change together: what three
+/// quarters of them, and three at least, take longer than in the minutes before is a backlog, and adds to the age.
 #[derive(Debug, Clone)]
 pub struct CellMapFilter {
     max_cells: usize,
+    backlog: Duration,
+    looked_at: Timestamp,
     cells: BTreeMap<NodeName, CellOrder>,
 }
 
@@ -56,6 +70,8 @@ struct CellOrder {
 #[derive(Debug, Clone)]
 struct DelayEstimate {
     least: MinimumDelay,
+    /// The least one of the last minutes.
+    least_long: MinimumDelay,
     /// A delay in microseconds of late, and since when none was much shorter.
     usual_us: i64,
     since: Timestamp,
@@ -64,7 +80,7 @@ struct DelayEstimate {
 impl CellMapFilter {
     /// A filter for so many cells at most.
     pub fn new(max_cells: usize) -> Self {
-        Self { max_cells, cells: BTreeMap::new() }
+        Self { max_cells, backlog: Duration::ZERO, looked_at: Timestamp::default(), cells: BTreeMap::new() }
     }
 
     /// Admits a map that came on `topic` and was read at `received_at` by this node's steady clock.
@@ -105,8 +121,20 @@ impl CellMapFilter {
         (order.epoch, order.round, order.received_at) = (epoch, map.round, received_at);
         let ages = [(&mut order.by_sender, *sent_at_us), (&mut order.by_cell, map.fused_at_us)]
             .map(|(delay, stamp)| delay.observe(received_at.micros_from(stamp), received_at));
-        let age = ages.into_iter().flatten().min().ok_or(RejectReason::Stale)?;
+        if received_at.since(self.looked_at) >= BACKLOG_PERIOD {
+            (self.backlog, self.looked_at) = (self.find_backlog(received_at), received_at);
+        }
+        let age = ages.into_iter().flatten().min().ok_or(RejectReason::Stale)? + self.backlog;
         if age > MAX_AGE { Err(RejectReason::Stale) } else { Ok(AdmittedMap { age }) }
+    }
+
+    /// What three quarters of the cells that are heard take longer than in the minutes before.
+    fn find_backlog(&self, now: Timestamp) -> Duration {
+        let heard = self.cells.values().filter(|order| now.since(order.received_at) <= MAX_AGE);
+        let mut lags_us: Vec<_> = heard.map(|order| order.by_sender.lag_us().min(order.by_cell.lag_us())).collect();
+        lags_us.sort_unstable();
+        let common_us = lags_us.get(lags_us.len() / 4).filter(|_| lags_us.len() >= MIN_BACKLOG_CELLS);
+        Duration::from_micros(common_us.filter(|lag_us| **lag_us > JITTER_US).map_or(0, |lag_us| lag_us.unsigned_abs()))
     }
 
     /// Forgets cells that have been silent for a minute.
@@ -130,12 +158,14 @@ impl CellOrder {
 
 impl DelayEstimate {
     fn new(now: Timestamp) -> Self {
-        Self { least: MinimumDelay::new(now), usual_us: i64::MAX, since: now }
+        let least_long = MinimumDelay::over(BACKLOG_SPAN, now);
+        Self { least: MinimumDelay::new(now), least_long, usual_us: i64::MAX, since: now }
     }
 
     /// Takes a delay; returns what it is beyond the least one, if that is known.
     fn observe(&mut self, delay_us: i64, now: Timestamp) -> Option<Duration> {
         self.least.observe(delay_us, now);
+        self.least_long.observe(delay_us, now);
         let least_us = self.least.least();
         if least_us < self.usual_us.saturating_sub(JITTER_US) {
             (self.usual_us, self.since) = (least_us, now);
@@ -143,5 +173,10 @@ impl DelayEstimate {
         self.usual_us = self.usual_us.max(least_us);
         let beyond_us = delay_us.saturating_sub(least_us);
         (now.since(self.since) >= SETTLES_AFTER).then(|| Duration::from_micros(beyond_us.unsigned_abs()))
+    }
+
+    /// The least delay of late beyond that of the last minutes, in microseconds.
+    fn lag_us(&self) -> i64 {
+        self.least.least().saturating_sub(self.least_long.least())
     }
 }

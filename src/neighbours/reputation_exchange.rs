@@ -8,14 +8,15 @@
 //! - *Kept.* Counts wait until the region has them: the own message comes back. That also acknowledges it. Without connection
 //!   only the latest counts of each vehicle wait.
 //! - *Never less.* A leader that knows less than the region does, such as one that lost its disk, first hears what its cell said
-//!   before, and sends the larger of every count.
+//!   before, and sends the larger of every count. What it hears too late it puts right.
+//! - *Resets.* A leader that missed a reset of its cell's evidence adds to what the region has only what it counts from then on.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
-use crate::reputation::{CellCounts, Counts, ForeignReputations, MAX_FOREIGN_VEHICLES};
+use crate::reputation::{CellCounts, ForeignReputations, MAX_FOREIGN_VEHICLES};
 use crate::wire::{CellReputation, ReputationTopic};
 
 /// Minimum time between two messages about one vehicle.
@@ -47,14 +48,27 @@ pub enum ExchangeStep {
     Publish(CellReputation),
 }
 
+/// News of another cell about a vehicle that is present.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ForeignNews {
+    /// Its first word about the vehicle: the vehicle starts by it.
+    First,
+    /// Further counts, which can wait.
+    Further,
+}
+
 /// A vehicle that is present or waits to be told of.
 #[derive(Debug, Clone, Default)]
 struct KnownVehicle {
     is_present: bool,
-    /// The counts of the ledger.
-    own: CellCounts,
-    /// The counts that the region has of this cell.
+    /// The counts of the ledger, once they are known.
+    own: Option<CellCounts>,
+    /// The counts that the region has of this cell: those heard last.
     told: CellCounts,
+    /// The largest of every count heard after the last reset.
+    heard: CellCounts,
+    /// The own counts when a reset was heard that the ledger does not have, and those of the region then.
+    missed_reset: Option<(CellCounts, CellCounts)>,
     /// The filter on this connection, and since when.
     filter: Option<(VehicleFilter, Timestamp)>,
     has_heard: bool,
@@ -79,10 +93,21 @@ pub struct ReputationExchange {
 impl KnownVehicle {
     /// What the region is to have: no count less than it has, since the last reset.
     fn wanted(&self) -> CellCounts {
-        let mut wanted = self.told;
-        // Counts made before a reset that another node of the cell told are few: the cell's nodes hear of it from each other.
-        wanted.merge(CellCounts { reset_at: self.own.reset_at.max(self.told.reset_at), ..self.own });
+        let mut wanted = self.heard;
+        let own = self.own.unwrap_or_default();
+        wanted.merge(self.missed_reset.map_or(own, |(before, base)| base.plus(own.since(before))));
         wanted
+    }
+
+    /// Notes or forgets that the ledger lacks a reset that the region has.
+    fn compare_resets(&mut self) {
+        let Some(own) = self.own else { return };
+        let noted_at = self.missed_reset.map(|(_, base)| base.reset_at);
+        if own.reset_at >= self.heard.reset_at.max(noted_at.unwrap_or_default()) {
+            self.missed_reset = None;
+        } else if noted_at.is_none_or(|at| at < self.heard.reset_at) {
+            self.missed_reset = Some((own, self.heard));
+        }
     }
 
     /// True if nothing is to be heard of it or told.
@@ -97,10 +122,9 @@ impl KnownVehicle {
     /// True if the counts say something that those in the region do not.
     fn is_news(&self) -> bool {
         let (wanted, told) = (self.wanted(), self.told);
-        let share = |counts: Counts| (counts.correct as f64 + 1.0) / (counts.total() as f64 + 2.0);
         wanted.reset_at > told.reset_at
             || wanted.all.total() as f64 > NEWS_FACTOR * told.all.total() as f64
-            || (share(wanted.remembered()) - share(told.remembered())).abs() > NEWS_SHARE
+            || (wanted.remembered().share() - told.remembered().share()).abs() > NEWS_SHARE
     }
 
     fn is_due(&self, now: Timestamp) -> bool {
@@ -134,46 +158,60 @@ impl ReputationExchange {
         Self { cell, vehicles: BTreeMap::new(), foreign: ForeignReputations::default(), dropped: 0 }
     }
 
-    /// Takes the vehicles that are present. What other cells say of the rest is forgotten.
-    pub fn set_present(&mut self, present: &BTreeSet<NodeName>) {
+    /// Takes the vehicles that are present. What other cells say of the rest is forgotten; true if they said anything.
+    pub fn set_present(&mut self, present: &BTreeSet<NodeName>) -> bool {
         for name in present.iter().take(MAX_FOREIGN_VEHICLES) {
             self.vehicles.entry(name.clone()).or_default();
         }
         for (name, vehicle) in &mut self.vehicles {
             vehicle.is_present = present.contains(name);
         }
-        self.foreign.retain(|name| present.contains(name));
+        let has_less = self.foreign.retain(|name| present.contains(name));
         self.make_room();
+        has_less
     }
 
     /// Takes what the ledger says of a vehicle.
     pub fn count(&mut self, vehicle: &NodeName, counts: CellCounts) {
-        self.vehicles.entry(vehicle.clone()).or_default().own = counts;
+        let known = self.vehicles.entry(vehicle.clone()).or_default();
+        known.own = Some(counts);
+        known.compare_resets();
         self.make_room();
     }
 
     /// Begins a connection: nothing is subscribed, and the broker may have lost what it had.
     pub fn connect(&mut self) {
         for vehicle in self.vehicles.values_mut() {
-            *vehicle = KnownVehicle { is_present: vehicle.is_present, own: vehicle.own, ..KnownVehicle::default() };
+            let KnownVehicle { is_present, own, missed_reset, .. } = *vehicle;
+            *vehicle = KnownVehicle { is_present, own, missed_reset, ..KnownVehicle::default() };
         }
     }
 
-    /// Takes a message of the region; true if it is news of another cell about a vehicle that is present.
-    pub fn hear(&mut self, message: &CellReputation) -> bool {
-        let Some(vehicle) = self.vehicles.get_mut(&message.vehicle) else { return false };
+    /// Takes a message of the region; some if it is news of another cell about a vehicle that is present.
+    pub fn hear(&mut self, message: &CellReputation) -> Option<ForeignNews> {
+        let vehicle = self.vehicles.get_mut(&message.vehicle)?;
         let counts = CellCounts::from(message);
         if message.cell == self.cell {
-            vehicle.told.merge(counts);
+            // A broker keeps the last message, which need not be the largest.
+            vehicle.told = counts;
+            vehicle.heard.merge(counts);
+            vehicle.compare_resets();
             vehicle.has_heard = true;
-            return false;
+            return None;
         }
-        vehicle.is_present && self.foreign.merge(&message.cell, &message.vehicle, counts)
+        let is_first = !self.foreign.has(&message.cell, &message.vehicle);
+        let is_news = vehicle.is_present && self.foreign.merge(&message.cell, &message.vehicle, counts);
+        is_news.then_some(if is_first { ForeignNews::First } else { ForeignNews::Further })
     }
 
     /// What other cells say of the vehicles that are present.
     pub fn foreign(&self) -> &ForeignReputations {
         &self.foreign
+    }
+
+    /// Trust in the word of each cell that the own evidence contradicts, 0 to 1.
+    pub fn trust_in_words(&self) -> BTreeMap<NodeName, f64> {
+        self.foreign.trust_in_words(|vehicle| Some(self.vehicles.get(vehicle)?.own?.remembered()))
     }
 
     /// The next steps on a connection, with at most so many messages.
@@ -222,7 +260,8 @@ impl ReputationExchange {
     fn make_room(&mut self) {
         self.vehicles.retain(|_, vehicle| vehicle.filter.is_some() || !vehicle.is_done());
         let waiting = self.vehicles.iter().filter(|(_, vehicle)| !vehicle.is_present);
-        let mut waiting: Vec<_> = waiting.map(|(name, vehicle)| (vehicle.own.all.total(), name.clone())).collect();
+        let mut waiting: Vec<_> =
+            waiting.map(|(name, vehicle)| (vehicle.own.unwrap_or_default().all.total(), name.clone())).collect();
         let excess = waiting.len().saturating_sub(MAX_WAITING);
         if excess > 0 {
             waiting.sort();

@@ -191,6 +191,33 @@ fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
     }
 }
 
+/// Maps of some cells at 10 Hz for two minutes; `late_ms` of a cell's number from the 40th second on. Numbers of maps of each that
+/// counted in the last minute.
+fn late_for_long(cells: u64, late_ms: impl Fn(u64) -> u64) -> Vec<usize> {
+    let mut filter = CellMapFilter::new(16);
+    let mut counted = vec![0; cells as usize];
+    for sent in (0..120_000).step_by(100) {
+        for number in 0..cells {
+            // Each clock is off by seconds of its own.
+            let message = map(1, "a", sent / 100 + 1, ms(sent).shifted(3_000_000 * number as i64), Vec::new());
+            let message = CellMap { cell: name(&format!("cell-{number}")), ..message };
+            let late_ms = if sent < 40_000 { 20 } else { 20 + late_ms(number) };
+            let admitted = filter.admit(&topic(message.cell.as_str(), &message.origin), &message, ms(sent + late_ms));
+            counted[number as usize] += usize::from(admitted.is_ok() && sent >= 60_000);
+        }
+    }
+    counted
+}
+
+#[test]
+fn a_backlog_of_all_cells_is_no_clock() {
+    assert_eq!(late_for_long(4, |_| 0), [600; 4]);
+    assert_eq!(late_for_long(4, |_| 2000), [0; 4], "all are late");
+    assert_eq!(late_for_long(4, |_| 1000), [600; 4], "younger than the limit");
+    assert_eq!(late_for_long(4, |number| if number < 2 { 2000 } else { 0 }), [600; 4], "clocks that have changed");
+    assert_eq!(late_for_long(2, |_| 2000), [600; 2], "two may be clocks");
+}
+
 #[test]
 fn a_silent_cell_is_forgotten() {
     let mut neighbours = home();

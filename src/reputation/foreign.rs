@@ -27,6 +27,15 @@ const MAX_SHARE_EACH: f64 = 0.5;
 /// Maximum weight of all cells' votes about a vehicle, as a multiple of the prior's.
 const MAX_SHARE: f64 = 2.0;
 
+/// Remembered votes of the own cell, and of another, from which the other's word about a vehicle is judged by the own ones.
+const MIN_JUDGED_VOTES: [u64; 2] = [20, 5];
+
+/// Difference of the shares of right votes from which two cells contradict each other about a vehicle.
+const CONTRADICTION: f64 = 0.35;
+
+/// Vehicles whose like contradiction halves the trust in a cell's word.
+const DOUBTED_VEHICLES: f64 = 2.0;
+
 /// Maximum number of cells about one vehicle; those with most votes count.
 const MAX_CELLS_EACH: usize = 16;
 
@@ -62,10 +71,17 @@ impl CellCounts {
 
     /// The votes that the cell remembers.
     pub fn remembered(&self) -> Counts {
-        Counts {
-            correct: self.all.correct.saturating_sub(self.old.correct),
-            incorrect: self.all.incorrect.saturating_sub(self.old.incorrect),
-        }
+        self.all.minus(self.old)
+    }
+
+    /// The votes that came after `before`, an earlier state of the same counts. The oldest votes are forgotten first.
+    pub fn since(&self, before: Self) -> Self {
+        Self { all: self.all.minus(before.all), old: self.old.minus(before.all), ..*self }
+    }
+
+    /// These counts and `later` votes after the same reset.
+    pub fn plus(&self, later: Self) -> Self {
+        Self { all: self.all.plus(later.all), old: self.old.plus(later.old), ..*self }
     }
 
     /// The message of a cell about a vehicle.
@@ -117,14 +133,42 @@ impl ForeignReputations {
         is_news
     }
 
-    /// Forgets vehicles that are not wanted.
-    pub fn retain(&mut self, mut is_wanted: impl FnMut(&NodeName) -> bool) {
+    /// Forgets vehicles that are not wanted; true if there were any.
+    pub fn retain(&mut self, mut is_wanted: impl FnMut(&NodeName) -> bool) -> bool {
+        let before = self.0.len();
         self.0.retain(|vehicle, _| is_wanted(vehicle));
+        self.0.len() < before
+    }
+
+    /// True if a cell says something of a vehicle.
+    pub fn has(&self, cell: &NodeName, vehicle: &NodeName) -> bool {
+        self.0.get(vehicle).is_some_and(|cells| cells.contains_key(cell))
     }
 
     /// The cells that say something.
     pub fn cells(&self) -> BTreeSet<&NodeName> {
         self.0.values().flat_map(BTreeMap::keys).collect()
+    }
+
+    /// Trust in the word of each cell that own evidence contradicts, 0 to 1; all others have 1. Counts of the own evidence are
+    /// those that are remembered.
+    pub fn trust_in_words(&self, own: impl Fn(&NodeName) -> Option<Counts>) -> BTreeMap<NodeName, f64> {
+        let mut judged = BTreeMap::<&NodeName, [f64; 2]>::new();
+        for (vehicle, cells) in &self.0 {
+            let Some(own) = own(vehicle).filter(|own| own.total() >= MIN_JUDGED_VOTES[0]) else { continue };
+            for (cell, counts) in cells {
+                let said = counts.remembered();
+                if said.total() >= MIN_JUDGED_VOTES[1] {
+                    let [contradicted, all] = judged.entry(cell).or_default();
+                    *contradicted += f64::from(u8::from((said.share() - own.share()).abs() > CONTRADICTION));
+                    *all += 1.0;
+                }
+            }
+        }
+        let contradicted = judged.into_iter().filter(|(_, [contradicted, _])| *contradicted > 0.0);
+        contradicted
+            .map(|(cell, [contradicted, all])| (cell.clone(), 1.0 - contradicted / (DOUBTED_VEHICLES + all)))
+            .collect()
     }
 
     /// Every vehicle's votes beside a prior of this weight in votes; `trust` in each cell is 0 to 1.

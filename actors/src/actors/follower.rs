@@ -45,6 +45,10 @@ pub struct FollowerArguments {
     /// A file to which every accepted map is appended with its time of receipt, one JSON
     /// object a line.
     pub log: Option<PathBuf>,
+    /// The node's cell.
+    pub cell: NodeName,
+    /// The cell in which its vehicle is present: maps of others are not logged.
+    pub present_cell: watch::Receiver<NodeName>,
     /// Where everything accepted is recorded.
     pub recording: LogSender,
     /// The last term that an earlier run of the node wrote to disk.
@@ -74,6 +78,8 @@ pub struct FollowerState {
     newest: Newest,
     filter: RoundFilter,
     log: Option<MapLog>,
+    cell: NodeName,
+    present_cell: watch::Receiver<NodeName>,
     recording: LogSender,
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
@@ -128,6 +134,8 @@ impl FollowerState {
         let FollowerArguments {
             newest,
             log,
+            cell,
+            present_cell,
             recording,
             saved_term,
             leadership,
@@ -138,8 +146,23 @@ impl FollowerState {
             counters,
             spans,
         } = arguments;
-        let (filter, log) = (RoundFilter::new(saved_term, clock::now()), log.map(MapLog::new));
-        Self { newest, filter, log, recording, leadership, election, fuser, door, clock, counters, spans }
+        let filter = RoundFilter::new(saved_term, clock::now());
+        let log = log.map(|path| MapLog::new(path, cell.clone()));
+        Self {
+            newest,
+            filter,
+            log,
+            cell,
+            present_cell,
+            recording,
+            leadership,
+            election,
+            fuser,
+            door,
+            clock,
+            counters,
+            spans,
+        }
     }
 
     fn take_map(&mut self, delivery: &Delivery<Arc<GlobalMap>>) -> Result<(), Refusal> {
@@ -153,7 +176,7 @@ impl FollowerState {
         }
         self.tell_election(accepted);
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
-        if let Some(log) = &mut self.log {
+        if let Some(log) = self.log.as_mut().filter(|_| *self.present_cell.borrow() == self.cell) {
             log.append(&ReceivedMap { received_at: self.clock.date(received_at), map: Arc::clone(map) });
         }
         self.recording.send(received_at, LogItem::Map(Arc::clone(map)));

@@ -1,4 +1,4 @@
-//! Check of the node's certificates and their expiry.
+//! Checks of the node's certificates and their expiry, in its own cell and in those to which it moves.
 
 use std::os::unix::fs::PermissionsExt;
 use std::time::Duration;
@@ -6,7 +6,7 @@ use std::time::Duration;
 use rustls::pki_types::UnixTime;
 
 use super::Finding;
-use crate::node::config::NodeConfig;
+use crate::node::config::{CellEntry, NodeConfig};
 use crate::platform::clock;
 use crate::transport::pki::{CertificateSubject, Credentials, CredentialsError};
 
@@ -68,5 +68,31 @@ pub(super) fn examine(config: &NodeConfig) -> Option<Finding> {
         Finding::doubtful(check, shown, format!("`ecod-node pki issue {name}` creates a new one"))
     } else {
         Finding::fine(check, shown)
+    })
+}
+
+/// Checks that a vehicle that moves on can take part in each cell.
+pub(super) fn cells(config: &NodeConfig) -> Option<Finding> {
+    let (check, path) = ("cells", config.cells.as_ref()?);
+    let cells = match config.load_cells() {
+        Ok(cells) => cells,
+        Err(error) => {
+            return Some(Finding::broken(check, error.to_string(), "correct the file, or leave `cells` out"));
+        }
+    };
+    let distrust = |cell: &CellEntry| match config.credentials_in(cell) {
+        Ok(credentials) => {
+            let current = credentials?.current();
+            let distrust = current.verify_node(current.certificate(), UnixTime::now()).err()?;
+            Some(format!("cell {}: it does not accept the node's certificate: {distrust}", cell.name))
+        }
+        Err(error) => Some(error.to_string()),
+    };
+    let unusable: Vec<_> = cells.iter().filter_map(distrust).collect();
+    Some(if unusable.is_empty() {
+        Finding::fine(check, format!("{} in {}", cells.len(), path.display()))
+    } else {
+        let fix = "correct these entries and their files: the vehicle does not move to such cells";
+        Finding::doubtful(check, unusable.join("; "), fix)
     })
 }

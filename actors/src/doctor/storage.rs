@@ -54,15 +54,6 @@ pub(super) fn floor_plan(config: &NodeConfig) -> Option<Finding> {
     })
 }
 
-/// Checks that a vehicle that moves on can take part in each cell.
-pub(super) fn cells(config: &NodeConfig) -> Option<Finding> {
-    let (check, path) = ("cells", config.cells.as_ref()?);
-    Some(match config.load_cells() {
-        Ok(cells) => Finding::fine(check, format!("{} in {}", cells.len(), path.display())),
-        Err(error) => Finding::broken(check, error.to_string(), "correct the file, or leave `cells` out"),
-    })
-}
-
 /// Checks that directories are writable and have space.
 pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
     let mut findings = Vec::new();

@@ -44,6 +44,8 @@ pub(super) enum Presence {
 /// Parts and addresses that a vehicle has once, in whatever cell it is.
 #[derive(Clone)]
 pub(super) struct VehicleParts {
+    /// The cell in which it is present.
+    pub(super) present_cell: watch::Sender<NodeName>,
     pub(super) counters: Arc<Counters>,
     /// The present node's log and spans.
     pub(super) log: watch::Sender<LogSender>,
@@ -74,6 +76,7 @@ impl VehicleParts {
         let counters = Arc::<Counters>::default();
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         Self {
+            present_cell: watch::Sender::new(config.cell.clone()),
             log: watch::Sender::new(LogSender::new(Arc::clone(&counters))),
             spans: watch::Sender::new(Spans::new(config.cell.clone(), name)),
             counters,

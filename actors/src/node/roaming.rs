@@ -56,7 +56,16 @@ impl Roamer {
     /// # Errors
     /// [`NodeError`] when a part cannot start, or the file of cells cannot be used.
     pub async fn start(config: NodeConfig) -> Result<Self, NodeError> {
-        let cells = config.load_cells().map_err(|error| NodeError::Failed(format!("key `cells`: {error}")))?;
+        let mut cells = config.load_cells().map_err(|error| NodeError::Failed(format!("key `cells`: {error}")))?;
+        // What is wrong with a cell elsewhere keeps no vehicle from its own.
+        cells.retain(|cell| {
+            let unusable = config.credentials_in(cell).err();
+            unusable
+                .inspect(
+                    |error| tracing::warn!(%error, "the vehicle does not move to a cell; `ecod-node doctor` tries all"),
+                )
+                .is_none()
+        });
         let vehicle = VehicleParts::new(&config);
         let choice = CellChoice::new(cells.iter().map(CellEntry::known).collect(), config.cell.clone());
         let present = start_with((vehicle.clone(), Presence::Whole), config.clone()).await?;
@@ -159,6 +168,7 @@ impl Roamer {
         let Some((_, next)) = self.next.take_if(|_| self.choice.enter(cell)) else { return Ok(()) };
         let former = self.former.insert(std::mem::replace(&mut self.present, next));
         step(former, MoveStep::HandOver).await?;
+        self.vehicle.present_cell.send_replace(cell.clone());
         step(&self.present, MoveStep::TakeOver).await?;
         if let Some(former) = self.former.take() {
             former.stop().await;

@@ -30,8 +30,8 @@ pub(super) struct ViewerId {
 #[derive(Debug)]
 struct TownWindow {
     tiles: Vec<Quadkey>,
-    /// Number of cells in them.
-    cells: usize,
+    /// Number of cells in them, once they were counted after the last look.
+    cells: Option<usize>,
     looked_at: Timestamp,
 }
 
@@ -86,7 +86,7 @@ impl Viewers {
             let replaced = self.replaced_by(&viewer, now).ok_or(MapsWithheld::ManyViews)?;
             self.views.remove(&replaced);
         }
-        self.views.insert(viewer, TownWindow { tiles, cells: 0, looked_at: now });
+        self.views.insert(viewer, TownWindow { tiles, cells: None, looked_at: now });
         Ok(())
     }
 
@@ -112,21 +112,28 @@ impl Viewers {
         now: Timestamp,
     ) -> (BTreeSet<Quadkey>, BTreeMap<ViewerId, MapsWithheld>) {
         self.views.retain(|_, view| now.since(view.looked_at) < VIEW_LASTS);
-        self.views.values_mut().for_each(|view| view.cells = count(&view.tiles));
+        for view in self.views.values_mut() {
+            view.cells.get_or_insert_with(|| count(&view.tiles));
+        }
         let mut by_host = BTreeMap::<IpAddr, Vec<_>>::new();
         self.views.iter().for_each(|(id, view)| by_host.entry(id.host).or_default().push((id, view)));
         let mut in_turn = Vec::new();
         for views in by_host.values_mut() {
             views.sort_by_key(|(_, view)| view.cells);
-            in_turn.extend(views.iter().enumerate().map(|(turn, (id, view))| (turn, view.cells, *id, *view)));
+            let of_host = views.iter().enumerate();
+            in_turn.extend(of_host.map(|(turn, (id, view))| (turn, view.cells.unwrap_or_default(), *id, *view)));
         }
         in_turn.sort_by_key(|(turn, cells, id, _)| (*turn, *cells, *id));
         let (mut read, mut withheld) = (self.watched.iter().copied().collect::<BTreeSet<_>>(), BTreeMap::new());
         let mut cells = 0;
-        for (_, _, id, view) in in_turn {
+        for (_, cells_of_view, id, view) in in_turn {
             let more: Vec<_> = view.tiles.iter().copied().filter(|tile| !is_within(*tile, &read)).collect();
-            let more_cells = count(&more);
-            if view.cells > MAX_CELLS_OF_VIEW {
+            let more_cells = match more.len() {
+                0 => 0,
+                all if all == view.tiles.len() => cells_of_view,
+                _ => count(&more),
+            };
+            if cells_of_view > MAX_CELLS_OF_VIEW {
                 withheld.insert(id.clone(), MapsWithheld::LargeView);
             } else if cells + more_cells > MAX_CELLS {
                 withheld.insert(id.clone(), MapsWithheld::ManyCells);

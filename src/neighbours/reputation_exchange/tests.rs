@@ -1,4 +1,5 @@
 use super::*;
+use crate::reputation::Counts;
 
 fn name(name: &str) -> NodeName {
     NodeName::new(name).unwrap()
@@ -67,7 +68,12 @@ fn a_leader_asks_about_who_is_present_and_about_nobody_else() {
     assert!(exchange.foreign().cells().is_empty(), "what is said of those who left is forgotten");
     let (begun, ended) = (vec!["ecod/v1/rep/gauss/+".into()], vec!["ecod/v1/rep/euclid/+".into()]);
     assert_eq!(region.serve(&mut exchange, at(2)), (begun, ended, 0));
-    assert!(!exchange.hear(&counts(0, 1).message(name("a"), name("euclid"))), "and is no news");
+    let mut hear = |vehicle, wrong| exchange.hear(&counts(0, wrong).message(name("d"), name(vehicle)));
+    assert_eq!(hear("euclid", 1), None, "and is no news");
+    assert_eq!(
+        [1, 2, 2].map(|wrong| hear("gauss", wrong)),
+        [Some(ForeignNews::First), Some(ForeignNews::Further), None]
+    );
     exchange.connect();
     assert_eq!(region.serve(&mut exchange, at(3)).0, ["ecod/v1/rep/gauss/+"], "a new connection knows nothing");
 }
@@ -165,8 +171,39 @@ fn a_leader_that_knows_less_than_its_region_lowers_nothing_but_by_a_reset() {
     assert_eq!(count(&mut exchange, reset(2, 0, 25), 60), Some((2, 0)));
     let mut late = ReputationExchange::new(name("a"));
     late.set_present(&[name("euclid")].into());
-    assert_eq!(count(&mut late, counts(5, 5), 90), Some((5, 5)), "a node that has not heard of it counts on");
-    assert_eq!(region.0.values().next().unwrap().reset_at_us, Some(at(25)), "under the same stamp");
+    assert_eq!(count(&mut late, counts(500, 9), 90), Some((2, 0)), "a node that has not heard of it undoes nothing");
+    let later = CellCounts { old: Counts { correct: 400, incorrect: 0 }, ..counts(600, 10) };
+    assert_eq!(count(&mut late, later, 120), Some((102, 1)), "and counts on");
+    late.connect();
+    let latest = CellCounts { old: Counts { correct: 510, incorrect: 0 }, ..counts(700, 10) };
+    assert_eq!(count(&mut late, latest, 150), Some((202, 1)), "on each connection");
+    assert_eq!(count(&mut late, reset(250, 2, 25), 180), Some((250, 2)), "until it has heard of it");
+    let told = region.0.values().next().unwrap();
+    assert_eq!(
+        (told.reset_at_us, told.old_correct),
+        (Some(at(25)), 10),
+        "votes from before the reset are no older ones"
+    );
+}
+
+#[test]
+fn a_region_that_answers_late_loses_nothing() {
+    let mut exchange = ReputationExchange::new(name("a"));
+    let euclid = name("euclid");
+    exchange.set_present(&[euclid.clone()].into());
+    exchange.count(&euclid, counts(3, 200));
+    let sent = |exchange: &mut ReputationExchange, second| {
+        exchange.next(at(second), 8).into_iter().find_map(|step| match step {
+            ExchangeStep::Publish(message) => Some(message),
+            _ => None,
+        })
+    };
+    assert_eq!(sent(&mut exchange, 0), None);
+    let message = sent(&mut exchange, 3).unwrap();
+    // What was retained comes first, then the message that has replaced it.
+    exchange.hear(&counts(400, 7).message(name("a"), euclid.clone()));
+    exchange.hear(&message);
+    assert_eq!(sent(&mut exchange, 13), Some(counts(400, 200).message(name("a"), euclid)));
 }
 
 #[test]
@@ -176,7 +213,7 @@ fn a_leader_that_leaves_tells_all_that_it_may_and_never_what_others_said() {
     assert!(exchange.farewell(at(0)).is_empty(), "it does not know yet what the region has");
     exchange.set_present(&[name("euclid"), name("gauss")].into());
     exchange.next(at(0), 8);
-    assert!(exchange.hear(&counts(0, 50).message(name("b"), name("gauss"))));
+    assert!(exchange.hear(&counts(0, 50).message(name("b"), name("gauss"))).is_some());
     assert!(exchange.farewell(at(1)).is_empty());
     let told = exchange.farewell(at(2));
     assert_eq!(told, [counts(30, 2).message(name("a"), name("euclid"))]);

@@ -5,7 +5,9 @@ use std::io::{self, BufWriter, Write};
 use std::path::PathBuf;
 use std::time::Duration;
 
+use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
+use serde::Serialize;
 
 use crate::messages::newest::ReceivedMap;
 
@@ -15,14 +17,15 @@ const RETRY_PAUSE: Duration = Duration::from_secs(60);
 /// A file of maps with their times of receipt, one JSON object a line. A disk that refuses it costs its lines only.
 pub(super) struct MapLog {
     path: PathBuf,
+    cell: NodeName,
     file: Option<BufWriter<File>>,
     retry_at: Timestamp,
 }
 
 impl MapLog {
-    /// A log that is opened with the first map.
-    pub(super) fn new(path: PathBuf) -> Self {
-        Self { path, file: None, retry_at: Timestamp::default() }
+    /// A log of a cell's maps that is opened with the first one.
+    pub(super) fn new(path: PathBuf, cell: NodeName) -> Self {
+        Self { path, cell, file: None, retry_at: Timestamp::default() }
     }
 
     /// Appends a map. A failure is logged, and ends attempts for [`RETRY_PAUSE`].
@@ -46,10 +49,18 @@ impl MapLog {
                 self.file.insert(BufWriter::new(file))
             }
         };
-        serde_json::to_writer(&mut *file, map)?;
+        serde_json::to_writer(&mut *file, &LogLine { cell: &self.cell, map })?;
         file.write_all(b"\n")?;
         file.flush()
     }
+}
+
+/// A line of the log; readers take it for a [`ReceivedMap`].
+#[derive(Serialize)]
+struct LogLine<'a> {
+    cell: &'a NodeName,
+    #[serde(flatten)]
+    map: &'a ReceivedMap,
 }
 
 #[cfg(test)]
@@ -73,13 +84,16 @@ mod tests {
     fn a_log_that_cannot_be_written_is_tried_again_later() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("absent").join("maps.jsonl");
-        let mut log = MapLog::new(path.clone());
+        let mut log = MapLog::new(path.clone(), NodeName::from_static("lot-1"));
         log.append(&map(Timestamp(0)));
         std::fs::create_dir(path.parent().unwrap()).unwrap();
         log.append(&map(Timestamp(0) + RETRY_PAUSE / 2));
         assert!(!path.exists());
         log.append(&map(Timestamp(0) + RETRY_PAUSE));
         log.append(&map(Timestamp(0) + RETRY_PAUSE));
-        assert_eq!(std::fs::read_to_string(&path).unwrap().lines().count(), 2);
+        let lines = std::fs::read_to_string(&path).unwrap();
+        let logged: Vec<ReceivedMap> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        assert_eq!(logged, [map(Timestamp(0) + RETRY_PAUSE), map(Timestamp(0) + RETRY_PAUSE)]);
+        assert!(lines.lines().all(|line| line.starts_with(r#"{"cell":"lot-1","received_at_us":"#)), "{lines}");
     }
 }

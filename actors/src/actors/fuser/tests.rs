@@ -73,6 +73,8 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         let arguments = FollowerArguments {
             newest: newest.clone(),
             log: None,
+            cell: NodeName::from_static("cell"),
+            present_cell: tokio::sync::watch::channel(NodeName::from_static("cell")).1,
             recording: LogSender::default(),
             saved_term: 0,
             leadership: tokio::sync::watch::channel(leadership.clone()).1,

@@ -17,12 +17,13 @@ mod protocol;
 use std::io::{self, BufRead, BufReader, Read};
 use std::process::{Child, ChildStderr, ChildStdout, Command, Stdio};
 use std::sync::mpsc::{self, Receiver, Sender};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, LazyLock, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use opencv::core::{Mat, Scalar};
 use opencv::prelude::*;
+use regex::Regex;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use self::protocol::{ImageHeader, VideoMessage, VideoRequest};
@@ -39,13 +40,16 @@ const MIN_OPEN_TIME: Duration = Duration::from_secs(30);
 /// Maximum number of pixels of a frame: 8K.
 const MAX_PIXELS: i64 = 7680 * 4320;
 
+/// Maximum length of a message in bytes, without a frame's pixels.
+const MAX_LINE: u64 = 64 * 1024;
+
 /// Time for a program that is gone to hand over its last words.
 const LAST_WORDS_TIME: Duration = Duration::from_millis(200);
 
-/// A running `ecod-video` and the frames that it writes. The program is killed when this is dropped.
+/// A running `ecod-video` and the frames that it writes.
 pub(super) struct VideoProcess {
     origin: String,
-    child: Child,
+    child: ProgramGuard,
     output: BufReader<DeadlineReader>,
     last_words: LastWords,
     frame_time: Duration,
@@ -64,9 +68,10 @@ impl VideoProcess {
         })?;
         let mut command = Command::new(&program);
         let started = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
-        let mut child = started.map_err(|e| failed(format!("cannot start {}: {e}", program.display())))?;
-        let (Some(stdin), Some(stdout), Some(stderr)) = (&mut child.stdin, child.stdout.take(), child.stderr.take())
-        else {
+        let child = started.map_err(|e| failed(format!("cannot start {}: {e}", program.display())))?;
+        let mut child = ProgramGuard(child);
+        let pipes = (&mut child.0.stdin, child.0.stdout.take(), child.0.stderr.take());
+        let (Some(stdin), Some(stdout), Some(stderr)) = pipes else {
             return Err(failed(format!("no pipes to {PROGRAM}")));
         };
         // If the program is gone already, its end says why.
@@ -88,7 +93,7 @@ impl VideoProcess {
     fn receive(&mut self, time: Duration) -> Result<VideoMessage, FrameError> {
         self.output.get_mut().deadline = Instant::now() + time;
         let mut line = String::new();
-        match self.output.read_line(&mut line) {
+        match (&mut self.output).take(MAX_LINE).read_line(&mut line) {
             Ok(0) => Err(self.end()),
             Ok(_) => {
                 serde_json::from_str(&line).map_err(|e| self.lost(format!("{PROGRAM} is of another version: {e}")))
@@ -122,8 +127,8 @@ impl VideoProcess {
     /// The end of the program, with its status and last words.
     fn end(&mut self) -> FrameError {
         // It may have closed its output and go on; of a program that is gone, the status stays.
-        let _ = self.child.kill();
-        let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
+        let _ = self.child.0.kill();
+        let status = self.child.0.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
         let words = self.last_words.wait();
         let words = if words.is_empty() { words } else { format!(": {words}") };
         self.lost(format!("{PROGRAM} ended, {status}{words}"))
@@ -144,10 +149,13 @@ impl FrameSource for VideoProcess {
     }
 }
 
-impl Drop for VideoProcess {
+/// The running program, which is killed when this is dropped.
+struct ProgramGuard(Child);
+
+impl Drop for ProgramGuard {
     fn drop(&mut self) {
-        if let Err(error) = self.child.kill().and_then(|()| self.child.wait()) {
-            tracing::warn!(camera = self.origin, %error, "cannot end {PROGRAM}");
+        if let Err(error) = self.0.kill().and_then(|()| self.0.wait()) {
+            tracing::warn!(%error, "cannot end {PROGRAM}");
         }
     }
 }
@@ -201,17 +209,18 @@ fn log(camera: &str, stderr: ChildStderr, last: &Mutex<String>, _until: &Sender<
     }
 }
 
-/// A text that may be logged: of each address in it, `rtsp://user:secret@camera/1`, without user and secret.
+/// A text that may be logged: addresses without login and query, and no value of a property such as `user-pw`.
 pub(super) fn without_credentials(text: &str) -> String {
-    let mut parts = text.split("://");
-    let mut bare = parts.next().unwrap_or_default().to_owned();
-    for part in parts {
-        let end = part.find(|c: char| c == '/' || c == '"' || c == '\'' || c.is_whitespace()).unwrap_or(part.len());
-        let (login_and_host, rest) = part.split_at(end);
-        let host = login_and_host.rsplit('@').next().unwrap_or_default();
-        bare = format!("{bare}://{host}{rest}");
-    }
-    bare
+    #[expect(clippy::expect_used, reason = "the expressions are constants")]
+    static SECRETS: LazyLock<[(Regex, &str); 3]> = LazyLock::new(|| {
+        let login = r#"://[^/?"'\s]*@"#;
+        let query = r#"(://[^?"'\s]*)\?[^"'\s]*"#;
+        let property =
+            r#"(?i)((?:pw|pass|passwd|password|passphrase|secret|token|key)\s*=\s*)(?:"[^"]*"|'[^']*'|[^\s"'!]+)"#;
+        [(login, "://"), (query, "$1"), (property, "${1}…")]
+            .map(|(secret, bare)| (Regex::new(secret).expect("a valid expression"), bare))
+    });
+    SECRETS.iter().fold(text.to_owned(), |text, (secret, bare)| secret.replace_all(&text, *bare).into_owned())
 }
 
 #[cfg(test)]
@@ -222,6 +231,13 @@ mod tests {
     fn secrets_of_addresses_are_not_shown() {
         assert_eq!(without_credentials("rtsp://user:p@ss@camera:554/1"), "rtsp://camera:554/1");
         assert_eq!(without_credentials("http://camera/a@b"), "http://camera/a@b");
+        assert_eq!(without_credentials("http://camera/video?user=admin&pwd=hush"), "http://camera/video");
+        assert_eq!(
+            without_credentials(
+                "rtspsrc location=rtsp://camera user-id=me user-pw=\"hu sh\" ! x264enc key-int-max=30 ! appsink"
+            ),
+            "rtspsrc location=rtsp://camera user-id=me user-pw=… ! x264enc key-int-max=30 ! appsink"
+        );
         assert_eq!(
             without_credentials(
                 "rtspsrc location=\"rtsp://user:secret@camera\" ! tee name=a@b ! udpsink uri=udp://x@host"

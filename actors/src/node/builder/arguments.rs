@@ -206,6 +206,8 @@ impl NodeBuilder {
         FollowerArguments {
             newest: self.newest.clone(),
             log: self.config.map_log.clone(),
+            cell: self.config.cell.clone(),
+            present_cell: self.vehicle.present_cell.subscribe(),
             recording: self.recording.clone(),
             saved_term: saved_term(self.state_file("term").as_ref()),
             leadership: self.leadership(),

@@ -1,6 +1,7 @@
 //! The file of cells between which a vehicle moves by its position, and its configuration in each of them.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use ecod::config::{ConfigError, check_range};
 use ecod::model::names::NodeName;
@@ -12,6 +13,7 @@ use serde::Deserialize;
 use super::shared::{SharedConfig, StatedKeys};
 use super::{LoadError, NodeConfig};
 use crate::transport::mqtt::BrokerAddress;
+use crate::transport::pki::Credentials;
 
 /// A file of cells, the same for all vehicles.
 #[derive(Debug, Deserialize)]
@@ -76,20 +78,11 @@ impl CellEntry {
 }
 
 impl NodeConfig {
-    /// The cells between which the vehicle moves, in each of which it can take part; none if it stays in its own.
+    /// The cells between which the vehicle moves; none if it stays in its own.
     ///
     /// # Errors
-    /// [`LoadError`] naming the file, and the entry and key in it, or the cell and what cannot be used there.
+    /// [`LoadError`] naming the file, and the entry and key in it.
     pub fn load_cells(&self) -> Result<Vec<CellEntry>, LoadError> {
-        let cells = self.read_cells()?;
-        for cell in &cells {
-            let unusable = |error: &dyn std::fmt::Display| LoadError::Malformed(format!("cell {}: {error}", cell.name));
-            self.in_cell(cell).map_err(|error| unusable(&error))?.security().map_err(|error| unusable(&error))?;
-        }
-        Ok(cells)
-    }
-
-    fn read_cells(&self) -> Result<Vec<CellEntry>, LoadError> {
         let Some(path) = &self.cells else { return Ok(Vec::new()) };
         let text = std::fs::read_to_string(path);
         let text = text.map_err(|source| LoadError::Unreadable { path: path.clone(), source })?;
@@ -113,6 +106,16 @@ impl NodeConfig {
             }
         }
         Ok(cells)
+    }
+
+    /// The credentials with which the vehicle takes part in a cell; none without certificates.
+    ///
+    /// # Errors
+    /// The cell, and what cannot be used there.
+    pub fn credentials_in(&self, cell: &CellEntry) -> Result<Option<Arc<Credentials>>, LoadError> {
+        let unusable = |error: &dyn std::fmt::Display| LoadError::Malformed(format!("cell {}: {error}", cell.name));
+        let config = self.in_cell(cell).map_err(|error| unusable(&error))?;
+        Ok(config.security().map_err(|error| unusable(&error))?.credentials)
     }
 
     /// True if the node receives poses: its cameras, or its choice of the cell, need them.
@@ -186,7 +189,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let own = "[origin]\nlatitude_deg = 52.2\nlongitude_deg = 21\n[mqtt]\nuser = \"euclid\"\npassword = \"hush\"\n[fusion.pace]\ngate_m = 2.0\n[membership]\nkey = \"a long enough key\"\nbind = \"0.0.0.0:17884\"\n";
         let config = vehicle(directory.path(), CELLS, own).unwrap();
-        let cells = config.read_cells().unwrap();
+        let cells = config.load_cells().unwrap();
         assert_eq!(config.in_cell(&cells[0]).unwrap(), config);
         let guest = config.in_cell(&cells[1]).unwrap();
         assert_eq!((guest.cell.as_str(), guest.role), ("lot-2", Role::Cav));
@@ -200,7 +203,7 @@ mod tests {
     #[test]
     fn errors_name_the_file_the_cell_and_the_key() {
         let directory = tempfile::tempdir().unwrap();
-        let error = |cells: &str| vehicle(directory.path(), cells, "").unwrap().read_cells().unwrap_err().to_string();
+        let error = |cells: &str| vehicle(directory.path(), cells, "").unwrap().load_cells().unwrap_err().to_string();
         for (cells, parts) in [
             (CELLS.replace("lot-1", "lot-3"), ["cells.toml", "lot-1", "not among"]),
             (CELLS.replace("lot-2\"", "lot-1\""), ["cells.toml", "`cells[1].name`", "unique"]),

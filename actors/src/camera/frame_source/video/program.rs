@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::{self, BufRead, Write};
+use std::ops::RangeInclusive;
 use std::path::Path;
 use std::process::{Command, ExitCode};
 use std::thread;
@@ -75,7 +76,10 @@ fn write_frame(output: &mut File, frame: &CameraFrame) -> anyhow::Result<()> {
     Ok(output.write_all(image.data_bytes()?)?)
 }
 
-/// Rate of a video file without one.
+/// Frames per second of video files.
+const PLAUSIBLE_FPS: RangeInclusive<f64> = 0.01..=1000.0;
+
+/// Rate of a video file without a plausible one.
 const FALLBACK_FPS: f64 = 25.0;
 
 /// An open capture.
@@ -133,7 +137,7 @@ impl Video {
     fn file(path: &Path, origin: String, looping: bool) -> Result<Self, FrameError> {
         readable(path, &origin)?;
         let mut video = Self::live(origin, || VideoCapture::from_file(path, videoio::CAP_ANY))?;
-        let fps = video.capture.get(videoio::CAP_PROP_FPS).ok().filter(|fps| fps.is_finite() && *fps > 0.0);
+        let fps = video.capture.get(videoio::CAP_PROP_FPS).ok().filter(|fps| PLAUSIBLE_FPS.contains(fps));
         video.playback = Some(Playback { pace: FramePacer::new(fps.unwrap_or(FALLBACK_FPS)), looping });
         Ok(video)
     }
