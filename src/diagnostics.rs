@@ -113,6 +113,8 @@ trouble_kinds! {
     UplinkUnreachable = "uplink_unreachable", LONG, "look at the link to the region, and whether its broker runs; the cell goes on without it";
     /// An uplink of a cell that has no place on Earth.
     NoOrigin = "no_origin", UNTIL_SETTLED, "set `[origin]` in the cell's description: `ecod-node cell set`";
+    /// A cell to which the vehicle cannot move.
+    CellLeftOut = "cell_left_out", UNTIL_SETTLED, "correct its entry in the file of `cells` and the files that it names: `ecod-node doctor` tries all";
     /// More troubles than are kept.
     NotShown = "not_shown", SHORT, "mend those that are shown, others then have room";
     /// State that cannot be saved.

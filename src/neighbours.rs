@@ -25,7 +25,7 @@ use nalgebra::Point2;
 
 pub use area::CoveredArea;
 pub use filter::{AdmittedMap, CellMapFilter, MAX_AGE};
-pub use reputation_exchange::{ExchangeStep, ForeignNews, ReputationExchange};
+pub use reputation_exchange::{ExchangeStep, ReputationExchange};
 
 use crate::model::names::NodeName;
 use crate::model::origin::GeographicOrigin;

@@ -24,6 +24,9 @@ pub const JOIN_TIMEOUT: Duration = Duration::from_secs(15);
 /// Time for which a cell that could not be joined is not tried again.
 pub const RETRY_AFTER: Duration = Duration::from_secs(30);
 
+/// Time for which a cell is not tried again from which the vehicle has turned away.
+pub const TURN_PAUSE: Duration = Duration::from_secs(5);
+
 /// A cell as a vehicle knows it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KnownCell {
@@ -36,9 +39,9 @@ pub struct KnownCell {
 }
 
 impl KnownCell {
-    /// Distance in metres to the edge; negative inside.
+    /// Distance in metres to the edge on the ground, whatever the height; negative inside.
     fn outside_m(&self, place: &GeographicPosition) -> f64 {
-        self.origin.to_map(place).coords.norm() - self.radius_m
+        self.origin.to_map(place).coords.xy().norm() - self.radius_m
     }
 }
 
@@ -88,7 +91,9 @@ impl CellChoice {
         let present_m = outside_m(&self.present);
         if let Some((next, _)) = &self.next {
             let has_turned = outside_m(next) >= present_m;
-            return self.next.take_if(|_| has_turned).map(|(next, _)| CellMove::GiveUp(next));
+            let (left, _) = self.next.take_if(|_| has_turned)?;
+            self.failed.insert(left.clone(), now + TURN_PAUSE);
+            return Some(CellMove::GiveUp(left));
         }
         let others =
             self.cells.iter().filter(|cell| cell.name != self.present && !self.failed.contains_key(&cell.name));
@@ -209,6 +214,22 @@ mod tests {
         assert!(!choice.enter(&name(2)), "only the next cell is entered");
         choice.fail(&name(1), s(47.0));
         assert!(!choice.enter(&name(1)));
+    }
+
+    #[test]
+    fn a_vehicle_that_goes_to_and_fro_joins_once_in_some_seconds() {
+        let mut choice = CellChoice::new(cells(), name(0));
+        let places = [at(SPACING_M, 0.0), at(0.0, 0.0)];
+        let moves = (0..100).filter_map(|tick| choice.observe(Some(&places[tick % 2]), s(0.2 * tick as f64)));
+        let joins = moves.filter(|step| matches!(step, CellMove::Join(_))).count();
+        assert!((2..=4).contains(&joins), "{joins} in 20 s");
+    }
+
+    #[test]
+    fn a_vehicle_high_above_the_sea_changes_cells_too() {
+        let mut choice = CellChoice::new(cells(), name(0));
+        let place = GeographicPosition { height_m: 1500.0, ..at(SPACING_M, 0.0) };
+        assert_eq!(choice.observe(Some(&place), s(0.0)), Some(CellMove::Join(name(1))));
     }
 
     #[test]

@@ -293,6 +293,20 @@ mod tests {
         assert!(finding.verdict == CheckResult::Doubtful && finding.seen.contains("gone.key"), "{finding:?}");
     }
 
+    #[tokio::test]
+    async fn a_cell_that_does_not_accept_the_nodes_certificate_is_doubtful() {
+        let (directory, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let (own, other) = (certificates(&config(), directory.path()), certificates(&config(), elsewhere.path()));
+        let file = directory.path().join("cells.toml");
+        let cell = |name, ca: &Path| {
+            format!("[[cells]]\nname = \"{name}\"\nlatitude_deg = 1\nlongitude_deg = 2\nca = {ca:?}\n")
+        };
+        std::fs::write(&file, cell("cell", &own.ca) + &cell("elsewhere", &other.ca)).unwrap();
+        let finding = finding(&NodeConfig { cells: Some(file), tls: Some(own), ..config() }, "cells").await;
+        assert_eq!(finding.verdict, CheckResult::Doubtful, "{finding:?}");
+        assert!(finding.seen.contains("cell elsewhere") && !finding.seen.contains("cell cell"), "{finding:?}");
+    }
+
     #[cfg(feature = "foxglove")]
     #[tokio::test]
     async fn a_live_port_in_use_is_named() {

@@ -210,6 +210,15 @@ impl Town {
             .collect()
     }
 
+    /// Cells in the order of their maps in the vehicle's log, each run once.
+    fn logged_cells(&self) -> Vec<String> {
+        let text = std::fs::read_to_string(self.directory.path().join("maps")).unwrap();
+        let lines = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+        let mut cells: Vec<_> = lines.map(|line| line["cell"].as_str().unwrap().to_owned()).collect();
+        cells.dedup();
+        cells
+    }
+
     fn drive_to(&self, x_m: f64) {
         *self.x_m.lock().unwrap() = x_m;
     }
@@ -229,6 +238,8 @@ impl Town {
                 cells += &format!("ca = \"lot-{cell}/ca.pem\"\nrevocation_list = \"lot-{cell}/revoked.pem\"\n");
             }
         }
+        // A cell elsewhere, the key of which is missing.
+        cells += "[[cells]]\nname = \"lot-9\"\nlatitude_deg = 0\nlongitude_deg = 0\nkey_file = \"lot-9.key\"\n";
         std::fs::write(directory.join("cells.toml"), cells).unwrap();
         let camera = camera(directory);
         let mut config = config(0, "euclid", role);
@@ -314,6 +325,8 @@ async fn a_vehicle_reports_in_the_cell_in_which_it_is_and_never_in_two() {
         let reported_m = reports.places_m();
         assert!(reported_m.iter().all(|x_m| places_m.contains(x_m)), "in the frame of its cell: {reported_m:?}");
     }
+    let logged = town.logged_cells();
+    assert_eq!(logged, ["lot-0", "lot-1"], "one cell's maps at a time");
     let maps = [0, 1].map(|cell| town.accepted(cell));
     let [last, next] = [maps[0].last().unwrap().0, maps[1][0].0];
     let seam = next.since(last);
@@ -391,6 +404,8 @@ async fn a_vehicle_that_cannot_know_where_it_is_says_so() {
     let troubles = vehicle.present().counters().troubles().present();
     let trouble = troubles.iter().find(|trouble| trouble.remedy.contains("`latitude_deg`"));
     assert!(trouble.is_some_and(|trouble| trouble.kind == "no_pose"), "{troubles:?}");
+    let left_out = troubles.iter().find(|trouble| trouble.kind == "cell_left_out");
+    assert!(left_out.is_some_and(|trouble| trouble.cause.contains("lot-9.key")), "{troubles:?}");
     vehicle.stop().await;
     town.stop().await;
 }

@@ -1,6 +1,6 @@
 //! A town of many cells in virtual time: generated traffic, one aggregator for each cell, and their neighbours' maps.
 //!
-//! Each vehicle reports to the cell in which it is. Cells send each other their maps, which take their time, come twice,
+//! Each vehicle reports to the cell that the core's `CellChoice` gives. Cells send each other their maps, which take their time, come twice,
 //! out of order or never. Each cell has a frame and a clock of its own. The town's map is all maps of one moment together,
 //! each identity once. Beside it, one aggregator gets all reports.
 
@@ -9,6 +9,7 @@ mod links;
 mod place;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 use std::time::Duration;
 
 use ecod::aggregator::{Algorithms, FusionConfig};
@@ -35,10 +36,13 @@ const TOWN: GeographicOrigin =
 /// Cells along each side.
 pub const CELLS_A_SIDE: usize = 3;
 
+/// Numbers of the cells, row by row from the south-west.
+const CELLS: Range<usize> = 0..CELLS_A_SIDE * CELLS_A_SIDE;
+
 /// Distance in metres of a border of cells up to which a place is at the border.
 pub const BORDER_M: f64 = 25.0;
 
-/// Time that a vehicle takes to get ready in the next cell.
+/// Time that a vehicle takes to get ready in the next cell; real nodes take 0.6 to 2 s.
 const JOIN_TIME: Duration = Duration::from_secs(1);
 
 /// Time of a map from the moment for which it counts, at most.
@@ -131,6 +135,7 @@ pub fn run(
     let mut cells: Vec<TownCell> =
         plan.frames(uniform).map(|(name, frame)| TownCell::new(name, frame, config.clone(), start)).collect();
     let mut links = TownLinks::new(link, uniform);
+    let numbers: BTreeMap<NodeName, usize> = CELLS.map(|number| (cell_name(number), number)).collect();
     let mut vehicles: BTreeMap<NodeName, TownVehicle> = BTreeMap::new();
     for arrived in &recording.reports {
         let now = arrived.received_at_us.unwrap_or(arrived.report.captured_at_us);
@@ -138,7 +143,8 @@ pub fn run(
         advance(&mut cells, &mut links, now);
         single.report(&arrived.report, now);
         let node = arrived.report.node.clone();
-        let number = vehicles.entry(node).or_insert_with(|| plan.vehicle(&arrived.report)).drive(&arrived.report, now);
+        let vehicle = vehicles.entry(node).or_insert_with(|| plan.vehicle(&arrived.report));
+        let number = numbers[vehicle.drive(&arrived.report, now)];
         cells[number].report(&arrived.report, now);
         links.send_from(&mut cells, number, now);
     }
@@ -189,7 +195,7 @@ impl TownPlan {
 
     /// Names and frames: each with a direction and a clock of its own, up to 2 s fast or slow.
     fn frames<'a>(&'a self, uniform: &'a mut dyn FnMut() -> f64) -> impl Iterator<Item = (NodeName, CellFrame)> + 'a {
-        (0..CELLS_A_SIDE * CELLS_A_SIDE).map(move |number| {
+        CELLS.map(move |number| {
             let origin = GeographicOrigin { rotation_deg: 360.0 * uniform(), ..self.middle(number) };
             let clock_us = ((4.0 * uniform() - 2.0) * 1e6) as i64;
             (cell_name(number), CellFrame::new(&TOWN, origin, clock_us))
@@ -204,12 +210,10 @@ impl TownPlan {
     fn vehicle(&self, report: &ObjectReport) -> TownVehicle {
         let place = place_of(report);
         let here = self.index(place.x) + CELLS_A_SIDE * self.index(place.y);
-        let cells = (0..CELLS_A_SIDE * CELLS_A_SIDE).map(|number| {
-            let middle = self.middle(number);
-            // A circle that has the corners in it.
-            KnownCell { name: cell_name(number), origin: middle, radius_m: 0.75 * self.side_m }
-        });
-        TownVehicle { cell: here, choice: CellChoice::new(cells.collect(), cell_name(here)), joined_at: None }
+        // Circles that have the corners in them.
+        let radius_m = 0.75 * self.side_m;
+        let known = |number| KnownCell { name: cell_name(number), origin: self.middle(number), radius_m };
+        TownVehicle { choice: CellChoice::new(CELLS.map(known).collect(), cell_name(here)), joined_at: None }
     }
 
     /// Place on Earth of the middle of a cell; its frame looks east.
@@ -238,7 +242,6 @@ impl TownPlan {
 
 /// A vehicle that reports to one cell at a time.
 struct TownVehicle {
-    cell: usize,
     choice: CellChoice,
     /// The next cell and when it was joined.
     joined_at: Option<(NodeName, Timestamp)>,
@@ -246,20 +249,17 @@ struct TownVehicle {
 
 impl TownVehicle {
     /// The cell to which it reports from where it is at `now`.
-    fn drive(&mut self, report: &ObjectReport, now: Timestamp) -> usize {
+    fn drive(&mut self, report: &ObjectReport, now: Timestamp) -> &NodeName {
         let place = place_of(report);
         match self.choice.observe(Some(&TOWN.to_wgs84(place.x, place.y, 0.0)), now) {
             Some(CellMove::Join(cell)) => self.joined_at = Some((cell, now)),
             Some(CellMove::GiveUp(_)) => self.joined_at = None,
             None => {}
         }
-        if let Some((cell, _)) = self.joined_at.take_if(|(_, at)| now.since(*at) >= JOIN_TIME)
-            && self.choice.enter(&cell)
-        {
-            self.cell =
-                (0..CELLS_A_SIDE * CELLS_A_SIDE).position(|number| cell_name(number) == cell).unwrap_or(self.cell);
+        if let Some((cell, _)) = self.joined_at.take_if(|(_, at)| now.since(*at) >= JOIN_TIME) {
+            self.choice.enter(&cell);
         }
-        self.cell
+        self.choice.present()
     }
 }
 

@@ -147,8 +147,8 @@ impl CellState {
 /// Maximum number of cells.
 pub const MAX_CELLS: usize = 100_000;
 
-/// Maximum size of a map in bytes: a cell of some thousand objects.
-const MAX_MAP_BYTES: usize = 1 << 20;
+/// Maximum size of a map in bytes: a cell of two thousand objects.
+const MAX_MAP_BYTES: usize = 256 << 10;
 
 /// Maximum size of a status in bytes, as at a cell's broker.
 const MAX_STATUS_BYTES: usize = 16 << 10;

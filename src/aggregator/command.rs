@@ -61,9 +61,6 @@ pub enum Command {
         /// All that other cells say of the vehicles that are present.
         #[schemars(with = "serde_json::Value")]
         reputations: Arc<ForeignReputations>,
-        /// Trust in the word of cells that the own evidence contradicts, 0 to 1.
-        #[serde(default)]
-        trust_in_words: BTreeMap<NodeName, f64>,
     },
     /// [`Aggregator::resume`].
     Resume {
@@ -97,7 +94,7 @@ impl Aggregator {
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::TakeNeighbours { objects, stated_at } => self.take_neighbours(objects, *stated_at),
-            Command::TakeForeign { reputations, trust_in_words } => self.take_foreign(reputations, trust_in_words),
+            Command::TakeForeign { reputations } => self.take_foreign(reputations),
             Command::Resume { reputations } => self.resume(reputations),
             Command::Configure { fusion, landmarks } => {
                 self.configure(FusionConfig::clone(fusion), landmarks.iter().map(Landmark::from).collect());

@@ -15,8 +15,6 @@ use crate::wire::ForeignVotes;
 #[derive(Debug, Clone, Default)]
 pub(super) struct ForeignView {
     reputations: Arc<ForeignReputations>,
-    /// Trust in the word of cells that the own evidence contradicts, 0 to 1.
-    trust_in_words: BTreeMap<NodeName, f64>,
     /// Trust in each cell, 0 to 1, by which votes and tracks weigh them at present; none if they do not yet.
     trust: Option<BTreeMap<NodeName, f64>>,
     /// True if what counts has changed since it was asked for.
@@ -25,9 +23,8 @@ pub(super) struct ForeignView {
 
 impl ForeignView {
     /// Takes all that is known.
-    pub(super) fn set(&mut self, reputations: &Arc<ForeignReputations>, trust_in_words: &BTreeMap<NodeName, f64>) {
+    pub(super) fn set(&mut self, reputations: &Arc<ForeignReputations>) {
         (self.reputations, self.trust) = (Arc::clone(reputations), None);
-        self.trust_in_words.clone_from(trust_in_words);
     }
 
     /// Has votes and tracks told again: they may have begun anew.
@@ -35,13 +32,10 @@ impl ForeignView {
         self.trust = None;
     }
 
-    /// Tells votes and tracks, if anything or the trust in any cell has changed. A cell is trusted as little as its map and
-    /// its word; if neither could be judged, as a newcomer is.
+    /// Tells votes and tracks, if anything or the trust in any cell has changed. A cell of which tracks know nothing is
+    /// trusted as a newcomer is.
     pub(super) fn weigh(&mut self, vote: Option<&mut Vote>, tracks: Option<&mut Tracker>) {
-        let of_cell = |cell: &NodeName| {
-            let of_word = self.trust_in_words.get(cell).copied().unwrap_or(1.0);
-            tracks.as_ref().map_or(1.0, |tracks| tracks.trust_in_cell(cell)).min(of_word)
-        };
+        let of_cell = |cell: &NodeName| tracks.as_ref().map_or(1.0, |tracks| tracks.trust_in_cell(cell));
         let trust = self.reputations.cells().into_iter().map(|cell| (cell.clone(), of_cell(cell))).collect();
         if self.trust.as_ref() == Some(&trust) {
             return;
@@ -68,9 +62,8 @@ impl ForeignView {
 
 impl Aggregator {
     /// Takes all that other cells say of vehicles. It moves the trust from which they start, from the next round on.
-    /// `trust_in_words` is that in cells which the own evidence contradicts, 0 to 1.
-    pub fn take_foreign(&mut self, reputations: &Arc<ForeignReputations>, trust_in_words: &BTreeMap<NodeName, f64>) {
-        self.foreign.set(reputations, trust_in_words);
+    pub fn take_foreign(&mut self, reputations: &Arc<ForeignReputations>) {
+        self.foreign.set(reputations);
     }
 
     /// The votes of other cells beside the prior of published reputations, if they have changed since the last call.

@@ -56,9 +56,10 @@ impl NeighbourView {
     }
 }
 
-/// True if two statements can be of one object, by its speed and their ages; `age_s` is that of the second.
+/// True if two statements can be of one object, by the lower speed and their ages; `age_s` is that of the second.
 fn is_near(told: &NeighbourObject, stated: &NeighbourObject, age_s: f64) -> bool {
     let [a, b] = [&told.object, &stated.object];
-    let speed_mps = a.velocity_mps.map_or(0.0, |[east, north]| east.hypot(north));
+    let speeds = [a, b].map(|object| object.velocity_mps.map_or(0.0, |[east, north]| east.hypot(north)));
+    let speed_mps = f64::min(speeds[0], speeds[1]);
     (a.x_m - b.x_m).hypot(a.y_m - b.y_m) <= SAME_PLACE_M + speed_mps * ((told.age_s - age_s).abs() + CLOCK_ERROR_S)
 }

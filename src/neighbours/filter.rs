@@ -37,8 +37,9 @@ const MIN_BACKLOG_CELLS: usize = 3;
 /// the sender's clock or by the cell's time, whichever makes it younger: the one may be new, the other may jump. While
 /// neither is known, no map counts: for a second from the first map of a cell on.
 ///
-/// A backlog that lasts looks like a clock that is as much behind. But the clocks of cells do not change together: what three
-/// quarters of them, and three at least, take longer than in the minutes before is a backlog, and adds to the age.
+/// A backlog that lasts looks like a clock that is as much behind. But clocks of cells do not change together. So a delay is a
+/// backlog if three quarters of the cells, and three at least, have it. It adds to the age of each map that is as late, for two
+/// to four minutes.
 #[derive(Debug, Clone)]
 pub struct CellMapFilter {
     max_cells: usize,
@@ -106,6 +107,9 @@ impl CellMapFilter {
                 return Err(RejectReason::TooManyCells);
             }
         }
+        if received_at.since(self.looked_at) >= BACKLOG_PERIOD {
+            (self.backlog, self.looked_at) = (self.find_backlog(received_at), received_at);
+        }
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
         let first = || CellOrder::new(epoch.clone(), received_at);
         let order = self.cells.entry(cell.clone()).or_insert_with(first);
@@ -121,20 +125,18 @@ impl CellMapFilter {
         (order.epoch, order.round, order.received_at) = (epoch, map.round, received_at);
         let ages = [(&mut order.by_sender, *sent_at_us), (&mut order.by_cell, map.fused_at_us)]
             .map(|(delay, stamp)| delay.observe(received_at.micros_from(stamp), received_at));
-        if received_at.since(self.looked_at) >= BACKLOG_PERIOD {
-            (self.backlog, self.looked_at) = (self.find_backlog(received_at), received_at);
-        }
-        let age = ages.into_iter().flatten().min().ok_or(RejectReason::Stale)? + self.backlog;
+        let backlog = self.backlog.min(order.lag());
+        let age = ages.into_iter().flatten().min().ok_or(RejectReason::Stale)? + backlog;
         if age > MAX_AGE { Err(RejectReason::Stale) } else { Ok(AdmittedMap { age }) }
     }
 
-    /// What three quarters of the cells that are heard take longer than in the minutes before.
+    /// The delay beyond that of the last minutes that three quarters of the cells share.
     fn find_backlog(&self, now: Timestamp) -> Duration {
         let heard = self.cells.values().filter(|order| now.since(order.received_at) <= MAX_AGE);
-        let mut lags_us: Vec<_> = heard.map(|order| order.by_sender.lag_us().min(order.by_cell.lag_us())).collect();
-        lags_us.sort_unstable();
-        let common_us = lags_us.get(lags_us.len() / 4).filter(|_| lags_us.len() >= MIN_BACKLOG_CELLS);
-        Duration::from_micros(common_us.filter(|lag_us| **lag_us > JITTER_US).map_or(0, |lag_us| lag_us.unsigned_abs()))
+        let mut lags: Vec<_> = heard.map(CellOrder::lag).collect();
+        lags.sort_unstable();
+        let common = lags.get(lags.len() / 4).filter(|_| lags.len() >= MIN_BACKLOG_CELLS);
+        common.copied().unwrap_or_default()
     }
 
     /// Forgets cells that have been silent for a minute.
@@ -153,6 +155,12 @@ impl CellOrder {
         let (by_sender, by_cell) = (DelayEstimate::new(now), DelayEstimate::new(now));
         // Rounds begin with 1.
         Self { epoch, round: 0, by_sender, by_cell, received_at: now }
+    }
+
+    /// The least delay of late beyond that of the last minutes, by the clock that makes it shorter; none for jitter.
+    fn lag(&self) -> Duration {
+        let lag_us = self.by_sender.lag_us().min(self.by_cell.lag_us());
+        Duration::from_micros(if lag_us > JITTER_US { lag_us.unsigned_abs() } else { 0 })
     }
 }
 

@@ -9,6 +9,7 @@
 //!   only the latest counts of each vehicle wait.
 //! - *Never less.* A leader that knows less than the region does, such as one that lost its disk, first hears what its cell said
 //!   before, and sends the larger of every count. What it hears too late it puts right.
+//! - *News.* The first word of a cell about a vehicle that is present is due at once, further counts are gathered for a second.
 //! - *Resets.* A leader that missed a reset of its cell's evidence adds to what the region has only what it counts from then on.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -34,8 +35,15 @@ const NEWS_SHARE: f64 = 0.05;
 /// Maximum number of vehicles that have left and wait to be told of; those with the fewest votes make room.
 const MAX_WAITING: usize = 1024;
 
-/// Maximum number of filters in one subscription.
-const MAX_FILTERS: usize = 64;
+/// Maximum number of filters in one subscription. All that is retained below them comes at once, and must fit into what a broker
+/// keeps for a subscriber.
+const MAX_FILTERS: usize = 16;
+
+/// Time for which first words of cells are gathered: a vehicle that comes is told of by many at once.
+const GATHER_TIME: Duration = Duration::from_millis(20);
+
+/// Time for which further counts are gathered.
+const FURTHER_GATHER_TIME: Duration = Duration::from_secs(1);
 
 /// A leader's next step on its region's broker.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -48,15 +56,6 @@ pub enum ExchangeStep {
     Publish(CellReputation),
 }
 
-/// News of another cell about a vehicle that is present.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ForeignNews {
-    /// Its first word about the vehicle: the vehicle starts by it.
-    First,
-    /// Further counts, which can wait.
-    Further,
-}
-
 /// A vehicle that is present or waits to be told of.
 #[derive(Debug, Clone, Default)]
 struct KnownVehicle {
@@ -67,12 +66,20 @@ struct KnownVehicle {
     told: CellCounts,
     /// The largest of every count heard after the last reset.
     heard: CellCounts,
-    /// The own counts when a reset was heard that the ledger does not have, and those of the region then.
-    missed_reset: Option<(CellCounts, CellCounts)>,
+    missed_reset: Option<MissedReset>,
     /// The filter on this connection, and since when.
     filter: Option<(VehicleFilter, Timestamp)>,
     has_heard: bool,
     sent_at: Option<Timestamp>,
+}
+
+/// A reset that the region has and the ledger does not.
+#[derive(Debug, Clone, Copy)]
+struct MissedReset {
+    /// The counts of the ledger when it was heard.
+    own: CellCounts,
+    /// The counts of the region then.
+    region: CellCounts,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -87,6 +94,10 @@ pub struct ReputationExchange {
     cell: NodeName,
     vehicles: BTreeMap<NodeName, KnownVehicle>,
     foreign: ForeignReputations,
+    /// When news of other cells, or another judgement of them, are due.
+    news_at: Option<Timestamp>,
+    /// True if there are news of other cells.
+    is_news: bool,
     dropped: u64,
 }
 
@@ -95,18 +106,18 @@ impl KnownVehicle {
     fn wanted(&self) -> CellCounts {
         let mut wanted = self.heard;
         let own = self.own.unwrap_or_default();
-        wanted.merge(self.missed_reset.map_or(own, |(before, base)| base.plus(own.since(before))));
+        wanted.merge(self.missed_reset.map_or(own, |missed| missed.region.plus(own.since(missed.own))));
         wanted
     }
 
     /// Notes or forgets that the ledger lacks a reset that the region has.
     fn compare_resets(&mut self) {
         let Some(own) = self.own else { return };
-        let noted_at = self.missed_reset.map(|(_, base)| base.reset_at);
+        let noted_at = self.missed_reset.map(|missed| missed.region.reset_at);
         if own.reset_at >= self.heard.reset_at.max(noted_at.unwrap_or_default()) {
             self.missed_reset = None;
         } else if noted_at.is_none_or(|at| at < self.heard.reset_at) {
-            self.missed_reset = Some((own, self.heard));
+            self.missed_reset = Some(MissedReset { own, region: self.heard });
         }
     }
 
@@ -153,29 +164,38 @@ impl VehicleFilter {
 }
 
 impl ReputationExchange {
-    /// No vehicles yet of a cell.
+    /// No vehicles yet of a cell. That is news: an earlier exchange may have said more.
     pub fn new(cell: NodeName) -> Self {
-        Self { cell, vehicles: BTreeMap::new(), foreign: ForeignReputations::default(), dropped: 0 }
+        let news_at = Some(Timestamp::default());
+        let (vehicles, foreign) = (BTreeMap::new(), ForeignReputations::default());
+        Self { cell, vehicles, foreign, news_at, is_news: true, dropped: 0 }
     }
 
-    /// Takes the vehicles that are present. What other cells say of the rest is forgotten; true if they said anything.
-    pub fn set_present(&mut self, present: &BTreeSet<NodeName>) -> bool {
+    /// Takes the vehicles that are present. What other cells say of the rest is forgotten. The same ones again come from an
+    /// aggregator that began anew, which is told anew.
+    pub fn set_present(&mut self, present: &BTreeSet<NodeName>) {
+        let mut is_same = true;
         for name in present.iter().take(MAX_FOREIGN_VEHICLES) {
             self.vehicles.entry(name.clone()).or_default();
         }
         for (name, vehicle) in &mut self.vehicles {
-            vehicle.is_present = present.contains(name);
+            let is_present = present.contains(name);
+            is_same &= std::mem::replace(&mut vehicle.is_present, is_present) == is_present;
         }
-        let has_less = self.foreign.retain(|name| present.contains(name));
+        if self.foreign.retain(|name| present.contains(name)) || is_same {
+            (self.news_at, self.is_news) = (Some(Timestamp::default()), true);
+        }
         self.make_room();
-        has_less
     }
 
-    /// Takes what the ledger says of a vehicle.
-    pub fn count(&mut self, vehicle: &NodeName, counts: CellCounts) {
+    /// Takes what the ledger says of a vehicle. It may contradict other cells.
+    pub fn count(&mut self, vehicle: &NodeName, counts: CellCounts, now: Timestamp) {
         let known = self.vehicles.entry(vehicle.clone()).or_default();
         known.own = Some(counts);
         known.compare_resets();
+        if known.is_present {
+            self.look_at(now + FURTHER_GATHER_TIME);
+        }
         self.make_room();
     }
 
@@ -187,9 +207,9 @@ impl ReputationExchange {
         }
     }
 
-    /// Takes a message of the region; some if it is news of another cell about a vehicle that is present.
-    pub fn hear(&mut self, message: &CellReputation) -> Option<ForeignNews> {
-        let vehicle = self.vehicles.get_mut(&message.vehicle)?;
+    /// Takes a message of the region at `now`; true if it is news of another cell about a vehicle that is present.
+    pub fn hear(&mut self, message: &CellReputation, now: Timestamp) -> bool {
+        let Some(vehicle) = self.vehicles.get_mut(&message.vehicle) else { return false };
         let counts = CellCounts::from(message);
         if message.cell == self.cell {
             // A broker keeps the last message, which need not be the largest.
@@ -197,21 +217,34 @@ impl ReputationExchange {
             vehicle.heard.merge(counts);
             vehicle.compare_resets();
             vehicle.has_heard = true;
-            return None;
+            return false;
         }
         let is_first = !self.foreign.has(&message.cell, &message.vehicle);
         let is_news = vehicle.is_present && self.foreign.merge(&message.cell, &message.vehicle, counts);
-        is_news.then_some(if is_first { ForeignNews::First } else { ForeignNews::Further })
+        if is_news {
+            self.is_news = true;
+            self.look_at(now + if is_first { GATHER_TIME } else { FURTHER_GATHER_TIME });
+        }
+        is_news
     }
 
-    /// What other cells say of the vehicles that are present.
-    pub fn foreign(&self) -> &ForeignReputations {
-        &self.foreign
+    /// When to call [`Self::take_news`].
+    pub fn news_at(&self) -> Option<Timestamp> {
+        self.news_at
     }
 
-    /// Trust in the word of each cell that the own evidence contradicts, 0 to 1.
-    pub fn trust_in_words(&self) -> BTreeMap<NodeName, f64> {
-        self.foreign.trust_in_words(|vehicle| Some(self.vehicles.get(vehicle)?.own?.remembered()))
+    /// All that other cells say of the vehicles that are present, if there is news and it is due. Their word is judged by the
+    /// own evidence.
+    pub fn take_news(&mut self, now: Timestamp) -> Option<ForeignReputations> {
+        self.news_at.take_if(|at| *at <= now)?;
+        let vehicles = &self.vehicles;
+        let is_judged = self.foreign.judge(|vehicle| Some(vehicles.get(vehicle)?.own?.remembered()));
+        let is_news = std::mem::take(&mut self.is_news) || is_judged;
+        is_news.then(|| self.foreign.clone())
+    }
+
+    fn look_at(&mut self, at: Timestamp) {
+        self.news_at = Some(self.news_at.map_or(at, |news_at| news_at.min(at)));
     }
 
     /// The next steps on a connection, with at most so many messages.

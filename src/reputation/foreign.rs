@@ -27,14 +27,17 @@ const MAX_SHARE_EACH: f64 = 0.5;
 /// Maximum weight of all cells' votes about a vehicle, as a multiple of the prior's.
 const MAX_SHARE: f64 = 2.0;
 
-/// Remembered votes of the own cell, and of another, from which the other's word about a vehicle is judged by the own ones.
-const MIN_JUDGED_VOTES: [u64; 2] = [20, 5];
+/// Minimum number of remembered own votes about a vehicle by which other cells' word about it is judged.
+const MIN_OWN_VOTES: u64 = 20;
+
+/// Minimum number of remembered votes of another cell about a vehicle from which its word is judged.
+const MIN_JUDGED_VOTES: u64 = 5;
 
 /// Difference of the shares of right votes from which two cells contradict each other about a vehicle.
 const CONTRADICTION: f64 = 0.35;
 
-/// Vehicles whose like contradiction halves the trust in a cell's word.
-const DOUBTED_VEHICLES: f64 = 2.0;
+/// Least trust in a cell's word. Vehicles that lie in one cell and not in another make the first one's word look wrong.
+const MIN_WORD_TRUST: f64 = 0.5;
 
 /// Maximum number of cells about one vehicle; those with most votes count.
 const MAX_CELLS_EACH: usize = 16;
@@ -110,17 +113,23 @@ impl From<&CellReputation> for CellCounts {
     }
 }
 
-/// Counts of other cells, by vehicle and cell.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct ForeignReputations(BTreeMap<NodeName, BTreeMap<NodeName, CellCounts>>);
+/// Counts of other cells, and what their word is worth.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ForeignReputations {
+    /// By vehicle and cell.
+    counts: BTreeMap<NodeName, BTreeMap<NodeName, CellCounts>>,
+    /// Trust, 0 to 1, in the word of the cells that own evidence contradicts.
+    word_trust: BTreeMap<NodeName, f64>,
+}
 
 impl ForeignReputations {
     /// Merges what a cell says of a vehicle; true if that changed anything. What is beyond the maxima is left out.
     pub fn merge(&mut self, cell: &NodeName, vehicle: &NodeName, counts: CellCounts) -> bool {
-        if self.0.len() >= MAX_FOREIGN_VEHICLES && !self.0.contains_key(vehicle) {
+        if self.counts.len() >= MAX_FOREIGN_VEHICLES && !self.counts.contains_key(vehicle) {
             return false;
         }
-        let cells = self.0.entry(vehicle.clone()).or_default();
+        let cells = self.counts.entry(vehicle.clone()).or_default();
         let is_news = cells.entry(cell.clone()).or_default().merge(counts);
         if cells.len() > MAX_CELLS_EACH {
             // Totals only grow, so that the result does not depend on the order of messages.
@@ -135,56 +144,57 @@ impl ForeignReputations {
 
     /// Forgets vehicles that are not wanted; true if there were any.
     pub fn retain(&mut self, mut is_wanted: impl FnMut(&NodeName) -> bool) -> bool {
-        let before = self.0.len();
-        self.0.retain(|vehicle, _| is_wanted(vehicle));
-        self.0.len() < before
+        let before = self.counts.len();
+        self.counts.retain(|vehicle, _| is_wanted(vehicle));
+        self.counts.len() < before
     }
 
     /// True if a cell says something of a vehicle.
     pub fn has(&self, cell: &NodeName, vehicle: &NodeName) -> bool {
-        self.0.get(vehicle).is_some_and(|cells| cells.contains_key(cell))
+        self.counts.get(vehicle).is_some_and(|cells| cells.contains_key(cell))
     }
 
     /// The cells that say something.
     pub fn cells(&self) -> BTreeSet<&NodeName> {
-        self.0.values().flat_map(BTreeMap::keys).collect()
+        self.counts.values().flat_map(BTreeMap::keys).collect()
     }
 
-    /// Trust in the word of each cell that own evidence contradicts, 0 to 1; all others have 1. Counts of the own evidence are
-    /// those that are remembered.
-    pub fn trust_in_words(&self, own: impl Fn(&NodeName) -> Option<Counts>) -> BTreeMap<NodeName, f64> {
+    /// Judges every cell's word by the own remembered votes about the same vehicles; true if that changes any weight. Two
+    /// vehicles about which it is contradicted halve it, and more do no more.
+    pub fn judge(&mut self, own: impl Fn(&NodeName) -> Option<Counts>) -> bool {
         let mut judged = BTreeMap::<&NodeName, [f64; 2]>::new();
-        for (vehicle, cells) in &self.0 {
-            let Some(own) = own(vehicle).filter(|own| own.total() >= MIN_JUDGED_VOTES[0]) else { continue };
-            for (cell, counts) in cells {
-                let said = counts.remembered();
-                if said.total() >= MIN_JUDGED_VOTES[1] {
-                    let [contradicted, all] = judged.entry(cell).or_default();
-                    *contradicted += f64::from(u8::from((said.share() - own.share()).abs() > CONTRADICTION));
-                    *all += 1.0;
-                }
+        for (vehicle, cells) in &self.counts {
+            let Some(own) = own(vehicle).filter(|own| own.total() >= MIN_OWN_VOTES) else { continue };
+            let said = cells.iter().map(|(cell, counts)| (cell, counts.remembered()));
+            for (cell, said) in said.filter(|(_, said)| said.total() >= MIN_JUDGED_VOTES) {
+                let [contradicted, all] = judged.entry(cell).or_default();
+                *contradicted += f64::from(u8::from((said.share() - own.share()).abs() > CONTRADICTION));
+                *all += 1.0;
             }
         }
         let contradicted = judged.into_iter().filter(|(_, [contradicted, _])| *contradicted > 0.0);
-        contradicted
-            .map(|(cell, [contradicted, all])| (cell.clone(), 1.0 - contradicted / (DOUBTED_VEHICLES + all)))
-            .collect()
+        let trust = |[contradicted, all]: [f64; 2]| (1.0 - contradicted / (all + 2.0)).max(MIN_WORD_TRUST);
+        let word_trust = contradicted.map(|(cell, counts)| (cell.clone(), trust(counts))).collect();
+        let is_news = self.word_trust != word_trust;
+        self.word_trust = word_trust;
+        is_news
     }
 
-    /// Every vehicle's votes beside a prior of this weight in votes; `trust` in each cell is 0 to 1.
+    /// Every vehicle's votes beside a prior of this weight in votes; `trust` in each cell's map is 0 to 1.
     pub fn votes(&self, prior_votes: f64, trust: impl Fn(&NodeName) -> f64) -> BTreeMap<NodeName, ForeignVotes> {
         let of_vehicle = |(vehicle, cells): (&NodeName, &BTreeMap<NodeName, CellCounts>)| {
             let mut sum = ForeignVotes::default();
             for (cell, counts) in cells {
                 let Counts { correct, incorrect } = counts.remembered();
                 let votes = (correct as f64 + incorrect as f64).max(1.0);
-                let weight = trust(cell).clamp(0.0, 1.0) * DISCOUNT.min(MAX_SHARE_EACH * prior_votes / votes);
+                let trust = trust(cell).min(self.word_trust.get(cell).copied().unwrap_or(1.0)).clamp(0.0, 1.0);
+                let weight = trust * DISCOUNT.min(MAX_SHARE_EACH * prior_votes / votes);
                 sum.correct += weight * correct as f64;
                 sum.incorrect += weight * incorrect as f64;
             }
             let kept = (MAX_SHARE * prior_votes / sum.total().max(f64::MIN_POSITIVE)).min(1.0);
             (vehicle.clone(), ForeignVotes { correct: kept * sum.correct, incorrect: kept * sum.incorrect })
         };
-        self.0.iter().map(of_vehicle).filter(|(_, votes)| votes.total() > 0.0).collect()
+        self.counts.iter().map(of_vehicle).filter(|(_, votes)| votes.total() > 0.0).collect()
     }
 }

@@ -7,7 +7,7 @@
 //!
 //! A cell is judged as a vehicle is (`trust`): it states that its objects exist.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use nalgebra::Vector2;
@@ -223,16 +223,24 @@ impl ForeignObjects {
         self.trust(cell, fleet) > 0.0
     }
 
-    /// The objects near a place at `at` of which their cells state that they exist. Their histories are what this cell's
-    /// vehicles saw there.
-    pub(super) fn stated_near(
+    /// The objects of which their cells state that they exist, and whose place at `at` is looked at; so many of each cell at most.
+    /// Their histories are what this cell's vehicles saw there.
+    pub(super) fn stated(
         &mut self,
-        centre: &Vector2<f64>,
-        reach_m: f64,
+        max_each: usize,
         at: Timestamp,
+        is_looked_at: impl Fn(&Vector2<f64>) -> bool,
     ) -> impl Iterator<Item = &mut Track> {
-        let stated = self.objects.iter_mut().filter(|object| object.is_stated()).map(|object| &mut object.track);
-        stated.filter(move |track| (track.state.position_at(at) - centre).norm() <= reach_m)
+        let mut left = BTreeMap::new();
+        let looked_at = self.objects.iter_mut().filter(move |object| {
+            object.is_stated() && is_looked_at(&object.track.state.position_at(at)) && {
+                let left: &mut usize = left.entry(object.cell.clone()).or_insert(max_each);
+                let has_room = *left > 0;
+                *left = left.saturating_sub(1);
+                has_room
+            }
+        });
+        looked_at.map(|object| &mut object.track)
     }
 
     /// True if there is none.

@@ -33,8 +33,8 @@ const MATURE_HITS: u32 = 8;
 /// Number of detections from which a track measures registration and detection rates.
 pub(super) const ESTABLISHED_HITS: u32 = 5;
 
-/// Maximum number of objects of neighbouring cells that are compared with a report.
-const MAX_FOREIGN: usize = 64;
+/// Maximum number of objects of each neighbouring cell that are compared with a report.
+const MAX_FOREIGN_EACH: usize = 32;
 
 /// Log-odds of a vehicle's confidence that it exists itself.
 const OWN_NATS: f64 = 4.0;
@@ -294,14 +294,22 @@ impl<'a> ReportUpdate<'a> {
     fn look_at_foreign(&mut self, detections: &[TimedDetection<'_>]) {
         let (id, at, gate) = (self.sensor.id, self.at, self.config.gate());
         let Some(centre) = self.sensor.coverage.centre().filter(|_| !self.foreign.is_empty()) else { return };
-        let reach_m = self.sensor.coverage.range_m();
-        for foreign in self.foreign.stated_near(&centre, reach_m, at).take(MAX_FOREIGN) {
+        let (coverage, occlusion) = (&self.sensor.coverage, &self.occlusion);
+        let (reach_m, near_m) = (coverage.range_m(), 2.0 * self.config.gate_m);
+        let rates_at = |place: &Vector2<f64>| coverage.rates_at(place).filter(|_| !occlusion.hides(place));
+        // Objects that nobody can see take no place from others.
+        let is_looked_at = |place: &Vector2<f64>| {
+            let is_within = (place - centre).norm() <= reach_m;
+            let mut places = detections.iter().map(|detection| detection.measurement.position);
+            is_within && (rates_at(place).is_some() || places.any(|other| (other - place).norm() <= near_m))
+        };
+        for foreign in self.foreign.stated(MAX_FOREIGN_EACH, at, is_looked_at) {
             let position = foreign.state.position_at(at);
-            let rates = self.sensor.coverage.rates_at(&position).filter(|_| !self.occlusion.hides(&position));
+            let rates = rates_at(&position);
             let near = detections.iter().filter(|detection| {
                 let innovation = foreign.state.innovation(at, &detection.measurement, self.config.density());
                 // Its place is as old as its cell's map.
-                innovation.offset.norm() <= 2.0 * self.config.gate_m && innovation.distance_squared <= gate
+                innovation.offset.norm() <= near_m && innovation.distance_squared <= gate
             });
             let likeliest = near.map(|detection| detection.log_odds).max_by(f64::total_cmp);
             match (likeliest, rates) {

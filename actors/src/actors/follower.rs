@@ -78,8 +78,6 @@ pub struct FollowerState {
     newest: Newest,
     filter: RoundFilter,
     log: Option<MapLog>,
-    cell: NodeName,
-    present_cell: watch::Receiver<NodeName>,
     recording: LogSender,
     leadership: watch::Receiver<Leadership>,
     election: ActorSlot<LeaderElectionMessage>,
@@ -147,22 +145,8 @@ impl FollowerState {
             spans,
         } = arguments;
         let filter = RoundFilter::new(saved_term, clock::now());
-        let log = log.map(|path| MapLog::new(path, cell.clone()));
-        Self {
-            newest,
-            filter,
-            log,
-            cell,
-            present_cell,
-            recording,
-            leadership,
-            election,
-            fuser,
-            door,
-            clock,
-            counters,
-            spans,
-        }
+        let log = log.map(|path| MapLog::new(path, cell, present_cell));
+        Self { newest, filter, log, recording, leadership, election, fuser, door, clock, counters, spans }
     }
 
     fn take_map(&mut self, delivery: &Delivery<Arc<GlobalMap>>) -> Result<(), Refusal> {
@@ -176,7 +160,7 @@ impl FollowerState {
         }
         self.tell_election(accepted);
         let received = ReceivedMap { received_at, map: Arc::clone(map) };
-        if let Some(log) = self.log.as_mut().filter(|_| *self.present_cell.borrow() == self.cell) {
+        if let Some(log) = &mut self.log {
             log.append(&ReceivedMap { received_at: self.clock.date(received_at), map: Arc::clone(map) });
         }
         self.recording.send(received_at, LogItem::Map(Arc::clone(map)));

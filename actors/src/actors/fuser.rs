@@ -144,9 +144,7 @@ impl Actor for Fuser {
             FuserMessage::TakeNeighbours { objects, stated_at } => {
                 state.command(Command::TakeNeighbours { objects, stated_at });
             }
-            FuserMessage::TakeForeign { reputations, trust_in_words } => {
-                state.command(Command::TakeForeign { reputations, trust_in_words });
-            }
+            FuserMessage::TakeForeign { reputations } => state.command(Command::TakeForeign { reputations }),
             FuserMessage::TellUplink => state.present.clear(),
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),

@@ -18,7 +18,6 @@ mod pace;
 mod region_link;
 mod reputations;
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use ecod::diagnostics::TroubleKind;
@@ -106,12 +105,6 @@ pub struct UplinkState {
     /// True if a neighbour's map was accepted since the fuser was told.
     has_news: bool,
     exchange: ReputationExchange,
-    /// The vehicles that are present.
-    present: BTreeSet<NodeName>,
-    /// When the fuser is to be told what other cells say of them, if there is news.
-    tell_foreign_at: Option<Timestamp>,
-    /// Trust in the word of other cells, as the fuser was told.
-    trust_in_words: BTreeMap<NodeName, f64>,
     watcher: JoinHandle<()>,
 }
 
@@ -150,7 +143,7 @@ impl Actor for Uplink {
                 FromRegion::Status(status) => state.hear_status(&status),
                 FromRegion::Reputation(message) => state.take_reputation(&message, delivery.received_at, &myself),
             },
-            UplinkMessage::SetPresent { vehicles } => state.set_present(vehicles),
+            UplinkMessage::SetPresent { vehicles } => state.set_present(&vehicles),
             UplinkMessage::TellCounts { counts } => state.count_vehicles(counts),
             UplinkMessage::Exchange => state.exchange_reputations(),
             UplinkMessage::LinkChanged { event } => {
@@ -178,9 +171,6 @@ impl UplinkState {
             neighbours: setup.origin.map(|origin| Neighbours::new(setup.cell.clone(), origin)),
             has_news: false,
             exchange: ReputationExchange::new(setup.cell.clone()),
-            present: BTreeSet::new(),
-            tell_foreign_at: None,
-            trust_in_words: BTreeMap::new(),
             seen: None,
             connection: setup.config.connection(&setup.mqtt),
             pace: MapPace::new(setup.config.max_hz),

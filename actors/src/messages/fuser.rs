@@ -42,8 +42,6 @@ pub enum FuserMessage {
     TakeForeign {
         /// All that they say of the vehicles that are present.
         reputations: Arc<ForeignReputations>,
-        /// Trust in the word of cells that the own evidence contradicts, 0 to 1.
-        trust_in_words: BTreeMap<NodeName, f64>,
     },
     /// Tell the uplink anew which vehicles are present.
     TellUplink,

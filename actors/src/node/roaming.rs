@@ -57,16 +57,16 @@ impl Roamer {
     /// [`NodeError`] when a part cannot start, or the file of cells cannot be used.
     pub async fn start(config: NodeConfig) -> Result<Self, NodeError> {
         let mut cells = config.load_cells().map_err(|error| NodeError::Failed(format!("key `cells`: {error}")))?;
-        // What is wrong with a cell elsewhere keeps no vehicle from its own.
-        cells.retain(|cell| {
-            let unusable = config.credentials_in(cell).err();
-            unusable
-                .inspect(
-                    |error| tracing::warn!(%error, "the vehicle does not move to a cell; `ecod-node doctor` tries all"),
-                )
-                .is_none()
-        });
         let vehicle = VehicleParts::new(&config);
+        // A mistake in a cell elsewhere keeps no vehicle from its own.
+        cells.retain(|cell| match config.credentials_in(cell) {
+            Ok(_) => true,
+            Err(error) => {
+                let (about, cause) = (cell.name.as_str(), error.to_string());
+                vehicle.counters.troubles().note_about(about, TroubleKind::CellLeftOut, &cause);
+                cell.name == config.cell
+            }
+        });
         let choice = CellChoice::new(cells.iter().map(CellEntry::known).collect(), config.cell.clone());
         let present = start_with((vehicle.clone(), Presence::Whole), config.clone()).await?;
         Ok(Self { config, cells, vehicle, choice, present, next: None, former: None, placed_at: clock::now() })
@@ -131,7 +131,8 @@ impl Roamer {
     fn place(&self) -> Option<GeographicPosition> {
         let (at, pose) = self.vehicle.poses.borrow().back().copied()?;
         let StatedPose::OnEarth(pose) = pose else { return None };
-        let is_fresh = clock::now().since(at) <= MAX_POSE_AGE;
+        let now = clock::now();
+        let is_fresh = now.since(at).max(at.since(now)) <= MAX_POSE_AGE;
         let (latitude_deg, longitude_deg) = (pose.latitude_deg, pose.longitude_deg);
         is_fresh.then(|| GeographicPosition { latitude_deg, longitude_deg, height_m: pose.height_m.unwrap_or(0.0) })
     }

@@ -131,7 +131,7 @@ impl Teller {
                     }
                     Ok(Event::Incoming(Packet::Publish(message))) => {
                         if let Ok(said) = decode(&message.payload, &Limits::default()) {
-                            self.exchange.hear(&said);
+                            self.exchange.hear(&said, clock::now());
                         }
                     }
                     Ok(_) => {}
@@ -155,7 +155,7 @@ impl Teller {
         if let Some((vehicle, _)) = self.vehicle.take() {
             let votes = 10 + self.passed;
             let all = Counts { correct: votes, incorrect: 1 };
-            self.exchange.count(&vehicle, CellCounts { all, ..CellCounts::default() });
+            self.exchange.count(&vehicle, CellCounts { all, ..CellCounts::default() }, clock::now());
             let topic = ReputationTopic { vehicle, cell: self.cell.clone() }.path();
             self.left.lock().unwrap_or_else(PoisonError::into_inner).insert(topic, votes);
             self.passed += 1;

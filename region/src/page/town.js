@@ -140,7 +140,8 @@ function drawCells(cells, names, all) {
     sign.page = cell.page;
     set(sign, { class: `cell ${cell.state}${cell.troubles.length ? " troubled" : ""}`, cx, cy });
     const age = cell.age_s === null ? "" : `, map ${span(cell.age_s)} old`;
-    text(sign.firstChild, `${cell.cell}: ${cell.state}, led by ${cell.leader ?? "nobody"}${age}`);
+    const page = cell.page ? `, page at ${cell.page}` : "";
+    text(sign.firstChild, `${cell.cell}: ${cell.state}, led by ${cell.leader ?? "nobody"}${age}${page}`);
   });
   keyed(names, named, key, () => svg("text"), (label, cell) => {
     const [cx, cy] = places.get(key(cell));

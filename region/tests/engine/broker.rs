@@ -37,7 +37,7 @@ impl Broker {
         }
         make_certificates(&directory.path().join("tls"));
         for (name, latitude, longitude) in [LOT, FAR] {
-            add_cell(directory.path(), name, latitude, longitude);
+            add_cell(directory.path(), &[], (name, latitude, longitude));
         }
         let mut command = Command::new("nats-server");
         command
@@ -56,7 +56,7 @@ impl Broker {
         let [servers, routes] = [(); 2].map(|()| [(); 3].map(|()| free_address()));
         let first = directories[0].path();
         make_certificates(&first.join("tls"));
-        add_cell(first, LOT.0, LOT.1, LOT.2);
+        add_cell(first, &[], LOT);
         let names = routes.map(|route| format!("\"nats://{route}\""));
         for directory in &directories {
             for file in ["common.conf", "nats-cluster.conf", "cluster-tls.conf", "mqtt.conf"] {
@@ -153,8 +153,26 @@ impl Broker {
 
     /// The account of one more cell, which the server takes while it runs.
     pub(crate) fn add_cell(&self, name: &str, latitude: f64, longitude: f64) {
-        add_cell(self.directory(), name, latitude, longitude);
+        add_cell(self.directory(), &[], (name, latitude, longitude));
         self.signal("HUP");
+    }
+
+    /// Another password for a cell, which the server takes while it runs.
+    pub(crate) fn renew_password(&self, name: &str, latitude: f64, longitude: f64) {
+        add_cell(self.directory(), &["--new-password"], (name, latitude, longitude));
+        self.signal("HUP");
+    }
+
+    /// The lines that `make-streams` prints.
+    pub(crate) fn make_streams(&self) -> Vec<String> {
+        let output = Command::new(Path::new(DEPLOY).join("make-streams"))
+            .args(["1", "-h", "127.0.0.1", "-p", &self.address.port().to_string(), "--cafile", "tls/ca.pem"])
+            .current_dir(self.directory())
+            .env("REGION_CONFIG", self.directory())
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap().lines().map(str::to_owned).collect()
     }
 
     /// A reader of the whole region that tells of each message.
@@ -179,8 +197,9 @@ impl Drop for Broker {
 }
 
 /// Runs `add-cell` as an operator does.
-fn add_cell(directory: &Path, name: &str, latitude: f64, longitude: f64) {
+fn add_cell(directory: &Path, flags: &[&str], (name, latitude, longitude): (&str, f64, f64)) {
     let output = Command::new(Path::new(DEPLOY).join("add-cell"))
+        .args(flags)
         .args([name, &latitude.to_string(), &longitude.to_string()])
         .env("REGION_CONFIG", directory)
         .env("REGION_PROGRAM", env!("CARGO_BIN_EXE_ecod-region"))

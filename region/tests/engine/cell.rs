@@ -12,7 +12,7 @@ use ecod::wire::{
 };
 use ecod_actors::platform::clock;
 use ecod_region::account::CellAccount;
-use rumqttc::{AsyncClient, Event, Packet, QoS, SubscribeFilter, SubscribeReasonCode};
+use rumqttc::{AsyncClient, Event, LastWill, Packet, QoS, SubscribeFilter, SubscribeReasonCode};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
@@ -67,6 +67,18 @@ impl Cell {
             }
         });
         Self { account: CellAccount::new(NodeName::from_static(name), &origin), origin, client, heard, polling }
+    }
+
+    /// Logs in as this user with a retained last will, if the broker lets it, and is gone without goodbye.
+    pub(crate) async fn vanish(broker: &Broker, user: &str, topic: &str) {
+        let mut options = broker.login(user).options();
+        options.set_last_will(LastWill::new(topic, "a last will", QoS::AtMostOnce, true));
+        let (_client, mut events) = AsyncClient::new(options, 4);
+        while let Ok(event) = events.poll().await {
+            if let Event::Incoming(Packet::ConnAck(_)) = event {
+                break;
+            }
+        }
     }
 
     pub(crate) fn heard(&self) -> Heard {

@@ -37,6 +37,11 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
     let both = [lot.topic(RegionTopicKind::Map), far.topic(RegionTopicKind::Map)];
     until("both cells are heard", || both.iter().all(|topic| arrived.lock().unwrap().contains(topic))).await;
     assert_eq!(lot.heard().logins, 1, "a refused message ends no connection");
+    let statuses = [far.topic(RegionTopicKind::Status), lot.topic(RegionTopicKind::Status)];
+    for topic in &statuses {
+        Cell::vanish(broker, LOT.0, topic).await;
+    }
+    until("the own last will is heard", || arrived.lock().unwrap().contains(&statuses[1])).await;
     // A retained forgery would come to whoever subscribes later.
     let later = listen(broker).await;
     lot.publish_map(2, 1);
@@ -45,14 +50,18 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
     arrived.into_iter().chain(later).collect()
 }
 
+/// All that [`attack`] sends and may.
+fn honest(lot: &Cell, far: &Cell) -> BTreeSet<String> {
+    [lot.topic(RegionTopicKind::Map), lot.topic(RegionTopicKind::Status), far.topic(RegionTopicKind::Map)].into()
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
     let broker = Broker::nats();
     let arrived = listen(&broker).await;
     let heard = attack(&broker, &arrived).await;
-    let lot = Cell::connect(&broker, LOT);
-    let (own, far) = (lot.topic(RegionTopicKind::Map), Cell::connect(&broker, FAR));
-    assert_eq!(heard, [own, far.topic(RegionTopicKind::Map)].into(), "nothing that is forged");
+    let (lot, far) = (Cell::connect(&broker, LOT), Cell::connect(&broker, FAR));
+    assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
 
     let tiles = lot.account.tile.with_neighbours();
     let around: Vec<_> = tiles.iter().map(|tile| RegionTopic::filter(*tile, RegionTopicKind::Map)).collect();
@@ -86,7 +95,7 @@ async fn on_mosquitto_a_cell_writes_below_its_own_tile_and_hears_the_tiles_aroun
     let heard = attack(&broker, &arrived).await;
     let (lot, far) = (Cell::connect(&broker, LOT), Cell::connect(&broker, FAR));
     let own = lot.topic(RegionTopicKind::Map);
-    assert_eq!(heard, [own.clone(), far.topic(RegionTopicKind::Map)].into(), "nothing that is forged");
+    assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
     // Subscriptions are granted, and nothing foreign comes.
     lot.subscribe(&["ecod/v1/#".to_owned()]).await;
     far.publish_map(2, 1);
@@ -117,6 +126,28 @@ async fn a_cell_is_added_while_the_others_stay_connected() {
     let state = broker.read(|_| ());
     until("its status is read", || state.town().cells().len() == 1).await;
     assert_eq!(lot.heard().logins, 1);
+
+    // It goes on with the password that it has.
+    broker.renew_password("new-1", 48.86, 2.30);
+    until("who has the former password is shut out", || added.heard().is_refused).await;
+    let mut owner = Cell::connect(&broker, ("new-1", 48.86, 2.30));
+    until("who has the new one is in", || {
+        if owner.heard().is_refused {
+            owner = Cell::connect(&broker, ("new-1", 48.86, 2.30));
+        }
+        owner.heard().logins == 1
+    })
+    .await;
+    assert_eq!(lot.heard().logins, 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_streams_are_made_once() {
+    let broker = Broker::nats();
+    let streams = ["ECOD_MAPS is there", "ECOD_REPUTATIONS is there"];
+    for _ in 0..2 {
+        assert_eq!(broker.make_streams(), streams);
+    }
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! What other cells say of vehicles, and what their maps are worth.
+//! Other cells' word about vehicles, and the trust in their maps.
 
 use uuid::Uuid;
 
@@ -7,7 +7,7 @@ use crate::model::geometry::{Covariance, Pose};
 use crate::reputation::{CellCounts, Counts, ForeignReputations};
 use crate::wire::{FieldOfView, FusedObject, NeighbourObject};
 
-/// What a cell vehicle sees all around.
+/// A report of two cars, with a view all around.
 fn watching(node: &str, ms: u64) -> Arc<ObjectReport> {
     Arc::new(ObjectReport {
         objects: [0.0, 8.0].map(|y_m| PerceivedObject::new("car", 0.9, 5.0, y_m)).into(),
@@ -39,7 +39,7 @@ fn the_word_of_a_cell_weighs_as_little_as_its_map() {
     let slander = CellCounts { all: Counts { correct: 0, incorrect: 90 }, ..CellCounts::default() };
     let noether = NodeName::from_static("noether");
     reputations.merge(&NodeName::from_static("liar"), &noether, slander);
-    cell.take_foreign(&reputations.into(), &Default::default());
+    cell.take_foreign(&reputations.into());
     let mut weights = Vec::new();
     for ms in (100..12_000).step_by(100) {
         if ms % 200 == 0 {

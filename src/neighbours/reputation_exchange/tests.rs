@@ -28,7 +28,7 @@ impl Retained {
                         let topic = ReputationTopic { vehicle: message.vehicle.clone(), cell: message.cell.clone() };
                         let all = ReputationTopic::filter_of_vehicle(&message.vehicle);
                         if filters.contains(&topic.path()) || filters.contains(&all) {
-                            exchange.hear(message);
+                            exchange.hear(message, now);
                         }
                     }
                     begun.extend(filters);
@@ -36,7 +36,7 @@ impl Retained {
                 ExchangeStep::Unsubscribe(filters) => ended.extend(filters),
                 ExchangeStep::Publish(message) => {
                     sent += 1;
-                    exchange.hear(&message);
+                    exchange.hear(&message, now);
                     self.0.insert((message.vehicle.clone(), message.cell.clone()), message);
                 }
             }
@@ -50,6 +50,42 @@ impl Retained {
     }
 }
 
+/// The cells whose word is news; panics if nothing is due.
+fn cells_in_news(exchange: &mut ReputationExchange, now: Timestamp) -> Vec<String> {
+    let news = exchange.take_news(now).expect("news are due");
+    news.cells().into_iter().map(NodeName::to_string).collect()
+}
+
+#[test]
+fn a_cells_first_word_about_a_vehicle_is_told_at_once_and_further_counts_once_a_second() {
+    let mut exchange = ReputationExchange::new(name("a"));
+    let present = [name("euclid"), name("gauss")].into();
+    let ms = |ms: u64| at(0) + Duration::from_millis(ms);
+    exchange.set_present(&present);
+    assert!(cells_in_news(&mut exchange, ms(0)).is_empty(), "an earlier leader may have told more");
+    let hear = |exchange: &mut ReputationExchange, vehicle: &str, wrong: u64, now| {
+        exchange.hear(&counts(0, wrong).message(name("b"), name(vehicle)), now)
+    };
+    let mut told = Vec::new();
+    for now in (10..3000).step_by(10) {
+        assert!(hear(&mut exchange, "euclid", now, ms(now)));
+        if now == 1500 {
+            assert!(hear(&mut exchange, "gauss", 1, ms(now)));
+        }
+        told.extend(exchange.take_news(ms(now)).map(|_| now));
+    }
+    assert_eq!(told, [30, 1040, 1520, 2530]);
+    exchange.set_present(&present);
+    assert_eq!(cells_in_news(&mut exchange, ms(3000)), ["b"], "an aggregator that began anew");
+    exchange.set_present(&[name("euclid"), name("gauss"), name("noether")].into());
+    assert_eq!(exchange.take_news(ms(3001)), None, "of whom nobody has said anything");
+    exchange.count(&name("gauss"), counts(5, 0), ms(4000));
+    assert_eq!(exchange.take_news(ms(5000)), None, "nor contradicted anybody");
+    assert!(hear(&mut exchange, "gauss", 50, ms(5000)) && exchange.take_news(ms(6000)).is_some());
+    exchange.count(&name("gauss"), counts(50, 0), ms(6000));
+    assert_eq!(cells_in_news(&mut exchange, ms(7000)), ["b"], "which is worth less now");
+}
+
 #[test]
 fn a_leader_asks_about_who_is_present_and_about_nobody_else() {
     let mut region = Retained::default();
@@ -61,19 +97,14 @@ fn a_leader_asks_about_who_is_present_and_about_nobody_else() {
     exchange.connect();
     exchange.set_present(&[name("euclid")].into());
     assert_eq!(region.serve(&mut exchange, at(0)), (vec!["ecod/v1/rep/euclid/+".into()], Vec::new(), 0));
-    assert_eq!(exchange.foreign().cells(), [&name("a"), &name("c")].into());
+    assert_eq!(cells_in_news(&mut exchange, at(1)), ["a", "c"]);
     assert_eq!(region.serve(&mut exchange, at(1)), Default::default(), "once");
 
     exchange.set_present(&[name("gauss")].into());
-    assert!(exchange.foreign().cells().is_empty(), "what is said of those who left is forgotten");
+    assert!(cells_in_news(&mut exchange, at(2)).is_empty(), "what is said of those who left is forgotten");
     let (begun, ended) = (vec!["ecod/v1/rep/gauss/+".into()], vec!["ecod/v1/rep/euclid/+".into()]);
     assert_eq!(region.serve(&mut exchange, at(2)), (begun, ended, 0));
-    let mut hear = |vehicle, wrong| exchange.hear(&counts(0, wrong).message(name("d"), name(vehicle)));
-    assert_eq!(hear("euclid", 1), None, "and is no news");
-    assert_eq!(
-        [1, 2, 2].map(|wrong| hear("gauss", wrong)),
-        [Some(ForeignNews::First), Some(ForeignNews::Further), None]
-    );
+    assert!(!exchange.hear(&counts(0, 1).message(name("a"), name("euclid")), at(2)), "and is no news");
     exchange.connect();
     assert_eq!(region.serve(&mut exchange, at(3)).0, ["ecod/v1/rep/gauss/+"], "a new connection knows nothing");
 }
@@ -87,7 +118,7 @@ fn counts_are_sent_when_they_say_something_new_and_when_their_vehicle_leaves() {
     exchange.set_present(&[euclid.clone()].into());
     let mut sent = 0;
     for second in 0..600 {
-        exchange.count(&euclid, counts(second * 9, second));
+        exchange.count(&euclid, counts(second * 9, second), at(second));
         sent += region.serve(&mut exchange, at(second)).2;
     }
     assert!((5..=20).contains(&sent), "{sent} messages in ten minutes");
@@ -109,9 +140,9 @@ fn whoever_turns_is_told_of_soon() {
         old: Counts { correct: 9_500 + wrong, incorrect: 0 },
         ..CellCounts::default()
     };
-    exchange.count(&euclid, remembered(0));
+    exchange.count(&euclid, remembered(0), at(0));
     (0..30).for_each(|second| _ = region.serve(&mut exchange, at(second)));
-    exchange.count(&euclid, remembered(40));
+    exchange.count(&euclid, remembered(40), at(30));
     region.serve(&mut exchange, at(30));
     assert_eq!(region.of("euclid", "a"), Some((10_000, 40)));
 }
@@ -121,7 +152,7 @@ fn without_a_connection_the_latest_counts_wait_and_those_with_most_votes_are_kep
     let mut exchange = ReputationExchange::new(name("a"));
     for votes in 1..=10 {
         for number in 0..MAX_WAITING as u64 + 100 {
-            exchange.count(&name(&format!("v{number}")), counts(votes * number, 0));
+            exchange.count(&name(&format!("v{number}")), counts(votes * number, 0), at(0));
         }
     }
     assert_eq!((exchange.vehicles.len(), exchange.dropped() > 0), (MAX_WAITING, true));
@@ -137,7 +168,7 @@ fn without_a_connection_the_latest_counts_wait_and_those_with_most_votes_are_kep
 fn a_message_that_is_lost_is_repeated() {
     let mut exchange = ReputationExchange::new(name("a"));
     let euclid = name("euclid");
-    exchange.count(&euclid, counts(30, 2));
+    exchange.count(&euclid, counts(30, 2), at(0));
     let mut publishes = |second| {
         let steps = exchange.next(at(second), 8);
         steps.iter().filter(|step| matches!(step, ExchangeStep::Publish(_))).count()
@@ -161,7 +192,7 @@ fn a_leader_that_knows_less_than_its_region_lowers_nothing_but_by_a_reset() {
     let mut exchange = ReputationExchange::new(name("a"));
     exchange.set_present(&[name("euclid")].into());
     let mut count = |exchange: &mut ReputationExchange, counts, from: u64| {
-        exchange.count(&name("euclid"), counts);
+        exchange.count(&name("euclid"), counts, at(from));
         (from..from + 20).for_each(|second| _ = region.serve(exchange, at(second)));
         region.of("euclid", "a")
     };
@@ -177,7 +208,7 @@ fn a_leader_that_knows_less_than_its_region_lowers_nothing_but_by_a_reset() {
     late.connect();
     let latest = CellCounts { old: Counts { correct: 510, incorrect: 0 }, ..counts(700, 10) };
     assert_eq!(count(&mut late, latest, 150), Some((202, 1)), "on each connection");
-    assert_eq!(count(&mut late, reset(250, 2, 25), 180), Some((250, 2)), "until it has heard of it");
+    assert_eq!(count(&mut late, reset(500, 20, 25), 180), Some((500, 20)), "until it has heard of it");
     let told = region.0.values().next().unwrap();
     assert_eq!(
         (told.reset_at_us, told.old_correct),
@@ -191,7 +222,7 @@ fn a_region_that_answers_late_loses_nothing() {
     let mut exchange = ReputationExchange::new(name("a"));
     let euclid = name("euclid");
     exchange.set_present(&[euclid.clone()].into());
-    exchange.count(&euclid, counts(3, 200));
+    exchange.count(&euclid, counts(3, 200), at(0));
     let sent = |exchange: &mut ReputationExchange, second| {
         exchange.next(at(second), 8).into_iter().find_map(|step| match step {
             ExchangeStep::Publish(message) => Some(message),
@@ -200,20 +231,20 @@ fn a_region_that_answers_late_loses_nothing() {
     };
     assert_eq!(sent(&mut exchange, 0), None);
     let message = sent(&mut exchange, 3).unwrap();
-    // What was retained comes first, then the message that has replaced it.
-    exchange.hear(&counts(400, 7).message(name("a"), euclid.clone()));
-    exchange.hear(&message);
+    // The retained message comes first, then the one that has replaced it.
+    exchange.hear(&counts(400, 7).message(name("a"), euclid.clone()), at(4));
+    exchange.hear(&message, at(4));
     assert_eq!(sent(&mut exchange, 13), Some(counts(400, 200).message(name("a"), euclid)));
 }
 
 #[test]
 fn a_leader_that_leaves_tells_all_that_it_may_and_never_what_others_said() {
     let mut exchange = ReputationExchange::new(name("a"));
-    exchange.count(&name("euclid"), counts(30, 2));
+    exchange.count(&name("euclid"), counts(30, 2), at(0));
     assert!(exchange.farewell(at(0)).is_empty(), "it does not know yet what the region has");
     exchange.set_present(&[name("euclid"), name("gauss")].into());
     exchange.next(at(0), 8);
-    assert!(exchange.hear(&counts(0, 50).message(name("b"), name("gauss"))).is_some());
+    assert!(exchange.hear(&counts(0, 50).message(name("b"), name("gauss")), at(0)));
     assert!(exchange.farewell(at(1)).is_empty());
     let told = exchange.farewell(at(2));
     assert_eq!(told, [counts(30, 2).message(name("a"), name("euclid"))]);

@@ -34,10 +34,7 @@ fn slander() -> Command {
     let mut reputations = ForeignReputations::default();
     let counts = CellCounts { all: Counts { correct: 1, incorrect: 30 }, ..CellCounts::default() };
     reputations.merge(&NodeName::from_static("west"), &NodeName::from_static("euclid"), counts);
-    Command::TakeForeign {
-        reputations: Arc::new(reputations),
-        trust_in_words: [(NodeName::from_static("west"), 0.6)].into(),
-    }
+    Command::TakeForeign { reputations: Arc::new(reputations) }
 }
 
 #[test]

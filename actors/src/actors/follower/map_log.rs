@@ -8,6 +8,7 @@ use std::time::Duration;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use serde::Serialize;
+use tokio::sync::watch;
 
 use crate::messages::newest::ReceivedMap;
 
@@ -18,19 +19,21 @@ const RETRY_PAUSE: Duration = Duration::from_secs(60);
 pub(super) struct MapLog {
     path: PathBuf,
     cell: NodeName,
+    present_cell: watch::Receiver<NodeName>,
     file: Option<BufWriter<File>>,
     retry_at: Timestamp,
 }
 
 impl MapLog {
-    /// A log of a cell's maps that is opened with the first one.
-    pub(super) fn new(path: PathBuf, cell: NodeName) -> Self {
-        Self { path, cell, file: None, retry_at: Timestamp::default() }
+    /// A log of a cell's maps while its vehicle is present there.
+    pub(super) fn new(path: PathBuf, cell: NodeName, present_cell: watch::Receiver<NodeName>) -> Self {
+        Self { path, cell, present_cell, file: None, retry_at: Timestamp::default() }
     }
 
     /// Appends a map. A failure is logged, and ends attempts for [`RETRY_PAUSE`].
     pub(super) fn append(&mut self, map: &ReceivedMap) {
-        if self.file.is_none() && map.received_at < self.retry_at {
+        let is_present = *self.present_cell.borrow() == self.cell;
+        if !is_present || self.file.is_none() && map.received_at < self.retry_at {
             return;
         }
         if let Err(error) = self.write(map) {
@@ -84,12 +87,16 @@ mod tests {
     fn a_log_that_cannot_be_written_is_tried_again_later() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("absent").join("maps.jsonl");
-        let mut log = MapLog::new(path.clone(), NodeName::from_static("lot-1"));
+        let cell = NodeName::from_static("lot-1");
+        let (present, present_cell) = watch::channel(cell.clone());
+        let mut log = MapLog::new(path.clone(), cell, present_cell);
         log.append(&map(Timestamp(0)));
         std::fs::create_dir(path.parent().unwrap()).unwrap();
         log.append(&map(Timestamp(0) + RETRY_PAUSE / 2));
         assert!(!path.exists());
         log.append(&map(Timestamp(0) + RETRY_PAUSE));
+        log.append(&map(Timestamp(0) + RETRY_PAUSE));
+        present.send_replace(NodeName::from_static("lot-2"));
         log.append(&map(Timestamp(0) + RETRY_PAUSE));
         let lines = std::fs::read_to_string(&path).unwrap();
         let logged: Vec<ReceivedMap> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();

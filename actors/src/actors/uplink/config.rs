@@ -37,8 +37,8 @@ impl Default for UplinkConfig {
 /// Messages that may wait to be sent. More would be old maps.
 const SEND_QUEUE: usize = 8;
 
-/// Largest map in bytes that is sent and decoded; NATS takes no larger message unless told so.
-const MAX_MAP_BYTES: usize = 1024 * 1024;
+/// Largest map in bytes that is sent and decoded, as the region's servers take it.
+const MAX_MAP_BYTES: usize = 256 * 1024;
 
 /// Milliseconds within which the broker must accept a connection. After an outage the cells of a region all log in at once.
 const CONNECT_TIMEOUT_MS: u64 = 10_000;
@@ -53,7 +53,7 @@ impl UplinkConfig {
         self.connection(&MqttConfig::default()).validate()
     }
 
-    /// Settings of the connection; the limits of payloads are those of `cell`.
+    /// Settings of the connection; the limit of payloads other than maps is that of `cell`.
     pub(crate) fn connection(&self, cell: &MqttConfig) -> MqttConfig {
         MqttConfig {
             broker: self.broker.clone(),
@@ -64,7 +64,7 @@ impl UplinkConfig {
             send_queue: SEND_QUEUE,
             connect_timeout_ms: CONNECT_TIMEOUT_MS,
             max_payload_bytes: cell.max_payload_bytes,
-            max_map_bytes: cell.max_map_bytes.min(MAX_MAP_BYTES),
+            max_map_bytes: MAX_MAP_BYTES,
             ..MqttConfig::default()
         }
     }

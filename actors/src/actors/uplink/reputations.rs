@@ -6,7 +6,7 @@ use std::time::Duration;
 use ecod::leadership::timers::MAX_RESET_AHEAD;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::neighbours::{ExchangeStep, ForeignNews};
+use ecod::neighbours::ExchangeStep;
 use ecod::reputation::CellCounts;
 use ecod::wire::{CellReputation, RejectReason};
 use ractor::ActorRef;
@@ -24,31 +24,18 @@ pub(super) const EXCHANGE_PERIOD: Duration = Duration::from_millis(250);
 /// Maximum number of messages about vehicles in that time. Maps share the link's queue.
 const MAX_MESSAGES: usize = 6;
 
-/// Time for which first words of other cells are gathered: a vehicle that comes is told of by many at once.
-const GATHER_TIME: Duration = Duration::from_millis(20);
-
-/// Time for which further counts are gathered.
-const FURTHER_GATHER_TIME: Duration = Duration::from_secs(1);
-
 impl UplinkState {
-    /// Takes the vehicles that are present, and tells the fuser if there is less to be said of them. The same ones again come
-    /// from a fuser that has been told nothing.
-    pub(super) fn set_present(&mut self, vehicles: BTreeSet<NodeName>) {
-        if self.exchange.set_present(&vehicles) || vehicles == self.present {
-            self.tell_foreign_at = Some(clock::now());
-        }
-        self.present = vehicles;
+    /// Takes the vehicles that are present.
+    pub(super) fn set_present(&mut self, vehicles: &BTreeSet<NodeName>) {
+        self.exchange.set_present(vehicles);
         self.exchange_reputations();
     }
 
-    /// Takes what the cell's own evidence says. It may contradict what other cells said.
+    /// Takes what the cell's own evidence says.
     pub(super) fn count_vehicles(&mut self, counts: Vec<(NodeName, CellCounts)>) {
-        let before = self.exchange.dropped();
-        counts.into_iter().for_each(|(vehicle, counts)| self.exchange.count(&vehicle, counts));
+        let (before, now) = (self.exchange.dropped(), clock::now());
+        counts.into_iter().for_each(|(vehicle, counts)| self.exchange.count(&vehicle, counts, now));
         self.setup.counters.add(Event::CellReputationDropped, self.exchange.dropped() - before);
-        if self.exchange.trust_in_words() != self.trust_in_words {
-            self.tell_foreign_at.get_or_insert(clock::now() + FURTHER_GATHER_TIME);
-        }
     }
 
     /// Takes what a cell says of a vehicle; what does not count is counted by its reason and cell.
@@ -65,22 +52,19 @@ impl UplinkState {
                 format!("what the cell {} says of {} not used: reset in the future", message.cell, message.vehicle)
             });
         }
-        let Some(news) = self.exchange.hear(message) else { return };
-        self.setup.counters.count(Event::CellReputationAccepted);
-        let gather_time = if news == ForeignNews::First { GATHER_TIME } else { FURTHER_GATHER_TIME };
-        let tell_at = clock::now() + gather_time;
-        if self.tell_foreign_at.is_none_or(|at| tell_at < at) {
-            self.tell_foreign_at = Some(tell_at);
-            myself.send_after(gather_time, || UplinkMessage::Exchange);
+        let before = self.exchange.news_at();
+        if self.exchange.hear(message, received_at) {
+            self.setup.counters.count(Event::CellReputationAccepted);
+        }
+        if let Some(news_at) = self.exchange.news_at().filter(|news_at| before.is_none_or(|before| *news_at < before)) {
+            myself.send_after(news_at.since(clock::now()), || UplinkMessage::Exchange);
         }
     }
 
     /// Tells the fuser what is new, and carries out the next steps on the link.
     pub(super) fn exchange_reputations(&mut self) {
-        if self.tell_foreign_at.take_if(|at| *at <= clock::now()).is_some() {
-            self.trust_in_words = self.exchange.trust_in_words();
-            let (reputations, trust_in_words) = (self.exchange.foreign().clone().into(), self.trust_in_words.clone());
-            self.setup.fuser.send(FuserMessage::TakeForeign { reputations, trust_in_words });
+        if let Some(reputations) = self.exchange.take_news(clock::now()) {
+            self.setup.fuser.send(FuserMessage::TakeForeign { reputations: reputations.into() });
         }
         let Some(link) = self.link.as_mut().filter(|link| link.is_up()) else { return };
         for step in self.exchange.next(clock::now(), MAX_MESSAGES) {

@@ -213,11 +213,11 @@ fn log(camera: &str, stderr: ChildStderr, last: &Mutex<String>, _until: &Sender<
 pub(super) fn without_credentials(text: &str) -> String {
     #[expect(clippy::expect_used, reason = "the expressions are constants")]
     static SECRETS: LazyLock<[(Regex, &str); 3]> = LazyLock::new(|| {
-        let login = r#"://[^/?"'\s]*@"#;
+        let login = r#"://[^/"'\s]*@"#;
         let query = r#"(://[^?"'\s]*)\?[^"'\s]*"#;
-        let property =
-            r#"(?i)((?:pw|pass|passwd|password|passphrase|secret|token|key)\s*=\s*)(?:"[^"]*"|'[^']*'|[^\s"'!]+)"#;
-        [(login, "://"), (query, "$1"), (property, "${1}…")]
+        let value = r#"(?:\([^)]*\))?(?:"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|(?:\\.|[^\s"'])+)"#;
+        let property = format!(r"(?i)((?:pw|pass|passwd|password|passphrase|secret|token|key)\s*=\s*){value}");
+        [(login, "://"), (query, "$1"), (&property, "${1}…")]
             .map(|(secret, bare)| (Regex::new(secret).expect("a valid expression"), bare))
     });
     SECRETS.iter().fold(text.to_owned(), |text, (secret, bare)| secret.replace_all(&text, *bare).into_owned())
@@ -230,6 +230,7 @@ mod tests {
     #[test]
     fn secrets_of_addresses_are_not_shown() {
         assert_eq!(without_credentials("rtsp://user:p@ss@camera:554/1"), "rtsp://camera:554/1");
+        assert_eq!(without_credentials("rtsp://user:p?ss@camera/1"), "rtsp://camera/1");
         assert_eq!(without_credentials("http://camera/a@b"), "http://camera/a@b");
         assert_eq!(without_credentials("http://camera/video?user=admin&pwd=hush"), "http://camera/video");
         assert_eq!(
@@ -238,6 +239,11 @@ mod tests {
             ),
             "rtspsrc location=rtsp://camera user-id=me user-pw=… ! x264enc key-int-max=30 ! appsink"
         );
+        for secret in [r"!hush", r"Winter!hush", r#""hu\"hush hush""#, r"hu\ hush", r#"(string)"hu hush""#, "'hu hush'"]
+        {
+            let shown = without_credentials(&format!("rtspsrc user-pw={secret} ! appsink"));
+            assert_eq!(shown, "rtspsrc user-pw=… ! appsink", "{secret}");
+        }
         assert_eq!(
             without_credentials(
                 "rtspsrc location=\"rtsp://user:secret@camera\" ! tee name=a@b ! udpsink uri=udp://x@host"
