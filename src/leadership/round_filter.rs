@@ -106,7 +106,7 @@ impl RoundFilter {
             verdicts: SuccessionFilter::new(floor),
             verdict_age: StalenessFilter::new(now),
             // Brokers retain them: a node that starts gets them before it can have heard of any term.
-            reputations: SuccessionFilter::of_any_term(floor),
+            reputations: SuccessionFilter::of_any_term(floor).with_retained(),
             proven: None,
         }
     }

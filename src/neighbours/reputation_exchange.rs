@@ -5,8 +5,8 @@
 //!
 //! - *In.* A leader subscribes to what all cells say of the vehicles that are present, and of no others.
 //! - *Out.* A present vehicle's counts are sent when they say something new, those of one that has left when they differ at all.
-//! - *Kept.* Counts wait until the region has them: the own message comes back. That also acknowledges it. Without connection
-//!   only the latest counts of each vehicle wait.
+//! - *Kept.* Counts wait until the region has them: the own message comes back. A broker may pass a message on that it then fails to
+//!   keep. So the region is asked once more, some seconds later. Without connection only the latest counts of each vehicle wait.
 //! - *Never less.* A leader that knows less than the region does, such as one that lost its disk, first hears what its cell said
 //!   before, and sends the larger of every count. What it hears too late it puts right.
 //! - *News.* The first word of a cell about a vehicle that is present is due at once, further counts are gathered for a second.
@@ -25,6 +25,9 @@ const SEND_PERIOD: Duration = Duration::from_secs(10);
 
 /// Time for which a leader listens for what its cell said of a vehicle before.
 const LISTEN_TIME: Duration = Duration::from_secs(2);
+
+/// Time after a message from which the region is asked whether it has kept it.
+const ASK_AGAIN_AFTER: Duration = Duration::from_secs(10);
 
 /// Factor on the number of votes that is news of a present vehicle.
 const NEWS_FACTOR: f64 = 1.5;
@@ -71,6 +74,8 @@ struct KnownVehicle {
     filter: Option<(VehicleFilter, Timestamp)>,
     has_heard: bool,
     sent_at: Option<Timestamp>,
+    /// True if what was sent is known to be kept, or was asked for once.
+    is_kept: bool,
 }
 
 /// A reset that the region has and the ledger does not.
@@ -123,7 +128,13 @@ impl KnownVehicle {
 
     /// True if nothing is to be heard of it or told.
     fn is_done(&self) -> bool {
-        !self.is_present && self.is_told()
+        !self.is_present && self.is_told() && (self.is_kept || self.sent_at.is_none())
+    }
+
+    /// True if the region is to be asked whether it has kept what was sent.
+    fn is_to_be_asked(&self, now: Timestamp) -> bool {
+        let is_due = self.sent_at.is_some_and(|at| now.since(at) >= ASK_AGAIN_AFTER);
+        !self.is_present && !self.is_kept && is_due && self.is_told()
     }
 
     fn is_told(&self) -> bool {
@@ -252,6 +263,10 @@ impl ReputationExchange {
         let mut steps = Vec::new();
         let (mut ended, mut begun) = (Vec::new(), Vec::new());
         for (name, vehicle) in &mut self.vehicles {
+            if vehicle.is_to_be_asked(now) {
+                (vehicle.filter, vehicle.has_heard, vehicle.told) = (None, false, CellCounts::default());
+                vehicle.is_kept = true;
+            }
             let wanted = (!vehicle.is_done()).then(|| vehicle.wanted_filter());
             let present = vehicle.filter.map(|(filter, _)| filter);
             if wanted == present || ended.len().max(begun.len()) >= MAX_FILTERS {

@@ -55,9 +55,9 @@ impl PassingVehicles {
         Ok(Self { left, is_over, runtime })
     }
 
-    /// Lets the last vehicles leave, and waits until a new reader has what was said of all; the numbers of vehicles, and of those
-    /// of which the region has less than was said.
-    pub(crate) fn end(&self, login: &BrokerLogin) -> anyhow::Result<(usize, usize)> {
+    /// Lets the last vehicles leave, and waits until a new reader has what was said of all; the number of vehicles, and the topics
+    /// on which the region has less than was said.
+    pub(crate) fn end(&self, login: &BrokerLogin) -> anyhow::Result<(usize, Vec<String>)> {
         self.is_over.store(true, Ordering::Relaxed);
         self.runtime.block_on(async {
             sleep(2 * STAY).await;
@@ -84,7 +84,7 @@ impl PassingVehicles {
                 }
             };
             let _ = timeout(PATIENCE, reading).await;
-            Ok((left.len(), missing.len()))
+            Ok((left.len(), missing.into_keys().collect()))
         })
     }
 }

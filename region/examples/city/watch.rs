@@ -33,7 +33,8 @@ struct Figures {
     other: u64,
     /// Newest map of each cell that counts: round and time of sending.
     newest: HashMap<NodeName, (u64, Timestamp)>,
-    too_old: u64,
+    /// Cells and ages of maps that counted though they were too old.
+    too_old: Vec<(NodeName, Duration)>,
 }
 
 /// How far the estimate of the least delay may be off on one machine.
@@ -83,7 +84,7 @@ impl Watch {
     /// Begins a new measurement.
     pub(crate) fn reset(&self) {
         let mut figures = lock(&self.figures);
-        let (newest, too_old) = (std::mem::take(&mut figures.newest), figures.too_old);
+        let (newest, too_old) = (std::mem::take(&mut figures.newest), std::mem::take(&mut figures.too_old));
         *figures = Figures { newest, too_old, ..Figures::default() };
     }
 
@@ -97,8 +98,9 @@ impl Watch {
         self.state.town().cells().len()
     }
 
-    pub(crate) fn too_old(&self) -> u64 {
-        lock(&self.figures).too_old
+    /// Cells and ages of maps that counted since the last call though they were too old.
+    pub(crate) fn take_too_old(&self) -> Vec<(NodeName, Duration)> {
+        std::mem::take(&mut lock(&self.figures).too_old)
     }
 
     /// The trouble of the connection, and the messages so far.
@@ -129,7 +131,7 @@ impl Default for Figures {
     fn default() -> Self {
         // Ages up to ten minutes, to three digits.
         let ages = Histogram::new_with_bounds(1, 600_000_000, 3).expect("these bounds are valid");
-        Self { ages, bytes: 0, maps: 0, missing: 0, stale: 0, other: 0, newest: HashMap::new(), too_old: 0 }
+        Self { ages, bytes: 0, maps: 0, missing: 0, stale: 0, other: 0, newest: HashMap::new(), too_old: Vec::new() }
     }
 }
 
@@ -138,7 +140,9 @@ impl Figures {
         let age = at.since(sent_at);
         self.maps += 1;
         self.ages.saturating_record(u64::try_from(age.as_micros()).unwrap_or(u64::MAX));
-        self.too_old += u64::from(age > MAX_AGE + TOLERANCE);
+        if age > MAX_AGE + TOLERANCE {
+            self.too_old.push((cell.clone(), age));
+        }
         let newest = self.newest.entry(cell.clone()).or_insert((round - 1, sent_at));
         // Real cells leave rounds out.
         if cell.as_str().starts_with("cell-") {

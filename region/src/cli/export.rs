@@ -3,7 +3,7 @@
 use std::cell::RefCell;
 use std::fs::File;
 use std::io::BufWriter;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -28,7 +28,7 @@ pub(super) struct ExportArguments {
     /// Tile to be read, by its quadkey; without one all of the region
     #[arg(long, value_name = "QUADKEY", default_value = "")]
     tile: Quadkey,
-    /// Seconds to read; GeoJSON then has the latest of each cell, MCAP all maps
+    /// Seconds to read, 2 at least: each cell's maps count after the first one. GeoJSON then has the latest of each cell, MCAP all
     #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = clap::value_parser!(u64).range(2..))]
     seconds: u64,
     /// File to be written: NAME.geojson or NAME.mcap
@@ -52,8 +52,10 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
     let login = arguments.broker.load().map_err(Failure::usage)?;
     let state = Arc::new(RegionState::default());
     state.ask([arguments.tile].into());
+    // A failure leaves the file of an earlier export alone.
+    let unfinished = arguments.out.with_added_extension("unfinished");
     let log = match format {
-        ExportFormat::Mcap => Some(CellMapLog::create(&arguments.out)?),
+        ExportFormat::Mcap => Some(CellMapLog::create(&unfinished)?),
         ExportFormat::GeoJson => None,
     };
     let (log, failed) = (RefCell::new(log), RefCell::new(None));
@@ -79,25 +81,28 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
             let (cells, maps) = log.finish()?;
             format!("{cells} cells, {maps} maps")
         }
-        None => write_geojson(arguments, &state, clock::now())?,
+        None => write_geojson((arguments.tile, &unfinished), &state, clock::now())?,
     };
     let link = state.link();
     let trouble = link
         .trouble
         .or_else(|| (link.logins == 0).then(|| "the broker has not answered; give it more --seconds".into()));
     if let (Some(trouble), 0) = (trouble, state.town().counts().maps) {
+        let _ = std::fs::remove_file(&unfinished);
         return Err(anyhow!("{trouble}").into());
     }
+    std::fs::rename(&unfinished, &arguments.out)
+        .with_context(|| format!("cannot write {}", arguments.out.display()))?;
     print(&format!("{}: {summary}\n", arguments.out.display()))?;
     Ok(())
 }
 
-fn write_geojson(arguments: &ExportArguments, state: &RegionState, now: Timestamp) -> anyhow::Result<String> {
+fn write_geojson((tile, path): (Quadkey, &Path), state: &RegionState, now: Timestamp) -> anyhow::Result<String> {
     let town = state.town();
-    let collection = geojson(&town, &GeographicBounds::of(arguments.tile), now);
-    let file = File::create(&arguments.out).with_context(|| format!("cannot write {}", arguments.out.display()))?;
+    let collection = geojson(&town, &GeographicBounds::of(tile), now);
+    let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
     if let Err(error) = serde_json::to_writer(BufWriter::new(file), &collection) {
-        bail!("cannot write {}: {error}", arguments.out.display());
+        bail!("cannot write {}: {error}", path.display());
     }
-    Ok(format!("{} cells, {} features", town.cells().len(), collection.features.len()))
+    Ok(format!("{} cells, {} features", town.count_within(&[tile]), collection.features.len()))
 }

@@ -101,11 +101,15 @@ pub(super) fn router(api: &Arc<RegionApi>, access: PageAccess) -> Router {
     with_headers(routes).with_state(Arc::clone(api))
 }
 
-/// Health: the broker lets the reader in.
+/// Health: the broker lets the reader in and read.
 async fn show_health(State(api): RegionRequest) -> Response {
-    match api.state.link().is_up {
-        true => (StatusCode::OK, "ok\n").into_response(),
-        false => (StatusCode::SERVICE_UNAVAILABLE, "no connection to the region's broker\n").into_response(),
+    let link = api.state.link();
+    match link.trouble {
+        None if link.is_up => (StatusCode::OK, "ok\n").into_response(),
+        trouble => {
+            let trouble = trouble.unwrap_or_else(|| "no connection to the region's broker".into());
+            (StatusCode::SERVICE_UNAVAILABLE, format!("{trouble}\n")).into_response()
+        }
     }
 }
 

@@ -69,10 +69,10 @@ impl Cell {
         Self { account: CellAccount::new(NodeName::from_static(name), &origin), origin, client, heard, polling }
     }
 
-    /// Logs in as this user with a retained last will, if the broker lets it, and is gone without goodbye.
-    pub(crate) async fn vanish(broker: &Broker, user: &str, topic: &str) {
+    /// Logs in as this user with a last will, if the broker lets it, and is gone without goodbye.
+    pub(crate) async fn vanish(broker: &Broker, user: &str, topic: &str, retain: bool) {
         let mut options = broker.login(user).options();
-        options.set_last_will(LastWill::new(topic, "a last will", QoS::AtMostOnce, true));
+        options.set_last_will(LastWill::new(topic, "a last will", QoS::AtMostOnce, retain));
         let (_client, mut events) = AsyncClient::new(options, 4);
         while let Ok(event) = events.poll().await {
             if let Event::Incoming(Packet::ConnAck(_)) = event {

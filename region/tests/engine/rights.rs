@@ -38,8 +38,8 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
     until("both cells are heard", || both.iter().all(|topic| arrived.lock().unwrap().contains(topic))).await;
     assert_eq!(lot.heard().logins, 1, "a refused message ends no connection");
     let statuses = [far.topic(RegionTopicKind::Status), lot.topic(RegionTopicKind::Status)];
-    for topic in &statuses {
-        Cell::vanish(broker, LOT.0, topic).await;
+    for (topic, retain) in statuses.iter().zip([true, false]) {
+        Cell::vanish(broker, LOT.0, topic, retain).await;
     }
     until("the own last will is heard", || arrived.lock().unwrap().contains(&statuses[1])).await;
     // A retained forgery would come to whoever subscribes later.

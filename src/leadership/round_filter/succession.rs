@@ -31,8 +31,12 @@ pub struct SuccessionFilter {
     gate: EpochGate,
     /// True if any term is believed while nobody is known to lead.
     believes_any_term: bool,
+    /// True if the first message may have been retained.
+    takes_retained: bool,
     /// Arrival of the last admitted message; before any, of the first message.
     newest_at: Option<Timestamp>,
+    /// True if the only admitted message may have been retained, and be of any age.
+    newest_is_retained: bool,
     elected: Option<Elected>,
     /// Time since when others than the elected are admitted, or it is not.
     others_since: Option<Timestamp>,
@@ -76,7 +80,9 @@ impl SuccessionFilter {
         Self {
             gate: EpochGate::new(floor),
             believes_any_term: false,
+            takes_retained: false,
             newest_at: None,
+            newest_is_retained: false,
             elected: None,
             others_since: None,
             overruled: None,
@@ -87,6 +93,11 @@ impl SuccessionFilter {
     /// A filter that believes any term from `floor` on while nobody is known to lead.
     pub fn of_any_term(floor: u64) -> Self {
         Self { believes_any_term: true, ..Self::new(floor) }
+    }
+
+    /// The same for a topic whose last message is retained: the second one may be many rounds later.
+    pub fn with_retained(self) -> Self {
+        Self { takes_retained: true, ..self }
     }
 
     /// Takes round `round` of `epoch`, or refuses it, given what the election says.
@@ -202,10 +213,14 @@ impl SuccessionFilter {
         received_at: Timestamp,
         may_lead: bool,
     ) -> Result<(), Refusal> {
+        let is_first = self.gate.latest().is_none();
         let silence = received_at.since(*self.newest_at.get_or_insert(received_at));
         let quiet = silence >= EPOCH_MEMORY;
         let limit = |last: u64| last.saturating_add(MAX_ROUNDS_AHEAD).saturating_add(max_rounds_in(silence));
-        if !quiet && self.gate.latest().is_some_and(|(latest, last)| latest == epoch && round > limit(last)) {
+        if !quiet
+            && !self.newest_is_retained
+            && self.gate.latest().is_some_and(|(latest, last)| latest == epoch && round > limit(last))
+        {
             return Err(Refusal::Implausible);
         }
         let mut admitted = self.gate.admit(epoch, round);
@@ -217,7 +232,7 @@ impl SuccessionFilter {
             Some((latest, _)) if latest == epoch => Refusal::Repeated,
             _ => Refusal::Superseded,
         })?;
-        self.newest_at = Some(received_at);
+        (self.newest_at, self.newest_is_retained) = (Some(received_at), is_first && self.takes_retained);
         Ok(())
     }
 }
@@ -250,6 +265,22 @@ mod tests {
 
     fn at(ms: u64) -> Timestamp {
         Timestamp(ms * 1000)
+    }
+
+    /// A vehicle joins a cell whose reputations have not changed for minutes; its own arrival changes them.
+    #[test]
+    fn a_retained_message_may_be_much_older_than_the_next_and_no_other_may() {
+        let elected = epoch(7, "edge");
+        let leadership = led_by(elected.clone(), None);
+        let mut filter = SuccessionFilter::new(0).with_retained();
+        let mut admit = |round, ms| filter.admit(&elected, round, at(ms), &leadership);
+        assert_eq!(admit(1, 0), Ok(()));
+        assert_eq!(admit(1700, 300), Ok(()));
+        assert_eq!(admit(1710, 1300), Ok(()));
+        assert_eq!(admit(90_000, 1400), Err(Refusal::Implausible));
+        let mut filter = SuccessionFilter::new(0);
+        let mut admit = |round, ms| filter.admit(&elected, round, at(ms), &leadership);
+        assert_eq!([admit(1, 0), admit(1700, 300)], [Ok(()), Err(Refusal::Implausible)]);
     }
 
     #[test]

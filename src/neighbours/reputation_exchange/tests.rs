@@ -124,7 +124,7 @@ fn counts_are_sent_when_they_say_something_new_and_when_their_vehicle_leaves() {
     assert!((5..=20).contains(&sent), "{sent} messages in ten minutes");
     assert!(region.of("euclid", "a").unwrap().0 > 3000);
     exchange.set_present(&BTreeSet::new());
-    (600..620).for_each(|second| _ = region.serve(&mut exchange, at(second)));
+    (600..640).for_each(|second| _ = region.serve(&mut exchange, at(second)));
     assert_eq!(region.of("euclid", "a"), Some((5391, 599)), "the last word");
     assert!(exchange.vehicles.is_empty());
 }
@@ -215,6 +215,20 @@ fn a_leader_that_knows_less_than_its_region_lowers_nothing_but_by_a_reset() {
         (Some(at(25)), 10),
         "votes from before the reset are no older ones"
     );
+}
+
+#[test]
+fn counts_of_one_that_has_left_are_told_again_if_the_broker_has_not_kept_them() {
+    let mut region = Retained::default();
+    let mut exchange = ReputationExchange::new(name("a"));
+    exchange.count(&name("euclid"), counts(30, 2), at(0));
+    (0..5).for_each(|second| _ = region.serve(&mut exchange, at(second)));
+    assert_eq!(region.of("euclid", "a"), Some((30, 2)));
+    // It passed the message on, and was killed before it had written it down.
+    region.0.clear();
+    (5..30).for_each(|second| _ = region.serve(&mut exchange, at(second)));
+    assert_eq!(region.of("euclid", "a"), Some((30, 2)));
+    assert!(exchange.vehicles.is_empty(), "and that is all");
 }
 
 #[test]

@@ -12,6 +12,7 @@ use serde::Deserialize;
 
 use super::shared::{SharedConfig, StatedKeys};
 use super::{LoadError, NodeConfig};
+use crate::transport::gossip::check_key;
 use crate::transport::mqtt::BrokerAddress;
 use crate::transport::pki::Credentials;
 
@@ -115,6 +116,9 @@ impl NodeConfig {
     pub fn credentials_in(&self, cell: &CellEntry) -> Result<Option<Arc<Credentials>>, LoadError> {
         let unusable = |error: &dyn std::fmt::Display| LoadError::Malformed(format!("cell {}: {error}", cell.name));
         let config = self.in_cell(cell).map_err(|error| unusable(&error))?;
+        if config.membership.has_key() {
+            check_key(&config.membership, &config.cell).map_err(|error| unusable(&error))?;
+        }
         Ok(config.security().map_err(|error| unusable(&error))?.credentials)
     }
 
