@@ -233,19 +233,22 @@ impl City {
     /// Cuts five real cells off, and tells what the uplink cost them.
     fn cut_off(&mut self) {
         let pids: Vec<_> = self.real.pids().into_iter().take(5).collect();
-        let percent = || {
+        let mean = || {
             let meters: Vec<_> = pids.iter().map(|pid| Meter::start(*pid)).collect();
             std::thread::sleep(PAUSE);
-            meters.iter().map(|meter| meter.read().0).sum::<f64>() / meters.len() as f64
+            let read = meters.iter().map(Meter::read).fold((0.0, 0.0), |sum, each| (sum.0 + each.0, sum.1 + each.1));
+            (read.0 / meters.len() as f64, read.1 / meters.len() as f64)
         };
-        let connected = percent();
+        let connected = mean();
         self.real.cut(5);
         let since = clock::now() + Duration::from_secs(1);
-        let apart = percent();
+        let apart = mean();
         let others: usize = self.watches.iter().map(|watch| watch.sent_after(since)).sum();
         self.real.mend();
         println!("  meanwhile {others} of {} cells are heard", self.cells);
-        println!("  a real node: {connected:.1} % of a core with its uplink, {apart:.1} % while it is cut off");
+        for (state, (percent, megabytes)) in [("with its uplink", connected), ("while it is cut off", apart)] {
+            println!("  a real node {state}: {percent:.1} % of a core, {megabytes:.1} MB");
+        }
     }
 
     /// The time in which a new reader gets the status of every cell.
