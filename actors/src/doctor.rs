@@ -274,12 +274,19 @@ mod tests {
         assert!(finding.verdict == CheckResult::Broken && finding.seen.contains("No such file"), "{finding:?}");
     }
 
+    /// A vehicle that moves between the cells of a file.
+    fn moving(file: &Path) -> NodeConfig {
+        let mut config = NodeConfig { cells: Some(file.to_owned()), ..config() };
+        config.pose.listen = Some("127.0.0.1:0".parse().unwrap());
+        config
+    }
+
     #[tokio::test]
     async fn a_file_of_cells_that_cannot_be_used_is_broken() {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("cells.toml");
         std::fs::write(&file, "[[cells]]\nname = \"elsewhere\"\nlatitude_deg = 1\nlongitude_deg = 2\n").unwrap();
-        let finding = finding(&NodeConfig { cells: Some(file), ..config() }, "cells").await;
+        let finding = finding(&moving(&file), "cells").await;
         assert!(finding.verdict == CheckResult::Broken && finding.seen.contains("not among"), "{finding:?}");
     }
 
@@ -289,7 +296,7 @@ mod tests {
         let file = directory.path().join("cells.toml");
         let cell = |name, more| format!("[[cells]]\nname = \"{name}\"\nlatitude_deg = 1\nlongitude_deg = 2\n{more}");
         std::fs::write(&file, cell("cell", "") + &cell("elsewhere", "key_file = \"gone.key\"\n")).unwrap();
-        let finding = finding(&NodeConfig { cells: Some(file), ..config() }, "cells").await;
+        let finding = finding(&moving(&file), "cells").await;
         assert!(finding.verdict == CheckResult::Doubtful && finding.seen.contains("gone.key"), "{finding:?}");
     }
 
@@ -302,9 +309,10 @@ mod tests {
             format!("[[cells]]\nname = \"{name}\"\nlatitude_deg = 1\nlongitude_deg = 2\nca = {ca:?}\n")
         };
         std::fs::write(&file, cell("cell", &own.ca) + &cell("elsewhere", &other.ca)).unwrap();
-        let finding = finding(&NodeConfig { cells: Some(file), tls: Some(own), ..config() }, "cells").await;
+        let finding = finding(&NodeConfig { tls: Some(own), ..moving(&file) }, "cells").await;
         assert_eq!(finding.verdict, CheckResult::Doubtful, "{finding:?}");
-        assert!(finding.seen.contains("cell elsewhere") && !finding.seen.contains("cell cell"), "{finding:?}");
+        assert!(finding.seen.contains("cell elsewhere: it does not accept"), "{finding:?}");
+        assert!(!finding.seen.contains("cell cell"), "{finding:?}");
     }
 
     #[cfg(feature = "foxglove")]

@@ -20,7 +20,7 @@ impl NodeConfig {
         Ok(observer.without_own_addresses())
     }
 
-    /// The configuration without camera, state, page and door, and without the addresses that are the node's.
+    /// The configuration without camera, poses, state, page and door, and without the addresses that are the node's.
     pub(crate) fn without_own_addresses(mut self) -> Self {
         if let Some(bind) = &mut self.membership.bind {
             bind.set_port(0);
@@ -30,6 +30,7 @@ impl NodeConfig {
             (self.camera, self.cameras) = (None, Vec::new());
         }
         (self.membership.advertise, self.state_dir, self.map_log) = (None, None, None);
+        (self.pose.listen, self.cells) = (None, None);
         self.dashboard.enabled = false;
         self.broker.door = false;
         self
