@@ -108,36 +108,38 @@ async fn on_mosquitto_a_cell_writes_below_its_own_tile_and_hears_the_tiles_aroun
     assert_eq!(topics, [own, "ecod/v1/rep/euclid/far-1".to_owned()]);
 }
 
+/// A cell that is added while the server runs.
+const NEW: (&str, f64, f64) = ("new-1", 48.86, 2.30);
+
+/// Connects a cell, again and again until the server has taken its password.
+async fn admitted(broker: &Broker, place: (&'static str, f64, f64)) -> Cell {
+    let mut cell = Cell::connect(broker, place);
+    until("the cell is in", || {
+        if cell.heard().is_refused {
+            cell = Cell::connect(broker, place);
+        }
+        cell.heard().logins == 1
+    })
+    .await;
+    cell
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_cell_is_added_while_the_others_stay_connected() {
     let broker = Broker::nats();
     let lot = Cell::connect(&broker, LOT);
     until("the cell is in", || lot.heard().logins == 1).await;
-    broker.add_cell("new-1", 48.86, 2.30);
-    let mut added = Cell::connect(&broker, ("new-1", 48.86, 2.30));
-    until("the new cell is in", || {
-        if added.heard().is_refused {
-            added = Cell::connect(&broker, ("new-1", 48.86, 2.30));
-        }
-        added.heard().logins == 1
-    })
-    .await;
+    broker.add_cell(NEW.0, NEW.1, NEW.2);
+    let added = admitted(&broker, NEW).await;
     added.publish(&added.topic(RegionTopicKind::Status), true, added.status(NodeState::Aggregating));
     let state = broker.read(|_| ());
     until("its status is read", || state.town().cells().len() == 1).await;
     assert_eq!(lot.heard().logins, 1);
 
     // It goes on with the password that it has.
-    broker.renew_password("new-1", 48.86, 2.30);
+    broker.renew_password(NEW.0, NEW.1, NEW.2);
     until("who has the former password is shut out", || added.heard().is_refused).await;
-    let mut owner = Cell::connect(&broker, ("new-1", 48.86, 2.30));
-    until("who has the new one is in", || {
-        if owner.heard().is_refused {
-            owner = Cell::connect(&broker, ("new-1", 48.86, 2.30));
-        }
-        owner.heard().logins == 1
-    })
-    .await;
+    admitted(&broker, NEW).await;
     assert_eq!(lot.heard().logins, 1);
 }
 
