@@ -106,7 +106,7 @@ impl RoundFilter {
             verdicts: SuccessionFilter::new(floor),
             verdict_age: StalenessFilter::new(now),
             // Brokers retain them: a node that starts gets them before it can have heard of any term.
-            reputations: SuccessionFilter::of_any_term(floor).with_retained(),
+            reputations: SuccessionFilter::of_retained(floor),
             proven: None,
         }
     }

@@ -29,10 +29,9 @@ fn max_rounds_in(time: Duration) -> u64 {
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct SuccessionFilter {
     gate: EpochGate,
-    /// True if any term is believed while nobody is known to lead.
-    believes_any_term: bool,
-    /// True if the first message may have been retained.
-    takes_retained: bool,
+    /// True if the topic's last message is retained: any term is believed while nobody is known to lead, and the first message
+    /// may be of any age.
+    is_retained: bool,
     /// Arrival of the last admitted message; before any, of the first message.
     newest_at: Option<Timestamp>,
     /// True if the only admitted message may have been retained, and be of any age.
@@ -79,8 +78,7 @@ impl SuccessionFilter {
     pub fn new(floor: u64) -> Self {
         Self {
             gate: EpochGate::new(floor),
-            believes_any_term: false,
-            takes_retained: false,
+            is_retained: false,
             newest_at: None,
             newest_is_retained: false,
             elected: None,
@@ -90,14 +88,10 @@ impl SuccessionFilter {
         }
     }
 
-    /// A filter that believes any term from `floor` on while nobody is known to lead.
-    pub fn of_any_term(floor: u64) -> Self {
-        Self { believes_any_term: true, ..Self::new(floor) }
-    }
-
-    /// The same for a topic whose last message is retained: the second one may be many rounds later.
-    pub fn with_retained(self) -> Self {
-        Self { takes_retained: true, ..self }
+    /// A filter for a topic whose last message is retained. It believes any term from `floor` on while nobody is known to lead, and
+    /// the second message may be many rounds later than the first.
+    pub fn of_retained(floor: u64) -> Self {
+        Self { is_retained: true, ..Self::new(floor) }
     }
 
     /// Takes round `round` of `epoch`, or refuses it, given what the election says.
@@ -138,7 +132,7 @@ impl SuccessionFilter {
     /// knows of a term that is over. Without any election only who publishes on and on is believed, and of several the
     /// first.
     fn is_strange(&mut self, epoch: &Epoch, known_term: u64, received_at: Timestamp) -> bool {
-        if self.believes_any_term {
+        if self.is_retained {
             return false;
         }
         let vouched = known_term..=known_term.saturating_add(TERMS_AHEAD);
@@ -232,7 +226,7 @@ impl SuccessionFilter {
             Some((latest, _)) if latest == epoch => Refusal::Repeated,
             _ => Refusal::Superseded,
         })?;
-        (self.newest_at, self.newest_is_retained) = (Some(received_at), is_first && self.takes_retained);
+        (self.newest_at, self.newest_is_retained) = (Some(received_at), is_first && self.is_retained);
         Ok(())
     }
 }
@@ -272,7 +266,7 @@ mod tests {
     fn a_retained_message_may_be_much_older_than_the_next_and_no_other_may() {
         let elected = epoch(7, "edge");
         let leadership = led_by(elected.clone(), None);
-        let mut filter = SuccessionFilter::new(0).with_retained();
+        let mut filter = SuccessionFilter::of_retained(0);
         let mut admit = |round, ms| filter.admit(&elected, round, at(ms), &leadership);
         assert_eq!(admit(1, 0), Ok(()));
         assert_eq!(admit(1700, 300), Ok(()));
@@ -287,7 +281,7 @@ mod tests {
     fn a_forged_epoch_does_not_silence_the_elected() {
         let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "gauss"));
         let leadership = led_by(elected.clone(), Some("euclid"));
-        let mut filter = SuccessionFilter::of_any_term(0);
+        let mut filter = SuccessionFilter::of_retained(0);
         for round in 0..100 {
             assert_eq!(filter.admit(&elected, round, at(100 * round), &leadership), Ok(()), "round {round}");
             let refused = filter.admit(&forged, round, at(100 * round + 50), &leadership);
@@ -299,7 +293,7 @@ mod tests {
     fn one_that_poses_as_the_next_leader_is_believed_once_and_briefly() {
         let (elected, forged) = (epoch(7, "edge"), epoch(u64::MAX, "euclid"));
         let leadership = led_by(elected.clone(), Some("euclid"));
-        let mut filter = SuccessionFilter::of_any_term(0);
+        let mut filter = SuccessionFilter::of_retained(0);
         let mut lost = Vec::new();
         for round in 0..100 {
             if filter.admit(&elected, round, at(100 * round), &leadership).is_err() {
@@ -335,7 +329,7 @@ mod tests {
     #[test]
     fn the_next_leader_is_taken_before_word_of_its_election_came() {
         let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
-        let mut filter = SuccessionFilter::of_any_term(0);
+        let mut filter = SuccessionFilter::of_retained(0);
         let (before, after) = (led_by(old.clone(), Some("euclid")), led_by(new.clone(), None));
         assert_eq!(filter.admit(&old, 1, at(0), &before), Ok(()));
         assert_eq!(filter.admit(&new, 2, at(100), &before), Ok(()));
@@ -380,7 +374,7 @@ mod tests {
     fn the_elected_goes_on_in_a_later_term_before_word_of_it_came() {
         let (before, renewed) = (epoch(7, "edge"), epoch(8, "edge"));
         let leadership = led_by(before.clone(), Some("euclid"));
-        let mut filter = SuccessionFilter::of_any_term(0);
+        let mut filter = SuccessionFilter::of_retained(0);
         assert_eq!(filter.admit(&before, 41, at(0), &leadership), Ok(()));
         assert_eq!(filter.admit(&renewed, 42, at(100), &leadership), Ok(()));
         assert_eq!(filter.admit(&before, 42, at(110), &leadership), Err(Refusal::Superseded));
@@ -398,7 +392,7 @@ mod tests {
     fn a_standby_that_still_leads_on_its_own_is_not_taken_for_the_next_leader() {
         let (elected, lone) = (epoch(2, "euclid"), epoch(3, "edge"));
         let leadership = led_by(elected.clone(), Some("edge"));
-        let mut filter = SuccessionFilter::of_any_term(0);
+        let mut filter = SuccessionFilter::of_retained(0);
         assert_eq!(filter.admit(&elected, 42, at(0), &leadership), Ok(()));
         assert_eq!(filter.admit(&lone, 3, at(50), &leadership), Err(Refusal::NotElected), "it has just started");
         assert_eq!(filter.admit(&lone, 9000, at(50), &leadership), Err(Refusal::NotElected), "it was alone for long");
@@ -481,7 +475,7 @@ mod tests {
     #[test]
     fn the_last_round_of_the_old_leader_passes_while_the_new_one_has_sent_none() {
         let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
-        let mut filter = SuccessionFilter::of_any_term(0);
+        let mut filter = SuccessionFilter::of_retained(0);
         let after = led_by(new.clone(), None);
         assert_eq!(filter.admit(&old, 1, at(0), &led_by(old.clone(), None)), Ok(()));
         assert_eq!(filter.admit(&old, 2, at(100), &after), Ok(()));
