@@ -127,7 +127,7 @@ struct Scene {
 }
 
 impl Scene {
-    /// A town with every number of observers, and a recording of two vehicles.
+    /// A town with every number of observers, a recording of two vehicles, and parked cars that many pass.
     fn all(options: &Options) -> Vec<Self> {
         let town = |&observers: &usize| Self {
             name: observers.to_string(),
@@ -137,7 +137,11 @@ impl Scene {
             name: "recorded".into(),
             config: TrafficConfig { duration_s: options.seconds, ..TrafficConfig::two_vehicle_recording() },
         };
-        options.observers.iter().map(town).chain([recorded]).collect()
+        let passed = Self {
+            name: "passed".into(),
+            config: TrafficConfig { duration_s: 4.0 * options.seconds, ..TrafficConfig::much_passed() },
+        };
+        options.observers.iter().map(town).chain([recorded, passed]).collect()
     }
 }
 
@@ -309,7 +313,7 @@ fn main() -> anyhow::Result<()> {
             };
             let ids: BTreeSet<usize> =
                 recording.truth.frames.iter().flat_map(|frame| frame.objects.iter().map(|object| object.id)).collect();
-            let scores = run(&recording, config.observers, &mut write)?;
+            let scores = run(&recording, config.observers + config.standing, &mut write)?;
             written?;
             calibrations.extend(scores.last().map(|ecod| ecod.calibration.clone()));
             for (method, scores) in scores.iter().enumerate() {

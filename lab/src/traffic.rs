@@ -200,6 +200,8 @@ struct Watch<'a> {
 
 struct Watcher {
     name: NodeName,
+    /// Its place among the bodies, unless it is a camera on a post.
+    body: usize,
     sensor: SimulatedSensor,
     /// Step of the next capture by the clockwork, and by the shutter.
     due: u64,
@@ -211,6 +213,7 @@ struct Watcher {
 impl<'a> Watch<'a> {
     fn new(config: &'a TrafficConfig, town: &Town, dice: &mut Dice<'_>) -> Self {
         let bodies = town.bodies().len();
+        let parked = town.vehicles.len();
         let period = (STEPS_PER_S / config.sensor.rate_hz).round() as usize;
         let mut watcher = |number| {
             let due = if config.synchronous { 0 } else { dice.below(period) as u64 };
@@ -218,6 +221,7 @@ impl<'a> Watch<'a> {
             let late_s = if number % 2 == 1 { config.sensor.stamped_late_s } else { 0.0 };
             Watcher {
                 name: observer_name(number),
+                body: if number < config.observers { number } else { parked + number - config.observers },
                 sensor: SimulatedSensor::new(bodies, dice),
                 due,
                 shutter: due,
@@ -225,7 +229,7 @@ impl<'a> Watch<'a> {
                 seq: 0,
             }
         };
-        let observers = (0..config.observers).map(&mut watcher).collect();
+        let observers = (0..config.observers + config.standing).map(&mut watcher).collect();
         Self { config, observers, seen_at: vec![None; bodies], arrived: Vec::new(), truth: TrafficTruth::default() }
     }
 
@@ -248,7 +252,7 @@ impl<'a> Watch<'a> {
 
     fn capture(&mut self, number: usize, step: u64, town: &Town, bodies: &[TrafficBody], dice: &mut Dice<'_>) {
         let config = self.config;
-        let (position, heading_rad) = match bodies.get(number) {
+        let (position, heading_rad) = match bodies.get(self.observers[number].body) {
             Some(vehicle) if !config.fixed => (vehicle.center, vehicle.heading_rad),
             _ => town.roads.post(number),
         };
@@ -287,8 +291,9 @@ impl<'a> Watch<'a> {
     /// Objects that belong to the truth.
     fn known(&self, step: u64, bodies: &[TrafficBody]) -> Vec<TruthObject> {
         let memory = (self.config.memory_s * STEPS_PER_S) as u64;
-        let observers = if self.config.said.poses && !self.config.fixed { self.observers.len() } else { 0 };
-        let is_known = |id: usize| id < observers || self.seen_at[id].is_some_and(|seen| step - seen <= memory);
+        let are_known = self.config.said.poses && !self.config.fixed;
+        let is_observer = |id: usize| are_known && self.observers.iter().any(|watcher| watcher.body == id);
+        let is_known = |id: usize| is_observer(id) || self.seen_at[id].is_some_and(|seen| step - seen <= memory);
         let round = |value: f64| (value * 1e3).round() / 1e3;
         let objects = bodies.iter().enumerate().filter(|(id, _)| is_known(*id));
         objects

@@ -2,6 +2,7 @@ mod beside;
 mod fast;
 mod fixed;
 mod foreign;
+mod passing;
 mod trust;
 
 use std::collections::BTreeSet;

@@ -44,6 +44,10 @@ const DISAPPEARANCE_RATE: f64 = 0.02;
 /// Time constant in seconds with which an unseen object disappears.
 const UNSEEN_S: f64 = 2.0;
 
+/// Time before its last detection within which a vehicle must have looked at an object to count as one that looks at it:
+/// as long as evidence lasts. An object that all have left gets no surer by that.
+const LOOKS_FOR: Duration = Duration::from_secs(3);
+
 /// Power at which survival enters the odds of existence: tracks are kept for longer than their objects are likely there.
 const SURVIVAL_POWER: f64 = 3.1;
 
@@ -55,7 +59,10 @@ pub(super) struct Track {
     pub(super) history: DetectionHistory,
     /// Fading weights of the labels that were read.
     labels: SmallVec<[(Label, f64); 1]>,
+    /// Direction that vehicles stated.
     heading_rad: Option<f64>,
+    /// Direction by another aggregator, which may be the course of then; it holds until a course is known here.
+    inherited_heading_rad: Option<f64>,
     size_m: Option<[f64; 2]>,
     pub(super) first_seen: Timestamp,
     pub(super) last_seen: Timestamp,
@@ -83,6 +90,7 @@ impl Track {
             history: DetectionHistory::default(),
             labels: SmallVec::new(),
             heading_rad: None,
+            inherited_heading_rad: None,
             size_m: None,
             first_seen: at,
             last_seen: at,
@@ -118,6 +126,9 @@ impl Track {
         if self.labels.len() > MAX_LABELS {
             self.labels.sort_by(|a, b| b.1.total_cmp(&a.1));
             self.labels.truncate(MAX_LABELS);
+        }
+        if self.course_rad().is_some() {
+            self.inherited_heading_rad = None;
         }
         if let Some(new) = heading_rad {
             let old = self.heading_rad.unwrap_or(new);
@@ -173,22 +184,29 @@ impl Track {
         quality: impl Fn(SensorId) -> SensorQuality,
     ) -> f64 {
         let (mut evidence, mut denied, mut detected) = (0.0, 0.0, 0.0);
-        let (mut looks_hz, mut even_excess) = (0.0, None);
-        let has_one_witness = self.witnesses().nth(1).is_none();
+        let (mut looks_hz, mut most_trusted) = (0.0, 0.0f64);
+        let (mut witnesses, mut even_excess) = (0, None);
+        let looking_since = self.last_seen - LOOKS_FOR;
         for history in self.history.iter() {
             let sensor = quality(history.sensor);
             let (shared, denial) = history.shared_nats(at);
             evidence += sensor.trust * shared;
             denied += sensor.trust * denial;
-            looks_hz += sensor.trust * sensor.looks_hz;
+            if history.last_look >= looking_since {
+                looks_hz += sensor.trust * sensor.looks_hz;
+                most_trusted = most_trusted.max(sensor.trust);
+            }
             if history.last_hit.is_some() && sensor.trust > 0.0 {
+                witnesses += 1;
                 detected = sensor.trust.max(detected);
                 even_excess = Some(even_excess.unwrap_or(sensor.even_excess).min(sensor.even_excess));
             }
         }
         let persistence = persistence_nats(self.last_seen.since(self.first_seen).as_secs_f64());
         let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
-        let evidence = if has_one_witness { evidence - denied.min(MAX_DENIAL_NATS) } else { evidence };
+        let evidence = if witnesses < 2 { evidence - denied.min(MAX_DENIAL_NATS) } else { evidence };
+        // Looks count beside each other, not less for all: those who are trusted little find an object no surer by that.
+        let looks_hz = if most_trusted > 0.0 { looks_hz / most_trusted } else { 0.0 };
         let alone = alone_nats(looks_hz, even_excess.unwrap_or_default());
         let nats = base_rate + alone + evidence + detected * persistence + inherited;
         self.clutter = Some(logistic(-nats));
@@ -221,10 +239,12 @@ impl Track {
         self.seen_by(at - CONFIRMED_WITHIN).any(|history| history.sensor != sensor)
     }
 
-    /// Whether a vehicle detected both objects in the frame of its last detection.
+    /// Whether a vehicle detected both objects in the frame of its last detection, which is not one of long ago: a duplicate of
+    /// then would else stay for as long as the vehicle.
     pub(super) fn is_resolved_from(&self, other: &Self) -> bool {
+        let since = self.last_seen.max(other.last_seen) - LOOKS_FOR;
         self.history.iter().any(|own| {
-            own.last_hit.is_some()
+            own.last_hit.is_some_and(|hit| hit >= since)
                 && other.history.iter().any(|theirs| theirs.sensor == own.sensor && theirs.last_hit == own.last_hit)
         })
     }
@@ -241,6 +261,7 @@ impl Track {
         self.hits = self.hits.saturating_add(other.hits);
         self.vehicle = self.vehicle.or(other.vehicle);
         self.heading_rad = self.heading_rad.or(other.heading_rad);
+        self.inherited_heading_rad = self.inherited_heading_rad.or(other.inherited_heading_rad);
         self.size_m = self.size_m.or(other.size_m);
     }
 
@@ -251,7 +272,7 @@ impl Track {
         self.inherited = Some(((existence / (1.0 - existence)).ln() - alone, at));
         self.first_seen = object.first_seen_us.map_or(self.first_seen, |first| first.min(self.first_seen));
         self.labels = object.scores.iter().map(|(label, score)| (label.clone(), *score)).collect();
-        self.heading_rad = object.heading_rad;
+        self.inherited_heading_rad = object.heading_rad;
         self.size_m = object.size_m;
     }
 
@@ -281,7 +302,7 @@ impl Track {
             existence: Some(existence),
             scores,
             velocity_mps: has_velocity.then_some([self.state.velocity.x, self.state.velocity.y]),
-            heading_rad: self.heading_rad.or_else(|| self.course_rad()),
+            heading_rad: self.heading_rad.or_else(|| self.course_rad()).or(self.inherited_heading_rad),
             size_m: self.size_m,
             age_s: Some(now.since(self.last_seen).as_secs_f64()),
             first_seen_us: Some(self.first_seen),

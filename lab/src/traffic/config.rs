@@ -15,6 +15,8 @@ pub struct TrafficConfig {
     pub vehicles: usize,
     /// Vehicles that are parked. Default 40.
     pub parked: usize,
+    /// Parked vehicles that report, too, beside the `observers`. Default 0.
+    pub standing: usize,
     /// People on the pavements. Default 30; with 0 and no bicycles there is one class only.
     pub people: usize,
     /// Bicycles beside the lanes. Default 12.
@@ -100,6 +102,7 @@ impl Default for TrafficConfig {
             observers: 8,
             vehicles: 60,
             parked: 40,
+            standing: 0,
             people: 30,
             bicycles: 12,
             roads: 4,
@@ -166,6 +169,22 @@ impl TrafficConfig {
         }
     }
 
+    /// Long roads about one block: observers pass others that are parked, one after the other, and go on reporting.
+    pub fn much_passed() -> Self {
+        Self {
+            observers: 24,
+            vehicles: 24,
+            parked: 24,
+            standing: 12,
+            people: 12,
+            bicycles: 6,
+            roads: 2,
+            block_m: 200.0,
+            duration_s: 120.0,
+            ..Self::default()
+        }
+    }
+
     /// Checks all values.
     ///
     /// # Errors
@@ -180,6 +199,8 @@ impl TrafficConfig {
         let max_observers = if self.fixed { posts } else { self.vehicles };
         check_range("observers", self.observers as f64, 1.0, max_observers as f64)?;
         check_range("parked", self.parked as f64, 0.0, lanes_m / 15.0)?;
+        let max_standing = if self.fixed { 0 } else { self.parked };
+        check_range("standing", self.standing as f64, 0.0, max_standing as f64)?;
         check_range("people", self.people as f64, 0.0, 1e4)?;
         check_range("bicycles", self.bicycles as f64, 0.0, 1e4)?;
         check_range("duration_s", self.duration_s, 0.1, 3600.0)?;

@@ -110,6 +110,22 @@ fn more_observers_see_more() {
 }
 
 #[test]
+fn whoever_stands_reports_from_its_place() {
+    let recording = generated(&TrafficConfig { observers: 3, standing: 2, ..small() }, 4);
+    let mut poses: BTreeMap<NodeName, Vec<Point2<f64>>> = BTreeMap::new();
+    for ArrivedReport { report, .. } in &recording.reports {
+        let pose = report.pose.unwrap();
+        poses.entry(report.node.clone()).or_default().push(Point2::new(pose.x_m, pose.y_m));
+    }
+    let went_m = |number| {
+        let poses = &poses[&observer_name(number)];
+        poses.iter().map(|pose| (pose - poses[0]).norm()).fold(0.0, f64::max)
+    };
+    assert_eq!(poses.len(), 5);
+    assert!((3..5).all(|number| went_m(number) < 2.0), "no farther than the pose errs");
+}
+
+#[test]
 fn a_recording_of_two_vehicles_says_no_more_than_they_did() {
     let config = TrafficConfig { duration_s: 2.0, ..TrafficConfig::two_vehicle_recording() };
     let recording = generated(&config, 1);
