@@ -49,7 +49,10 @@ def main():
     assert position["altitude"]["altitudeValue"] == 11_300, position
     assert inside["OriginatingVehicleContainer"]["orientationAngle"]["value"] == 900, inside  # east
     objects = inside["PerceivedObjectContainer"]["perceivedObjects"]
+    # Twelve were seen, of which one is a vacancy sign.
     assert len(objects) == 11 and len({thing["objectId"] for thing in objects}) == 11
+    for thing in objects:
+        assert ("angles" in thing) == ("objectDimensionX" in thing) == ("objectDimensionY" in thing), thing
     car = objects[0]
     assert abs(car["position"]["xCoordinate"]["value"] + 1000) <= 1, car
     assert abs(car["position"]["yCoordinate"]["value"] + 2310) <= 1, car
@@ -62,6 +65,9 @@ def main():
     assert empty[2]["PerceivedObjectContainer"]["perceivedObjects"] == [], empty
     cars = whole[2]["PerceivedObjectContainer"]["perceivedObjects"]
     assert len(cars) == 255 and all(car["objectAge"] == 700 for car in cars), cars[0]
+    # Last seen 250 ms before the map, at 4 m/s to the north.
+    assert all(car["measurementDeltaTime"] == -250 for car in cars), cars[0]
+    assert all(car["position"]["yCoordinate"]["value"] == 150 for car in cars), cars[0]
     print(f"{len(messages)} messages of {[len(message) for message in messages]} bytes decoded, and encoded to the same bytes")
 
 

@@ -6,36 +6,45 @@
 //! cpm/received/<name> -> detections/<node>--cpm-<station>
 //! ```
 
-use std::collections::BTreeMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+mod sightings;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
-use ecod_client::{Cell, Error, ForeignMessage, Frame, GeographicOrigin, GlobalMap, NodeName, ObjectReport, Settings};
+use ecod_client::{Cell, Error, ForeignMessage, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings};
 
-use crate::cpm::{self, CpmError, ObjectIds, ReceivedCpm, StationIds};
-
-/// Part of the node's name in which a station's objects are reported, before the station's number.
-const PART: &str = "cpm-";
+use self::sightings::Sightings;
+use crate::cpm::{self, CpmCell, CpmError, ObjectIds, RECEIVED_PART, ReceivedCpm, Segments, StationIds};
 
 /// Maximum number of stations at a time. A node has room for 16 parts.
 const MAX_STATIONS: usize = 12;
 
 /// Silence after which a station gives its place to another.
-const STATION_RETENTION: Duration = Duration::from_secs(60);
+const STATION_RETENTION: Duration = Duration::from_secs(10);
+
+/// Time between two reports of all stations together. The node's door takes 50 reports a second of all its programs, and a vehicle's
+/// own detector needs most of them.
+const REPORT_INTERVAL: Duration = Duration::from_millis(50);
+
+/// Most by which a message's time may differ from this machine's. A station's is that of GNSS: no other offset is one of its clock.
+const MAX_CLOCK_DIFFERENCE: Duration = Duration::from_secs(2);
 
 /// Maximum number of receivers whose unusable messages are counted apart.
 const MAX_RECEIVERS: usize = 256;
 
-/// Age of the origin at which it is asked for anew.
-const ORIGIN_AGE: Duration = Duration::from_secs(1);
+/// Age of the cell's description at which it is asked for anew.
+const DESCRIPTION_AGE: Duration = Duration::from_secs(1);
 
 /// A bridge beside a node.
 pub struct CpmBridge {
     cell: Cell,
     settings: Settings,
-    origin: Mutex<(Instant, GeographicOrigin)>,
+    described: Mutex<(Instant, Arc<CpmCell>)>,
     numbers: Mutex<StationIds>,
+    sightings: Mutex<Sightings>,
     refusals: Mutex<BTreeMap<(NodeName, CpmRefusal), u64>>,
 }
 
@@ -48,9 +57,18 @@ pub enum CpmRefusal {
     /// It has the station number of a node of this cell: an echo.
     #[error("a station number of this cell")]
     Own,
+    /// It is of another time, as a recorded message is, or this machine's clock is wrong.
+    #[error("a time more than 2 s from this machine's")]
+    Time,
+    /// The station's messages come more often than there is room for beside other stations and the node itself.
+    #[error("more often than can be reported")]
+    TooOften,
     /// As many stations as there is room for were heard lately.
     #[error("too many stations")]
     TooManyStations,
+    /// The node's broker does not let the station's part in.
+    #[error("the part for the station cannot connect")]
+    NotConnected,
     /// Its values are no report, or the node's broker refuses it.
     #[error("refused as a report")]
     Report,
@@ -65,28 +83,27 @@ impl CpmBridge {
         let invalid = |error: &dyn std::fmt::Display| Error::Invalid(error.to_string());
         let name = NodeName::new(&settings.cell).map_err(|error| invalid(&error))?;
         let cell = Cell::connect(Settings { part: "cpm".to_owned(), ..settings.clone() })?;
-        let origin = cell.origin()?.ok_or_else(|| {
+        let described = described(&cell)?.ok_or_else(|| {
             Error::Invalid(format!(
                 "the description of the cell {name} has no [origin], and a CPM needs a reference position on Earth: add \
                  latitude_deg and longitude_deg (docs/configuration.md#origin) and set it with `ecod-node cell set`"
             ))
         })?;
-        let (origin, numbers) = (Mutex::new((Instant::now(), origin)), Mutex::new(StationIds::new(name)));
-        Ok(Self { cell, settings, origin, numbers, refusals: Mutex::default() })
+        let described = Mutex::new((Instant::now(), Arc::new(described)));
+        let numbers = Mutex::new(StationIds::new(name));
+        Ok(Self { cell, settings, described, numbers, sightings: Mutex::default(), refusals: Mutex::default() })
     }
 
     /// Carries messages until the connection is closed.
     ///
     /// # Errors
     /// [`Error::Refused`] when the node's broker refuses the bridge.
+    ///
+    /// # Panics
+    /// When one of its threads did.
     pub fn run(&self) -> Result<(), Error> {
-        thread::scope(|scope| {
-            let maps = scope.spawn(|| self.until_closed(|| self.send_maps()));
-            let reports = scope.spawn(|| self.until_closed(|| self.send_reports()));
-            let received = self.until_closed(|| self.take_received());
-            let sent = [maps.join(), reports.join()].into_iter().flatten();
-            sent.fold(received, Result::and)
-        })
+        let carry: [Carry<'_>; 3] = [&|| self.send_maps(), &|| self.send_reports(), &|| self.take_received()];
+        until_one_ends(carry, || self.cell.close())
     }
 
     /// Ends the connection, and with it [`CpmBridge::run`].
@@ -99,32 +116,26 @@ impl CpmBridge {
         lock(&self.refusals).clone()
     }
 
-    fn until_closed(&self, carry: impl Fn() -> Result<(), Error>) -> Result<(), Error> {
-        let ended = carry();
-        self.cell.close();
-        ended
-    }
-
     fn send_maps(&self) -> Result<(), Error> {
         let mut ids = ObjectIds::default();
         for map in self.cell.maps() {
             let map: &GlobalMap = &*map?;
             let number = lock(&self.numbers).of(&map.aggregator);
             let Some(number) = number else { continue };
-            let encoded = cpm::encode_map(map, &self.origin(), number, &mut ids);
+            let is_own = |position_m| lock(&self.sightings).is_own(position_m, Instant::now());
+            let encoded = cpm::encode_map(map, &self.described(), number, &mut ids, is_own);
             self.send("map", encoded)?;
         }
         Ok(())
     }
 
     fn send_reports(&self) -> Result<(), Error> {
-        let is_foreign =
-            |node: &NodeName| node.as_str().split_once("--").is_some_and(|(_, part)| part.starts_with(PART));
         for report in self.cell.reports() {
             let report: &ObjectReport = &*report?;
-            let number = (!is_foreign(&report.node)).then(|| lock(&self.numbers).of(&report.node)).flatten();
+            lock(&self.sightings).observe(report, Instant::now());
+            let number = (!cpm::is_received(&report.node)).then(|| lock(&self.numbers).of(&report.node)).flatten();
             let Some(number) = number else { continue };
-            let encoded = cpm::encode_report(report, &self.origin(), number);
+            let encoded = cpm::encode_report(report, &self.described(), number);
             self.send(&format!("vehicles/{}", report.node), encoded)?;
         }
         Ok(())
@@ -157,25 +168,33 @@ impl CpmBridge {
     }
 
     fn take(&self, stations: &mut Stations<'_>, message: &ForeignMessage) -> Result<(), CpmRefusal> {
-        let received = cpm::decode(&message.payload, &self.origin())?;
+        let received = cpm::decode(&message.payload, &self.described().origin)?;
+        if received.left_out > 0 {
+            log::debug!("cpm/received/{}: {} objects without a usable place", message.receiver, received.left_out);
+        }
         if lock(&self.numbers).is_own(received.station_id) {
             return Err(CpmRefusal::Own);
+        }
+        let (captured_at, now) = (capture_time(&received), SystemTime::now());
+        let difference = now.duration_since(captured_at).unwrap_or_else(|later| later.duration());
+        if difference > MAX_CLOCK_DIFFERENCE {
+            return Err(CpmRefusal::Time);
         }
         stations.report(received)
     }
 
-    /// The cell's origin, as it was a second ago at most; the last known one while it cannot be had.
-    fn origin(&self) -> GeographicOrigin {
-        let mut origin = lock(&self.origin);
-        if origin.0.elapsed() > ORIGIN_AGE {
-            origin.0 = Instant::now();
-            match self.cell.origin() {
-                Ok(Some(present)) => origin.1 = present,
+    /// The cell as it was described a second ago at most; the last known state while it cannot be had.
+    fn described(&self) -> Arc<CpmCell> {
+        let mut last = lock(&self.described);
+        if last.0.elapsed() > DESCRIPTION_AGE {
+            last.0 = Instant::now();
+            match described(&self.cell) {
+                Ok(Some(present)) => last.1 = Arc::new(present),
                 Ok(None) => log::warn!("the cell has no [origin] any more; the last one is used"),
-                Err(error) => log::debug!("origin: {error}"),
+                Err(error) => log::debug!("description: {error}"),
             }
         }
-        origin.1
+        Arc::clone(&last.1)
     }
 
     /// Counts a message that became no report, and tells of the first of each kind.
@@ -193,6 +212,38 @@ impl CpmBridge {
     }
 }
 
+type Carry<'a> = &'a (dyn Fn() -> Result<(), Error> + Sync);
+
+/// Runs all at a time until one ends, which closes the others. A panic goes on here, so that the program does not end as if
+/// all were well.
+fn until_one_ends<const N: usize>(carry: [Carry<'_>; N], close: impl Fn() + Sync) -> Result<(), Error> {
+    let close = &close;
+    thread::scope(|scope| {
+        let threads = carry.map(|carry| {
+            scope.spawn(move || {
+                let ended = catch_unwind(AssertUnwindSafe(carry));
+                close();
+                ended.unwrap_or_else(|panic| resume_unwind(panic))
+            })
+        });
+        let ended = threads.map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        ended.into_iter().fold(Ok(()), Result::and)
+    })
+}
+
+/// The cell by its description; `None` without an origin.
+fn described(cell: &Cell) -> Result<Option<CpmCell>, Error> {
+    let Some(origin) = cell.origin()? else { return Ok(None) };
+    Ok(Some(CpmCell { origin, vacancy_signs: vacancy_signs(&cell.description()?.text) }))
+}
+
+/// Labels of the vacancy signs at the known locations of a description.
+fn vacancy_signs(description: &str) -> BTreeSet<Label> {
+    let settings: toml::Table = description.parse().unwrap_or_default();
+    let landmarks = settings.get("landmarks").and_then(toml::Value::as_array).into_iter().flatten();
+    landmarks.filter_map(|place| place.get("vacancy")?.get("label")?.as_str()).map(Label::new).collect()
+}
+
 /// Connections in which stations report.
 struct Stations<'a> {
     settings: &'a Settings,
@@ -202,8 +253,8 @@ struct Stations<'a> {
 struct Station {
     cell: Cell,
     heard_at: Instant,
-    /// Segments of the latest time so far.
-    segments: BTreeMap<u8, ReceivedCpm>,
+    reported_at: Option<Instant>,
+    segments: Segments,
 }
 
 impl Stations<'_> {
@@ -211,38 +262,72 @@ impl Stations<'_> {
         let number = received.station_id;
         self.connected.retain(|other, station| *other == number || station.heard_at.elapsed() < STATION_RETENTION);
         if !self.connected.contains_key(&number) {
+            // A place is for those who have something to say.
+            if received.objects.is_empty() {
+                return Ok(());
+            }
             if self.connected.len() >= MAX_STATIONS {
                 return Err(CpmRefusal::TooManyStations);
             }
-            let settings = Settings { part: format!("{PART}{number}"), ..self.settings.clone() };
-            let cell = Cell::connect(settings).map_err(|_| CpmRefusal::Report)?;
-            self.connected.insert(number, Station { cell, heard_at: Instant::now(), segments: BTreeMap::new() });
+            let settings = Settings { part: format!("{RECEIVED_PART}{number}"), ..self.settings.clone() };
+            let cell = Cell::connect(settings).map_err(|error| {
+                log::debug!("{RECEIVED_PART}{number}: {error}");
+                CpmRefusal::NotConnected
+            })?;
+            let station = Station { cell, heard_at: Instant::now(), reported_at: None, segments: Segments::default() };
+            self.connected.insert(number, station);
         }
+        let interval = REPORT_INTERVAL * self.connected.len() as u32;
         let Some(station) = self.connected.get_mut(&number) else { return Ok(()) };
         station.heard_at = Instant::now();
-        let Some(whole) = station.join(received) else { return Ok(()) };
-        let since_epoch = Duration::from_micros(whole.captured_at.micros());
-        let frame = Frame { captured_at: SystemTime::UNIX_EPOCH + since_epoch, ..Frame::new(whole.objects) };
+        let Some(whole) = station.segments.join(received) else { return Ok(()) };
+        if station.reported_at.is_some_and(|reported_at| reported_at.elapsed() < interval) {
+            return Err(CpmRefusal::TooOften);
+        }
+        station.reported_at = Some(Instant::now());
+        let frame = Frame { captured_at: capture_time(&whole), ..Frame::new(whole.objects) };
         station.cell.report(frame).map(drop).map_err(|_| CpmRefusal::Report)
     }
 }
 
-impl Station {
-    /// A whole message; `None` while segments of it are missing. Objects that a report omits would count as gone.
-    fn join(&mut self, received: ReceivedCpm) -> Option<ReceivedCpm> {
-        let Some((number, total)) = received.segment else { return Some(received) };
-        self.segments.retain(|_, segment| segment.captured_at == received.captured_at);
-        self.segments.insert(number, received);
-        if self.segments.len() < usize::from(total) {
-            return None;
-        }
-        let mut segments = std::mem::take(&mut self.segments).into_values();
-        let mut whole = segments.next()?;
-        whole.objects.extend(segments.flat_map(|segment| segment.objects));
-        Some(whole)
-    }
+fn capture_time(received: &ReceivedCpm) -> SystemTime {
+    SystemTime::UNIX_EPOCH + Duration::from_micros(received.captured_at.micros())
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::panic)]
+
+    use std::sync::atomic::{AtomicBool, Ordering};
+
+    use super::*;
+
+    #[test]
+    fn a_panic_ends_all_threads_and_is_no_orderly_end() {
+        let is_closed = AtomicBool::new(false);
+        let wait = || {
+            while !is_closed.load(Ordering::Relaxed) {
+                thread::yield_now();
+            }
+            Ok(())
+        };
+        let fall = || panic!("a thread fell");
+        let close = || is_closed.store(true, Ordering::Relaxed);
+        assert!(catch_unwind(AssertUnwindSafe(|| until_one_ends([&wait, &fall, &wait], close))).is_err());
+        is_closed.store(false, Ordering::Relaxed);
+        let refuse = || Err(Error::Refused("no".into()));
+        assert_eq!(until_one_ends([&wait, &wait, &refuse], close), Err(Error::Refused("no".into())));
+    }
+
+    #[test]
+    fn vacancy_signs_are_those_of_the_description() {
+        let description = "[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\nvacancy = { label = \"EMPTY\", x_m = 0, y_m = 1 }\n\
+                           [[landmarks]]\nid = \"b\"\nx_m = 5\ny_m = 0\n";
+        assert_eq!(vacancy_signs(description), BTreeSet::from(["EMPTY".into()]));
+        assert!(vacancy_signs("[origin]").is_empty());
+    }
 }

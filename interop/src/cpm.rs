@@ -8,19 +8,34 @@ mod decoding;
 mod encoding;
 mod frame;
 mod identifiers;
+mod segments;
 
+use std::collections::BTreeSet;
+
+use ecod::model::names::Label;
+use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::wire::PerceivedObject;
 
 pub use decoding::decode;
 pub use encoding::{encode_map, encode_report};
-pub use identifiers::{ObjectIds, StationIds};
+pub use identifiers::{ObjectIds, RECEIVED_PART, StationIds, is_received};
+pub use segments::Segments;
 
 /// Maximum size of a message in bytes: 255 objects with all that a message may say of each need less than half of it.
 pub const MAX_BYTES: usize = 64 * 1024;
 
 /// Standard deviations in the half width of an interval of 95 %.
 const SIGMAS: f64 = 1.96;
+
+/// Coordinates in centimetres that are no codes of those out of range.
+const COORDINATES_CM: std::ops::RangeInclusive<i32> = -131_071..=131_070;
+
+/// Code of a coordinate's confidence: the half width is more than 40.94 m.
+const WIDE_COORDINATE: u16 = 4095;
+
+/// Code of a coordinate's confidence that is unavailable.
+const UNSTATED_COORDINATE: u16 = 4096;
 
 /// Version of the protocol in the header of all messages of release 2.
 const PROTOCOL_VERSION: u8 = 2;
@@ -30,6 +45,15 @@ const MESSAGE_ID: u8 = 14;
 
 /// Milliseconds from the Unix epoch to 2004-01-01, less the five leap seconds since then, which `TimestampIts` counts.
 const ITS_EPOCH_MS: u64 = 1_072_915_200_000 - 5_000;
+
+/// A cell as its messages need it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CpmCell {
+    /// Place of the cell's frame on Earth.
+    pub origin: GeographicOrigin,
+    /// Labels of vacancy signs, which are no objects.
+    pub vacancy_signs: BTreeSet<Label>,
+}
 
 /// A message to be sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -51,6 +75,9 @@ pub struct ReceivedCpm {
     pub segment: Option<(u8, u8)>,
     /// The objects in the cell's frame.
     pub objects: Vec<PerceivedObject>,
+    /// Objects without a usable place: a coordinate out of range, or a measurement more than a second from the reference
+    /// time.
+    pub left_out: usize,
 }
 
 /// A message that cannot be written or used.
@@ -62,10 +89,13 @@ pub enum CpmError {
     /// Not UPER of a CPM.
     #[error("not a CPM in UPER")]
     Malformed,
+    /// Values that UPER of a CPM has no room for, such as a time after 2143.
+    #[error("values for which a CPM has no room")]
+    Unencodable,
     /// Another version or kind of message.
     #[error("not a CPM of release 2")]
     OtherMessage,
-    /// A reference position that is unavailable.
+    /// A reference position that is unavailable, or has an error out of range: the standard calls it not valid.
     #[error("no reference position")]
     NoPosition,
     /// A reference position more than 100 km from the cell's origin.

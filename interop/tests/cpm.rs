@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -14,7 +15,7 @@ use ecod_client::{
     Cell, Error, Frame, GeographicOrigin, NodeName, ObjectReport, PerceivedObject, Role, Settings, Timestamp, Tls, now,
 };
 use ecod_interop::bridge::{CpmBridge, CpmRefusal};
-use ecod_interop::cpm::{self, CpmError, ReceivedCpm};
+use ecod_interop::cpm::{self, CpmCell, CpmError, ReceivedCpm};
 use rumqttc::{Client, Event, Incoming, MqttOptions, QoS};
 use tokio::runtime::Runtime;
 
@@ -87,18 +88,33 @@ impl Drop for Edge {
     }
 }
 
-const DESCRIPTION: &str =
-    "[origin]\nlatitude_deg = 52.2296756\nlongitude_deg = 21.0122287\nheight_m = 113\nrotation_deg = 40\n";
+const DESCRIPTION: &str = r#"
+[origin]
+latitude_deg = 52.2296756
+longitude_deg = 21.0122287
+height_m = 113
+rotation_deg = 40
+
+[fusion.tracks]
+mode = "on"
+
+[[landmarks]]
+id = "slot-0"
+x_m = 200
+y_m = 0
+vacancy = { label = "EMPTY", x_m = 200, y_m = -0.1 }
+"#;
 
 /// A bus 12 m ahead of a foreign station, as that station says it.
-fn foreign_cpm(at: Timestamp) -> Vec<u8> {
+fn foreign_cpm(at: Timestamp, station: u32) -> Vec<u8> {
     let bus = PerceivedObject {
         covariance_m2: Some([0.04, 0.0, 0.04]),
         size_m: Some([12.0, 2.5]),
         ..PerceivedObject::new("bus", 0.93, 12.0, -3.0)
     };
     let report = ObjectReport { objects: vec![bus], ..ObjectReport::new(NodeName::from_static("elsewhere"), 1, at) };
-    cpm::encode_report(&report, &ORIGIN, 4711).unwrap().bytes
+    let cell = CpmCell { origin: ORIGIN, vacancy_signs: BTreeSet::new() };
+    cpm::encode_report(&report, &cell, station).unwrap().bytes
 }
 
 #[test]
@@ -113,48 +129,95 @@ fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
     // A vehicle without a node beside the foreign station.
     let vehicle =
         Cell::connect(Settings { node: "euclid".into(), part: String::new(), ..edge.settings.clone() }).unwrap();
-    let car = || {
+    let frame = || {
         let covariance_m2 = Some([0.04, 0.0, 0.04]);
-        Frame::new(vec![PerceivedObject { covariance_m2, ..PerceivedObject::new("car", 0.9, 4.0, 30.0) }])
+        let car = PerceivedObject { covariance_m2, ..PerceivedObject::new("car", 0.9, 4.0, 30.0) };
+        Frame::new(vec![car, PerceivedObject::new("EMPTY", 0.9, 200.0, -0.1)])
     };
     let speaker = client.clone();
     let talking = Arc::clone(&bridge);
     let talk = std::thread::spawn(move || {
         let began = Instant::now();
         while began.elapsed() < SOON && Arc::strong_count(&talking) > 2 {
-            speaker.publish("ecod/v1/lot-1/cpm/received/obu", QoS::AtMostOnce, false, foreign_cpm(now())).unwrap();
-            speaker.publish("ecod/v1/lot-1/cpm/received/broken", QoS::AtMostOnce, false, [2, 14, 7]).unwrap();
-            vehicle.report(car()).unwrap();
+            let say = |name: &str, message: Vec<u8>| {
+                speaker.publish(format!("ecod/v1/lot-1/cpm/received/{name}"), QoS::AtMostOnce, false, message).unwrap();
+            };
+            say("obu", foreign_cpm(now(), 4711));
+            say("broken", vec![2, 14, 7]);
+            vehicle.report(frame()).unwrap();
             std::thread::sleep(Duration::from_millis(100));
         }
     });
+    let reader = Cell::connect(edge.settings.clone()).unwrap();
+    let of_bus = std::thread::spawn(move || {
+        let mut maps = reader.maps().filter_map(Result::ok);
+        maps.find_map(|map| Some((map.fused_at_us, map.objects.iter().find(|object| object.label == "bus")?.clone())))
+    });
     let (mut of_map, mut of_vehicle) = (None::<ReceivedCpm>, None::<ReceivedCpm>);
+    let echo = (NodeName::from_static("echo"), CpmRefusal::Own);
+    let mut bus = None;
+    let mut of_bus = Some(of_bus);
     let began = Instant::now();
     for event in connection.iter() {
-        assert!(began.elapsed() < SOON, "{of_map:?} {of_vehicle:?}");
+        assert!(began.elapsed() < SOON, "{of_map:?} {of_vehicle:?} {bus:?} {:?}", bridge.refusals());
+        if let Some(found) = of_bus.take_if(|found| found.is_finished()) {
+            bus = found.join().unwrap();
+        }
         let Ok(Event::Incoming(Incoming::Publish(message))) = event else { continue };
         match message.topic.strip_prefix("ecod/v1/lot-1/cpm/") {
-            Some("map") => of_map = Some(cpm::decode(&message.payload, &ORIGIN).unwrap()),
+            Some("map") => {
+                of_map = Some(cpm::decode(&message.payload, &ORIGIN).unwrap());
+                let topic = "ecod/v1/lot-1/cpm/received/echo";
+                client.publish(topic, QoS::AtMostOnce, false, message.payload).unwrap();
+            }
             Some("vehicles/euclid") => of_vehicle = Some(cpm::decode(&message.payload, &ORIGIN).unwrap()),
             Some(level) => assert!(level.starts_with("received/"), "{level}"),
             None => panic!("{}", message.topic),
         }
-        let has_both = of_map.as_ref().is_some_and(|map| map.objects.len() == 2);
-        if has_both && of_vehicle.is_some() {
+        let is_later =
+            bus.as_ref().zip(of_map.as_ref()).is_some_and(|((fused_at, _), map)| map.captured_at > *fused_at);
+        if is_later && of_vehicle.is_some() && bridge.refusals().contains_key(&echo) {
             break;
         }
     }
-    let (map, vehicle) = (of_map.unwrap(), of_vehicle.unwrap());
+    let (map, vehicle, (_, bus)) = (of_map.unwrap(), of_vehicle.unwrap(), bus.unwrap());
     assert_ne!(map.station_id, vehicle.station_id);
-    let bus = map.objects.iter().find(|object| object.label == "bus").unwrap();
     assert!((bus.x_m - 12.0).abs() < 0.5 && (bus.y_m + 3.0).abs() < 0.5, "{bus:?}");
-    assert!((vehicle.objects[0].x_m - 4.0).abs() < 0.01 && vehicle.objects[0].label == "car", "{vehicle:?}");
+    assert_eq!(bus.contributors, [NodeName::from_static("edge")]);
+    let labels = |message: &ReceivedCpm| message.objects.iter().map(|object| object.label.clone()).collect::<Vec<_>>();
+    assert_eq!(labels(&map), ["car"], "the bus is another station's, and known from it alone");
+    assert_eq!(labels(&vehicle), ["car"], "a vacancy sign is no object");
+    assert!((vehicle.objects[0].x_m - 4.0).abs() < 0.01, "{vehicle:?}");
     let broken = (NodeName::from_static("broken"), CpmRefusal::Cpm(CpmError::Malformed));
     assert!(bridge.refusals()[&broken] > 0, "{:?}", bridge.refusals());
     bridge.close();
     drop(bridge);
     thread.join().unwrap().unwrap();
     talk.join().unwrap();
+}
+
+#[test]
+fn there_is_room_for_twelve_stations_at_a_time_and_for_the_present() {
+    let edge = Edge::start(None);
+    edge.describe(DESCRIPTION);
+    let bridge = Arc::new(CpmBridge::connect(edge.settings.clone()).unwrap());
+    let running = Arc::clone(&bridge);
+    let thread = std::thread::spawn(move || running.run());
+    let radio = Cell::connect(edge.settings.clone()).unwrap();
+    let yesterday = Timestamp(now().micros() - 86_400_000_000);
+    let expected = [("13", CpmRefusal::TooManyStations), ("1", CpmRefusal::TooOften), ("recorded", CpmRefusal::Time)];
+    let is_refused = |(receiver, refusal)| bridge.refusals().contains_key(&(NodeName::from_static(receiver), refusal));
+    let began = Instant::now();
+    while !expected.into_iter().all(is_refused) {
+        assert!(began.elapsed() < SOON, "{:?}", bridge.refusals());
+        radio.publish_cpm("received/recorded", foreign_cpm(yesterday, 99)).unwrap();
+        for station in 1..=13_u32 {
+            radio.publish_cpm(&format!("received/{station}"), foreign_cpm(now(), station)).unwrap();
+        }
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    bridge.close();
+    thread.join().unwrap().unwrap();
 }
 
 #[test]

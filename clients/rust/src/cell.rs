@@ -113,6 +113,9 @@ pub struct Messages<M> {
 /// Keep-alive as the default of nodes.
 const KEEP_ALIVE: Duration = Duration::from_secs(5);
 
+/// Messages that await an acknowledgement: questions, which are asked one at a time.
+const MAX_UNDER_WAY: u16 = 16;
+
 /// Silence after which the log says where to look.
 const SILENCE: Duration = Duration::from_secs(10);
 
@@ -147,6 +150,8 @@ impl Cell {
         let limits = Limits::default();
         options.set_keep_alive(KEEP_ALIVE).set_clean_start(true);
         options.set_connection_timeout(settings.timeout.as_secs().clamp(1, 10));
+        // Memory is taken for each, by default 14 MB.
+        options.set_outgoing_inflight_upper_limit(MAX_UNDER_WAY);
         options.set_max_packet_size(u32::try_from(limits.map_bytes + HEADER_BYTES).ok());
         let mut network = rumqttc::NetworkOptions::new();
         // Otherwise small messages wait for acknowledgements.

@@ -2,7 +2,7 @@
 
 use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd::{
     ObjectClass, OtherSubClass, TrafficParticipantType, VruProfileAndSubprofile, VruSubProfileAnimal,
-    VruSubProfileBicyclist, VruSubProfileMotorcyclist, VruSubProfilePedestrian,
+    VruSubProfileBicyclist as LightVehicle, VruSubProfileMotorcyclist, VruSubProfilePedestrian,
 };
 
 /// Vehicles by `TrafficParticipantType`; the first label of a type is the one that a received message gets.
@@ -26,7 +26,7 @@ pub(super) fn road_user(label: &str) -> Option<ObjectClass> {
     use VruProfileAndSubprofile::{animal, bicyclistAndLightVruVehicle, motorcyclist, pedestrian};
     let vru = match label {
         "person" | "pedestrian" => pedestrian(VruSubProfilePedestrian(0)),
-        "bicycle" | "cyclist" => bicyclistAndLightVruVehicle(VruSubProfileBicyclist(1)),
+        "bicycle" | "cyclist" => bicyclistAndLightVruVehicle(LightVehicle(1)),
         "moped" => motorcyclist(VruSubProfileMotorcyclist(1)),
         "motorcycle" | "motorbike" => motorcyclist(VruSubProfileMotorcyclist(2)),
         "animal" | "dog" | "cat" | "horse" | "sheep" | "cow" => animal(VruSubProfileAnimal(0)),
@@ -55,7 +55,15 @@ pub(super) fn label(class: &ObjectClass) -> &'static str {
             _ => VEHICLES.iter().find(|(_, number)| number == kind).map_or("vehicle", |(name, _)| name),
         },
         ObjectClass::vruSubClass(VruProfileAndSubprofile::pedestrian(_)) => "person",
-        ObjectClass::vruSubClass(VruProfileAndSubprofile::bicyclistAndLightVruVehicle(_)) => "bicycle",
+        ObjectClass::vruSubClass(VruProfileAndSubprofile::bicyclistAndLightVruVehicle(LightVehicle(profile))) => {
+            match profile {
+                // Wheelchair user, roller skater, e-scooter, personal transporter: detectors see the person.
+                2 | 4..=6 => "person",
+                // Horse and rider.
+                3 => "animal",
+                _ => "bicycle",
+            }
+        }
         ObjectClass::vruSubClass(VruProfileAndSubprofile::motorcyclist(VruSubProfileMotorcyclist(1))) => "moped",
         ObjectClass::vruSubClass(VruProfileAndSubprofile::motorcyclist(_)) => "motorcycle",
         ObjectClass::vruSubClass(VruProfileAndSubprofile::animal(_)) => "animal",

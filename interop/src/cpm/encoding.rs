@@ -6,7 +6,6 @@ use c_its_parser::standards::cpm_2_1_1::cpm_originating_station_containers::{
 };
 use c_its_parser::standards::cpm_2_1_1::cpm_pdu_descriptions as pdu;
 use c_its_parser::standards::cpm_2_1_1::cpm_perceived_object_container::{PerceivedObjectContainer, PerceivedObjects};
-use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport};
 use rasn::types::Any;
@@ -14,41 +13,47 @@ use uuid::Uuid;
 
 use super::frame::MessageFrame;
 use super::identifiers::ObjectIds;
-use super::{CpmError, EncodedCpm, ITS_EPOCH_MS, MESSAGE_ID, PROTOCOL_VERSION, SIGMAS, classes};
+use super::{
+    COORDINATES_CM, CpmCell, CpmError, EncodedCpm, ITS_EPOCH_MS, MESSAGE_ID, PROTOCOL_VERSION, SIGMAS,
+    UNSTATED_COORDINATE, WIDE_COORDINATE, classes,
+};
 use crate::object::CellObject;
 
 /// Maximum number of objects in a message.
 const MAX_OBJECTS: usize = 255;
 
-/// Largest coordinate in centimetres.
-const MAX_CENTIMETRES: f64 = 131_071.0;
-
 /// Greatest age that a message states, in milliseconds: at least so old.
 const MAX_AGE_MS: u16 = 1500;
 
-/// A map as the message of a roadside unit: its objects, and known locations at which a road user stands.
+/// A map as the message of a roadside unit: its objects, and known locations at which a road user stands. `is_own` tells by
+/// position (metres) whether the cell itself knows of an object there; the others are left out.
 ///
 /// # Errors
-/// [`CpmError::NoTime`] before 2004, [`CpmError::TooFar`] if all objects are far from the origin.
+/// [`CpmError::NoTime`] before 2004, [`CpmError::TooFar`] if all objects are far from the origin, [`CpmError::Unencodable`].
 pub fn encode_map(
     map: &GlobalMap,
-    origin: &GeographicOrigin,
+    cell: &CpmCell,
     station_id: u32,
     ids: &mut ObjectIds,
+    is_own: impl Fn([f64; 2]) -> bool,
 ) -> Result<EncodedCpm, CpmError> {
-    let objects = map.objects.iter().map(|object| (object.id, object.into(), age_ms(object, map)));
-    let at_places = map.landmarks.iter().filter_map(|place| {
+    let own = map.objects.iter().filter(|object| is_own([object.x_m, object.y_m]));
+    let objects = own.map(|object| {
+        let (age_ms, delta_ms) = (age_ms(object, map), delta_ms(object));
+        (object.id, CpmObject { age_ms, delta_ms, ..CpmObject::now(object.into()) })
+    });
+    let at_places = map.landmarks.iter().filter(|place| is_own([place.x_m, place.y_m])).filter_map(|place| {
         let object = CellObject::at(place)?;
         classes::road_user(object.label)?;
-        Some((Uuid::new_v5(&Uuid::NAMESPACE_OID, place.id.as_bytes()), object, None))
+        Some((Uuid::new_v5(&Uuid::NAMESPACE_OID, place.id.as_bytes()), CpmObject::now(object)))
     });
-    let all: Vec<_> = objects.chain(at_places).collect();
-    let numbers = ids.assign(&all.iter().map(|(id, ..)| *id).collect::<Vec<_>>());
-    let numbered =
-        all.into_iter().map(|(id, object, age_ms)| CpmObject { object, number: numbers.get(&id).copied(), age_ms });
+    let all = objects.chain(at_places).filter(|(_, source)| !cell.vacancy_signs.contains(source.object.label));
+    let all: Vec<_> = all.collect();
+    let numbers = ids.assign(&all.iter().map(|(id, _)| *id).collect::<Vec<_>>());
+    let numbered = all.into_iter().map(|(id, source)| CpmObject { number: numbers.get(&id).copied(), ..source });
     let sources: Vec<_> = numbered.collect();
     let (x_m, y_m) = centre(&sources);
-    let frame = MessageFrame::at(origin, x_m, y_m)?;
+    let frame = MessageFrame::at(&cell.origin, x_m, y_m)?;
     let rsu = uper(&OriginatingRsuContainer::new(None))?;
     encode(station_id, map.fused_at_us, &frame, (pdu::ORIGINATING_RSU_CONTAINER, rsu), sources)
 }
@@ -58,19 +63,14 @@ pub fn encode_map(
 ///
 /// # Errors
 /// As [`encode_map`].
-pub fn encode_report(
-    report: &ObjectReport,
-    origin: &GeographicOrigin,
-    station_id: u32,
-) -> Result<EncodedCpm, CpmError> {
+pub fn encode_report(report: &ObjectReport, cell: &CpmCell, station_id: u32) -> Result<EncodedCpm, CpmError> {
     let first = (report.seq as u16).wrapping_mul(256);
     let numbers = (0..=u16::MAX).map(|index| first.wrapping_add(index));
-    let numbered = report.objects.iter().zip(numbers);
-    let numbered =
-        numbered.map(|(object, number)| CpmObject { object: object.into(), number: Some(number), age_ms: None });
+    let objects = report.objects.iter().filter(|object| !cell.vacancy_signs.contains(&object.label)).zip(numbers);
+    let numbered = objects.map(|(object, number)| CpmObject { number: Some(number), ..CpmObject::now(object.into()) });
     let sources: Vec<_> = numbered.collect();
     let (x_m, y_m) = report.pose.map_or_else(|| centre(&sources), |pose| (pose.x_m, pose.y_m));
-    let frame = MessageFrame::at(origin, x_m, y_m)?;
+    let frame = MessageFrame::at(&cell.origin, x_m, y_m)?;
     let station = match report.pose {
         Some(pose) => {
             let azimuth_deg = 90.0 - frame.heading_to_message(pose.heading_rad).to_degrees();
@@ -89,7 +89,10 @@ pub fn encode_report(
 struct CpmObject<'a> {
     object: CellObject<'a>,
     number: Option<u16>,
+    /// Time since the first detection.
     age_ms: Option<u16>,
+    /// Time of the last detection after the reference time; not positive.
+    delta_ms: i16,
 }
 
 /// Age of an object on a map, as far as a message states it.
@@ -98,11 +101,24 @@ fn age_ms(object: &FusedObject, map: &GlobalMap) -> Option<u16> {
     Some(u16::try_from(age).unwrap_or(MAX_AGE_MS).min(MAX_AGE_MS))
 }
 
-impl CpmObject<'_> {
-    /// The object as a message has it; `None` if it is too far from the reference position.
+/// Time of an object's last detection after that of the map. Its least value also means "or earlier".
+fn delta_ms(object: &FusedObject) -> i16 {
+    (object.age_s.unwrap_or(0.0) * -1000.0).round().clamp(-2048.0, 0.0) as i16
+}
+
+impl<'a> CpmObject<'a> {
+    /// An object that is detected at the reference time.
+    fn now(object: CellObject<'a>) -> Self {
+        Self { object, number: None, age_ms: None, delta_ms: 0 }
+    }
+
+    /// The object as a message has it, where it was when it was last detected; `None` if that is too far from the reference
+    /// position.
     fn perceived(&self, frame: &MessageFrame) -> Option<cdd::PerceivedObject> {
-        let [x_m, y_m] = self.object.position_m;
-        let [east_m, north_m] = frame.to_message(x_m, y_m);
+        let ([x_m, y_m], [east_mps, north_mps]) =
+            (self.object.position_m, self.object.velocity_mps.unwrap_or_default());
+        let delta_s = f64::from(self.delta_ms) / 1000.0;
+        let [east_m, north_m] = frame.to_message(x_m + east_mps * delta_s, y_m + north_mps * delta_s);
         let variances = self.object.covariance_m2.map(|covariance| frame.variances_to_message(covariance));
         let position = cdd::CartesianPosition3dWithConfidence {
             x_coordinate: coordinate(east_m, variances.map(|[east, _]| east))?,
@@ -122,10 +138,12 @@ impl CpmObject<'_> {
             let z_angle = cdd::CartesianAngle { value, confidence: cdd::AngleConfidence(127) };
             cdd::EulerAnglesWithConfidence { z_angle, y_angle: None, x_angle: None }
         });
-        let [length, width] = self.object.size_m.map_or([None, None], |[length, width]| [Some(length), Some(width)]);
+        // Without a heading the box would be one along east.
+        let size_m = self.object.size_m.filter(|_| angles.is_some());
+        let [length, width] = size_m.map_or([None, None], |[length, width]| [Some(length), Some(width)]);
         Some(cdd::PerceivedObject::new(
             self.number.map(cdd::Identifier2B),
-            cdd::DeltaTimeMilliSecondSigned(0),
+            cdd::DeltaTimeMilliSecondSigned(self.delta_ms),
             position,
             velocity,
             None,
@@ -143,21 +161,26 @@ impl CpmObject<'_> {
         ))
     }
 
-    /// The eight most probable classes, or the only one without a confidence.
+    /// The eight most probable classes, or the only one without a confidence. Labels of one class add up.
     fn classification(&self) -> cdd::ObjectClassDescription {
-        let mut classes: Vec<(cdd::ObjectClass, u8)> = Vec::new();
+        let mut classes: Vec<(cdd::ObjectClass, f64)> = Vec::new();
         for (label, score) in self.object.scores {
-            let (class, percent) = (classes::of_label(label), (score * 100.0).round().clamp(1.0, 100.0) as u8);
+            let class = classes::of_label(label);
             match classes.iter_mut().find(|(other, _)| *other == class) {
-                Some((_, most)) => *most = percent.max(*most),
-                None => classes.push((class, percent)),
+                Some((_, sum)) => *sum += score,
+                None => classes.push((class, *score)),
             }
         }
-        if classes.is_empty() {
-            classes.push((classes::of_label(self.object.label), 101));
+        classes.sort_by(|(_, a), (_, b)| b.total_cmp(a));
+        let mut described: Vec<_> = classes
+            .into_iter()
+            .take(8)
+            .map(|(class, sum)| (class, (sum * 100.0).round().clamp(1.0, 100.0) as u8))
+            .collect();
+        if described.is_empty() {
+            described.push((classes::of_label(self.object.label), 101));
         }
-        classes.sort_by_key(|(_, percent)| std::cmp::Reverse(*percent));
-        let described = classes.into_iter().take(8).map(|(object_class, percent)| cdd::ObjectClassWithConfidence {
+        let described = described.into_iter().map(|(object_class, percent)| cdd::ObjectClassWithConfidence {
             object_class,
             confidence: cdd::ConfidenceLevel(percent),
         });
@@ -195,7 +218,7 @@ fn encode(
 }
 
 fn uper<T: rasn::Encode>(value: &T) -> Result<Vec<u8>, CpmError> {
-    rasn::uper::encode(value).map_err(|_| CpmError::Malformed)
+    rasn::uper::encode(value).map_err(|_| CpmError::Unencodable)
 }
 
 /// The origin if all objects are near enough, or else the middle between the outermost.
@@ -210,19 +233,24 @@ fn centre(sources: &[CpmObject<'_>]) -> (f64, f64) {
 }
 
 fn coordinate(metres: f64, variance_m2: Option<f64>) -> Option<cdd::CartesianCoordinateWithConfidence> {
-    let centimetres = (metres * 100.0).round();
-    let half_width = variance_m2.map(|variance| (SIGMAS * variance.max(0.0).sqrt() * 100.0).ceil().clamp(1.0, 4095.0));
-    (centimetres.abs() <= MAX_CENTIMETRES).then(|| cdd::CartesianCoordinateWithConfidence {
-        value: cdd::CartesianCoordinateLarge(centimetres as i32),
-        confidence: cdd::CoordinateConfidence(half_width.map_or(4096, |half_width| half_width as u16)),
+    let centimetres = (metres * 100.0).round() as i32;
+    let confidence = variance_m2.map_or(UNSTATED_COORDINATE, |variance| {
+        let half_width_cm = SIGMAS * variance.max(0.0).sqrt() * 100.0;
+        half_width_cm.ceil().clamp(1.0, f64::from(WIDE_COORDINATE)) as u16
+    });
+    COORDINATES_CM.contains(&centimetres).then_some(cdd::CartesianCoordinateWithConfidence {
+        value: cdd::CartesianCoordinateLarge(centimetres),
+        confidence: cdd::CoordinateConfidence(confidence),
     })
 }
 
+/// A component of a velocity; beyond the range the codes that say so.
 fn velocity_component(mps: f64) -> cdd::VelocityComponent {
-    let value = cdd::VelocityComponentValue((mps * 100.0).round().clamp(-16_382.0, 16_381.0) as i16);
+    let value = cdd::VelocityComponentValue((mps * 100.0).round().clamp(-16_383.0, 16_382.0) as i16);
     cdd::VelocityComponent { value, confidence: cdd::SpeedConfidence(127) }
 }
 
+/// A dimension; beyond the range the code that says so.
 fn dimension(metres: f64) -> cdd::ObjectDimension {
     let value = cdd::ObjectDimensionValue((metres * 10.0).round().clamp(1.0, 255.0) as u16);
     cdd::ObjectDimension { value, confidence: cdd::ObjectDimensionConfidence(32) }

@@ -1,5 +1,7 @@
 //! The frame of a message: east and north of its reference position.
 
+use std::f64::consts::FRAC_PI_2;
+
 use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd as cdd;
 use ecod::model::geometry::{Covariance, wrap_angle};
 use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition};
@@ -12,12 +14,25 @@ const NO_LATITUDE: i32 = 900_000_001;
 const NO_LONGITUDE: i32 = 1_800_000_001;
 const NO_ALTITUDE: i32 = 800_001;
 
+/// Codes of the semi-axes of a position's error: more than 4.093 m, and unavailable.
+const WIDE_AXIS: u16 = 4094;
+const UNSTATED_AXIS: u16 = 4095;
+
+/// Code of an ellipse's direction that is unavailable.
+const NO_DIRECTION: u16 = 3601;
+
+/// Standard deviations in a semi-axis of an ellipse of 95 %: the root of the quantile of chi-squared with two degrees.
+const ELLIPSE_SIGMAS: f64 = 2.4477;
+
+/// Semi-axis in metres where the station states none: usual for satellite positioning without corrections.
+const UNSTATED_AXIS_M: f64 = 5.0;
+
 /// A cell's frame and that of a message.
 pub(super) struct MessageFrame {
     cell: GeographicOrigin,
     reference: GeographicOrigin,
     /// Direction of the cell's x axis in the message's frame, in radians counter-clockwise from east.
-    pub(super) rotation_rad: f64,
+    rotation_rad: f64,
 }
 
 impl MessageFrame {
@@ -46,6 +61,28 @@ impl MessageFrame {
         Self::new(cell, GeographicPosition { latitude_deg, longitude_deg, height_m })
     }
 
+    /// Covariance of a received reference position in the cell's frame.
+    ///
+    /// # Errors
+    /// [`CpmError::NoPosition`] for an error out of range.
+    pub(super) fn position_error(&self, ellipse: &cdd::PosConfidenceEllipse) -> Result<Covariance, CpmError> {
+        let (major, minor) = (ellipse.semi_major_confidence.0, ellipse.semi_minor_confidence.0);
+        if major == WIDE_AXIS || minor == WIDE_AXIS {
+            return Err(CpmError::NoPosition);
+        }
+        let is_stated = |axis: u16| (1..WIDE_AXIS).contains(&axis);
+        if !is_stated(major) || !is_stated(minor) {
+            return Ok(Covariance::isotropic(UNSTATED_AXIS_M / ELLIPSE_SIGMAS));
+        }
+        let sigma_m = |axis: u16| f64::from(axis) / 100.0 / ELLIPSE_SIGMAS;
+        let direction = ellipse.semi_major_orientation.0;
+        if direction >= 3600 {
+            return Ok(Covariance::isotropic(sigma_m(major.max(minor))));
+        }
+        let bearing_rad = self.heading_to_cell(FRAC_PI_2 - (f64::from(direction) / 10.0).to_radians());
+        Ok(Covariance::along_bearing(bearing_rad, sigma_m(major), sigma_m(minor)))
+    }
+
     fn new(cell: &GeographicOrigin, at: GeographicPosition) -> Result<Self, CpmError> {
         let GeographicPosition { latitude_deg, longitude_deg, height_m } = at;
         let east = GeographicPose { latitude_deg, longitude_deg, height_m: Some(height_m), azimuth_deg: 90.0 };
@@ -54,16 +91,17 @@ impl MessageFrame {
         Ok(Self { cell: *cell, reference, rotation_rad: -east.heading_rad })
     }
 
-    /// The reference position as a message states it, without confidence.
+    /// The reference position as a message states it. Its error is unavailable: a node does not know that of its origin or
+    /// pose.
     pub(super) fn reference_position(&self) -> cdd::ReferencePosition {
         let tenth_microdegrees = |degrees: f64| (degrees * 1e7).round() as i32;
         cdd::ReferencePosition {
             latitude: cdd::Latitude(tenth_microdegrees(self.reference.latitude_deg)),
             longitude: cdd::Longitude(tenth_microdegrees(self.reference.longitude_deg)),
             position_confidence_ellipse: cdd::PosConfidenceEllipse {
-                semi_major_confidence: cdd::SemiAxisLength(4095),
-                semi_minor_confidence: cdd::SemiAxisLength(4095),
-                semi_major_orientation: cdd::HeadingValue(3601),
+                semi_major_confidence: cdd::SemiAxisLength(UNSTATED_AXIS),
+                semi_minor_confidence: cdd::SemiAxisLength(UNSTATED_AXIS),
+                semi_major_orientation: cdd::HeadingValue(NO_DIRECTION),
             },
             altitude: cdd::Altitude {
                 altitude_value: cdd::AltitudeValue((self.reference.height_m * 100.0).round() as i32),
@@ -111,7 +149,7 @@ impl MessageFrame {
     }
 
     /// The covariance in the cell's frame of variances east and north.
-    pub(super) fn variances_to_cell(&self, [east_m2, north_m2]: [f64; 2]) -> [f64; 3] {
-        Covariance::along_bearing(-self.rotation_rad, east_m2.sqrt(), north_m2.sqrt()).into()
+    pub(super) fn variances_to_cell(&self, [east_m2, north_m2]: [f64; 2]) -> Covariance {
+        Covariance::along_bearing(-self.rotation_rad, east_m2.sqrt(), north_m2.sqrt())
     }
 }

@@ -2,10 +2,18 @@
 
 use std::collections::{HashMap, HashSet};
 
-use ecod::model::names::NodeName;
+use ecod::model::names::{NodeName, PART_MARK};
 use uuid::Uuid;
 
-/// Station numbers of the nodes of a cell.
+/// Part of a node's name in which a foreign station's objects are reported, before the station's number.
+pub const RECEIVED_PART: &str = "cpm-";
+
+/// True if a node's name is that of a part which reports the objects of received messages.
+pub fn is_received(node: &NodeName) -> bool {
+    node.as_str().split_once(PART_MARK).is_some_and(|(_, part)| part.starts_with(RECEIVED_PART))
+}
+
+/// Station numbers of the nodes of a cell. Each part of a node, such as its second camera, is a station of its own.
 ///
 /// A number is the first four bytes of the name-based UUID (version 5) of `<cell>/<node>` in the namespace of URLs, so that
 /// it is the same in every run. Where two nodes collide, the later gets the next free number.
@@ -14,6 +22,7 @@ pub struct StationIds {
     cell: NodeName,
     by_name: HashMap<NodeName, u32>,
     used: HashSet<u32>,
+    is_full: bool,
 }
 
 /// Maximum number of nodes with a number.
@@ -22,15 +31,18 @@ const MAX_STATIONS: usize = 4096;
 impl StationIds {
     /// Numbers for a cell of this name.
     pub fn new(cell: NodeName) -> Self {
-        Self { cell, by_name: HashMap::new(), used: HashSet::new() }
+        Self { cell, by_name: HashMap::new(), used: HashSet::new(), is_full: false }
     }
 
-    /// The number of a node; `None` if the cell has had 4096 others.
+    /// The number of a node; `None` if the cell has had 4096 others, which the log tells once.
     pub fn of(&mut self, node: &NodeName) -> Option<u32> {
         if let Some(number) = self.by_name.get(node) {
             return Some(*number);
         }
         if self.by_name.len() >= MAX_STATIONS {
+            if !std::mem::replace(&mut self.is_full, true) {
+                log::warn!("nothing sent of {node}, nor of later names: {MAX_STATIONS} nodes have station numbers");
+            }
             return None;
         }
         let name = Uuid::new_v5(&Uuid::NAMESPACE_URL, format!("{}/{node}", self.cell).as_bytes());

@@ -2,10 +2,14 @@
 
 use std::f64::consts::{PI, TAU};
 
+use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd as cdd;
+use c_its_parser::standards::cpm_2_1_1::cpm_pdu_descriptions::{
+    CollectivePerceptionMessage, PERCEIVED_OBJECT_CONTAINER,
+};
+use c_its_parser::standards::cpm_2_1_1::cpm_perceived_object_container::PerceivedObjectContainer;
 use ecod::model::epoch::Epoch;
 use ecod::model::geometry::{Covariance, wrap_angle};
 use ecod::model::names::NodeName;
-use ecod::model::origin::GeographicOrigin;
 use ecod::wire::{FusedObject, GlobalMap, LandmarkState, Limits, ObjectReport, SCHEMA_VERSION, WirePose};
 use proptest::prelude::*;
 use uuid::Uuid;
@@ -16,6 +20,11 @@ const NOW: Timestamp = Timestamp(1_795_239_882_123_000);
 
 fn origin(rotation_deg: f64) -> GeographicOrigin {
     GeographicOrigin { latitude_deg: 52.2296756, longitude_deg: 21.0122287, height_m: 113.0, rotation_deg }
+}
+
+/// A cell with the sign "EMPTY".
+fn cell(rotation_deg: f64) -> CpmCell {
+    CpmCell { origin: origin(rotation_deg), vacancy_signs: BTreeSet::from(["EMPTY".into()]) }
 }
 
 fn report(objects: Vec<PerceivedObject>) -> ObjectReport {
@@ -48,7 +57,15 @@ fn detection() -> impl Strategy<Value = PerceivedObject> {
     let label =
         prop_oneof![Just("car"), Just("bus"), Just("person"), Just("bicycle"), Just("motorcycle"), Just("object")];
     let shape = proptest::option::of([0.2..25.0, 0.2..25.0]);
-    (label, 0.0..1.0, position, proptest::option::of(0.0001..9.0), motion, proptest::option::of(-PI..PI), shape)
+    (
+        label,
+        0.0..1.0,
+        position,
+        proptest::option::of(prop_oneof![0.0001..9.0, 9.0..1e5]),
+        motion,
+        proptest::option::of(-PI..PI),
+        shape,
+    )
         .prop_map(|(label, confidence, (x_m, y_m), variance, velocity_mps, heading_rad, size_m)| PerceivedObject {
             covariance_m2: variance.map(|variance: f64| [variance, 0.0, variance]),
             velocity_mps,
@@ -68,7 +85,7 @@ proptest! {
     ) {
         let pose = pose.map(|(x_m, y_m, heading_rad)| WirePose::new(x_m, y_m, heading_rad));
         let sent = ObjectReport { pose, ..report(objects) };
-        let message = encode_report(&sent, &origin(rotation_deg), station).unwrap();
+        let message = encode_report(&sent, &cell(rotation_deg), station).unwrap();
         prop_assert_eq!(message.left_out, 0);
         let received = decode(&message.bytes, &origin(rotation_deg)).unwrap();
         prop_assert_eq!((received.station_id, received.captured_at, received.segment), (station, NOW, None));
@@ -79,12 +96,13 @@ proptest! {
             let place = left.iter().position(|other| is_it(other) && other.label == object.label);
             let other = left.swap_remove(place.expect("it is within a centimetre"));
             prop_assert!((other.confidence - object.confidence).abs() < 0.5 / 15.0 + 1e-9);
-            prop_assert_eq!(other.covariance_m2.is_some(), object.covariance_m2.is_some());
-            if let (Some([xx, xy, yy]), Some([variance, ..])) = (other.covariance_m2, object.covariance_m2) {
-                let coarser = (variance.sqrt() + 0.01 / SIGMAS).powi(2) + 1e-9;
-                prop_assert!(xx >= variance - 1e-9 && yy >= variance - 1e-9, "no certainty is gained");
-                prop_assert!(xx <= coarser && yy <= coarser && xy.abs() < 1e-9);
-            }
+            // The reference position's own error is unavailable; beyond 41 m only that much is known.
+            let [xx, xy, yy] = other.covariance_m2.unwrap();
+            let (own, wide) = ((5.0_f64 / 2.4477).powi(2), (40.95 / SIGMAS).powi(2));
+            let variance = object.covariance_m2.map_or((10.0 / SIGMAS).powi(2), |[variance, ..]| variance).min(wide);
+            let coarser = (variance.sqrt() + 0.01 / SIGMAS).powi(2) + own + 1e-6;
+            prop_assert!(xx >= variance + own - 1e-6 && yy >= variance + own - 1e-6, "no certainty is gained");
+            prop_assert!(xx <= coarser && yy <= coarser && xy.abs() < 1e-6);
             prop_assert_eq!(other.velocity_mps.is_some(), object.velocity_mps.is_some());
             for (got, was) in other.velocity_mps.iter().flatten().zip(object.velocity_mps.iter().flatten()) {
                 prop_assert!((got - was).abs() < 0.0072, "{} {}", got, was);
@@ -93,7 +111,7 @@ proptest! {
             for (got, was) in other.heading_rad.iter().zip(object.heading_rad) {
                 prop_assert!(wrap_angle(got - was).abs() < TAU / 7200.0 + 1e-6);
             }
-            prop_assert_eq!(other.size_m.is_some(), object.size_m.is_some());
+            prop_assert_eq!(other.size_m.is_some(), object.size_m.is_some() && object.heading_rad.is_some());
             for (got, was) in other.size_m.iter().flatten().zip(object.size_m.iter().flatten()) {
                 prop_assert!((got - was).abs() < 0.0501);
             }
@@ -106,7 +124,7 @@ proptest! {
         flips in proptest::collection::vec((0usize..200, any::<u8>()), 0..6),
     ) {
         let objects = vec![PerceivedObject::new("car", 0.9, 4.0, 5.0); 3];
-        let mut bytes = encode_report(&report(objects), &origin(0.0), 9).unwrap().bytes;
+        let mut bytes = encode_report(&report(objects), &cell(0.0), 9).unwrap().bytes;
         for (place, value) in flips {
             let length = bytes.len();
             bytes[place % length] = value;
@@ -156,7 +174,8 @@ fn a_map_has_its_objects_and_the_road_users_at_known_locations() {
         readings: Vec::new(),
     };
     let places = vec![at("a", Some("truck")), at("b", Some("EMPTY")), at("c", None)];
-    let message = encode_map(&map(vec![fused(1, 12.0)], places), &origin(0.0), 3, &mut ObjectIds::default()).unwrap();
+    let message =
+        encode_map(&map(vec![fused(1, 12.0)], places), &cell(0.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
     let objects = decode(&message.bytes, &origin(0.0)).unwrap().objects;
     let labels: Vec<_> = objects.iter().map(|object| (object.label.as_str(), object.x_m.round())).collect();
     assert_eq!(labels, [("truck", 5.0), ("car", 12.0)]);
@@ -167,7 +186,7 @@ fn of_too_many_objects_the_surest_are_sent() {
     let objects =
         (0..300_u16).map(|number| FusedObject { confidence: f64::from(number) / 300.0, ..fused(number.into(), 1.0) });
     let large = map(objects.collect(), Vec::new());
-    let message = encode_map(&large, &origin(0.0), 3, &mut ObjectIds::default()).unwrap();
+    let message = encode_map(&large, &cell(0.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
     assert_eq!(message.left_out, 45);
     let received = decode(&message.bytes, &origin(0.0)).unwrap();
     assert!(received.objects.len() == 255 && received.objects.iter().all(|object| object.confidence > 0.13));
@@ -177,24 +196,26 @@ fn of_too_many_objects_the_surest_are_sent() {
 #[test]
 fn a_map_far_from_the_origin_has_its_reference_position_among_its_objects() {
     let far = map(vec![fused(1, 5000.0), fused(2, 5800.0), fused(3, 9000.0)], Vec::new());
-    let message = encode_map(&far, &origin(30.0), 3, &mut ObjectIds::default()).unwrap();
+    let message = encode_map(&far, &cell(30.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
     assert_eq!(message.left_out, 2, "the middle is 2 km from the outermost");
     let near = map(vec![fused(1, 5000.0), fused(2, 5800.0)], Vec::new());
-    let message = encode_map(&near, &origin(30.0), 3, &mut ObjectIds::default()).unwrap();
+    let message = encode_map(&near, &cell(30.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
     let objects = decode(&message.bytes, &origin(30.0)).unwrap().objects;
     assert!((objects[0].x_m - 5000.0).abs() < 0.01 && (objects[1].x_m - 5800.0).abs() < 0.01);
 }
 
 #[test]
 fn messages_that_are_not_for_here_are_refused_by_reason() {
-    let message = encode_report(&report(Vec::new()), &origin(0.0), 1).unwrap().bytes;
+    let message = encode_report(&report(Vec::new()), &cell(0.0), 1).unwrap().bytes;
     let there = GeographicOrigin { latitude_deg: 48.0, ..origin(0.0) };
     assert_eq!(decode(&message, &there), Err(CpmError::TooFar));
     assert_eq!(decode(&message[..12], &origin(0.0)), Err(CpmError::Malformed));
     assert_eq!(decode(&[2, 2, 0, 0], &origin(0.0)), Err(CpmError::OtherMessage));
     assert_eq!(decode(&vec![0; MAX_BYTES + 1], &origin(0.0)), Err(CpmError::TooLarge));
     let early = ObjectReport { captured_at_us: Timestamp(5), ..report(Vec::new()) };
-    assert_eq!(encode_report(&early, &origin(0.0), 1), Err(CpmError::NoTime));
+    assert_eq!(encode_report(&early, &cell(0.0), 1), Err(CpmError::NoTime));
+    let late = ObjectReport { captured_at_us: Timestamp((1 << 53) - 1), ..report(Vec::new()) };
+    assert_eq!(encode_report(&late, &cell(0.0), 1), Err(CpmError::Unencodable), "the year 2255");
 }
 
 #[test]
@@ -202,11 +223,121 @@ fn a_covariance_turns_with_the_frames() {
     // The cell's x axis points north.
     let quarter = origin(90.0);
     let object = PerceivedObject { covariance_m2: Some([4.0, 0.0, 1.0]), ..PerceivedObject::new("car", 0.9, 3.0, 2.0) };
-    let message = encode_report(&report(vec![object]), &quarter, 1).unwrap().bytes;
+    let message = encode_report(&report(vec![object]), &cell(90.0), 1).unwrap().bytes;
     let there = decode(&message, &quarter).unwrap().objects.remove(0);
     let [along_x, _, along_y] = there.covariance_m2.unwrap();
-    assert!((along_x - 4.0).abs() < 0.03 && (along_y - 1.0).abs() < 0.03, "{along_x} {along_y}");
+    let own = (5.0_f64 / 2.4477).powi(2);
+    assert!((along_x - own - 4.0).abs() < 0.03 && (along_y - own - 1.0).abs() < 0.03, "{along_x} {along_y}");
     let by_east = decode(&message, &origin(0.0)).unwrap().objects.remove(0);
     let [east, _, north] = by_east.covariance_m2.unwrap();
-    assert!((east - 1.0).abs() < 0.03 && (north - 4.0).abs() < 0.03, "{east} {north}");
+    assert!((east - own - 1.0).abs() < 0.03 && (north - own - 4.0).abs() < 0.03, "{east} {north}");
+}
+
+/// The only object of a message as the standard has it.
+fn perceived(message: &EncodedCpm) -> cdd::PerceivedObject {
+    let whole: CollectivePerceptionMessage = rasn::uper::decode(&message.bytes).unwrap();
+    let containers = &whole.payload.cpm_containers.0.0;
+    let container = containers.iter().find(|container| container.container_id == PERCEIVED_OBJECT_CONTAINER).unwrap();
+    let container: PerceivedObjectContainer = rasn::uper::decode(container.container_data.as_bytes()).unwrap();
+    assert_eq!(container.perceived_objects.0.len(), 1);
+    container.perceived_objects.0[0].clone()
+}
+
+fn written(object: PerceivedObject) -> cdd::PerceivedObject {
+    perceived(&encode_report(&report(vec![object]), &cell(0.0), 1).unwrap())
+}
+
+#[test]
+fn values_beyond_the_range_are_written_as_the_codes_that_say_so() {
+    let car = PerceivedObject::new("car", 0.9, 4.0, 5.0);
+    let wide = written(PerceivedObject {
+        covariance_m2: Some([20.9 * 20.9, 0.0, 1e5]),
+        velocity_mps: Some([170.0, -170.0]),
+        heading_rad: Some(0.0),
+        size_m: Some([40.0, 25.4]),
+        ..car.clone()
+    });
+    assert_eq!((wide.position.x_coordinate.confidence.0, wide.position.y_coordinate.confidence.0), (4095, 4095));
+    let Some(cdd::Velocity3dWithConfidence::cartesianVelocity(velocity)) = wide.velocity else { panic!() };
+    assert_eq!((velocity.x_velocity.value.0, velocity.y_velocity.value.0), (16_382, -16_383));
+    assert_eq!(wide.object_dimension_x.map(|size| size.value.0), Some(255));
+    assert_eq!(wide.object_dimension_y.map(|size| size.value.0), Some(254));
+    // At the last centimetre, and at the codes beyond it.
+    let here = WirePose::new(0.0, 0.0, 0.0);
+    let places = [1310.70, 1310.71, -1310.71, -1310.72].map(|x_m| PerceivedObject { x_m, y_m: 0.0, ..car.clone() });
+    let sent = ObjectReport { pose: Some(here), ..report(places.into()) };
+    let message = encode_report(&sent, &cell(0.0), 1).unwrap();
+    let objects = decode(&message.bytes, &origin(0.0)).unwrap().objects;
+    assert_eq!((message.left_out, objects.len()), (2, 2));
+}
+
+#[test]
+fn without_a_heading_no_box_is_stated() {
+    let car = PerceivedObject { size_m: Some([4.5, 1.8]), ..PerceivedObject::new("car", 0.9, 4.0, 5.0) };
+    let turned = written(PerceivedObject { heading_rad: Some(1.0), ..car.clone() });
+    assert!(turned.object_dimension_x.is_some() && turned.object_dimension_y.is_some());
+    let unknown = written(car);
+    assert!(unknown.object_dimension_x.is_none() && unknown.object_dimension_y.is_none() && unknown.angles.is_none());
+}
+
+#[test]
+fn labels_of_one_class_add_up() {
+    let scores = [("car".into(), 0.4), ("dog".into(), 0.25), ("cat".into(), 0.25), ("cup".into(), 0.1)].into();
+    let classes = written(PerceivedObject { scores, ..PerceivedObject::new("car", 0.4, 1.0, 0.0) }).classification;
+    let percents: Vec<_> = classes.unwrap().0.iter().map(|class| class.confidence.0).collect();
+    assert_eq!(percents, [50, 40, 10]);
+}
+
+#[test]
+fn an_object_that_is_no_longer_seen_is_dated_and_placed_as_it_was_last_seen() {
+    let coasting = |age_s| FusedObject { age_s: Some(age_s), velocity_mps: Some([10.0, 0.0]), ..fused(1, 50.0) };
+    let message = |age_s| {
+        let map = map(vec![coasting(age_s)], Vec::new());
+        encode_map(&map, &cell(0.0), 3, &mut ObjectIds::default(), |_| true).unwrap()
+    };
+    let old = perceived(&message(0.8));
+    assert_eq!((old.measurement_delta_time.0, old.position.x_coordinate.value.0), (-800, 4200));
+    let there = decode(&message(0.8).bytes, &origin(0.0)).unwrap().objects.remove(0);
+    assert!((there.x_m - 50.0).abs() < 0.01, "{there:?}");
+    assert_eq!(perceived(&message(30.0)).measurement_delta_time.0, -2048);
+    let ghost = decode(&message(1.2).bytes, &origin(0.0)).unwrap();
+    assert_eq!((ghost.objects.len(), ghost.left_out), (0, 1));
+}
+
+#[test]
+fn objects_that_the_cell_does_not_know_by_itself_are_not_sent() {
+    let map = map(vec![fused(1, 10.0), fused(2, 20.0)], Vec::new());
+    let message = encode_map(&map, &cell(0.0), 3, &mut ObjectIds::default(), |[x_m, _]| x_m > 15.0).unwrap();
+    let objects = decode(&message.bytes, &origin(0.0)).unwrap().objects;
+    assert_eq!((objects.len(), objects[0].x_m.round(), message.left_out), (1, 20.0, 0));
+}
+
+#[test]
+fn vacancy_signs_are_no_objects() {
+    let read = |label: &str| PerceivedObject::new(label, 0.9, 4.0, 5.0);
+    let sent = report(vec![read("EMPTY"), read("MNOP101"), read("car")]);
+    let message = encode_report(&sent, &cell(0.0), 1).unwrap();
+    let labels: Vec<_> =
+        decode(&message.bytes, &origin(0.0)).unwrap().objects.into_iter().map(|object| object.label).collect();
+    assert_eq!((labels, message.left_out), (vec!["object".into(), "car".into()], 0));
+    let stray = FusedObject { label: "EMPTY".into(), ..fused(1, 3.0) };
+    let message =
+        encode_map(&map(vec![stray], Vec::new()), &cell(0.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
+    assert!(decode(&message.bytes, &origin(0.0)).unwrap().objects.is_empty());
+}
+
+#[test]
+fn parts_that_report_received_messages_are_told_from_others() {
+    let is_received = |name: &'static str| is_received(&NodeName::from_static(name));
+    assert!(is_received("edge--cpm-4711"));
+    assert!(!["edge", "edge--cpm", "edge--ros2", "cpm-1", "euclid--cpmlike"].into_iter().any(is_received));
+}
+
+#[test]
+fn there_are_station_numbers_for_so_many_names() {
+    let mut numbers = StationIds::new(NodeName::from_static("lot-1"));
+    let name = |index: u32| NodeName::new(format!("node-{index}")).unwrap();
+    let all: BTreeSet<_> = (0..4096).map(|index| numbers.of(&name(index)).unwrap()).collect();
+    assert_eq!((all.len(), numbers.of(&name(4096))), (4096, None));
+    assert!(numbers.of(&name(7)).is_some());
 }

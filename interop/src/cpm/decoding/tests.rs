@@ -1,0 +1,320 @@
+//! Messages of other stations, made of ETSI's types and not by the encoder here.
+
+#![allow(clippy::indexing_slicing, clippy::unwrap_used)]
+
+use c_its_parser::standards::cpm_2_1_1::cpm_perceived_object_container::PerceivedObjects;
+use ecod::model::geometry::wrap_angle;
+use rasn::types::Any;
+
+use super::*;
+use crate::cpm::Segments;
+
+/// 2026-11-21T05:44:42.123Z in milliseconds of TAI since 2004-01-01.
+const TIME: u64 = 1_795_239_882_123 - 1_072_915_200_000 + 5_000;
+
+const ORIGIN: GeographicOrigin =
+    GeographicOrigin { latitude_deg: 52.2296756, longitude_deg: 21.0122287, height_m: 113.0, rotation_deg: 0.0 };
+
+/// Semi-axes of 1.22 m, about half a metre of standard deviation, and no direction.
+const HALF_METRE: (u16, u16, u16) = (122, 122, 3601);
+
+fn coordinate(value: i32, confidence: u16) -> cdd::CartesianCoordinateWithConfidence {
+    cdd::CartesianCoordinateWithConfidence {
+        value: cdd::CartesianCoordinateLarge(value),
+        confidence: cdd::CoordinateConfidence(confidence),
+    }
+}
+
+/// An object 10 m east and 20 m north, measured at the reference time, of which nothing else is said.
+fn object() -> cdd::PerceivedObject {
+    let (x_coordinate, y_coordinate) = (coordinate(1000, 196), coordinate(2000, 98));
+    let position = cdd::CartesianPosition3dWithConfidence { x_coordinate, y_coordinate, z_coordinate: None };
+    let mut object = cdd::PerceivedObject::new(
+        None,
+        cdd::DeltaTimeMilliSecondSigned(0),
+        position,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+    );
+    object.object_id = Some(cdd::Identifier2B(7));
+    object
+}
+
+/// The same, with more said of it.
+fn with(change: impl FnOnce(&mut cdd::PerceivedObject)) -> cdd::PerceivedObject {
+    let mut object = object();
+    change(&mut object);
+    object
+}
+
+fn at(x: i32, y: i32) -> cdd::PerceivedObject {
+    with(|object| {
+        object.position.x_coordinate.value.0 = x;
+        object.position.y_coordinate.value.0 = y;
+    })
+}
+
+fn message(
+    objects: Vec<cdd::PerceivedObject>,
+    (major, minor, direction): (u16, u16, u16),
+    segment: Option<(u8, u8)>,
+    time: u64,
+) -> Vec<u8> {
+    let position = cdd::ReferencePosition {
+        latitude: cdd::Latitude(522_296_756),
+        longitude: cdd::Longitude(210_122_287),
+        position_confidence_ellipse: cdd::PosConfidenceEllipse {
+            semi_major_confidence: cdd::SemiAxisLength(major),
+            semi_minor_confidence: cdd::SemiAxisLength(minor),
+            semi_major_orientation: cdd::HeadingValue(direction),
+        },
+        altitude: cdd::Altitude {
+            altitude_value: cdd::AltitudeValue(800_001),
+            altitude_confidence: cdd::AltitudeConfidence::unavailable,
+        },
+    };
+    let segment = segment.map(|(this, total)| {
+        cdd::MessageSegmentationInfo::new(cdd::CardinalNumber3b(total), cdd::OrdinalNumber3b(this))
+    });
+    let management = pdu::ManagementContainer::new(cdd::TimestampIts(time), position, segment, None);
+    let container = PerceivedObjectContainer::new(cdd::CardinalNumber1B(9), PerceivedObjects(objects));
+    let data = Any::new(rasn::uper::encode(&container).unwrap());
+    let container = pdu::WrappedCpmContainer::new(pdu::PERCEIVED_OBJECT_CONTAINER, data);
+    let containers = pdu::ConstraintWrappedCpmContainers(pdu::WrappedCpmContainers(vec![container]));
+    let header = cdd::ItsPduHeader {
+        protocol_version: cdd::OrdinalNumber1B(2),
+        message_id: cdd::MessageId(14),
+        station_id: cdd::StationId(4711),
+    };
+    let payload = pdu::CpmPayload::new(management, containers);
+    rasn::uper::encode(&pdu::CollectivePerceptionMessage::new(header, payload)).unwrap()
+}
+
+fn received(objects: Vec<cdd::PerceivedObject>) -> ReceivedCpm {
+    decode(&message(objects, HALF_METRE, None, TIME), &ORIGIN).unwrap()
+}
+
+fn only(object: cdd::PerceivedObject) -> PerceivedObject {
+    let mut objects = received(vec![object]).objects;
+    assert_eq!(objects.len(), 1);
+    objects.remove(0)
+}
+
+fn cartesian(x: i16, y: i16, confidence: u8) -> Option<cdd::Velocity3dWithConfidence> {
+    let component =
+        |value| cdd::VelocityComponent::new(cdd::VelocityComponentValue(value), cdd::SpeedConfidence(confidence));
+    let (x_velocity, y_velocity) = (component(x), component(y));
+    let velocity = cdd::VelocityCartesian { x_velocity, y_velocity, z_velocity: None };
+    Some(cdd::Velocity3dWithConfidence::cartesianVelocity(velocity))
+}
+
+fn polar(speed: u16, tenth_degrees: u16) -> Option<cdd::Velocity3dWithConfidence> {
+    let (magnitude, direction) =
+        (cdd::Speed::new(cdd::SpeedValue(speed), cdd::SpeedConfidence(127)), angle(tenth_degrees));
+    Some(cdd::Velocity3dWithConfidence::polarVelocity(cdd::VelocityPolarWithZ::new(magnitude, direction, None)))
+}
+
+fn angle(tenth_degrees: u16) -> cdd::CartesianAngle {
+    cdd::CartesianAngle::new(cdd::CartesianAngleValue(tenth_degrees), cdd::AngleConfidence(127))
+}
+
+fn yaw(tenth_degrees: u16) -> Option<cdd::EulerAnglesWithConfidence> {
+    Some(cdd::EulerAnglesWithConfidence { z_angle: angle(tenth_degrees), y_angle: None, x_angle: None })
+}
+
+fn dimension(value: u16) -> Option<cdd::ObjectDimension> {
+    let confidence = cdd::ObjectDimensionConfidence(32);
+    Some(cdd::ObjectDimension { value: cdd::ObjectDimensionValue(value), confidence })
+}
+
+fn classes(all: &[(cdd::ObjectClass, u8)]) -> Option<cdd::ObjectClassDescription> {
+    let class = |(class, percent): &(cdd::ObjectClass, u8)| cdd::ObjectClassWithConfidence {
+        object_class: class.clone(),
+        confidence: cdd::ConfidenceLevel(*percent),
+    };
+    Some(cdd::ObjectClassDescription(all.iter().map(class).collect()))
+}
+
+fn vehicle(kind: u8) -> cdd::ObjectClass {
+    cdd::ObjectClass::vehicleSubClass(cdd::TrafficParticipantType(kind))
+}
+
+#[track_caller]
+fn assert_near<const N: usize>(got: [f64; N], expected: [f64; N], tolerance: f64) {
+    let is_near = got.iter().zip(&expected).all(|(got, expected)| (got - expected).abs() <= tolerance);
+    assert!(is_near, "{got:?} is not {expected:?}");
+}
+
+#[test]
+fn a_measurement_before_the_reference_time_is_moved_ahead_to_it() {
+    let moving = |delta_ms| {
+        with(|object| {
+            object.measurement_delta_time.0 = delta_ms;
+            object.velocity = cartesian(500, -200, 127);
+        })
+    };
+    for (delta_ms, place) in [(-400, [12.0, 19.2]), (400, [8.0, 20.8]), (0, [10.0, 20.0])] {
+        let object = only(moving(delta_ms));
+        assert_near([object.x_m, object.y_m], place, 1e-6);
+    }
+    // An own guess of the station is none of its measurements; the ends of the range also stand for all beyond.
+    let old = received(vec![moving(-1001), moving(-1000), moving(-2048), moving(2047)]);
+    assert_eq!((old.objects.len(), old.left_out), (1, 3));
+    assert_eq!(old.captured_at, Timestamp(1_795_239_882_123_000));
+}
+
+#[test]
+fn velocity_may_be_polar_and_codes_of_it_are_no_values() {
+    let velocity = |velocity| only(with(|object| object.velocity = velocity)).velocity_mps;
+    assert_near(velocity(polar(1000, 900)).unwrap(), [0.0, 10.0], 1e-6);
+    assert_near(velocity(polar(1000, 1800)).unwrap(), [-10.0, 0.0], 1e-6);
+    assert_near(velocity(polar(16_381, 0)).unwrap(), [163.81, 0.0], 1e-6);
+    assert_near(velocity(cartesian(-16_382, 16_381, 127)).unwrap(), [-163.82, 163.81], 1e-6);
+    let codes = [
+        polar(16_382, 0),
+        polar(16_383, 0),
+        polar(1000, 3601),
+        cartesian(-16_383, 0, 127),
+        cartesian(0, 16_382, 127),
+        cartesian(16_383, 0, 127),
+        // Of a confidence out of range the standard says that the value is not valid.
+        cartesian(100, 0, 126),
+    ];
+    for code in codes {
+        assert_eq!(velocity(code.clone()), None, "{code:?}");
+    }
+}
+
+#[test]
+fn angles_are_tenths_of_degrees_and_accelerations_change_nothing() {
+    let component = cdd::AccelerationComponent::new(cdd::AccelerationValue(150), cdd::AccelerationConfidence(102));
+    let acceleration = cdd::AccelerationCartesian::new(component.clone(), component, None);
+    let turned = only(with(|object| {
+        object.angles = yaw(2255);
+        object.acceleration = Some(cdd::Acceleration3dWithConfidence::cartesianAcceleration(acceleration));
+    }));
+    assert!(wrap_angle(turned.heading_rad.unwrap() - 225.5_f64.to_radians()).abs() < 1e-6, "{turned:?}");
+    assert_near([turned.x_m, turned.y_m], [10.0, 20.0], 1e-6);
+    for code in [3600, 3601] {
+        assert_eq!(only(with(|object| object.angles = yaw(code))).heading_rad, None);
+    }
+}
+
+#[test]
+fn an_object_with_a_coordinate_out_of_range_is_left_out() {
+    let received = received(vec![at(-131_072, 0), at(0, 131_071), at(-131_071, 131_070), at(0, 0)]);
+    assert_eq!((received.objects.len(), received.left_out), (2, 2));
+    assert_near([received.objects[0].x_m, received.objects[0].y_m], [-1310.71, 1310.70], 1e-6);
+}
+
+#[test]
+fn a_confidence_that_is_a_code_is_a_wide_covariance() {
+    let variance = |confidence| {
+        only(with(|object| object.position.x_coordinate.confidence.0 = confidence)).covariance_m2.unwrap()[0]
+    };
+    let own = (1.22_f64 / 2.4477).powi(2);
+    for (confidence, half_width_m) in [(196, 1.96), (4094, 40.94), (4095, 40.95), (4096, 10.0)] {
+        assert_near([variance(confidence)], [(half_width_m / 1.96_f64).powi(2) + own], 1e-6);
+    }
+}
+
+#[test]
+fn the_error_of_the_reference_position_adds_to_that_of_each_object() {
+    let covariance = |ellipse| {
+        let received = decode(&message(vec![object()], ellipse, None, TIME), &ORIGIN).unwrap();
+        received.objects[0].covariance_m2.unwrap()
+    };
+    // Standard deviations of 1.6342 m and 0.8171 m, to the north-east, then to the east.
+    let [along, across] = [(4.0_f64 / 2.4477).powi(2), (2.0_f64 / 2.4477).powi(2)];
+    let (mean, half) = ((along + across) / 2.0, (along - across) / 2.0);
+    assert_near(covariance((400, 200, 450)), [1.0 + mean, half, 0.25 + mean], 1e-6);
+    assert_near(covariance((400, 200, 900)), [1.0 + along, 0.0, 0.25 + across], 1e-6);
+    assert_near(covariance((400, 200, 3601)), [1.0 + along, 0.0, 0.25 + along], 1e-6);
+    let usual = (5.0_f64 / 2.4477).powi(2);
+    assert_near(covariance((4095, 200, 900)), [1.0 + usual, 0.0, 0.25 + usual], 1e-6);
+    assert_near(covariance((4095, 4095, 3601)), [1.0 + usual, 0.0, 0.25 + usual], 1e-6);
+    let wide = message(vec![object()], (4094, 4094, 3601), None, TIME);
+    assert_eq!(decode(&wide, &ORIGIN), Err(CpmError::NoPosition));
+}
+
+#[test]
+fn a_dimension_that_is_a_code_is_no_size() {
+    let size = |length, width| {
+        let boxed = with(|object| {
+            object.angles = yaw(0);
+            object.object_dimension_x = dimension(length);
+            object.object_dimension_y = dimension(width);
+        });
+        only(boxed).size_m
+    };
+    assert_eq!(size(120, 25), Some([12.0, 2.5]));
+    assert_eq!(size(254, 25), Some([25.4, 2.5]));
+    assert_eq!((size(255, 25), size(256, 25), size(45, 256)), (None, None, None));
+}
+
+#[test]
+fn classes_of_one_label_add_up() {
+    let classification = classes(&[(vehicle(5), 40), (vehicle(8), 30), (vehicle(10), 20), (vehicle(8), 30)]);
+    let truck = only(with(|object| object.classification = classification));
+    assert_eq!((truck.label.as_str(), truck.confidence), ("truck", 0.6));
+    assert_eq!(truck.scores, [("car".into(), 0.4), ("special vehicle".into(), 0.2), ("truck".into(), 0.6)].into());
+    let classification = classes(&[(vehicle(6), 101), (vehicle(5), 101)]);
+    let unsure = only(with(|object| object.classification = classification));
+    assert_eq!((unsure.label.as_str(), unsure.confidence, unsure.scores.len()), ("bus", 0.5, 0));
+    let unknown = only(object());
+    assert_eq!((unknown.label.as_str(), unknown.confidence), ("object", 0.5));
+}
+
+#[test]
+fn profiles_of_road_users_are_those_of_the_standard() {
+    use cdd::VruProfileAndSubprofile::{animal, bicyclistAndLightVruVehicle, motorcyclist, pedestrian};
+    let light = |profile| bicyclistAndLightVruVehicle(cdd::VruSubProfileBicyclist(profile));
+    let motor = |profile| motorcyclist(cdd::VruSubProfileMotorcyclist(profile));
+    let expected = [
+        (pedestrian(cdd::VruSubProfilePedestrian(2)), "person"),
+        (light(0), "bicycle"),
+        (light(1), "bicycle"),
+        (light(2), "person"),
+        (light(3), "animal"),
+        (light(4), "person"),
+        (light(5), "person"),
+        (light(6), "person"),
+        (light(7), "bicycle"),
+        (light(10), "bicycle"),
+        (motor(0), "motorcycle"),
+        (motor(1), "moped"),
+        (motor(4), "motorcycle"),
+        (animal(cdd::VruSubProfileAnimal(1)), "animal"),
+    ];
+    for (profile, label) in expected {
+        let classification = classes(&[(cdd::ObjectClass::vruSubClass(profile.clone()), 90)]);
+        assert_eq!(only(with(|object| object.classification = classification)).label, label, "{profile:?}");
+    }
+}
+
+#[test]
+fn segments_are_joined_and_a_message_that_lacks_one_is_dropped() {
+    let segment = |x, this, time| {
+        decode(&message(vec![at(x, 0), at(131_071, 0)], HALF_METRE, Some((this, 2)), time), &ORIGIN).unwrap()
+    };
+    let mut segments = Segments::default();
+    assert_eq!(segments.join(segment(100, 1, TIME)), None);
+    assert_eq!(segments.join(segment(300, 2, TIME + 100)), None, "the first of this time is missing");
+    let whole = segments.join(segment(200, 1, TIME + 100)).unwrap();
+    let places: Vec<_> = whole.objects.iter().map(|object| object.x_m.round()).collect();
+    assert_eq!((places, whole.left_out), (vec![2.0, 3.0], 2));
+    assert_eq!(segments.join(segment(100, 2, TIME)), None, "what was joined is gone");
+    let single = decode(&message(vec![at(500, 0)], HALF_METRE, None, TIME), &ORIGIN).unwrap();
+    assert_eq!(segments.join(single.clone()), Some(single));
+}
