@@ -1,4 +1,5 @@
-"""Reads logs of profile ros2 by mcap-ros2-support, and has rosbags write each message again to the same bytes."""
+"""Reads logs of profile ros2 by mcap-ros2-support, has rosbags write each message again to the same bytes, and holds the definitions
+in the logs against those of ROS 2 Humble."""
 
 import collections
 import sys
@@ -10,7 +11,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 def read(path, counts):
     seen = set()
-    store = get_typestore(Stores.EMPTY)
+    store, humble = get_typestore(Stores.EMPTY), get_typestore(Stores.ROS2_HUMBLE)
     with open(path, "rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
@@ -18,6 +19,9 @@ def read(path, counts):
             if schema.name not in seen:
                 seen.add(schema.name)
                 types = get_types_from_msg(schema.data.decode(), schema.name)
+                for name, (_, fields) in types.items():
+                    # vision_msgs is no part of it.
+                    assert name.startswith("vision_msgs/") or fields == humble.fielddefs[name][1], name
                 store.register({name: fields for name, fields in types.items() if name not in store.types})
             again = store.serialize_cdr(store.deserialize_cdr(message.data, schema.name), schema.name)
             assert bytes(again) == message.data, channel.topic
@@ -27,6 +31,11 @@ def read(path, counts):
                 assert decoded.header.frame_id == "map" and car.results[0].hypothesis.class_id == "car"
                 assert abs(car.results[0].hypothesis.score - 0.93) < 1e-9
                 assert car.bbox.center.position.x == 12.5 and car.bbox.center.position.y == -3.0
+            if channel.topic == "/ecod/map/detections":
+                for found in decoded.detections:
+                    # Both know cars alone: the score is how certain the object is.
+                    (hypothesis,) = (result.hypothesis for result in found.results)
+                    assert hypothesis.class_id == "car" and 0 < hypothesis.score < 0.999
             if channel.topic == "/tf":
                 transform, optical = decoded.transforms
                 assert transform.child_frame_id == "euclid_2_camera" and transform.transform.translation.y == 6.0

@@ -10,10 +10,12 @@ mod detections;
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
+use std::time::{Duration, Instant, SystemTime};
 
-use ecod_client::{Cell, Error, GlobalMap, ObjectReport, Settings};
+use ecod_client::{Cell, Error, Frame, GlobalMap, ObjectReport, Settings};
 use futures::channel::oneshot;
 use futures::executor::block_on_stream;
 use futures::stream::{BoxStream, select_all};
@@ -39,6 +41,12 @@ const PART: &str = "ros2";
 
 /// Samples of a topic that are kept for slow readers, as ROS does unless told otherwise.
 const DEPTH: i32 = 10;
+
+/// Time after which a topic on which nothing is said is given up, as that of a vehicle that has left.
+const SILENCE: Duration = Duration::from_secs(60);
+
+/// Most by which a stamp may differ from this machine's time.
+const MAX_CLOCK_DIFFERENCE: Duration = Duration::from_secs(10);
 
 /// Domain, network and input of a bridge.
 #[derive(Debug, Clone, Default)]
@@ -133,7 +141,7 @@ impl RosBridge {
             let reports = scope.spawn(|| self.until_closed(|| self.send_reports()));
             let taken = self.input.is_some().then(|| scope.spawn(|| self.until_closed(|| self.take_detections())));
             let ended = [maps.join(), reports.join()].into_iter().chain(taken.map(thread::ScopedJoinHandle::join));
-            ended.flatten().fold(Ok(()), Result::and)
+            ended.map(|ended| ended.unwrap_or_else(|panic| resume_unwind(panic))).fold(Ok(()), Result::and)
         })
     }
 
@@ -148,14 +156,15 @@ impl RosBridge {
         self.refusals.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// Carries messages of one kind; the bridge ends with it, however it ends.
     fn until_closed(&self, carry: impl Fn() -> Result<(), RosBridgeError>) -> Result<(), RosBridgeError> {
-        let ended = carry();
+        let ended = catch_unwind(AssertUnwindSafe(carry));
         self.close();
-        ended
+        ended.unwrap_or_else(|panic| resume_unwind(panic))
     }
 
     fn send_maps(&self) -> Result<(), RosBridgeError> {
-        let mut topics = LiveTopics { participant: &self.participant, writers: BTreeMap::new() };
+        let mut topics = LiveTopics { participant: &self.participant, topics: BTreeMap::new() };
         for map in self.cell.maps() {
             let map: &GlobalMap = &*map?;
             put_map(map, &mut topics)?;
@@ -164,7 +173,7 @@ impl RosBridge {
     }
 
     fn send_reports(&self) -> Result<(), RosBridgeError> {
-        let mut topics = LiveTopics { participant: &self.participant, writers: BTreeMap::new() };
+        let mut topics = LiveTopics { participant: &self.participant, topics: BTreeMap::new() };
         for report in self.cell.reports() {
             let report: &ObjectReport = &*report?;
             put_report(report, &mut topics)?;
@@ -195,6 +204,8 @@ impl RosBridge {
                 }
                 Taken::Closed => break,
             };
+            let placed =
+                placed.and_then(|placed| if is_timely(&placed.0) { Ok(placed) } else { Err(InputRefusal::BadTime) });
             let (frame, unplaced) = match placed {
                 Ok(placed) => placed,
                 Err(refusal) => {
@@ -250,6 +261,13 @@ impl RosBridge {
     }
 }
 
+/// False for a frame whose time cannot be that of the cell.
+fn is_timely(frame: &Frame) -> bool {
+    let now = SystemTime::now();
+    let earlier = now.duration_since(frame.captured_at);
+    earlier.unwrap_or_else(|later| later.duration()) <= MAX_CLOCK_DIFFERENCE
+}
+
 fn qos(reliability: Reliability) -> QosPolicies {
     QosPolicyBuilder::new().reliability(reliability).history(History::KeepLast { depth: DEPTH }).build()
 }
@@ -268,7 +286,13 @@ fn ros_topic<M: RosMessage>(
 /// Topics of a domain that messages are put on, each announced with its first message.
 struct LiveTopics<'a> {
     participant: &'a DomainParticipant,
-    writers: BTreeMap<String, DataWriter<Encoded, Encoded>>,
+    topics: BTreeMap<String, LiveTopic>,
+}
+
+struct LiveTopic {
+    writer: DataWriter<Encoded, Encoded>,
+    said_at: Instant,
+    is_failing: bool,
 }
 
 /// A message in CDR, little-endian.
@@ -290,18 +314,23 @@ impl RosSink for LiveTopics<'_> {
     type Error = RosBridgeError;
 
     fn put<M: Serialize + Definition>(&mut self, name: &str, message: &M) -> Result<(), RosBridgeError> {
-        if !self.writers.contains_key(name) {
+        let now = Instant::now();
+        if !self.topics.contains_key(name) {
+            self.topics.retain(|_, topic| now.duration_since(topic.said_at) < SILENCE);
             let qos = qos(Reliability::Reliable { max_blocking_time: rustdds::Duration::ZERO });
             let topic = ros_topic::<M>(self.participant, name, &qos)?;
             let publisher = self.participant.create_publisher(&qos).map_err(RosBridgeError::dds)?;
             let writer = publisher.create_datawriter_no_key(&topic, Some(qos)).map_err(RosBridgeError::dds)?;
-            self.writers.insert(name.to_owned(), writer);
+            self.topics.insert(name.to_owned(), LiveTopic { writer, said_at: now, is_failing: false });
         }
-        let Some(writer) = self.writers.get(name) else { return Ok(()) };
+        let Some(topic) = self.topics.get_mut(name) else { return Ok(()) };
+        topic.said_at = now;
         let encoded = Encoded(encode(message).map_err(RosBridgeError::dds)?);
-        if let Err(error) = writer.write(encoded, None) {
-            log::debug!("nothing sent on {name}: {error}");
+        let sent = topic.writer.write(encoded, None);
+        if let Some(error) = sent.as_ref().err().filter(|_| !topic.is_failing) {
+            log::warn!("messages on {name} are lost until DDS takes them again: {error}");
         }
+        topic.is_failing = sent.is_err();
         Ok(())
     }
 }

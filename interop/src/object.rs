@@ -3,14 +3,14 @@
 use std::collections::BTreeMap;
 
 use ecod::model::names::Label;
-use ecod::wire::{FusedObject, LandmarkState, PerceivedObject};
+use ecod::wire::{FusedObject, GlobalMap, LandmarkState, PerceivedObject};
 
 /// An object in the cell's frame: metres and radians, `covariance_m2` as `[xx, xy, yy]`, `size_m` as length and width.
 #[derive(Debug, Clone)]
 pub(crate) struct CellObject<'a> {
     pub(crate) label: &'a Label,
     pub(crate) confidence: f64,
-    /// Confidence of each class; empty where only that of the label is known.
+    /// Confidence of each class, in a map the share of each; empty where only that of the label is known.
     pub(crate) scores: &'a BTreeMap<Label, f64>,
     pub(crate) position_m: [f64; 2],
     pub(crate) covariance_m2: Option<[f64; 3]>,
@@ -52,6 +52,13 @@ impl<'a> From<&'a PerceivedObject> for CellObject<'a> {
 }
 
 impl<'a> CellObject<'a> {
+    /// Objects of a map and what stands at its known locations, each with its id.
+    #[cfg(feature = "ros2")]
+    pub(crate) fn all_of(map: &'a GlobalMap) -> impl Iterator<Item = (Self, String)> {
+        let objects = map.objects.iter().map(|object| (object.into(), object.id.to_string()));
+        objects.chain(map.landmarks.iter().filter_map(|place| Some((Self::at(place)?, place.id.to_string()))))
+    }
+
     /// What stands at a known location; `None` if nothing does.
     pub(crate) fn at(landmark: &'a LandmarkState) -> Option<Self> {
         Some(Self {

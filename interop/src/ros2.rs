@@ -18,9 +18,11 @@ use serde::Serialize;
 
 #[cfg(feature = "dds")]
 pub(crate) use camera::CameraInfo;
+#[cfg(all(test, feature = "dds"))]
+pub(crate) use camera::RegionOfInterest;
 pub(crate) use detections::Detection3DArray;
 #[cfg(feature = "dds")]
-pub(crate) use detections::{Detection3D, ObjectHypothesisWithPose};
+pub(crate) use detections::{Detection3D, ObjectHypothesis, ObjectHypothesisWithPose};
 use markers::MarkerArray;
 use transforms::TFMessage;
 
@@ -66,7 +68,65 @@ fn ros_name(node: &NodeName) -> String {
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used)]
+
+    use ecod::model::epoch::Epoch;
+    use ecod::model::geometry::Covariance;
+    use ecod::model::time::Timestamp;
+    use ecod::wire::{FusedObject, LandmarkState, PerceivedObject, SCHEMA_VERSION};
+
     use super::*;
+    use crate::ros2::messages::RosTime;
+
+    const NOW: Timestamp = Timestamp(1_795_239_882_123_000);
+
+    #[test]
+    fn a_ghost_is_unlikely_in_ros_and_places_are_drawn() {
+        let ghost = FusedObject {
+            scores: [("car".into(), 0.75), ("truck".into(), 0.25)].into(),
+            ..FusedObject::new(uuid::Uuid::from_u128(1), "car", 0.04, 12.0, 0.0, Covariance::isotropic(0.04))
+        };
+        let place = LandmarkState {
+            id: "slot-1".into(),
+            label: Some("van".into()),
+            confidence: 0.9,
+            x_m: 5.0,
+            y_m: -2.0,
+            contributors: Vec::new(),
+            observers: Vec::new(),
+            readings: Vec::new(),
+        };
+        let Epoch { term, leader } = Epoch::new(7, NodeName::from_static("edge"));
+        let map = GlobalMap {
+            schema: SCHEMA_VERSION,
+            aggregator: leader,
+            epoch: term,
+            round: 1,
+            fused_at_us: NOW,
+            oldest_capture_us: None,
+            landmarks: vec![place],
+            objects: vec![ghost],
+            pose_corrections: Default::default(),
+            neighbour_objects: Vec::new(),
+        };
+        let scores = |detections: Detection3DArray| -> Vec<_> {
+            assert_eq!(detections.header.stamp, RosTime::of(NOW));
+            let results = detections.detections.into_iter().flat_map(|detection| detection.results);
+            results.map(|result| (result.hypothesis.class_id, (1000.0 * result.hypothesis.score).round())).collect()
+        };
+        let of_map = scores(Detection3DArray::of_map(&map));
+        assert_eq!(of_map, [("car".into(), 30.0), ("truck".into(), 10.0), ("van".into(), 900.0)]);
+        let seen = PerceivedObject {
+            scores: [("car".into(), 0.6), ("truck".into(), 0.3)].into(),
+            ..PerceivedObject::new("car", 0.6, 1.0, 2.0)
+        };
+        let report = ObjectReport { objects: vec![seen], ..ObjectReport::new(NodeName::from_static("euclid"), 1, NOW) };
+        let of_report = scores(Detection3DArray::of_report(&report));
+        assert_eq!(of_report, [("car".into(), 600.0), ("truck".into(), 300.0)], "a detector's own confidences");
+        let drawn = serde_json::to_value(MarkerArray::of_map(&map)).unwrap();
+        let opacity: Vec<_> = (1..5).map(|marker| drawn["markers"][marker]["color"]["a"].as_f64().unwrap()).collect();
+        assert!(opacity[..2].iter().all(|a| *a < 0.05) && opacity[2..].iter().all(|a| *a > 0.8), "{drawn}");
+    }
 
     #[test]
     fn names_are_as_ros_allows_them() {

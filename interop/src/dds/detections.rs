@@ -12,7 +12,8 @@ use ecod_client::{Frame, Label};
 use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
 
 use crate::ros2::{
-    CameraInfo, Detection2DArray, Detection3D, Detection3DArray, Header, ObjectHypothesisWithPose, RosPose,
+    CameraInfo, Detection2DArray, Detection3D, Detection3DArray, Header, ObjectHypothesis, ObjectHypothesisWithPose,
+    RosPose,
 };
 
 /// A detector's camera.
@@ -48,8 +49,8 @@ pub enum InputRefusal {
     /// Boxes in pictures whose optics are not known.
     #[error("boxes before a CameraInfo, or one without focal lengths")]
     NoOptics,
-    /// A stamp before 1970.
-    #[error("a stamp before 1970")]
+    /// A stamp before 1970, or far from this machine's time, as simulated ones are.
+    #[error("a stamp more than 10 s from this machine's time, as with `use_sim_time`")]
     BadTime,
     /// An object without a class.
     #[error("an object without a hypothesis")]
@@ -116,12 +117,17 @@ impl RosCamera {
 
     /// An object without a place: label and confidence of the best hypothesis, and those of all if there are several.
     fn unplaced(&self, results: &[ObjectHypothesisWithPose]) -> Result<PerceivedObject, InputRefusal> {
-        let classes = results.iter().map(|result| {
-            let class = &result.hypothesis.class_id;
-            (Label::from(self.labels.get(class).unwrap_or(class).as_str()), result.hypothesis.score)
-        });
-        let (label, confidence) = classes.clone().max_by(|a, b| a.1.total_cmp(&b.1)).ok_or(InputRefusal::NoClass)?;
-        let scores = if results.len() > 1 { classes.collect() } else { BTreeMap::new() };
+        let mut scores = BTreeMap::new();
+        for ObjectHypothesis { class_id, score } in results.iter().map(|result| &result.hypothesis) {
+            // Several classes may have one label.
+            let label = self.labels.get(class_id).unwrap_or(class_id).as_str();
+            *scores.entry(Label::from(label)).or_insert(0.0) += score;
+        }
+        let best = scores.iter().max_by(|a, b| a.1.total_cmp(b.1));
+        let (label, confidence) = best.map(|(label, score)| (label.clone(), *score)).ok_or(InputRefusal::NoClass)?;
+        if results.len() == 1 {
+            scores.clear();
+        }
         Ok(PerceivedObject { label, confidence, scores, ..PerceivedObject::default() })
     }
 
@@ -152,7 +158,10 @@ pub(super) fn place_in_pictures(
         let PerceivedObject { label, confidence, scores, .. } = camera.unplaced(&detection.results)?;
         let bounds = &detection.bbox;
         let (x, y) = (bounds.center.position.x, bounds.center.position.y);
-        let (half_width, half_height) = (bounds.size_x / 2.0, bounds.size_y / 2.0);
+        // The upright box about one that is turned.
+        let (sin, cos) = bounds.center.theta.sin_cos();
+        let half_width = ((bounds.size_x * cos).abs() + (bounds.size_y * sin).abs()) / 2.0;
+        let half_height = ((bounds.size_x * sin).abs() + (bounds.size_y * cos).abs()) / 2.0;
         let (x_min, x_max, y_min, y_max) = (x - half_width, x + half_width, y - half_height, y + half_height);
         let bounding_box = BoundingBox { x_min, y_min, x_max, y_max };
         let detection = Detection { label, confidence, bounding_box, corners: None };
@@ -169,8 +178,14 @@ impl CameraInfo {
         let [fx, _, cx, _, _, fy, cy, ..] = self.p;
         let [raw_fx, _, raw_cx, _, raw_fy, raw_cy, ..] = self.k;
         let (fx, fy, cx, cy) = if fx > 0.0 { (fx, fy, cx, cy) } else { (raw_fx, raw_fy, raw_cx, raw_cy) };
-        let is_usable = fx > 0.0 && fy > 0.0 && cx.is_finite() && cy.is_finite() && self.width > 0 && self.height > 0;
-        is_usable.then_some(Intrinsics { width: self.width, height: self.height, fx, fy, cx, cy })
+        let (columns, rows) = (self.binning_x.max(1), self.binning_y.max(1));
+        let of_region = |part: u32, whole: u32| if part > 0 { part } else { whole };
+        let (width, height) =
+            (of_region(self.roi.width, self.width) / columns, of_region(self.roi.height, self.height) / rows);
+        let (fx, cx) = (fx / f64::from(columns), (cx - f64::from(self.roi.x_offset)) / f64::from(columns));
+        let (fy, cy) = (fy / f64::from(rows), (cy - f64::from(self.roi.y_offset)) / f64::from(rows));
+        let is_usable = fx > 0.0 && fy > 0.0 && cx.is_finite() && cy.is_finite() && width > 0 && height > 0;
+        is_usable.then_some(Intrinsics { width, height, fx, fy, cx, cy })
     }
 }
 
@@ -208,6 +223,7 @@ mod tests {
     use std::f64::consts::FRAC_PI_2;
 
     use super::*;
+    use crate::ros2::RegionOfInterest;
 
     /// One object in a frame, with its variances along the frame's axes.
     fn message(frame: &str, at: [f64; 3], variances: [f64; 3], yaw_rad: f64) -> Detection3DArray {
@@ -267,12 +283,61 @@ mod tests {
     }
 
     #[test]
+    fn classes_of_one_label_count_together() {
+        let labels = [("2".to_owned(), "car".to_owned()), ("7".to_owned(), "car".to_owned())].into();
+        let mut message = message("map", [1.0, 0.0, 0.0], [0.1; 3], 0.0);
+        let results = &mut message.detections[0].results;
+        results.extend([results[0].clone(), results[0].clone()]);
+        for (result, (class, score)) in results.iter_mut().zip([("2", 0.35), ("0", 0.4), ("7", 0.25)]) {
+            result.hypothesis = ObjectHypothesis { class_id: class.to_owned(), score };
+        }
+        let object = only(&RosCamera { labels, ..camera() }, &message);
+        assert_eq!((object.label.as_str(), object.confidence), ("car", 0.6));
+        assert_eq!(object.scores, [("0".into(), 0.4), ("car".into(), 0.6)].into());
+    }
+
+    #[test]
     fn a_camera_that_looks_down_places_what_is_before_it_nearer() {
         let mount = Mount { height_m: Some(3.0), pitch_rad: 0.5, ..Mount::default() };
         let tilted = RosCamera { mount, ..camera() };
         let object = only(&tilted, &message("front_optical", [0.0, 0.0, 10.0], [0.0; 3], 0.0));
         assert!((object.y_m - 1.0 - 10.0 * 0.5f64.cos()).abs() < 1e-9 && (object.x_m - 5.0).abs() < 1e-9, "{object:?}");
         assert_eq!(object.covariance_m2, None, "zeros state nothing");
+    }
+
+    #[test]
+    fn boxes_are_placed_alike_in_a_whole_picture_and_in_a_binned_part_of_it() {
+        let boxes = |x: f64, y: f64, size_x: f64, size_y: f64, theta: f64| -> Detection2DArray {
+            let header = r#"{"stamp": {"sec": 1000, "nanosec": 5000}, "frame_id": "front"}"#;
+            let results =
+                serde_json::to_value(message("map", [0.0; 3], [0.0; 3], 0.0).detections.remove(0).results).unwrap();
+            let bbox = format!(
+                r#"{{"center": {{"position": {{"x": {x}, "y": {y}}}, "theta": {theta}}}, "size_x": {size_x}, "size_y": {size_y}}}"#
+            );
+            let detection = format!(r#"{{"header": {header}, "results": {results}, "bbox": {bbox}, "id": ""}}"#);
+            serde_json::from_str(&format!(r#"{{"header": {header}, "detections": [{detection}]}}"#)).unwrap()
+        };
+        let (fx, cx, cy) = (900.0, 640.0, 480.0);
+        let k = [fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0];
+        let whole = CameraInfo { width: 1280, height: 960, k, ..CameraInfo::default() };
+        let roi =
+            RegionOfInterest { x_offset: 200, y_offset: 100, width: 800, height: 600, ..RegionOfInterest::default() };
+        let part = CameraInfo { binning_x: 2, binning_y: 2, roi, ..whole.clone() };
+        let mount = Mount { height_m: Some(1.5), ..Mount::default() };
+        let camera = RosCamera { mount, ..camera() };
+        let place = |boxes: &Detection2DArray, optics| {
+            let (frame, refused) = place_in_pictures(&camera, boxes, Some(optics)).unwrap();
+            assert_eq!(refused, []);
+            (frame.objects[0].x_m, frame.objects[0].y_m)
+        };
+        let (x, y) = place(&boxes(700.0, 520.0, 120.0, 100.0, 0.0), &whole);
+        let turned = place(&boxes(700.0, 520.0, 100.0, 120.0, FRAC_PI_2), &whole);
+        let binned = place(&boxes(250.0, 210.0, 60.0, 50.0, 0.0), &part);
+        // A pixel's noise is twice as large there.
+        for ((other_x, other_y), within_m) in [(turned, 1e-6), (binned, 0.1)] {
+            let error_m = (x - other_x).hypot(y - other_y);
+            assert!(error_m < within_m, "{x} {y}, {other_x} {other_y}");
+        }
     }
 
     #[test]

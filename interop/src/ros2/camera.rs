@@ -24,14 +24,15 @@ impl Definition for RosImage {
 
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct RegionOfInterest {
-    x_offset: u32,
-    y_offset: u32,
-    height: u32,
-    width: u32,
-    do_rectify: bool,
+    pub(crate) x_offset: u32,
+    pub(crate) y_offset: u32,
+    pub(crate) height: u32,
+    pub(crate) width: u32,
+    pub(crate) do_rectify: bool,
 }
 
-/// Optics of a camera. `d` are OpenCV's k1, k2, p1, p2, k3; `p` is for pictures without distortion.
+/// Optics of a camera. `d` are OpenCV's k1, k2, p1, p2, k3; `p` is for pictures without distortion. All are for the whole sensor, of
+/// which a picture is the region of interest, with one pixel for `binning_x` by `binning_y`; zeros mean the whole and one.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(crate) struct CameraInfo {
     pub(crate) header: Header,

@@ -58,7 +58,8 @@ pub(super) fn size(object: &CellObject<'_>) -> RosVector {
     RosVector { x, y, z: HEIGHT_M }
 }
 
-fn detection(object: &CellObject<'_>, header: &Header, id: String) -> Detection3D {
+/// A detection. Scores of classes are weighted by `existence`, the probability that there is an object at all.
+fn detection(object: &CellObject<'_>, existence: f64, header: &Header, id: String) -> Detection3D {
     let mut covariance = [[0.0; 6]; 6];
     for (index, row) in covariance.iter_mut().enumerate() {
         row.iter_mut().skip(index).take(1).for_each(|variance| *variance = UNKNOWN_VARIANCE);
@@ -66,10 +67,11 @@ fn detection(object: &CellObject<'_>, header: &Header, id: String) -> Detection3
     if let (Some([xx, xy, yy]), [[a, b, ..], [c, d, ..], ..]) = (object.covariance_m2, &mut covariance) {
         (*a, *b, *c, *d) = (xx, xy, xy, yy);
     }
-    let only = [(object.label, &object.confidence)];
-    let scores: Vec<_> = if object.scores.is_empty() { only.into() } else { object.scores.iter().collect() };
+    let weighted = object.scores.iter().map(|(label, score)| (label, score * existence));
+    let scores: Vec<_> =
+        if object.scores.is_empty() { vec![(object.label, object.confidence)] } else { weighted.collect() };
     let results = scores.into_iter().map(|(label, score)| ObjectHypothesisWithPose {
-        hypothesis: ObjectHypothesis { class_id: label.to_string(), score: *score },
+        hypothesis: ObjectHypothesis { class_id: label.to_string(), score },
         pose: PoseWithCovariance { pose: pose(object), covariance },
     });
     let bbox = BoundingBox3D { center: pose(object), size: size(object) };
@@ -85,9 +87,8 @@ pub(crate) struct Detection3DArray {
 impl Detection3DArray {
     pub(super) fn of_map(map: &GlobalMap) -> Self {
         let header = Header::in_map(map.fused_at_us);
-        let objects = map.objects.iter().map(|object| (object.into(), object.id.to_string()));
-        let at_places = map.landmarks.iter().filter_map(|place| Some((CellObject::at(place)?, place.id.to_string())));
-        let detections = objects.chain(at_places).map(|(object, id)| detection(&object, &header, id)).collect();
+        let detections =
+            CellObject::all_of(map).map(|(object, id)| detection(&object, object.confidence, &header, id)).collect();
         Self { header, detections }
     }
 
@@ -95,7 +96,8 @@ impl Detection3DArray {
         let header = Header::in_map(report.captured_at_us);
         let detections = report.objects.iter().map(|object| {
             let id = object.landmark.as_ref().map(ToString::to_string).unwrap_or_default();
-            detection(&object.into(), &header, id)
+            // Of a detector, scores are confidences as they are.
+            detection(&object.into(), 1.0, &header, id)
         });
         Self { detections: detections.collect(), header }
     }

@@ -59,7 +59,7 @@ pub(super) struct MarkerArray {
 }
 
 impl MarkerArray {
-    /// Boxes and labels of all objects, in place of those before.
+    /// Boxes and labels of all objects, in place of those before; opaque are those that are certain.
     pub(super) fn of_map(map: &GlobalMap) -> Self {
         let none = RosPose { position: RosVector::default(), orientation: RosQuaternion::of(0.0, 0.0, 0.0) };
         let marker = |ns: &str, id: i32| Marker {
@@ -70,7 +70,7 @@ impl MarkerArray {
             action: 0,
             pose: none,
             scale: RosVector::default(),
-            color: ColorRGBA { r: 0.2, g: 0.6, b: 1.0, a: 0.6 },
+            color: ColorRGBA::default(),
             lifetime: RosTime::default(),
             frame_locked: false,
             points: Vec::new(),
@@ -84,14 +84,16 @@ impl MarkerArray {
             mesh_use_embedded_materials: false,
         };
         let mut markers = vec![Marker { action: DELETE_ALL, ..marker("objects", 0) }];
-        for (object, number) in map.objects.iter().map(CellObject::from).zip(1..) {
+        for ((object, _), number) in CellObject::all_of(map).zip(1..) {
             let pose = pose(&object);
+            // Ghosts are faint.
+            let a = object.confidence as f32;
             let mut above = pose;
             above.position.z = HEIGHT_M + 0.5;
             let scale = RosVector { z: 0.5, ..RosVector::default() };
-            let color = ColorRGBA { r: 1.0, g: 1.0, b: 1.0, a: 1.0 };
+            let (box_color, color) = (ColorRGBA { r: 0.2, g: 0.6, b: 1.0, a }, ColorRGBA { r: 1.0, g: 1.0, b: 1.0, a });
             let text = object.label.to_string();
-            markers.push(Marker { pose, scale: size(&object), ..marker("objects", number) });
+            markers.push(Marker { pose, scale: size(&object), color: box_color, ..marker("objects", number) });
             markers.push(Marker { kind: TEXT, pose: above, scale, color, text, ..marker("labels", number) });
         }
         Self { markers }

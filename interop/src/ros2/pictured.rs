@@ -14,10 +14,10 @@ pub(crate) struct Point2D {
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(crate) struct Pose2D {
     pub(crate) position: Point2D,
-    theta: f64,
+    pub(crate) theta: f64,
 }
 
-/// A box in pixels; `theta` is taken for zero.
+/// A box in pixels, turned by `theta` in radians.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct BoundingBox2D {
     pub(crate) center: Pose2D,
