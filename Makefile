@@ -111,7 +111,7 @@ attack: setup ## attackers of all kinds against real cells, and a table; ROWS=te
 
 lint: setup ## formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
-	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets --features ecod-interop/dds -- -D warnings
+	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets --features ecod-instructions/detectors -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items
 
 doc: setup ## API documentation in target/doc
@@ -238,10 +238,10 @@ instructions: PACKAGES := build-essential ca-certificates valgrind
 instructions: setup ## instructions of the core's hot paths against the baseline; SAVE=1 writes a new one
 	packaging/instructions $(if $(SAVE),--save)
 
-instructions-arm64: PACKAGES := build-essential ca-certificates debootstrap python3 systemd-container valgrind
-instructions-arm64: setup ## instructions of the core's work on arm64 beside amd64, and the time that Pis take by them; needs root
-	cargo build --release --locked -p ecod-instructions --bin ecod-work
-	packaging/arm64 cargo build --release --locked --target aarch64-unknown-linux-gnu -p ecod-instructions --bin ecod-work
+instructions-arm64: PACKAGES += debootstrap python3 systemd-container valgrind
+instructions-arm64: setup ## instructions of core and detectors on arm64 beside amd64, and the time that Pis take by them; needs root
+	cargo build --release --locked -p ecod-instructions --features detectors --bin ecod-work
+	packaging/arm64 cargo build --release --locked --target aarch64-unknown-linux-gnu -p ecod-instructions --features detectors --bin ecod-work
 	packaging/count-arm64 $(BUILD)/release/ecod-work target/arm64/aarch64-unknown-linux-gnu/release/ecod-work
 
 liars: setup ## what lying vehicles achieve against VOTE, within a bound: table in docs/vote.md, drawing in target/liars.svg; SEEDS=n only checks

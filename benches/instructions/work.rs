@@ -1,4 +1,8 @@
-//! `ecod-work NAME TIMES`: one of the workloads done once or, with 0, only prepared, for counters that take whole programs.
+//! `ecod-work NAME TIMES`: one of the workloads done once or, with 0, only prepared, for counters that take whole programs. A detector
+//! prepares itself at its first picture: it is done once or twice.
+
+#[cfg(feature = "detectors")]
+mod detectors;
 
 use std::hint::black_box;
 
@@ -8,7 +12,11 @@ use ecod_instructions as workload;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [name, times] = &arguments[..] else { panic!("usage: ecod-work NAME 0|1") };
+    let [name, times] = &arguments[..] else { panic!("usage: ecod-work NAME 0|1|2") };
+    #[cfg(feature = "detectors")]
+    if detectors::detect(name, times.parse().expect("a number of times")) {
+        return;
+    }
     let is_done = times != "0";
     match name.as_str() {
         "projection" => {
