@@ -239,8 +239,8 @@ impl Track {
         self.seen_by(at - CONFIRMED_WITHIN).any(|history| history.sensor != sensor)
     }
 
-    /// Whether a vehicle detected both objects in the frame of its last detection, which is not one of long ago: a duplicate of
-    /// then would else stay for as long as the vehicle.
+    /// True if a vehicle detected both objects in the frame of its last detection. Detections of long ago do not count: a
+    /// duplicate of then would stay for as long as the vehicle.
     pub(super) fn is_resolved_from(&self, other: &Self) -> bool {
         let since = self.last_seen.max(other.last_seen) - LOOKS_FOR;
         self.history.iter().any(|own| {
