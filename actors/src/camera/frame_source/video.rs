@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 
 use opencv::core::{Mat, Scalar};
 use opencv::prelude::*;
-use regex::Regex;
+use regex_lite::Regex;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use self::protocol::{ImageHeader, VideoMessage, VideoRequest};
