@@ -122,8 +122,10 @@ impl CpmBridge {
             let map: &GlobalMap = &*map?;
             let number = lock(&self.numbers).of(&map.aggregator);
             let Some(number) = number else { continue };
-            let is_own = |position_m| lock(&self.sightings).is_own(position_m, Instant::now());
-            let encoded = cpm::encode_map(map, &self.described(), number, &mut ids, is_own);
+            let (described, now) = (self.described(), Instant::now());
+            let sightings = lock(&self.sightings);
+            let encoded = cpm::encode_map(map, &described, number, &mut ids, |at| sightings.is_own(at, now));
+            drop(sightings);
             self.send("map", encoded)?;
         }
         Ok(())

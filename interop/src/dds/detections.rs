@@ -119,9 +119,10 @@ impl RosCamera {
     fn unplaced(&self, results: &[ObjectHypothesisWithPose]) -> Result<PerceivedObject, InputRefusal> {
         let mut scores = BTreeMap::new();
         for ObjectHypothesis { class_id, score } in results.iter().map(|result| &result.hypothesis) {
-            // Several classes may have one label.
+            // Several classes may have one label, and independent scores a sum above one.
             let label = self.labels.get(class_id).unwrap_or(class_id).as_str();
-            *scores.entry(Label::from(label)).or_insert(0.0) += score;
+            let sum = scores.entry(Label::from(label)).or_insert(0.0);
+            *sum = if results.len() == 1 { *score } else { (*sum + score).min(1.0) };
         }
         let best = scores.iter().max_by(|a, b| a.1.total_cmp(b.1));
         let (label, confidence) = best.map(|(label, score)| (label.clone(), *score)).ok_or(InputRefusal::NoClass)?;
@@ -291,9 +292,12 @@ mod tests {
         for (result, (class, score)) in results.iter_mut().zip([("2", 0.35), ("0", 0.4), ("7", 0.25)]) {
             result.hypothesis = ObjectHypothesis { class_id: class.to_owned(), score };
         }
-        let object = only(&RosCamera { labels, ..camera() }, &message);
+        let camera = RosCamera { labels, ..camera() };
+        let object = only(&camera, &message);
         assert_eq!((object.label.as_str(), object.confidence), ("car", 0.6));
         assert_eq!(object.scores, [("0".into(), 0.4), ("car".into(), 0.6)].into());
+        message.detections[0].results.iter_mut().for_each(|result| result.hypothesis.score = 0.8);
+        assert_eq!(only(&camera, &message).confidence, 1.0, "of independent scores");
     }
 
     #[test]

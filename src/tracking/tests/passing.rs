@@ -72,7 +72,7 @@ fn a_vehicle_of_little_trust_is_not_believed_the_more_for_it() {
     assert!(by_distrust.is_sorted_by(|more, less| more >= less) && by_distrust[3] < 0.5, "{by_distrust:?}");
 }
 
-/// Whoever leaves has seen a duplicate of a parked car in its last frame. The two that stay see the car a metre apart.
+/// The vehicle that leaves has seen a duplicate of a parked car in its last frame. The two that stay see the car a metre apart.
 #[test]
 fn a_duplicate_goes_when_the_vehicle_that_stated_it_has_left() {
     let mut tracker = tracker();
