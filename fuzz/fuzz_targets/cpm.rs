@@ -2,10 +2,12 @@
 
 #![no_main]
 
+use std::collections::BTreeSet;
+
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::wire::{Limits, ObjectReport};
-use ecod_interop::cpm::{decode, encode_report};
+use ecod_interop::cpm::{CpmCell, decode, encode_report};
 use libfuzzer_sys::fuzz_target;
 
 const ORIGIN: GeographicOrigin =
@@ -20,5 +22,6 @@ fuzz_target!(|input: &[u8]| {
         report.objects.len() > Limits::default().objects || report.validate(&Limits::default()).is_ok(),
         "{report:?}"
     );
-    assert!(encode_report(&report, &ORIGIN, received.station_id).is_ok());
+    let cell = CpmCell { origin: ORIGIN, vacancy_signs: BTreeSet::new() };
+    assert!(encode_report(&report, &cell, received.station_id).is_ok());
 });
