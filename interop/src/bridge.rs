@@ -9,14 +9,13 @@
 mod sightings;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
 use ecod_client::{Cell, Error, ForeignMessage, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings};
 
 use self::sightings::Sightings;
+use crate::carrying::{Carry, is_within, until_one_ends};
 use crate::cpm::{self, CpmCell, CpmError, ObjectIds, RECEIVED_PART, ReceivedCpm, Segments, StationIds};
 
 /// Maximum number of stations at a time. A node has room for 16 parts.
@@ -102,7 +101,8 @@ impl CpmBridge {
     /// # Panics
     /// When one of its threads did.
     pub fn run(&self) -> Result<(), Error> {
-        let carry: [Carry<'_>; 3] = [&|| self.send_maps(), &|| self.send_reports(), &|| self.take_received()];
+        let carry: Vec<Carry<'_, Error>> =
+            vec![Box::new(|| self.send_maps()), Box::new(|| self.send_reports()), Box::new(|| self.take_received())];
         until_one_ends(carry, || self.cell.close())
     }
 
@@ -177,9 +177,7 @@ impl CpmBridge {
         if lock(&self.numbers).is_own(received.station_id) {
             return Err(CpmRefusal::Own);
         }
-        let (captured_at, now) = (capture_time(&received), SystemTime::now());
-        let difference = now.duration_since(captured_at).unwrap_or_else(|later| later.duration());
-        if difference > MAX_CLOCK_DIFFERENCE {
+        if !is_within(capture_time(&received), MAX_CLOCK_DIFFERENCE) {
             return Err(CpmRefusal::Time);
         }
         stations.report(received)
@@ -212,25 +210,6 @@ impl CpmBridge {
             log::warn!("no report from cpm/received/{receiver}: {refusal}; others like it are only counted");
         }
     }
-}
-
-type Carry<'a> = &'a (dyn Fn() -> Result<(), Error> + Sync);
-
-/// Runs all at a time until one ends, which closes the others. A panic goes on here, so that the program does not end as if
-/// all were well.
-fn until_one_ends<const N: usize>(carry: [Carry<'_>; N], close: impl Fn() + Sync) -> Result<(), Error> {
-    let close = &close;
-    thread::scope(|scope| {
-        let threads = carry.map(|carry| {
-            scope.spawn(move || {
-                let ended = catch_unwind(AssertUnwindSafe(carry));
-                close();
-                ended.unwrap_or_else(|panic| resume_unwind(panic))
-            })
-        });
-        let ended = threads.map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
-        ended.into_iter().fold(Ok(()), Result::and)
-    })
 }
 
 /// The cell by its description; `None` without an origin.
@@ -302,28 +281,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 #[cfg(test)]
 mod tests {
-    #![allow(clippy::unwrap_used, clippy::panic)]
-
-    use std::sync::atomic::{AtomicBool, Ordering};
-
     use super::*;
-
-    #[test]
-    fn a_panic_ends_all_threads_and_is_no_orderly_end() {
-        let is_closed = AtomicBool::new(false);
-        let wait = || {
-            while !is_closed.load(Ordering::Relaxed) {
-                thread::yield_now();
-            }
-            Ok(())
-        };
-        let fall = || panic!("a thread fell");
-        let close = || is_closed.store(true, Ordering::Relaxed);
-        assert!(catch_unwind(AssertUnwindSafe(|| until_one_ends([&wait, &fall, &wait], close))).is_err());
-        is_closed.store(false, Ordering::Relaxed);
-        let refuse = || Err(Error::Refused("no".into()));
-        assert_eq!(until_one_ends([&wait, &wait, &refuse], close), Err(Error::Refused("no".into())));
-    }
 
     #[test]
     fn vacancy_signs_are_those_of_the_description() {

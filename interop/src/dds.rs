@@ -10,12 +10,10 @@ mod detections;
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
-use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Mutex, PoisonError};
-use std::thread;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
-use ecod_client::{Cell, Error, Frame, GlobalMap, ObjectReport, Settings};
+use ecod_client::{Cell, Error, GlobalMap, ObjectReport, Settings};
 use futures::channel::oneshot;
 use futures::executor::block_on_stream;
 use futures::stream::{BoxStream, select_all};
@@ -30,6 +28,7 @@ use rustdds::{
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use crate::carrying::{Carry, is_within, until_one_ends};
 use crate::ros2::{
     CameraInfo, Definition, Detection2DArray, Detection3DArray, RosMessage, RosSink, encode, put_map, put_report,
 };
@@ -136,13 +135,12 @@ impl RosBridge {
     /// # Errors
     /// [`RosBridgeError`] when the node's broker refuses the bridge, or DDS a topic.
     pub fn run(&self) -> Result<(), RosBridgeError> {
-        thread::scope(|scope| {
-            let maps = scope.spawn(|| self.until_closed(|| self.send_maps()));
-            let reports = scope.spawn(|| self.until_closed(|| self.send_reports()));
-            let taken = self.input.is_some().then(|| scope.spawn(|| self.until_closed(|| self.take_detections())));
-            let ended = [maps.join(), reports.join()].into_iter().chain(taken.map(thread::ScopedJoinHandle::join));
-            ended.map(|ended| ended.unwrap_or_else(|panic| resume_unwind(panic))).fold(Ok(()), Result::and)
-        })
+        let mut carry: Vec<Carry<'_, RosBridgeError>> =
+            vec![Box::new(|| self.send_maps()), Box::new(|| self.send_reports())];
+        if self.input.is_some() {
+            carry.push(Box::new(|| self.take_detections()));
+        }
+        until_one_ends(carry, || self.close())
     }
 
     /// Ends the connections, and with them [`RosBridge::run`].
@@ -154,13 +152,6 @@ impl RosBridge {
     /// Messages and objects of the detector that were not reported, by reason.
     pub fn refusals(&self) -> BTreeMap<InputRefusal, u64> {
         self.refusals.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-
-    /// Carries messages of one kind; the bridge ends with it, however it ends.
-    fn until_closed(&self, carry: impl Fn() -> Result<(), RosBridgeError>) -> Result<(), RosBridgeError> {
-        let ended = catch_unwind(AssertUnwindSafe(carry));
-        self.close();
-        ended.unwrap_or_else(|panic| resume_unwind(panic))
     }
 
     fn send_maps(&self) -> Result<(), RosBridgeError> {
@@ -204,9 +195,11 @@ impl RosBridge {
                 }
                 Taken::Closed => break,
             };
-            let placed =
-                placed.and_then(|placed| if is_timely(&placed.0) { Ok(placed) } else { Err(InputRefusal::BadTime) });
             let (frame, unplaced) = match placed {
+                Ok((frame, _)) if !is_within(frame.captured_at, MAX_CLOCK_DIFFERENCE) => {
+                    self.note(InputRefusal::BadTime);
+                    continue;
+                }
                 Ok(placed) => placed,
                 Err(refusal) => {
                     self.note(refusal);
@@ -259,13 +252,6 @@ impl RosBridge {
             log::warn!("not reported from ROS: {refusal}; others like it are only counted");
         }
     }
-}
-
-/// False for a frame whose time cannot be that of the cell.
-fn is_timely(frame: &Frame) -> bool {
-    let now = SystemTime::now();
-    let earlier = now.duration_since(frame.captured_at);
-    earlier.unwrap_or_else(|later| later.duration()) <= MAX_CLOCK_DIFFERENCE
 }
 
 fn qos(reliability: Reliability) -> QosPolicies {

@@ -6,6 +6,7 @@
 #![deny(clippy::unwrap_used, clippy::expect_used, clippy::indexing_slicing, clippy::panic)]
 
 pub mod bridge;
+mod carrying;
 pub mod cpm;
 #[cfg(feature = "dds")]
 pub mod dds;
