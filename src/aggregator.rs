@@ -47,7 +47,7 @@ use crate::tracking::{HandOvers, Tracker, TracksLosses, TracksMode, TracksRound}
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
     FusedObject, GlobalMap, LandmarkState, NeighbourObject, ObjectReport, PerceivedObject, RejectReason, ReportKind,
-    Reputation, SCHEMA_VERSION, Verdict, Verdicts,
+    Reputation, Verdict, Verdicts,
 };
 
 /// A closed round.
@@ -448,16 +448,12 @@ impl Aggregator {
         let oldest = [pace.as_ref().and_then(|pace| pace.oldest_capture), oldest_capture].into_iter().flatten().min();
         let pace = pace.map(|PaceRound { landmarks, .. }| self.agree(landmarks, verdicts.as_deref(), now));
         let map = pace.map(|landmarks| GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: epoch.leader.clone(),
-            epoch: epoch.term,
-            round,
-            fused_at_us: fused_at,
             oldest_capture_us: oldest.map(|oldest| self.in_cell_time(oldest)),
             landmarks,
             neighbour_objects: self.neighbours.shown(&objects, self.tracks.as_ref(), now, self.cell_offset_us),
             objects,
             pose_corrections,
+            ..GlobalMap::new(&epoch, round, fused_at)
         });
         let verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());

@@ -217,6 +217,24 @@ pub struct GlobalMap {
     pub neighbour_objects: Vec<NeighbourObject>,
 }
 
+impl GlobalMap {
+    /// An empty map of a leadership's round that closed at `fused_at`.
+    pub fn new(epoch: &Epoch, round: u64, fused_at: Timestamp) -> Self {
+        Self {
+            schema: SCHEMA_VERSION,
+            aggregator: epoch.leader.clone(),
+            epoch: epoch.term,
+            round,
+            fused_at_us: fused_at,
+            oldest_capture_us: None,
+            landmarks: Vec::new(),
+            objects: Vec::new(),
+            pose_corrections: BTreeMap::new(),
+            neighbour_objects: Vec::new(),
+        }
+    }
+}
+
 /// The agreed state of one known location.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct LandmarkState {

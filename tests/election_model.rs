@@ -18,7 +18,7 @@ use ecod::leadership::{Leadership, Rights};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeStatus, Role, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, NodeStatus, Role};
 use stateright::{Checker, HasDiscoveries, Model, Property, UniformChooser};
 use uuid::Uuid;
 
@@ -260,18 +260,7 @@ impl Cell {
     fn accept(&mut self, index: usize, map: Map) {
         let node = &mut self.nodes[index];
         let Map { epoch, round, fused_at } = map;
-        let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: epoch.leader.clone(),
-            epoch: epoch.term,
-            round,
-            fused_at_us: fused_at,
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: Vec::new(),
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        };
+        let map = GlobalMap::new(&epoch, round, fused_at);
         let accepted = node.filter.accept_map(&map, Origin::Claimed, node.clock, &node.leadership);
         if node.machine.is_none() || accepted.is_err() {
             return;

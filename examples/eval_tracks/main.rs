@@ -11,7 +11,7 @@ mod baselines;
 mod plot;
 mod reliability;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write as _};
 use std::ops::Range;
@@ -22,10 +22,11 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use ecod::aggregator::{Aggregator, Algorithms, Fused, FusionConfig};
+use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind, SCHEMA_VERSION};
+use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind};
 use ecod_lab::eval::tracks::{AP_DISTANCES_M, ReliabilityBins, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
 use ecod_lab::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
 use rand::{RngExt, SeedableRng};
@@ -256,18 +257,8 @@ impl Files {
             let covariance = Covariance::isotropic(1.0);
             FusedObject::new(id, said.label.clone(), said.score, said.position.x, said.position.y, covariance)
         });
-        let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: NodeName::from_static("late-fusion"),
-            epoch: 1,
-            round: 1,
-            fused_at_us: at,
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: objects.collect(),
-            pose_corrections: BTreeMap::new(),
-            neighbour_objects: Vec::new(),
-        };
+        let epoch = Epoch::new(1, NodeName::from_static("late-fusion"));
+        let map = GlobalMap { objects: objects.collect(), ..GlobalMap::new(&epoch, 1, at) };
         Ok(writeln!(self.maps, "{}", serde_json::to_string(&map)?)?)
     }
 }

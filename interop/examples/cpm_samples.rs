@@ -1,7 +1,8 @@
 //! Prints messages of a map and of a report, one hexadecimal line each: what `make cpm-check` has another reader decode.
 
+use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Covariance;
-use ecod::wire::{FusedObject, GlobalMap, SCHEMA_VERSION};
+use ecod::wire::{FusedObject, GlobalMap};
 use ecod_client::{GeographicOrigin, NodeName, ObjectReport, PerceivedObject, Timestamp, WirePose};
 use ecod_interop::cpm::{CpmCell, EncodedCpm, ObjectIds, encode_map, encode_report};
 use uuid::Uuid;
@@ -36,18 +37,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let first_seen_us = Some(Timestamp(at.micros() - 700_000));
         FusedObject { first_seen_us, heading_rad: Some(1.57), size_m: Some([4.5, 1.8]), ..car }
     });
-    let map = GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: NodeName::from_static("edge"),
-        epoch: 1,
-        round: 1,
-        fused_at_us: at,
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: cars.collect(),
-        pose_corrections: Default::default(),
-        neighbour_objects: Vec::new(),
-    };
+    let epoch = Epoch::new(1, NodeName::from_static("edge"));
+    let map = GlobalMap { objects: cars.collect(), ..GlobalMap::new(&epoch, 1, at) };
     print(&encode_map(&map, &cell, 77, &mut ObjectIds::default(), |_| true)?);
     Ok(())
 }

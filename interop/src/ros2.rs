@@ -73,7 +73,7 @@ mod tests {
     use ecod::model::epoch::Epoch;
     use ecod::model::geometry::Covariance;
     use ecod::model::time::Timestamp;
-    use ecod::wire::{FusedObject, LandmarkState, PerceivedObject, SCHEMA_VERSION};
+    use ecod::wire::{FusedObject, LandmarkState, PerceivedObject};
 
     use super::*;
     use crate::ros2::messages::RosTime;
@@ -96,19 +96,8 @@ mod tests {
             observers: Vec::new(),
             readings: Vec::new(),
         };
-        let Epoch { term, leader } = Epoch::new(7, NodeName::from_static("edge"));
-        let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: leader,
-            epoch: term,
-            round: 1,
-            fused_at_us: NOW,
-            oldest_capture_us: None,
-            landmarks: vec![place],
-            objects: vec![ghost],
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        };
+        let epoch = Epoch::new(7, NodeName::from_static("edge"));
+        let map = GlobalMap { landmarks: vec![place], objects: vec![ghost], ..GlobalMap::new(&epoch, 1, NOW) };
         let scores = |detections: Detection3DArray| -> Vec<_> {
             assert_eq!(detections.header.stamp, RosTime::of(NOW));
             let results = detections.detections.into_iter().flat_map(|detection| detection.results);

@@ -7,9 +7,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
+use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, NodeStatus, ObjectReport, PerceivedObject, Role};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments, ReportKind};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::platform::clock;
@@ -141,16 +142,7 @@ fn report(seq: u64) -> ObjectReport {
 }
 
 fn answer_to(report: &ObjectReport) -> GlobalMap {
-    GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: NodeName::new("edge").expect("a valid name"),
-        epoch: 1,
-        round: report.seq,
-        fused_at_us: Timestamp::default(),
-        oldest_capture_us: Some(report.captured_at_us),
-        landmarks: vec![],
-        objects: vec![],
-        pose_corrections: Default::default(),
-        neighbour_objects: Vec::new(),
-    }
+    let epoch = Epoch::new(1, NodeName::from_static("edge"));
+    let oldest_capture_us = Some(report.captured_at_us);
+    GlobalMap { oldest_capture_us, ..GlobalMap::new(&epoch, report.seq, Timestamp::default()) }
 }

@@ -223,18 +223,7 @@ mod tests {
     }
 
     fn map(epoch: u64, round: u64, fused_at: Timestamp) -> GlobalMap {
-        GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: NodeName::from_static("edge"),
-            epoch,
-            round,
-            fused_at_us: fused_at,
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: Vec::new(),
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        }
+        GlobalMap::new(&Epoch::new(epoch, NodeName::from_static("edge")), round, fused_at)
     }
 
     fn take(filter: &mut RoundFilter, map: &GlobalMap, at: Timestamp, leadership: &Leadership) -> Result<(), Refusal> {

@@ -6,6 +6,7 @@ use proptest::prelude::*;
 use uuid::Uuid;
 
 use super::*;
+use crate::model::epoch::Epoch;
 use crate::model::geometry::Covariance;
 use crate::model::origin::GeographicPosition;
 use crate::wire::{RegionTopicKind, SCHEMA_VERSION};
@@ -35,18 +36,7 @@ fn object(number: u128, x_m: f64, y_m: f64) -> FusedObject {
 
 /// A map of a cell 200 m to the east, fused and sent at `at` by its own clock.
 fn map(epoch: u64, leader: &str, round: u64, at: Timestamp, objects: Vec<FusedObject>) -> CellMap {
-    let map = GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: name(leader),
-        epoch,
-        round,
-        fused_at_us: at,
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects,
-        pose_corrections: BTreeMap::new(),
-        neighbour_objects: Vec::new(),
-    };
+    let map = GlobalMap { objects, ..GlobalMap::new(&Epoch::new(epoch, name(leader)), round, at) };
     CellMap { schema: SCHEMA_VERSION, cell: name("east"), sent_at_us: at, origin: beside(200.0, 90.0), map }
 }
 

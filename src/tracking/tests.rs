@@ -18,9 +18,10 @@ use uuid::Uuid;
 use super::coverage::Coverage;
 use super::kinematics::{KinematicState, Measurement};
 use super::*;
+use crate::model::epoch::Epoch;
 use crate::model::geometry::Covariance;
 use crate::reputation::ReputationConfig;
-use crate::wire::{FieldOfView, GlobalMap, ObjectReport, PerceivedObject, SCHEMA_VERSION, WirePose};
+use crate::wire::{FieldOfView, GlobalMap, ObjectReport, PerceivedObject, WirePose};
 
 const START: Timestamp = Timestamp(1_732_154_400_000_000);
 
@@ -348,18 +349,8 @@ fn whoever_hears_the_same_gives_the_same_identities_and_whoever_comes_later_take
         existence: Some(0.9),
         ..FusedObject::new(Uuid::from_u128(7), "bus", 0.9, 60.0, 60.0, Covariance::isotropic(0.2))
     };
-    let map = GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: name("edge"),
-        epoch: 1,
-        round: 30,
-        fused_at_us: at(29),
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: map.objects.into_iter().chain([unseen]).collect(),
-        pose_corrections: BTreeMap::new(),
-        neighbour_objects: Vec::new(),
-    };
+    let objects = map.objects.into_iter().chain([unseen]).collect();
+    let map = GlobalMap { objects, ..GlobalMap::new(&Epoch::new(1, name("edge")), 30, at(29)) };
     newcomer.adopt_map(&map, at(29));
     let adopted = two_cars(&mut newcomer, 30..31, |_| true);
     assert!(ids(&adopted).is_superset(&map.objects[..2].iter().map(|object| object.id).collect()));

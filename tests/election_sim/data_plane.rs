@@ -12,7 +12,7 @@ use ecod::leadership::round_filter::Origin;
 use ecod::leadership::timers::{ELECTED_SILENCE, EPOCH_MEMORY, MAX_ROUND_AGE};
 use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, LedgerShare, LedgerSignature, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, LedgerShare, LedgerSignature};
 
 use crate::node::{Accepted, Arrival, Map, address_of};
 use crate::world::{MS, World};
@@ -151,18 +151,7 @@ impl World {
         let node = &mut self.nodes[to];
         let received_at = Timestamp(self.now).shifted(node.steady_clock);
         let Map { epoch, round, .. } = map.clone();
-        let global = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: epoch.leader.clone(),
-            epoch: epoch.term,
-            round,
-            fused_at_us: map.fused_at,
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: Vec::new(),
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        };
+        let global = GlobalMap::new(&epoch, round, map.fused_at);
         let Ok(accepted) = node.filter.accept_map(&global, Origin::Claimed, received_at, &node.leadership) else {
             node.refused += 1;
             return;

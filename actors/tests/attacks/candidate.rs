@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ecod::leadership::election::{Body, MAX_TERM};
+use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
-use ecod::model::time::Timestamp;
-use ecod::wire::{Encoding, GlobalMap, MAX_INTEGER, Role, SCHEMA_VERSION, encode};
+use ecod::wire::{Encoding, GlobalMap, MAX_INTEGER, Role, encode};
 use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::EvidenceSigner;
 use futures_util::future::join_all;
@@ -114,20 +114,10 @@ async fn largest_term(target: Target) -> anyhow::Result<()> {
 }
 
 async fn largest_round(target: Target) -> anyhow::Result<()> {
-    let map = |epoch| GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: NodeName::from_static(LEADER),
-        epoch,
-        round: MAX_INTEGER,
-        fused_at_us: Timestamp(clock::now().micros()),
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: Vec::new(),
-        pose_corrections: Default::default(),
-        neighbour_objects: Vec::new(),
-    };
+    let epoch = |term| Epoch::new(term, NodeName::from_static(LEADER));
+    let map = |term| GlobalMap::new(&epoch(term), MAX_INTEGER, clock::now());
     let maps =
-        TERMS.map(|epoch| publish(&format!("ecod/v1/{CELL}/global_detections"), &encode(&map(epoch), Encoding::Json)));
+        TERMS.map(|term| publish(&format!("ecod/v1/{CELL}/global_detections"), &encode(&map(term), Encoding::Json)));
     publish_for_ever(&target, &maps).await
 }
 

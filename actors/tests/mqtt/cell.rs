@@ -4,9 +4,10 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, ReportKind, Role, SCHEMA_VERSION};
+use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, ReportKind, Role};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::telemetry::counters::Counters;
@@ -193,16 +194,5 @@ pub(crate) fn report(node: &str, seq: u64) -> ObjectReport {
 }
 
 pub(crate) fn map(aggregator: &str, round: u64) -> Arc<GlobalMap> {
-    Arc::new(GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: name(aggregator),
-        epoch: 1,
-        round,
-        fused_at_us: Timestamp(1_732_154_400_200_000),
-        oldest_capture_us: None,
-        landmarks: vec![],
-        objects: vec![],
-        pose_corrections: Default::default(),
-        neighbour_objects: Vec::new(),
-    })
+    Arc::new(GlobalMap::new(&Epoch::new(1, name(aggregator)), round, Timestamp(1_732_154_400_200_000)))
 }

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
+use ecod::model::epoch::Epoch;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::wire::{ContentHash, Encoding, encode};
 use ecod_actors::node::config::NodeConfig;
@@ -268,18 +269,7 @@ fn speaker(broker: SocketAddr) -> Client {
 }
 
 fn map(epoch: u64, round: u64) -> Vec<u8> {
-    let map = GlobalMap {
-        schema: 1,
-        aggregator: NodeName::from_static("edge"),
-        epoch,
-        round,
-        fused_at_us: Timestamp(1),
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: Vec::new(),
-        pose_corrections: Default::default(),
-        neighbour_objects: Vec::new(),
-    };
+    let map = GlobalMap::new(&Epoch::new(epoch, NodeName::from_static("edge")), round, Timestamp(1));
     encode(&map, Encoding::Json)
 }
 

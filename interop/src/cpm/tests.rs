@@ -10,7 +10,7 @@ use c_its_parser::standards::cpm_2_1_1::cpm_perceived_object_container::Perceive
 use ecod::model::epoch::Epoch;
 use ecod::model::geometry::{Covariance, wrap_angle};
 use ecod::model::names::NodeName;
-use ecod::wire::{FusedObject, GlobalMap, LandmarkState, Limits, ObjectReport, SCHEMA_VERSION, WirePose};
+use ecod::wire::{FusedObject, GlobalMap, LandmarkState, Limits, ObjectReport, WirePose};
 use proptest::prelude::*;
 use uuid::Uuid;
 
@@ -32,19 +32,8 @@ fn report(objects: Vec<PerceivedObject>) -> ObjectReport {
 }
 
 fn map(objects: Vec<FusedObject>, landmarks: Vec<LandmarkState>) -> GlobalMap {
-    let Epoch { term, leader } = Epoch::new(7, NodeName::from_static("edge"));
-    GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: leader,
-        epoch: term,
-        round: 1,
-        fused_at_us: NOW,
-        oldest_capture_us: None,
-        landmarks,
-        objects,
-        pose_corrections: Default::default(),
-        neighbour_objects: Vec::new(),
-    }
+    let epoch = Epoch::new(7, NodeName::from_static("edge"));
+    GlobalMap { landmarks, objects, ..GlobalMap::new(&epoch, 1, NOW) }
 }
 
 fn fused(id: u128, x_m: f64) -> FusedObject {

@@ -185,33 +185,19 @@ const OLDEST_CAPTURE: &[u8] = b"\"oldest_capture_us\":";
 
 #[cfg(test)]
 mod tests {
+    use ecod::model::epoch::Epoch;
     use ecod::model::names::NodeName;
-    use ecod::wire::{Encoding, SCHEMA_VERSION, encode};
+    use ecod::wire::{Encoding, encode};
 
     use super::*;
 
     #[test]
     fn a_map_and_verdicts_in_any_encoding_tell_their_round_and_what_they_rest_on() {
-        let mut map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: NodeName::from_static("edge"),
-            epoch: u64::MAX >> 11,
-            round: u64::MAX >> 11,
-            fused_at_us: Timestamp(1_732_154_400_200_000),
-            oldest_capture_us: Some(Timestamp(1_732_154_400_123_456)),
-            landmarks: vec![],
-            objects: vec![],
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        };
-        let verdicts = Verdicts {
-            schema: SCHEMA_VERSION,
-            aggregator: map.aggregator.clone(),
-            epoch: map.epoch,
-            round: 4711,
-            fused_at_us: map.fused_at_us,
-            verdicts: vec![],
-        };
+        let (largest, fused_at) = (u64::MAX >> 11, Timestamp(1_732_154_400_200_000));
+        let epoch = Epoch::new(largest, NodeName::from_static("edge"));
+        let oldest_capture_us = Some(Timestamp(1_732_154_400_123_456));
+        let mut map = GlobalMap { oldest_capture_us, ..GlobalMap::new(&epoch, largest, fused_at) };
+        let verdicts = Verdicts::new(&epoch, 4711, fused_at, Vec::new());
         for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
             let head = MapHead { round: map.round, oldest_capture: map.oldest_capture_us };
             assert_eq!(MapHead::of(&encode(&map, encoding)), Some(head));

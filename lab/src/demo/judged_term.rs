@@ -58,24 +58,13 @@ mod tests {
     use std::sync::Arc;
 
     use ecod::model::names::NodeName;
-    use ecod::wire::SCHEMA_VERSION;
 
     use super::*;
 
     fn taken(leader: &str, epoch: u64, round: u64, at_ms: u64) -> ReceivedMap {
-        let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: NodeName::new(leader).unwrap(),
-            epoch,
-            round,
-            fused_at_us: Timestamp(at_ms * 1000),
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: Vec::new(),
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        };
-        ReceivedMap { received_at: Timestamp(at_ms * 1000), map: Arc::new(map) }
+        let received_at = Timestamp(at_ms * 1000);
+        let map = GlobalMap::new(&Epoch::new(epoch, NodeName::new(leader).unwrap()), round, received_at);
+        ReceivedMap { received_at, map: Arc::new(map) }
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use ecod::leadership::BrokerAddress;
+use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
@@ -153,17 +154,11 @@ impl SimulatedCell {
                 ..FusedObject::new(id, "car", 0.9, x_m, y_m, Covariance::isotropic(0.1))
             }
         };
+        let epoch = Epoch::new(1, NodeName::from_static("edge"));
         let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: NodeName::from_static("edge"),
-            epoch: 1,
-            round,
-            fused_at_us: now,
             oldest_capture_us: Some(now),
-            landmarks: Vec::new(),
             objects: (0..self.objects).map(object).collect(),
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
+            ..GlobalMap::new(&epoch, round, now)
         };
         let origin = self.place.origin;
         CellMap { schema: SCHEMA_VERSION, cell: self.place.cell.clone(), sent_at_us: now, origin, map }

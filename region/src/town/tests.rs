@@ -1,3 +1,4 @@
+use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Covariance;
 use ecod::wire::{Encoding, NodeState, Role, SCHEMA_VERSION, encode};
 use uuid::Uuid;
@@ -33,18 +34,8 @@ fn map(
         let of = FusedObject::new(Uuid::new_v4(), "car", 0.9, *x_m, 0.0, Covariance::isotropic(0.1));
         FusedObject { contributors, scores, ..of }
     };
-    let map = GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: NodeName::from_static("edge"),
-        epoch: 1,
-        round,
-        fused_at_us: at(ms),
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: east_m.iter().map(object).collect(),
-        pose_corrections: BTreeMap::new(),
-        neighbour_objects: Vec::new(),
-    };
+    let (epoch, objects) = (Epoch::new(1, NodeName::from_static("edge")), east_m.iter().map(object).collect());
+    let map = GlobalMap { objects, ..GlobalMap::new(&epoch, round, at(ms)) };
     let cell_name = NodeName::from_static(cell);
     let message = CellMap { schema: SCHEMA_VERSION, cell: cell_name, sent_at_us: at(ms), origin: PLACE, map };
     town.accept(&topic(cell, RegionTopicKind::Map).path(), &encode(&message, Encoding::Compact), at(ms))

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
@@ -102,7 +103,7 @@ impl Cell {
 
     pub(crate) fn map(&self, round: u64, objects: usize) -> CellMap {
         let now = clock::now();
-        let leader = NodeName::from_static("edge");
+        let epoch = Epoch::new(1, NodeName::from_static("edge"));
         let object = |number: usize| FusedObject {
             velocity_mps: Some([1.0, 2.0]),
             vehicle: (number == 0).then(|| NodeName::from_static("euclid")),
@@ -115,18 +116,8 @@ impl Cell {
                 Covariance::isotropic(0.1),
             )
         };
-        let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: leader,
-            epoch: 1,
-            round,
-            fused_at_us: now,
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: (0..objects).map(object).collect(),
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        };
+        let objects = (0..objects).map(object).collect();
+        let map = GlobalMap { objects, ..GlobalMap::new(&epoch, round, now) };
         CellMap { schema: SCHEMA_VERSION, cell: self.account.cell.clone(), sent_at_us: now, origin: self.origin, map }
     }
 

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
@@ -123,18 +124,8 @@ fn map(cell: &NodeName, origin: GeographicOrigin, round: u64) -> Vec<u8> {
             Covariance::isotropic(0.1),
         )
     };
-    let map = GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: NodeName::from_static("edge"),
-        epoch: 1,
-        round,
-        fused_at_us: now,
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: (0..OBJECTS).map(object).collect(),
-        pose_corrections: Default::default(),
-        neighbour_objects: Vec::new(),
-    };
+    let epoch = Epoch::new(1, NodeName::from_static("edge"));
+    let map = GlobalMap { objects: (0..OBJECTS).map(object).collect(), ..GlobalMap::new(&epoch, round, now) };
     let message = CellMap { schema: SCHEMA_VERSION, cell: cell.clone(), sent_at_us: now, origin, map };
     encode(&message, Encoding::Compact)
 }

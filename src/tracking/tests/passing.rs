@@ -103,18 +103,7 @@ fn a_heading_of_another_aggregator_gives_way_to_the_course() {
     let east = drive(&mut leader, 0..30, |frame| [frame, 0.0]);
     let heading_rad = sure(&east)[0].heading_rad.unwrap();
     assert!(heading_rad.abs() < 0.1, "{heading_rad}");
-    let map = GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: name("edge"),
-        epoch: 1,
-        round: 30,
-        fused_at_us: at(29),
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: east.objects,
-        pose_corrections: BTreeMap::new(),
-        neighbour_objects: Vec::new(),
-    };
+    let map = GlobalMap { objects: east.objects, ..GlobalMap::new(&Epoch::new(1, name("edge")), 30, at(29)) };
     newcomer.adopt_map(&map, at(29));
     let taken_over = newcomer.close(at(29));
     assert_eq!(taken_over.objects[0].heading_rad, Some(heading_rad), "until more is known");

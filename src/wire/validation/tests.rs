@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use uuid::Uuid;
 
 use super::*;
+use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
 use crate::wire::{Encoding, ForeignVotes, NeighbourObject, NodeState, Reputation, Role, decode, encode};
 
@@ -14,11 +15,6 @@ fn edge() -> NodeName {
 
 fn map() -> GlobalMap {
     GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: edge(),
-        epoch: 3,
-        round: 88,
-        fused_at_us: Timestamp(1_732_154_400_123_456),
         oldest_capture_us: Some(Timestamp(1_732_154_400_000_000)),
         landmarks: vec![LandmarkState {
             id: "slot-0".into(),
@@ -47,7 +43,7 @@ fn map() -> GlobalMap {
             PoseCorrection { about_m: [1.0, 2.0], dx_m: 0.2, dy_m: -0.1, dheading_rad: 0.01, pairs: 12.5 },
         )]
         .into(),
-        neighbour_objects: Vec::new(),
+        ..GlobalMap::new(&Epoch::new(3, edge()), 88, Timestamp(1_732_154_400_123_456))
     }
 }
 

@@ -1,12 +1,10 @@
 //! What a new leader goes on from.
 
-use std::collections::BTreeMap;
-
 use ecod::aggregator::FusionConfig;
 use ecod::leadership::{Leadership, Position};
 use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
-use ecod::wire::{PerceivedObject, SCHEMA_VERSION, WirePose};
+use ecod::wire::{PerceivedObject, WirePose};
 
 use super::*;
 use crate::actors::follower::{Follower, FollowerArguments};
@@ -18,27 +16,12 @@ fn epoch(term: u64, leader: &'static str) -> Epoch {
     Epoch::new(term, NodeName::from_static(leader))
 }
 
-fn global_map(Epoch { term, leader }: Epoch, round: u64) -> Arc<GlobalMap> {
-    Arc::new(GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: leader,
-        epoch: term,
-        round,
-        fused_at_us: Timestamp(0),
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: Vec::new(),
-        pose_corrections: BTreeMap::new(),
-        neighbour_objects: Vec::new(),
-    })
-}
-
 fn spans() -> Spans {
     Spans::new(NodeName::from_static("lot"), NodeName::from_static("gauss"))
 }
 
-fn map(epoch: Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
-    let map = global_map(epoch, round);
+fn map(epoch: &Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
+    let map = Arc::new(GlobalMap::new(epoch, round, Timestamp(0)));
     FollowerMessage::TakeMap { delivery: Delivery::local(map, received_at) }
 }
 
@@ -87,11 +70,11 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         };
         let (follower, _) = Actor::spawn(None, Follower, arguments).await.unwrap();
         for round in 1..=3 {
-            follower.cast(map(epoch(7, "edge"), round, Timestamp(round))).unwrap();
-            follower.cast(map(epoch(u64::MAX, "gauss"), round, Timestamp(round))).unwrap();
+            follower.cast(map(&epoch(7, "edge"), round, Timestamp(round))).unwrap();
+            follower.cast(map(&epoch(u64::MAX, "gauss"), round, Timestamp(round))).unwrap();
         }
         // The filter believes who goes on publishing; a new leader does not go on from that.
-        follower.cast(map(epoch(u64::MAX, "gauss"), 4, Timestamp(600_000))).unwrap();
+        follower.cast(map(&epoch(u64::MAX, "gauss"), 4, Timestamp(600_000))).unwrap();
         follower.drain_and_wait(None).await.unwrap();
         fuser.get().unwrap().drain_and_wait(None).await.unwrap();
 
@@ -110,7 +93,7 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
 #[tokio::test]
 async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more() {
     let mut fuser = standby();
-    let FollowerMessage::TakeMap { delivery } = map(epoch(7, "edge"), 1, Timestamp(1)) else { panic!("a map") };
+    let FollowerMessage::TakeMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else { panic!("a map") };
     fuser.take_map(Arc::clone(&delivery.message), Timestamp(1));
     fuser.forget_map(&NodeName::from_static("gauss"));
     assert!(fuser.last_map.is_some(), "another's");

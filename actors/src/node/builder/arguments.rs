@@ -430,7 +430,7 @@ impl NodeBuilder {
 #[cfg(test)]
 mod tests {
     use ecod::model::time::Timestamp;
-    use ecod::wire::{GlobalMap, Role, SCHEMA_VERSION};
+    use ecod::wire::{GlobalMap, Role};
 
     use ecod::model::names::NodeName;
     use tokio::sync::watch;
@@ -471,18 +471,7 @@ mod tests {
         let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
         let builder = builder(config);
         assert_eq!((builder.status().epoch, builder.status().aggregator), (0, None));
-        let map = GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: NodeName::from_static("edge"),
-            epoch: 7,
-            round: 1,
-            fused_at_us: Timestamp(0),
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: Vec::new(),
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        };
+        let map = GlobalMap::new(&Epoch::new(7, NodeName::from_static("edge")), 1, Timestamp(0));
         builder.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
         assert_eq!(
             (builder.status().epoch, builder.status().aggregator.as_ref().map(NodeName::as_str)),

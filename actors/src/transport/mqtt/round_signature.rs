@@ -102,7 +102,7 @@ mod tests {
     use ecod::model::epoch::Epoch;
     use ecod::model::names::NodeName;
     use ecod::model::time::Timestamp;
-    use ecod::wire::{Encoding, GlobalMap, Limits, Reputations, SCHEMA_VERSION, Verdicts, decode, encode};
+    use ecod::wire::{Encoding, GlobalMap, Limits, Reputations, Verdicts, decode, encode};
 
     use super::*;
 
@@ -111,18 +111,7 @@ mod tests {
     }
 
     fn map() -> GlobalMap {
-        GlobalMap {
-            schema: SCHEMA_VERSION,
-            aggregator: NodeName::from_static("edge"),
-            epoch: 7,
-            round: 88,
-            fused_at_us: Timestamp(5),
-            oldest_capture_us: None,
-            landmarks: Vec::new(),
-            objects: Vec::new(),
-            pose_corrections: Default::default(),
-            neighbour_objects: Vec::new(),
-        }
+        GlobalMap::new(&Epoch::new(7, NodeName::from_static("edge")), 88, Timestamp(5))
     }
 
     #[test]

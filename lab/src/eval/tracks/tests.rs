@@ -1,6 +1,7 @@
+use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
-use ecod::wire::{FusedObject, SCHEMA_VERSION};
+use ecod::wire::FusedObject;
 
 use super::matching::MatchedPair;
 use super::*;
@@ -186,18 +187,8 @@ fn the_matching_has_the_greatest_sum_however_many_contest() {
 fn map(at: u64, objects: &[(u128, f64)]) -> GlobalMap {
     let covariance = Covariance::isotropic(1.0);
     let object = |&(id, x_m): &(u128, f64)| FusedObject::new(Uuid::from_u128(id), "car", 0.9, x_m, 0.0, covariance);
-    GlobalMap {
-        schema: SCHEMA_VERSION,
-        aggregator: NodeName::from_static("edge"),
-        epoch: 1,
-        round: at,
-        fused_at_us: Timestamp(at),
-        oldest_capture_us: None,
-        landmarks: Vec::new(),
-        objects: objects.iter().map(object).collect(),
-        pose_corrections: BTreeMap::new(),
-        neighbour_objects: Vec::new(),
-    }
+    let epoch = Epoch::new(1, NodeName::from_static("edge"));
+    GlobalMap { objects: objects.iter().map(object).collect(), ..GlobalMap::new(&epoch, at, Timestamp(at)) }
 }
 
 /// An object at ten metres a frame, judged by maps about the frames, with one lost.

@@ -1,3 +1,4 @@
+use ecod::model::epoch::Epoch;
 use ecod::model::time::Timestamp;
 
 use super::*;
@@ -21,18 +22,9 @@ fn map(testbed: &Testbed, scene: &Scene, otherwise: &[(&str, Option<&str>)]) -> 
             readings: Vec::new(),
         }
     };
-    GlobalMap {
-        schema: ecod::wire::SCHEMA_VERSION,
-        aggregator: NodeName::from_static("edge"),
-        epoch: 1,
-        round: 1,
-        fused_at_us: Timestamp(0),
-        oldest_capture_us: None,
-        landmarks: scene.spots.iter().map(state).collect(),
-        objects: Vec::new(),
-        pose_corrections: Default::default(),
-        neighbour_objects: Vec::new(),
-    }
+    let epoch = Epoch::new(1, NodeName::from_static("edge"));
+    let landmarks = scene.spots.iter().map(state).collect();
+    GlobalMap { landmarks, ..GlobalMap::new(&epoch, 1, Timestamp(0)) }
 }
 
 fn texts(svg: &str) -> Vec<String> {

@@ -309,6 +309,7 @@ fn listed(nodes: &[NodeName]) -> String {
 mod tests {
     use std::f64::consts::FRAC_PI_2;
 
+    use ecod::model::epoch::Epoch;
     use ecod::wire::{FusedObject, LandmarkState};
     use uuid::Uuid;
 
@@ -373,18 +374,9 @@ mod tests {
             observers: Vec::new(),
             readings: Vec::new(),
         };
-        let map = GlobalMap {
-            schema: 1,
-            aggregator: NodeName::from_static("edge"),
-            epoch: 1,
-            round: 1,
-            fused_at_us: Timestamp(1),
-            oldest_capture_us: None,
-            landmarks: vec![state("p0"), state("p1")],
-            objects: vec![car],
-            pose_corrections: BTreeMap::new(),
-            neighbour_objects: Vec::new(),
-        };
+        let epoch = Epoch::new(1, NodeName::from_static("edge"));
+        let landmarks = vec![state("p0"), state("p1")];
+        let map = GlobalMap { landmarks, objects: vec![car], ..GlobalMap::new(&epoch, 1, Timestamp(1)) };
         let entities = style.map(&map).entities;
         assert_eq!(entities.iter().map(|entity| entity.arrows.len()).collect::<Vec<_>>(), [0, 1, 0]);
         let facing = entities[1].arrows[0].pose.orientation;
