@@ -226,6 +226,7 @@ impl SensorModel {
             let mean_s = self.interval_s.unwrap_or(passed_s);
             self.interval_s = Some(mean_s + INTERVAL_GAIN * (passed_s - mean_s));
         }
+        let is_placed = self.coverage.centre().is_some();
         let has_jumped = self.coverage.observe(report);
         if has_jumped {
             self.registration = Registration::new(at, &config.bias_prior());
@@ -233,15 +234,15 @@ impl SensorModel {
         let stands = self.stands(report, at);
         self.registration.stand(stands.then_some(passed_s));
         self.pose = report.pose;
-        if let Some(centre) = self.coverage.centre().filter(|_| !stands) {
+        if let Some(centre) = self.coverage.centre().filter(|_| !stands || !is_placed || has_jumped) {
             self.registration.set_pivot(centre);
         }
         has_jumped
     }
 
     /// True if the vehicle is known to be where it was at the report before. Estimates of the pose of one that drives, and
-    /// even waits, differ from report to report. Without a pose, the detections of one that stands stay about a place for
-    /// longer than any signal is red.
+    /// even waits, differ from report to report. Without a pose, it declares that it does not move, or its detections stay
+    /// about a place for longer than any signal is red.
     fn stands(&mut self, report: &ObjectReport, at: Timestamp) -> bool {
         let (place, since) = self.place;
         let centre = self.coverage.centre().unwrap_or(place);
@@ -249,7 +250,7 @@ impl SensorModel {
             self.place = (centre, at);
         }
         match (report.pose, self.pose) {
-            (None, None) => at.since(since) > STAYS_FOR && self.place.1 == since,
+            (None, None) => report.moving == Some(false) || at.since(since) > STAYS_FOR && self.place.1 == since,
             (pose, before) => pose == before,
         }
     }

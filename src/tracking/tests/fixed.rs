@@ -49,44 +49,95 @@ fn people(frame: u64) -> Vec<Vector2<f64>> {
     (0..8).map(person).collect()
 }
 
-/// The mean of all corrections' offsets, and the largest difference between what two cameras are still wrong by, each at
-/// the centre of its rotation.
-fn common_and_rest(round: &TracksRound, cameras: &[Camera]) -> (Vector2<f64>, f64) {
-    let correction = |camera: &Camera| {
-        let correction = round.pose_corrections.get(&name(&camera.node))?;
+/// Means of the offsets, rotations and delays by which all cameras are corrected.
+#[derive(Debug, Default)]
+struct Common {
+    offset: Vector2<f64>,
+    rotation_rad: f64,
+    delay_s: f64,
+}
+
+/// What all corrections have in common, and the largest difference between what two cameras are still wrong by, each at
+/// the centre of its rotation: metres and radians.
+fn common_and_rest(tracker: &Tracker, round: &TracksRound, cameras: &[Camera]) -> (Common, f64, f64) {
+    let mut common = Common::default();
+    let mut rests = Vec::new();
+    for camera in cameras {
+        let node = name(&camera.node);
+        let Some(correction) = round.pose_corrections.get(&node) else { continue };
         let arm = Vector2::from(correction.about_m) - camera.place;
         let wrong = camera.offset + nalgebra::Rotation2::new(camera.turned_rad) * arm - arm;
         let offset = Vector2::new(correction.dx_m, correction.dy_m);
-        Some((offset, offset + wrong))
-    };
-    let corrections: Vec<_> = cameras.iter().filter_map(correction).collect();
-    let common = corrections.iter().map(|(offset, _)| offset).sum::<Vector2<f64>>() / corrections.len().max(1) as f64;
-    let rests = || corrections.iter().map(|(_, rest)| rest);
-    let rest = rests().flat_map(|a| rests().map(move |b| (a - b).norm())).fold(0.0, f64::max);
-    (common, rest)
+        common.offset += offset;
+        common.rotation_rad += correction.dheading_rad;
+        let registration = tracker.sensors.by_name(&node).map(|sensor| &sensor.registration);
+        common.delay_s +=
+            registration.map_or(0.0, |registration| registration.delay_s(&TracksConfig::default().bias_prior()));
+        rests.push((offset + wrong, correction.dheading_rad + camera.turned_rad));
+    }
+    let count = rests.len().max(1) as f64;
+    common.offset /= count;
+    common.rotation_rad /= count;
+    common.delay_s /= count;
+    let pairs = || rests.iter().flat_map(|a| rests.iter().map(move |b| (a, b)));
+    let apart_m = pairs().map(|(a, b)| (a.0 - b.0).norm()).fold(0.0, f64::max);
+    (common, apart_m, pairs().map(|(a, b)| (a.1 - b.1).abs()).fold(0.0, f64::max))
 }
 
-/// An hour at two frames a second.
+/// An hour at two frames a second. A radian of rotation in common moves what is 15 m away by 15 m, a second of delay the
+/// fastest by 2 m.
 #[test]
 fn nothing_moves_the_map_of_fixed_cameras() {
     for (seed, count, is_posed) in [(1, 2, true), (2, 2, false), (3, 3, true)] {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let cameras = Camera::around(count, is_posed, &mut rng);
         let mut tracker = tracker();
-        let (mut common_m, mut rest_m, mut rounds) = (0.0, 0.0, 0.0);
+        let (mut sums, mut rounds) = ([0.0; 5], 0.0);
         for frame in (0..36_000).step_by(5) {
             for camera in &cameras {
                 tracker.observe(camera.report(frame, &people(frame), &mut rng), at(frame));
             }
-            let (common, rest) = common_and_rest(&tracker.close(at(frame)), &cameras);
+            let round = tracker.close(at(frame));
+            let (common, apart_m, apart_rad) = common_and_rest(&tracker, &round, &cameras);
             if frame > 600 {
-                (common_m, rest_m, rounds) = (common_m + common.norm(), rest_m + rest, rounds + 1.0);
+                let Common { offset, rotation_rad, delay_s } = common;
+                let figures = [offset.norm(), 15.0 * rotation_rad.abs(), 2.0 * delay_s.abs(), apart_m, apart_rad];
+                sums.iter_mut().zip(figures).for_each(|(sum, figure)| *sum += figure);
+                rounds += 1.0;
             }
         }
-        let (common_m, rest_m) = (common_m / rounds, rest_m / rounds);
-        assert!(common_m < 0.02, "{count} cameras, poses {is_posed}: {common_m} m in common");
-        assert!(rest_m < 0.1, "{count} cameras, poses {is_posed}: {rest_m} m apart");
+        let [shifted_m, turned_m, delayed_m, apart_m, apart_rad] = sums.map(|sum| sum / rounds);
+        let scene = format!("{count} cameras, poses {is_posed}");
+        let common = [shifted_m, turned_m, delayed_m];
+        assert!(common.iter().all(|moved_m| *moved_m < 0.02), "{scene}: {common:?} m in common");
+        assert!(apart_m < 0.1 && apart_rad < 0.005, "{scene}: {apart_m} m and {apart_rad} rad apart");
     }
+}
+
+/// A camera that states no pose, but that it does not move, keeps its correction while nothing passes.
+#[test]
+fn a_camera_that_declares_to_stand_is_aligned_and_stays_so() {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let cameras = Camera::around(2, false, &mut rng);
+    let mut tracker = tracker();
+    let mut corrections = Vec::new();
+    for frame in (0..1100).step_by(5) {
+        let people = if frame < 500 { people(frame) } else { Vec::new() };
+        for camera in &cameras {
+            let report = camera.report(frame, &people, &mut rng);
+            tracker.observe(ObjectReport { moving: Some(false), ..report }, at(frame));
+        }
+        let round = tracker.close(at(frame));
+        if matches!(frame, 500 | 1095) {
+            let kept = cameras.iter().filter_map(|camera| round.pose_corrections.get(&name(&camera.node)));
+            corrections.push(kept.map(|kept| Vector2::new(kept.dx_m, kept.dy_m)).collect::<Vec<_>>());
+            let (_, apart_m, _) = common_and_rest(&tracker, &round, &cameras);
+            assert!(apart_m < 0.2, "{apart_m} m apart at frame {frame}");
+        }
+    }
+    let [before, after] = &corrections[..] else { panic!("{corrections:?}") };
+    assert_eq!((before.len(), after.len()), (2, 2), "{corrections:?}");
+    assert!(before.iter().zip(after).all(|(a, b)| (a - b).norm() < 0.02), "from {before:?} to {after:?}");
 }
 
 /// Mean offset of the objects of a map from the people that are nearest.
@@ -138,12 +189,12 @@ fn a_camera_that_joins_an_hour_later_is_aligned_and_does_not_pull_the_others() {
                 tracker.observe(camera.report(frame, &people, &mut rng), at(frame));
             }
             let round = tracker.close(at(frame));
-            let (common, rest) = common_and_rest(&round, &cameras[..2]);
+            let (common, rest, _) = common_and_rest(&tracker, &round, &cameras[..2]);
             match frame {
-                35_000..36_000 => before.push(common),
+                35_000..36_000 => before.push(common.offset),
                 38_000.. => {
-                    after.push(common);
-                    rest_m = rest_m.max(rest).max(common_and_rest(&round, &cameras).1);
+                    after.push(common.offset);
+                    rest_m = rest_m.max(rest).max(common_and_rest(&tracker, &round, &cameras).1);
                 }
                 _ => {}
             }
