@@ -6,7 +6,10 @@
 //! DIR holds copies of public repositories, named as they are there; `docs/measurements.md` has the list. What is missing
 //! is named, and makes the program fail after all others were judged.
 
+#[path = "../eval_tracks/baselines.rs"]
+mod baselines;
 mod foot_points;
+mod ground_camera;
 mod kitti;
 mod wildtrack;
 
@@ -26,17 +29,40 @@ const LABEL_SETS: [&str; 4] = ["CF", "CF_amt", "SP", "SP_amt"];
 /// Paths below DIR and the repository that has them.
 const LABELS: (&str, &str) = ("truth-inference-at-scale/data/active-crowd-toolkit", "yuan-li/truth-inference-at-scale");
 
-const HEADER: &str = "| set | method | AP@0.5 | AP@1 | AP@2 | AP@4 | best F1 | MODA | HOTA | IDF1 | switches | fragments | \
-                      calibration error |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|";
+const COLUMNS: [&str; 17] = [
+    "set",
+    "method",
+    "AP@0.5",
+    "AP@1",
+    "AP@2",
+    "AP@4",
+    "MODA@0.5",
+    "MODA@1",
+    "MODA@2",
+    "best F1",
+    "mean error",
+    "best threshold",
+    "confidence off",
+    "existence off",
+    "HOTA",
+    "IDF1",
+    "switches, fragments",
+];
 
-/// A recording: its truth, its detections and its reports, all judged in one form of file.
+/// Configuration without correction of poses.
+const UNALIGNED: &str = "[fusion.tracks]\nalign = false\n";
+
+/// A recording: its truth, what others make of it, all in one form of file, and its reports.
 struct Recording {
     name: &'static str,
     format: &'static str,
     frame_rate: &'static str,
     truth: PathBuf,
-    detections: PathBuf,
+    /// By name of the method.
+    others: Vec<(String, PathBuf)>,
     reports: PathBuf,
+    /// True if several observers report.
+    is_fused: bool,
 }
 
 fn main() -> anyhow::Result<()> {
@@ -70,11 +96,14 @@ fn main() -> anyhow::Result<()> {
     missing.iter().for_each(|what| eprintln!("{what}"));
     let wildtrack = wildtrack.map(|((boxes, cameras), truth)| Wildtrack::read(&boxes, &cameras, &truth)).transpose()?;
     if let Some(wildtrack) = &wildtrack {
-        foot_points::print(wildtrack)?;
+        foot_points::print(wildtrack);
     }
-    println!("{HEADER}");
-    if let Some((detections, truth)) = kitti {
-        judge(&program, &kitti::convert(&detections, &truth, &folder(&work, "kitti")?)?)?;
+    println!("| {} |\n|{}", COLUMNS.join(" | "), "---|".repeat(COLUMNS.len()));
+    if let Some(kitti) = kitti {
+        let last = &kitti::SEQUENCES[kitti::FITTED..];
+        for (name, sequences) in [("KITTI", &kitti::SEQUENCES[..]), ("KITTI, last five", last)] {
+            judge(&program, &kitti::convert(name, sequences, &kitti, &folder(&work, name)?)?)?;
+        }
     }
     if let Some(wildtrack) = wildtrack {
         judge(&program, &wildtrack.convert(&folder(&work, "wildtrack")?)?)?;
@@ -93,12 +122,24 @@ fn folder(work: &Path, name: &str) -> anyhow::Result<PathBuf> {
 }
 
 fn judge(program: &Path, recording: &Recording) -> anyhow::Result<()> {
-    let Recording { name, detections, reports, .. } = recording;
-    row(name, "detections", &eval(program, recording, detections)?);
+    let Recording { name, others, reports, is_fused, .. } = recording;
+    for (method, said) in others {
+        row(name, method, false, &eval(program, recording, said)?);
+    }
     let maps = reports.with_file_name("maps.jsonl");
-    let mut replay = Command::new(program);
-    run(replay.arg("replay").arg("--input").arg(reports).arg("--output").arg(&maps))?;
-    row(name, "ecod", &eval(program, recording, &maps)?);
+    let replay = || {
+        let mut replay = Command::new(program);
+        replay.arg("replay").arg("--input").arg(reports).arg("--output").arg(&maps);
+        replay
+    };
+    run(&mut replay())?;
+    row(name, "ecod", true, &eval(program, recording, &maps)?);
+    if *is_fused {
+        let config = reports.with_file_name("unaligned.toml");
+        fs::write(&config, UNALIGNED)?;
+        run(replay().arg("--config").arg(&config))?;
+        row(name, "ecod, `align = false`", true, &eval(program, recording, &maps)?);
+    }
     Ok(())
 }
 
@@ -124,17 +165,21 @@ fn run(command: &mut Command) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Prints a row of the table. Detections go on in no frame, so their identities are not judged.
-fn row(set: &str, method: &str, tracks: &Value) {
-    let share = |value: &Value| value.as_f64().map_or("-".to_owned(), |share| format!("{share:.1}"));
-    let at = &tracks["at_best_f1"];
-    let mut cells: Vec<String> = tracks["ap_pct"].as_array().into_iter().flatten().map(share).collect();
-    cells.extend([&tracks["best_f1_pct"], &at["moda_pct"]].map(share));
-    let is_tracked = method == "ecod" && !at["idf1_pct"].is_null();
-    let identities = [&at["hota_pct"], &at["idf1_pct"]].map(share).into_iter();
-    let counts = [&at["id_switches"], &at["fragments"]].map(Value::to_string).into_iter();
-    cells.extend(identities.chain(counts).map(|figure| if is_tracked { figure } else { "-".to_owned() }));
-    cells.push(share(&tracks["calibration"]["confidence"]["ece_pct"]));
+/// Prints a row of the table. Identities are those of tracks only.
+fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) {
+    let figure = |value: &Value, digits: usize| value.as_f64().map(|figure| format!("{figure:.digits$}"));
+    let share = |value: &Value| figure(value, 1);
+    let (at, calibration) = (&tracks["at_best_f1"], &tracks["calibration"]);
+    let mut cells: Vec<Option<String>> = (0..4).map(|place| share(&tracks["ap_pct"][place])).collect();
+    cells.extend((0..3).map(|place| share(&tracks["best_moda_pct"][place])));
+    cells.push(share(&tracks["best_f1_pct"]));
+    cells.extend([&at["motp_m"], &at["threshold"]].map(|value| figure(value, 2)));
+    cells.extend(["confidence", "existence"].map(|kind| share(&calibration[kind]["ece_pct"])));
+    let counts = format!("{}, {}", at["id_switches"], at["fragments"]);
+    let identities = [share(&at["hota_pct"]), share(&at["idf1_pct"]), Some(counts)];
+    let is_judged = is_tracked && !at["idf1_pct"].is_null();
+    cells.extend(identities.map(|figure| figure.filter(|_| is_judged)));
+    let cells: Vec<String> = cells.into_iter().map(|cell| cell.unwrap_or_else(|| "-".to_owned())).collect();
     println!("| {set} | {method} | {} |", cells.join(" | "));
 }
 

@@ -1,7 +1,7 @@
 //! WILDTRACK (Chavdarova et al., CVPR 2018): seven cameras around a square, with boxes that ReST keeps of MVDeTr.
 //!
-//! The 40 frames of its test part, two a second. Each camera reports the feet of its boxes on the ground. MVDeTr finds
-//! people in all images together, so the cameras' errors are not independent. The truth of MVDet has no identities.
+//! The 40 frames of its test part, two a second. Each camera reports the feet of its boxes on the ground, and its own pose,
+//! at which it stands. MVDeTr finds people in all images together, so the cameras' errors are not independent. The truth of MVDet has no identities.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -9,12 +9,15 @@ use std::fs;
 use std::path::Path;
 
 use anyhow::Context;
+use ecod::model::geometry::Pose;
 use ecod::model::names::NodeName;
-use ecod::wire::{ObjectReport, PerceivedObject};
+use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 use ecod_lab::eval::formats::time_of;
 use nalgebra::{Matrix2, Matrix3, Point2, Vector3};
 use serde_json::Value;
 
+use super::baselines::{Latest, Tracker, suppressed};
+use super::ground_camera::GroundCamera;
 use super::{Recording, write_reports};
 
 pub(super) const BOXES: (&str, &str) =
@@ -37,6 +40,9 @@ const CONFIDENCE: f64 = 0.9;
 /// Standard deviation in pixels of the foot of a box.
 const FOOT_PIXELS: f64 = 5.0;
 
+/// Row of pixels at which the image cuts a box, so that its foot is not in view.
+const LAST_ROW: f64 = 1079.0;
+
 /// The boxes of a frame: left, top, width, height, nothing, camera.
 type Boxes = BTreeMap<u64, Vec<[f64; 6]>>;
 
@@ -44,7 +50,8 @@ type Boxes = BTreeMap<u64, Vec<[f64; 6]>>;
 pub(super) struct Wildtrack {
     pub(super) boxes: Boxes,
     /// From the ground in centimetres to the image without distortion, by camera.
-    pub(super) homographies: Vec<Matrix3<f64>>,
+    homographies: Vec<Matrix3<f64>>,
+    pub(super) cameras: Vec<GroundCamera>,
     /// Places of people in metres by frame.
     pub(super) positions: BTreeMap<u64, Vec<Point2<f64>>>,
 }
@@ -55,7 +62,10 @@ impl Wildtrack {
         let boxes = serde_json::from_str(&read(boxes)?)?;
         let cameras: Value = serde_json::from_str(&read(cameras)?)?;
         let homographies: Vec<[[f64; 3]; 3]> = serde_json::from_value(cameras["sequence1"]["homography"].clone())?;
-        let homographies = homographies.iter().map(|rows| Matrix3::from_fn(|row, column| rows[row][column])).collect();
+        let homographies: Vec<Matrix3<f64>> =
+            homographies.iter().map(|rows| Matrix3::from_fn(|row, column| rows[row][column])).collect();
+        let cameras: Option<Vec<_>> = homographies.iter().map(GroundCamera::new).collect();
+        let cameras = cameras.context("a homography of no pinhole camera")?;
         let mut positions: BTreeMap<u64, Vec<Point2<f64>>> = BTreeMap::new();
         for (number, line) in read(truth)?.lines().enumerate() {
             let cells: Option<Vec<u64>> = line.split_ascii_whitespace().map(|cell| cell.parse().ok()).collect();
@@ -67,41 +77,58 @@ impl Wildtrack {
             let place: [f64; 2] = std::array::from_fn(|axis| CORNER_M[axis] + GRID_M * place[axis]);
             positions.entry(frame / TRUTH_FRAMES).or_default().push(place.into());
         }
-        Ok(Self { boxes, homographies, positions })
+        Ok(Self { boxes, homographies, cameras, positions })
     }
 
     pub(super) fn convert(&self, work: &Path) -> anyhow::Result<Recording> {
-        let recording = Recording {
-            name: "WILDTRACK",
-            format: "mot",
-            frame_rate: "2",
-            truth: work.join("truth.txt"),
-            detections: work.join("detections.txt"),
-            reports: work.join("reports.jsonl"),
-        };
+        let (truth, reports) = (work.join("truth.txt"), work.join("reports.jsonl"));
         let to_ground: Option<Vec<_>> = self.homographies.iter().map(|homography| homography.try_inverse()).collect();
         let to_ground = to_ground.context("a homography has no inverse")?;
-        let (mut truth, mut detections, mut reports) = (String::new(), String::new(), Vec::new());
+        let (mut places, mut all, mut late_fusion) = (String::new(), String::new(), String::new());
+        let (mut alone, mut reported) = (vec![String::new(); to_ground.len()], Vec::new());
+        let (mut latest, mut tracker) = (Latest::default(), Tracker::default());
         for (number, (frame, boxes)) in (1..).zip(&self.boxes) {
             for place in self.positions.get(frame).into_iter().flatten() {
-                writeln!(truth, "{number},-1,0,0,0,0,1,{},{},0", place.x, place.y)?;
+                writeln!(places, "{}", line(number, 1.0, place))?;
             }
+            let at = time_of(0, number, FRAME_RATE_HZ);
             for (camera, to_ground) in to_ground.iter().enumerate() {
                 let of_camera = boxes.iter().filter(|cells| cells[5] as usize == camera);
-                let objects: Vec<PerceivedObject> = of_camera.map(|cells| object(cells, to_ground)).collect();
+                let with_foot = of_camera.filter(|[_, top, _, height, ..]| top + height < LAST_ROW);
+                let objects: Vec<PerceivedObject> = with_foot.map(|cells| object(cells, to_ground)).collect();
                 for PerceivedObject { x_m, y_m, .. } in &objects {
-                    writeln!(detections, "{number},-1,0,0,0,0,{CONFIDENCE},{x_m},{y_m},0")?;
+                    let line = line(number, CONFIDENCE, &Point2::new(*x_m, *y_m));
+                    writeln!(all, "{line}")?;
+                    writeln!(alone[camera], "{line}")?;
                 }
+                let Pose { position, heading_rad } = self.cameras[camera].pose;
+                let pose = Some(WirePose::new(position.x, position.y, heading_rad));
                 let node = NodeName::new(format!("camera-{}", camera + 1))?;
-                let at = time_of(0, number, FRAME_RATE_HZ);
-                reports.push(ObjectReport { objects, ..ObjectReport::new(node, number, at) });
+                let report = ObjectReport { objects, pose, moving: Some(false), ..ObjectReport::new(node, number, at) };
+                latest.report(&report);
+                reported.push(report);
+            }
+            for said in tracker.track(at, &suppressed(latest.union(at))) {
+                writeln!(late_fusion, "{}", line(number, said.score, &said.position))?;
             }
         }
-        fs::write(&recording.truth, truth)?;
-        fs::write(&recording.detections, detections)?;
-        write_reports(&recording.reports, reports)?;
-        Ok(recording)
+        let alone = (1..).zip(alone).map(|(camera, lines)| (format!("camera {camera}"), lines));
+        let others = [("detections".to_owned(), all)].into_iter().chain(alone);
+        let others = others.chain([("late fusion".to_owned(), late_fusion)]).map(|(method, lines)| {
+            let path = work.join(format!("{method}.txt"));
+            fs::write(&path, lines)?;
+            anyhow::Ok((method, path))
+        });
+        let others = others.collect::<Result<_, _>>()?;
+        fs::write(&truth, places)?;
+        write_reports(&reports, reported)?;
+        Ok(Recording { name: "WILDTRACK", format: "mot", frame_rate: "2", truth, others, reports, is_fused: true })
     }
+}
+
+/// A line of MOTChallenge: an object without track and box.
+fn line(frame: u64, score: f64, place: &Point2<f64>) -> String {
+    format!("{frame},-1,0,0,0,0,{score},{},{},0", place.x, place.y)
 }
 
 /// The foot of a box on the ground, with the error of its pixels.

@@ -2,6 +2,7 @@
 
 mod bench;
 mod columns;
+mod convert;
 mod demo;
 mod eval;
 mod report;
@@ -39,6 +40,8 @@ enum Command {
     Bench(bench::BenchArguments),
     /// Write one page about a log, as `ecod-node report`, judged by what is true
     Report(report::LogReportArguments),
+    /// Convert detections in files of benchmarks to reports, which `ecod-node replay` fuses
+    Convert(convert::ConvertArguments),
     /// Judge the output of a replay by what is true
     Eval(eval::EvalArguments),
 }
@@ -53,6 +56,7 @@ pub fn main() -> ExitCode {
         Command::Testbed(arguments) => testbed::run(&arguments),
         Command::Bench(arguments) => bench::run(&arguments),
         Command::Report(arguments) => report::run(&arguments),
+        Command::Convert(arguments) => convert::run(&arguments),
         Command::Eval(arguments) => eval::run(&arguments),
     };
     exit("ecod-lab", outcome)

@@ -157,6 +157,40 @@ fn files_of_benchmarks_are_judged_by_name_line_and_field() {
     assert!(said_by(&broken).contains("broken.txt: line 1: column 11 (x): \"x\" is no number"), "{}", said_by(&broken));
 }
 
+/// Two cameras detect a person; a replay of what they said has one.
+#[test]
+fn detections_in_files_of_benchmarks_are_replayed_as_reports() {
+    let folder = TempDir::new().unwrap();
+    let file = |name: &str, content: String| {
+        let path = folder.path().join(name);
+        fs::write(&path, content).unwrap();
+        path
+    };
+    let each = |line: &str| (1..=30).map(|frame| format!("{frame},{line}\n")).collect();
+    let left = file("left.txt", each("-1,0,0,9,9,0.9,3.1,4,0"));
+    let right = file("right.txt", each("-1,0,0,9,9,0.8,2.9,4,0"));
+    let truth = file("truth.txt", each("1,0,0,9,9,1,3,4,0"));
+    let [reports, maps, result] = ["reports.jsonl", "maps.jsonl", "result.json"].map(|name| folder.path().join(name));
+    let right = format!("right={}", text(&right));
+    let convert = |left: &str| {
+        let vehicles = ["--vehicle", left, "--vehicle", &right];
+        ecod_lab(&[&["convert", "--format", "mot", "--output", text(&reports)][..], &vehicles].concat())
+    };
+    let run = convert(&format!("left={}", text(&left)));
+    assert!(run.status.success(), "{}", said_by(&run));
+    let (fused, summary) = replay(ReplayConfig::default(), &reports);
+    assert_eq!((summary.lines, summary.used()), (60, 60));
+    let lines: Vec<_> = fused.iter().map(|line| serde_json::to_string(line).unwrap()).collect();
+    fs::write(&maps, lines.join("\n")).unwrap();
+    let flags = ["eval", "--format", "mot", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)];
+    assert!(ecod_lab(&flags).status.success());
+    let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
+    let at = &result["tracks"]["at_best_f1"];
+    assert_eq!((at["false_alarms"].as_u64(), at["misses"].as_u64().map(|n| n < 10)), (Some(0), Some(true)), "{at}");
+    let broken = convert(text(&left));
+    assert!(broken.status.code() == Some(2) && said_by(&broken).contains("is not NAME=FILE"), "{}", said_by(&broken));
+}
+
 #[test]
 fn a_truth_without_identities_judges_none() {
     let folder = TempDir::new().unwrap();

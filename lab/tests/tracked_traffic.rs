@@ -170,6 +170,14 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 3] {
     [ours[0], ours[1], figures(late)]
 }
 
+/// The same, means of four scenes: a single one of 20 s is too short to tell half a point.
+fn means(scene: impl Fn(u64) -> TrafficRecording) -> [[f64; 6]; 3] {
+    let scenes = [0, 1, 2, 3].map(|number| aligned_or_not(&scene(SEED + number)));
+    [0, 1, 2].map(|method| {
+        [0, 1, 2, 3, 4, 5].map(|figure| scenes.iter().map(|scene| scene[method][figure]).sum::<f64>() / 4.0)
+    })
+}
+
 /// Two cameras on posts, whose positions are off by `pose_m` and as much again at 40 m by their headings.
 fn two_posts(seed: u64, pose_m: f64) -> TrafficRecording {
     let sensor = SensorConfig { pose_m, pose_rad: pose_m / 40.0, lures: 0.1, ..SensorConfig::default() };
@@ -179,18 +187,68 @@ fn two_posts(seed: u64, pose_m: f64) -> TrafficRecording {
     recording_by(seed, &config)
 }
 
-#[test]
-fn alignment_costs_cameras_whose_poses_are_right_nothing() {
-    // A single scene of 20 s is too short to tell half a point.
-    let scenes = [0, 1, 2, 3].map(|scene| aligned_or_not(&two_posts(SEED + scene, 0.02)));
-    let mean = |method: usize, figure: usize| scenes.iter().map(|scene| scene[method][figure]).sum::<f64>() / 4.0;
-    let [aligned, unaligned] = [0, 1].map(|method| [0, 1, 2, 3, 4, 5].map(|figure| mean(method, figure)));
-    assert!((0..6).all(|figure| aligned[figure] > unaligned[figure] - 0.5), "{aligned:?} aligned, {unaligned:?} not");
+/// Two vehicles, one of which stamps its captures 100 ms late.
+fn stamped_late(seed: u64) -> TrafficRecording {
+    let recording = TrafficConfig::two_vehicle_recording();
+    let sensor = SensorConfig { stamped_late_s: 0.1, ..recording.sensor.clone() };
+    let config = TrafficConfig { sensor, duration_s: 20.0, ..recording };
+    config.validate().unwrap();
+    recording_by(seed, &config)
 }
 
 #[test]
-fn aligned_cameras_on_posts_make_a_better_map_than_late_fusion() {
-    let [aligned, unaligned, late] = aligned_or_not(&two_posts(SEED, 0.35));
-    assert!((0..6).all(|figure| aligned[figure] > late[figure]), "{aligned:?}, {late:?} by late fusion");
-    assert!(aligned[0] > unaligned[0], "{aligned:?} aligned, {unaligned:?} not");
+fn alignment_costs_cameras_whose_poses_are_right_nothing() {
+    let [aligned, unaligned, _] = means(|seed| two_posts(seed, 0.02));
+    assert!((0..6).all(|figure| aligned[figure] > unaligned[figure] - 0.5), "{aligned:?} aligned, {unaligned:?} not");
+}
+
+/// Alignment gains places, and costs nothing.
+fn assert_best(scene: &str, [aligned, unaligned, late]: [[f64; 6]; 3]) {
+    let is_best = |figure: usize| aligned[figure] > unaligned[figure] - 0.5 && aligned[figure] > late[figure];
+    let is_nearer = aligned[0] > unaligned[0];
+    assert!(
+        is_nearer && (0..6).all(is_best),
+        "{scene}: {aligned:?} aligned, {unaligned:?} not, {late:?} by late fusion"
+    );
+}
+
+#[test]
+fn alignment_makes_maps_of_cameras_on_posts_better() {
+    for pose_m in [0.1, 0.35] {
+        assert_best(&format!("{pose_m} m"), means(|seed| two_posts(seed, pose_m)));
+    }
+}
+
+#[test]
+fn alignment_makes_maps_of_stamps_that_differ_better() {
+    assert_best("stamps", means(stamped_late));
+}
+
+/// Calibration error of confidences and F1 that is lost at 0.5 beside the best threshold, in percent, means of four scenes.
+fn calibration(config: &TrafficConfig) -> [f64; 2] {
+    let mut sums = [0.0; 2];
+    for seed in SEED..SEED + 4 {
+        let recording = recording_by(seed, config);
+        let mut judge =
+            TrackEvaluation::new(TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap());
+        fuse(&recording, |_, map| map.into_iter().for_each(|map| judge.map(map)));
+        let scores = judge.result();
+        let at = &scores.at_default;
+        let f1 = 200.0 * at.matches as f64 / (2 * at.matches + at.false_alarms + at.misses) as f64;
+        sums[0] += scores.calibration.confidence.ece_pct.unwrap();
+        sums[1] += scores.best_f1_pct.unwrap() - f1;
+    }
+    sums.map(|sum| sum / 4.0)
+}
+
+#[test]
+fn confidences_can_be_taken_at_their_word_whoever_looks_and_however_often() {
+    let town = TrafficConfig { duration_s: 15.0, ..TrafficConfig::default() };
+    let slow = SensorConfig { rate_hz: 2.0, ..SensorConfig::default() };
+    let towns = [1, 4].map(|observers| TrafficConfig { observers, ..town.clone() });
+    let slow = TrafficConfig { observers: 4, sensor: slow, ..town.clone() };
+    for config in towns.into_iter().chain([slow, TrafficConfig { fixed: true, observers: 4, ..town }]) {
+        let [error, lost] = calibration(&config);
+        assert!(error < 5.0 && lost < 1.5, "{config:?}: calibration error {error} %, 0.5 loses {lost} of F1");
+    }
 }

@@ -50,7 +50,8 @@ pub(super) struct EvalArguments {
     out: Option<PathBuf>,
 }
 
-fn frame_rate(text: &str) -> Result<f64, String> {
+/// Frames a second of files of benchmarks.
+pub(super) fn frame_rate(text: &str) -> Result<f64, String> {
     let rate = text.parse().ok().filter(|rate| (0.01..=1000.0).contains(rate));
     rate.ok_or_else(|| "is no number from 0.01 to 1000".to_owned())
 }

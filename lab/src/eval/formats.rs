@@ -14,8 +14,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::ValueEnum;
-use ecod::model::names::Label;
+use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
+use ecod::wire::{ObjectReport, PerceivedObject};
 use nalgebra::Point2;
 
 /// Time between the beginnings of two sequences.
@@ -55,6 +56,31 @@ pub struct Sequence {
     pub first: u64,
     /// Its frames.
     pub frames: Frames,
+}
+
+impl Sequence {
+    /// Number of the last frame that has objects.
+    pub fn last(&self) -> u64 {
+        self.frames.keys().last().copied().unwrap_or(self.first)
+    }
+
+    /// A vehicle's reports of all frames up to `last`, where this is the sequence with that number.
+    pub fn reports(
+        &self,
+        number: usize,
+        frame_rate_hz: f64,
+        node: &NodeName,
+        last: u64,
+    ) -> impl Iterator<Item = ObjectReport> {
+        (self.first..=last).map(move |frame| {
+            let objects = self.frames.get(&frame).into_iter().flatten();
+            let of = |FileObject { label, score, position, .. }: &FileObject| {
+                PerceivedObject::new(label.clone(), *score, position.x, position.y)
+            };
+            let at = time_of(number, frame, frame_rate_hz);
+            ObjectReport { objects: objects.map(of).collect(), ..ObjectReport::new(node.clone(), frame, at) }
+        })
+    }
 }
 
 /// A line that cannot be read.

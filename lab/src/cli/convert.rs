@@ -1,0 +1,55 @@
+//! `ecod-lab convert`: detections in files of benchmarks as reports, for `ecod-node replay`.
+
+use std::io::Write as _;
+use std::path::PathBuf;
+
+use anyhow::Context;
+use clap::Args;
+use ecod::model::names::NodeName;
+use ecod_actors::cli::{Failure, lines};
+
+use super::eval::frame_rate;
+use crate::eval::formats::FileFormat;
+
+/// Flags of `convert`.
+#[derive(Debug, Args)]
+pub(super) struct ConvertArguments {
+    /// Form of the files
+    #[arg(long, value_enum, value_name = "FORM")]
+    format: FileFormat,
+    /// A vehicle, and the file of its detections or a directory with one for each sequence; may be given several times
+    #[arg(long, value_name = "NAME=FILE", required = true, value_parser = vehicle)]
+    vehicle: Vec<(NodeName, PathBuf)>,
+    /// Frames a second
+    #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = frame_rate)]
+    frame_rate: f64,
+    /// File for the reports, one JSON object per line in order of time; `-` for standard output
+    #[arg(long, value_name = "FILE")]
+    output: PathBuf,
+}
+
+fn vehicle(text: &str) -> Result<(NodeName, PathBuf), String> {
+    let (name, file) = text.split_once('=').ok_or("is not NAME=FILE, such as euclid=det.txt")?;
+    Ok((NodeName::new(name).map_err(|error| error.to_string())?, file.into()))
+}
+
+pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
+    let ConvertArguments { format, vehicle, frame_rate, output } = arguments;
+    let mut reports = Vec::new();
+    for (name, path) in vehicle {
+        for (place, sequence) in format.read(path).map_err(Failure::usage)?.iter().enumerate() {
+            reports.extend(sequence.reports(place, *frame_rate, name, sequence.last()));
+        }
+    }
+    reports.sort_by_key(|report| report.captured_at_us);
+    let inputs: Vec<_> = vehicle.iter().map(|(_, path)| path.clone()).collect();
+    let mut sink = lines::create(output, &inputs).map_err(Failure::usage)?;
+    let mut write = || -> std::io::Result<()> {
+        for report in &reports {
+            serde_json::to_writer(&mut sink, report)?;
+            sink.write_all(b"\n")?;
+        }
+        sink.flush()
+    };
+    Ok(write().with_context(|| format!("cannot write {}", output.display()))?)
+}
