@@ -40,13 +40,14 @@ impl NodeBuilder {
         let camera = self.camera(place)?;
         let source = camera.source.clone();
         let timeout = camera::open_timeout(camera);
+        let (record, log) = (self.config.record.as_ref(), self.vehicle.log.subscribe());
         Ok(DetectorArguments {
             open: Arc::new(move || source.open(timeout)),
             capture: camera.capture.clone(),
             detect: camera.detector.build().context("key `camera.detector`")?,
             lens: camera::lens(camera)?,
             projector: self.slots.projectors.get(place).cloned().unwrap_or_default(),
-            images: ImageRecorder::new(self.config.record.as_ref(), &self.name, camera, self.vehicle.log.subscribe()),
+            images: ImageRecorder::new(record, &self.name, camera, log, self.clock.clone()),
             camera_feed: self.camera_feed(place),
             troubles: self.camera_troubles(camera),
             counters: self.counters(),

@@ -2,19 +2,20 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
+use std::time::Duration;
 
 use ecod::aggregator::Command;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::replay::{JournalEntry, JournalEvent};
-use ecod::wire::{ReportKind, Topic};
+use ecod::wire::{ObjectReport, ReportKind, Topic, WirePose};
 use mcap::McapResult;
 use serde::Serialize;
 
 use super::channels::{CounterReading, LeadershipChange, SchemaName};
 use super::foxglove::picture::{CameraCalibration, CompressedImage, ImageAnnotations};
-use super::foxglove::scene::SceneStyle;
+use super::foxglove::scene::{SceneEntity, SceneStyle, SceneUpdate};
 use super::foxglove::{FrameTransform, Level, Log};
 use super::log_sender::{CapturedPicture, LogEntry, LogItem};
 use crate::transport::mqtt::LinkState;
@@ -47,6 +48,9 @@ pub(crate) struct EntryEncoder {
     style: SceneStyle,
     /// Latest frame of each vehicle that was drawn, and whether the vehicle reports for PACE.
     drawn: BTreeMap<NodeName, (Timestamp, bool)>,
+    /// Vehicles of late, each with the time of its entry, and the time at which all were drawn.
+    vehicles: BTreeMap<NodeName, (Timestamp, SceneEntity)>,
+    vehicles_drawn_at: Timestamp,
     /// Buffer reused for every message.
     json: Vec<u8>,
 }
@@ -54,7 +58,15 @@ pub(crate) struct EntryEncoder {
 impl EntryEncoder {
     /// An encoder that also draws entries of a cell with these known locations if they are to be `drawable`.
     pub(crate) fn new(node: NodeName, landmarks: &[LandmarkConfig], drawable: bool) -> Self {
-        Self { node, drawable, style: SceneStyle::of(landmarks), drawn: BTreeMap::new(), json: Vec::new() }
+        Self {
+            node,
+            drawable,
+            style: SceneStyle::of(landmarks),
+            drawn: BTreeMap::new(),
+            vehicles: BTreeMap::new(),
+            vehicles_drawn_at: Timestamp::default(),
+            json: Vec::new(),
+        }
     }
 
     /// Writes the messages of an entry.
@@ -71,8 +83,9 @@ impl EntryEncoder {
                 let topic = format_args!("scene/{vehicle}");
                 output.draw(SchemaName::SceneUpdate, topic, captured_at, |style| style.report(report))?;
                 let Some(pose) = report.pose else { return Ok(()) };
-                let scene = |style: &SceneStyle| style.vehicle(vehicle, &pose, report);
-                output.draw(SchemaName::SceneUpdate, "scene/vehicles", captured_at, scene)?;
+                if let Some(vehicles) = output.encoder.vehicles(at, vehicle, &pose, report) {
+                    output.draw(SchemaName::SceneUpdate, "scene/vehicles", captured_at, |_| vehicles)?;
+                }
                 let transform = |_: &SceneStyle| FrameTransform::of(vehicle, pose, captured_at);
                 output.draw(SchemaName::FrameTransform, "tf", captured_at, transform)
             }
@@ -116,6 +129,26 @@ impl EntryEncoder {
         }
     }
 
+    /// All vehicles of late with this one, if it is time to draw them: a viewer that begins in the middle has the last message alone.
+    fn vehicles(
+        &mut self,
+        at: Timestamp,
+        vehicle: &NodeName,
+        pose: &WirePose,
+        report: &ObjectReport,
+    ) -> Option<SceneUpdate> {
+        self.vehicles.retain(|_, (drawn_at, _)| at.since(*drawn_at) < VEHICLE_SHOWN_FOR);
+        if self.vehicles.len() < MAX_DRAWN {
+            self.vehicles.insert(vehicle.clone(), (at, self.style.vehicle(vehicle, pose, report)));
+        }
+        if at.since(self.vehicles_drawn_at) < VEHICLES_PERIOD {
+            return None;
+        }
+        self.vehicles_drawn_at = at;
+        let vehicles = self.vehicles.values().map(|(_, entity)| entity.clone());
+        Some(SceneUpdate::new(report.captured_at_us, vehicles))
+    }
+
     /// True for the first report of a frame: of both kinds and by whatever broker, a vehicle is drawn once. Votes have not
     /// all objects; they are drawn where a vehicle sends nothing else.
     fn is_to_be_drawn(&mut self, kind: ReportKind, vehicle: &NodeName, captured_at: Timestamp) -> bool {
@@ -145,6 +178,10 @@ impl EntryEncoder {
 /// Vehicles whose latest frame is remembered; beyond them, all are forgotten.
 const MAX_DRAWN: usize = 4096;
 
+/// Time between two drawings of all vehicles, and time for which one that is silent is among them.
+const VEHICLES_PERIOD: Duration = Duration::from_millis(100);
+const VEHICLE_SHOWN_FOR: Duration = Duration::from_secs(1);
+
 /// The sink of one entry.
 struct Output<'a, S> {
     encoder: &'a mut EntryEncoder,
@@ -160,18 +197,18 @@ impl<S: MessageSink> Output<'_, S> {
 
     /// A picture with the optics and the boxes of its time.
     fn picture(&mut self, picture: &CapturedPicture) -> McapResult<()> {
-        let at = self.at;
+        let made_at = picture.captured_at;
         let topic =
             |root: &str| picture.camera.as_ref().map_or_else(|| root.to_owned(), |name| format!("{root}/{name}"));
-        if let Some(calibration) = CameraCalibration::of(picture, at) {
-            self.put(SchemaName::CameraCalibration, topic("camera_calibration"), at, &calibration)?;
+        if let Some(calibration) = CameraCalibration::of(picture) {
+            self.put(SchemaName::CameraCalibration, topic("camera_calibration"), made_at, &calibration)?;
         }
-        let boxes = |_: &SceneStyle| ImageAnnotations::of(picture, at);
-        self.draw(SchemaName::ImageAnnotations, topic("camera_boxes"), at, boxes)?;
-        let optical = |_: &SceneStyle| FrameTransform::optical(&picture.reporter, at);
-        self.draw(SchemaName::FrameTransform, "tf", at, optical)?;
+        let boxes = |_: &SceneStyle| ImageAnnotations::of(picture);
+        self.draw(SchemaName::ImageAnnotations, topic("camera_boxes"), made_at, boxes)?;
+        let optical = |_: &SceneStyle| FrameTransform::optical(&picture.reporter, made_at);
+        self.draw(SchemaName::FrameTransform, "tf", made_at, optical)?;
         // Viewers draw over a picture what they have when it comes.
-        self.put(SchemaName::CompressedImage, topic("camera"), at, &CompressedImage::of(picture, at))
+        self.put(SchemaName::CompressedImage, topic("camera"), made_at, &CompressedImage::of(picture))
     }
 
     fn log(&mut self, level: Level, message: impl FnOnce() -> String) -> McapResult<()> {
@@ -213,29 +250,35 @@ mod tests {
     use std::sync::Arc;
 
     use ecod::model::geometry::Pose;
-    use ecod::wire::ObjectReport;
+    use serde_json::Value;
 
     use super::*;
 
-    struct Topics(Vec<String>);
+    #[derive(Default)]
+    struct Messages(Vec<(String, Value)>);
 
-    impl MessageSink for Topics {
+    impl MessageSink for Messages {
         fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()> {
-            self.0.push(message.topic.to_owned());
+            self.0.push((message.topic.to_owned(), serde_json::from_slice(message.json).unwrap()));
             Ok(())
         }
+    }
+
+    fn report(node: &str, at: u64) -> ObjectReport {
+        let pose = Some(Pose::new(0.0, 0.0, 0.0).into());
+        ObjectReport { pose, ..ObjectReport::new(NodeName::new(node).unwrap(), at, Timestamp(at)) }
+    }
+
+    fn write(encoder: &mut EntryEncoder, sink: &mut Messages, kind: ReportKind, node: &str, at: u64) {
+        let entry = LogEntry { at: Timestamp(at), item: LogItem::Report(kind, Arc::new(report(node, at))) };
+        encoder.write(&entry, sink).unwrap();
     }
 
     #[test]
     fn a_frame_is_drawn_once_however_many_reports_it_makes() {
         let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), &[], true);
-        let mut topics = Topics(Vec::new());
-        let mut write = |kind, node: &str, at: u64| {
-            let pose = Some(Pose::new(0.0, 0.0, 0.0).into());
-            let report = ObjectReport { pose, ..ObjectReport::new(NodeName::new(node).unwrap(), at, Timestamp(at)) };
-            let entry = LogEntry { at: Timestamp(at), item: LogItem::Report(kind, Arc::new(report)) };
-            encoder.write(&entry, &mut topics).unwrap();
-        };
+        let mut messages = Messages::default();
+        let mut write = |kind, node: &str, at: u64| write(&mut encoder, &mut messages, kind, node, at);
         for at in 1..=10 {
             for _ in 0..2 {
                 write(ReportKind::VoteDetections, "euclid", at);
@@ -243,8 +286,26 @@ mod tests {
             }
             write(ReportKind::VoteDetections, "voter", at);
         }
-        let count = |topic: &str| topics.0.iter().filter(|known| *known == topic).count();
+        let count = |topic: &str| messages.0.iter().filter(|(known, _)| known == topic).count();
         assert_eq!([count("scene/euclid"), count("scene/voter"), count("tf")], [10, 10, 20]);
         assert_eq!([count("detections/euclid"), count("vote_detections/euclid")], [20, 20], "each report is kept");
+    }
+
+    #[test]
+    fn the_last_drawing_of_vehicles_has_all_that_report() {
+        let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), &[], true);
+        let mut messages = Messages::default();
+        for round in 20..40 {
+            write(&mut encoder, &mut messages, ReportKind::Detections, "euclid", 100_000 * round);
+            if round < 25 {
+                write(&mut encoder, &mut messages, ReportKind::Detections, "gauss", 100_000 * round + 30_000);
+            }
+        }
+        let drawn = |(topic, update): &(String, Value)| {
+            (topic == "scene/vehicles").then(|| update["entities"].as_array().unwrap().len())
+        };
+        let drawn: Vec<usize> = messages.0.iter().filter_map(drawn).collect();
+        assert_eq!(drawn[..3], [1, 2, 2]);
+        assert_eq!((drawn.len(), drawn.last()), (20, Some(&1)), "{drawn:?}: one that left goes");
     }
 }

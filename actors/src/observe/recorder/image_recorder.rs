@@ -13,6 +13,7 @@ use crate::camera::frame::CameraFrame;
 use crate::camera::image_codec;
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
+use crate::platform::cell_clock::CellClock;
 
 /// Quality of recorded pictures, from which detectors are judged later: 1 to 100.
 const JPEG_QUALITY: u8 = 95;
@@ -22,6 +23,7 @@ const JPEG_QUALITY: u8 = 95;
 pub struct ImageRecorder {
     /// The log of the vehicle's present node.
     log: watch::Receiver<LogSender>,
+    clock: CellClock,
     camera: Option<String>,
     reporter: NodeName,
     period: Duration,
@@ -35,10 +37,18 @@ impl ImageRecorder {
         vehicle: &NodeName,
         camera: &CameraConfig,
         log: watch::Receiver<LogSender>,
+        clock: CellClock,
     ) -> Option<Self> {
         let hz = config.map(|record| record.camera_hz).filter(|hz| *hz > 0.0)?;
         let (camera, reporter) = (camera.name.clone(), camera.reporter(vehicle));
-        Some(Self { log, camera, reporter, period: Duration::from_secs_f64(1.0 / hz), due: Timestamp::default() })
+        Some(Self {
+            log,
+            clock,
+            camera,
+            reporter,
+            period: Duration::from_secs_f64(1.0 / hz),
+            due: Timestamp::default(),
+        })
     }
 
     /// Records the frame with its detections if one is due, which takes some milliseconds.
@@ -46,7 +56,9 @@ impl ImageRecorder {
         if frame.captured_at < self.due {
             return;
         }
-        self.due = frame.captured_at + self.period;
+        // By whole periods: a frame that comes a little early does not cost the next one its place.
+        let next = self.due + self.period;
+        self.due = if next <= frame.captured_at { frame.captured_at + self.period } else { next };
         match image_codec::encode_jpeg(&frame.image, JPEG_QUALITY) {
             Ok(jpeg) => {
                 let size = ImageSize::of(&frame.image);
@@ -54,6 +66,7 @@ impl ImageRecorder {
                     camera: self.camera.clone(),
                     reporter: self.reporter.clone(),
                     jpeg,
+                    captured_at: self.clock.date(frame.captured_at),
                     height: size.height,
                     optics: lens.in_pixels_of(size).ok().map(|lens| (lens.intrinsics, lens.distortion)),
                     detections: detections.to_vec(),
@@ -62,5 +75,55 @@ impl ImageRecorder {
             }
             Err(error) => tracing::debug!(%error, "cannot encode frame as JPEG"),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::mpsc::{self, Receiver};
+
+    use ecod::leadership::cell_time::ClockReading;
+    use ecod::perception::camera::Intrinsics;
+    use opencv::core::{CV_8UC3, Mat, Scalar};
+
+    use super::*;
+    use crate::observe::recorder::log_sender::LogEntry;
+
+    fn recorder(clock: CellClock, period: Duration) -> (ImageRecorder, Receiver<LogEntry>) {
+        let (sender, recorded) = mpsc::sync_channel(64);
+        let log = LogSender::default();
+        log.connect(Some(sender));
+        let (log, reporter) = (watch::channel(log).1, NodeName::from_static("euclid"));
+        (ImageRecorder { log, clock, camera: None, reporter, period, due: Timestamp::default() }, recorded)
+    }
+
+    fn offer(recorder: &mut ImageRecorder, captured_at: Timestamp) {
+        let image = Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::all(128.0)).unwrap();
+        let lens = Lens::ideal(Intrinsics::with_square_pixels(64, 48, 1.0));
+        recorder.offer(&CameraFrame { image, captured_at, seq: 1 }, &lens, &[]);
+    }
+
+    /// A Pi without a clock of its own starts years ago: viewers look for the vehicle's pose at the picture's time.
+    #[test]
+    fn a_picture_is_dated_as_reports_are() {
+        let clock = CellClock::default();
+        clock.show(ClockReading { offset_us: 5_000_000, error_us: Some(1_000) });
+        let (mut recorder, recorded) = recorder(clock, Duration::from_secs(1));
+        offer(&mut recorder, Timestamp(1_000));
+        let entry = recorded.try_recv().unwrap();
+        let LogItem::Picture(picture) = entry.item else { panic!("a picture") };
+        assert_eq!((entry.at, picture.captured_at), (Timestamp(1_000), Timestamp(5_001_000)));
+    }
+
+    #[test]
+    fn frames_that_come_as_often_as_asked_for_are_all_recorded_but_one() {
+        let (mut recorder, recorded) = recorder(CellClock::default(), Duration::from_millis(200));
+        for frame in 1..=20 {
+            let jitter_us = [0, 15_000, -15_000][frame as usize % 3];
+            offer(&mut recorder, Timestamp(200_000 * frame).shifted(jitter_us));
+        }
+        assert!(recorded.try_iter().count() >= 19);
+        (0..10).for_each(|frame| offer(&mut recorder, Timestamp(60_000_000 + 20_000 * frame)));
+        assert_eq!(recorded.try_iter().count(), 1, "and no more often, also after a pause");
     }
 }

@@ -62,6 +62,8 @@ pub struct CapturedPicture {
     pub reporter: NodeName,
     /// The picture as JPEG.
     pub jpeg: Vec<u8>,
+    /// Time of capture, in the cell's time, as in reports.
+    pub captured_at: Timestamp,
     /// Height of the picture in pixels.
     pub height: u32,
     /// Optics for pixels of the picture, and OpenCV's k1, k2, p1, p2, k3; absent where they are for another shape.

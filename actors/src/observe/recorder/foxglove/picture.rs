@@ -2,7 +2,6 @@
 
 use base64::prelude::{BASE64_STANDARD, Engine};
 use ecod::model::detection::Detection;
-use ecod::model::time::Timestamp;
 use schemars::JsonSchema;
 use serde::Serialize;
 
@@ -88,19 +87,19 @@ const CLEAR: Color = Color { r: 0.0, g: 0.0, b: 0.0, a: 0.0 };
 const SHADE: Color = Color { r: 0.0, g: 0.0, b: 0.0, a: 0.6 };
 
 impl CompressedImage {
-    pub(crate) fn of(picture: &CapturedPicture, at: Timestamp) -> Self {
+    pub(crate) fn of(picture: &CapturedPicture) -> Self {
         let data = BASE64_STANDARD.encode(&picture.jpeg);
-        Self { timestamp: at.into(), frame_id: optical_frame(&picture.reporter), data, format: "jpeg" }
+        Self { timestamp: picture.captured_at.into(), frame_id: optical_frame(&picture.reporter), data, format: "jpeg" }
     }
 }
 
 impl CameraCalibration {
     /// The optics of a picture; `None` if they are not known for its shape.
-    pub(crate) fn of(picture: &CapturedPicture, at: Timestamp) -> Option<Self> {
+    pub(crate) fn of(picture: &CapturedPicture) -> Option<Self> {
         let (camera, distortion) = picture.optics?;
         let (fx, fy, cx, cy) = (camera.fx, camera.fy, camera.cx, camera.cy);
         Some(Self {
-            timestamp: at.into(),
+            timestamp: picture.captured_at.into(),
             frame_id: optical_frame(&picture.reporter),
             width: camera.width,
             height: camera.height,
@@ -115,8 +114,8 @@ impl CameraCalibration {
 
 impl ImageAnnotations {
     /// A box for each detection, and its label and confidence above.
-    pub(crate) fn of(picture: &CapturedPicture, at: Timestamp) -> Self {
-        let (timestamp, rows) = (Time::from(at), f64::from(picture.height));
+    pub(crate) fn of(picture: &CapturedPicture) -> Self {
+        let (timestamp, rows) = (Time::from(picture.captured_at), f64::from(picture.height));
         let outline = |detection: &Detection| {
             let b = &detection.bounding_box;
             let corners = [(b.x_min, b.y_min), (b.x_max, b.y_min), (b.x_max, b.y_max), (b.x_min, b.y_max)];

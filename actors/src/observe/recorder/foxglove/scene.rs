@@ -18,12 +18,21 @@ use super::{Color, FoxglovePose, MAP, Time, Vector3, camera_pose, plane_pose};
 #[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
 #[schemars(title = "foxglove.SceneUpdate")]
 pub(crate) struct SceneUpdate {
-    deletions: [(); 0],
+    deletions: [SceneDeletion; 1],
     entities: Vec<SceneEntity>,
 }
 
+/// `foxglove.SceneEntityDeletion`.
+#[derive(Debug, Clone, PartialEq, Serialize, JsonSchema)]
+struct SceneDeletion {
+    timestamp: Time,
+    #[serde(rename = "type")]
+    kind: u8,
+    id: String,
+}
+
 #[derive(Debug, Clone, Default, PartialEq, Serialize, JsonSchema)]
-struct SceneEntity {
+pub(crate) struct SceneEntity {
     timestamp: Time,
     frame_id: &'static str,
     id: String,
@@ -100,6 +109,9 @@ struct FoxgloveText {
 /// Time for which an entity is drawn after its last update.
 const LIFETIME: Time = Time { sec: 1, nsec: 0 };
 
+/// `SceneEntityDeletionType` of all entities of a topic.
+const DELETE_ALL: u8 = 1;
+
 /// Diameter in metres of an object without a size, in a cell without two known locations.
 const OBJECT_M: f64 = 0.6;
 
@@ -107,9 +119,14 @@ const OBJECT_M: f64 = 0.6;
 const SPACING_SHARE: f64 = 0.4;
 const OBJECT_BOUNDS_M: [f64; 2] = [0.02, 1.0];
 
-/// Diameter of a detection, and length of a vehicle, in diameters of an object.
+/// Diameter of a detection, length of a vehicle and of a facing, and height of a text above what it names, in diameters of an object.
 const DETECTED: f64 = 0.4;
 const VEHICLE: f64 = 2.0;
+const FACING: f64 = 1.5;
+const TEXT: f64 = 1.2;
+
+/// Probability that there is an object, below which no ellipse is drawn: that of a track that is nearly lost covers the map.
+const LIKELY: f64 = 0.5;
 
 /// Maximum height in metres of an object with a size.
 const MAX_HEIGHT_M: f64 = 1.5;
@@ -131,6 +148,7 @@ const EMPTY_COLOR: Color = Color { r: 0.55, g: 0.55, b: 0.55, a: 0.35 };
 const DETECTED_COLOR: Color = Color { r: 0.90, g: 0.55, b: 0.10, a: 0.6 };
 const VEHICLE_COLOR: Color = Color { r: 0.15, g: 0.40, b: 0.80, a: 1.0 };
 const VIEW_COLOR: Color = Color { a: 0.5, ..VEHICLE_COLOR };
+const TEXT_COLOR: Color = Color { r: 1.0, g: 1.0, b: 1.0, a: 1.0 };
 
 /// Sizes of a cell's drawings and the facing of its known locations.
 #[derive(Debug, Clone, PartialEq)]
@@ -161,31 +179,40 @@ impl SceneStyle {
         let landmarks = map.landmarks.iter().map(|landmark| {
             let pose = plane_pose(landmark.x_m, landmark.y_m, 0.0);
             let color = if landmark.label.is_some() { FUSED_COLOR } else { EMPTY_COLOR };
-            let label = landmark.label.as_deref().unwrap_or("-");
+            let text = match &landmark.label {
+                Some(label) => format!("{} {label}", landmark.id),
+                None => landmark.id.to_string(),
+            };
             let entity = SceneEntity::new(map.fused_at_us, format!("landmark/{}", landmark.id))
                 .ball(pose, self.object_m, color)
-                .text(pose, format!("{} {label}", landmark.id))
+                .text(pose, TEXT * self.object_m, text, 1.0)
                 .note("confidence", landmark.confidence.to_string())
                 .note("contributors", listed(&landmark.contributors));
             match self.facing_rad.get(&landmark.id) {
-                Some(facing) => entity.arrow(plane_pose(landmark.x_m, landmark.y_m, *facing), self.object_m, color),
+                Some(facing) => {
+                    entity.arrow(plane_pose(landmark.x_m, landmark.y_m, *facing), FACING * self.object_m, color)
+                }
                 None => entity,
             }
         });
         let objects = map.objects.iter().map(|object| {
             let pose = plane_pose(object.x_m, object.y_m, object.heading_rad.unwrap_or(0.0));
+            let existence = object.existence.unwrap_or(1.0);
+            let color = Color { a: FUSED_COLOR.a * existence, ..FUSED_COLOR };
             let entity = SceneEntity::new(map.fused_at_us, format!("object/{}", object.id));
-            let entity = match object.size_m {
-                Some(size_m) => entity.block(pose, size_m, FUSED_COLOR),
-                None => entity.ball(pose, self.object_m, FUSED_COLOR),
+            let (entity, height_m) = match object.size_m {
+                Some(size_m) => (entity.block(pose, size_m, color), MAX_HEIGHT_M),
+                None => (entity.ball(pose, self.object_m, color), 0.0),
             };
+            let is_likely = existence >= LIKELY;
+            let position = [object.x_m, object.y_m];
+            let entity = if is_likely { entity.ellipse(position, &object.covariance(), color) } else { entity };
             entity
-                .ellipse([object.x_m, object.y_m], &object.covariance(), FUSED_COLOR)
-                .text(pose, object.label.to_string())
+                .text(pose, height_m + TEXT * self.object_m, object.label.to_string(), existence)
                 .note("confidence", object.confidence.to_string())
                 .note("contributors", listed(&object.contributors))
         });
-        SceneUpdate { deletions: [], entities: landmarks.chain(objects).collect() }
+        SceneUpdate::new(map.fused_at_us, landmarks.chain(objects))
     }
 
     /// A vehicle and its detections.
@@ -201,28 +228,36 @@ impl SceneStyle {
                 None => entity,
             }
         });
-        SceneUpdate { deletions: [], entities: vehicle.into_iter().chain(objects).collect() }
+        SceneUpdate::new(at, vehicle.into_iter().chain(objects))
     }
 
     /// A vehicle with the field of view that it states.
-    pub(crate) fn vehicle(&self, node: &NodeName, pose: &WirePose, report: &ObjectReport) -> SceneUpdate {
+    pub(crate) fn vehicle(&self, node: &NodeName, pose: &WirePose, report: &ObjectReport) -> SceneEntity {
         let entity = self.vehicle_entity(node, pose, report.captured_at_us);
-        let entity = match report.view {
+        match report.view {
             Some(view) => entity.view(pose, view),
             None => entity,
-        };
-        SceneUpdate { deletions: [], entities: vec![entity] }
+        }
     }
 
     fn vehicle_entity(&self, node: &NodeName, pose: &WirePose, at: Timestamp) -> SceneEntity {
         let pose = camera_pose(pose);
         let entity = SceneEntity::new(at, format!("vehicle/{node}"));
-        entity.arrow(pose, VEHICLE * self.object_m, VEHICLE_COLOR).text(pose, node.to_string())
+        let length_m = VEHICLE * self.object_m;
+        entity.arrow(pose, length_m, VEHICLE_COLOR).text(pose, TEXT * self.object_m, node.to_string(), 1.0)
     }
 }
 
 /// Maximum number of known locations whose distance to the next is looked up.
 const MAX_SPACINGS: usize = 256;
+
+impl SceneUpdate {
+    /// All that a topic shows; what it showed before goes, so that nothing stays where it no longer is.
+    pub(crate) fn new(at: Timestamp, entities: impl Iterator<Item = SceneEntity>) -> Self {
+        let all = SceneDeletion { timestamp: at.into(), kind: DELETE_ALL, id: String::new() };
+        Self { deletions: [all], entities: entities.collect() }
+    }
+}
 
 impl SceneEntity {
     fn new(at: Timestamp, id: String) -> Self {
@@ -289,8 +324,11 @@ impl SceneEntity {
         self
     }
 
-    fn text(mut self, pose: FoxglovePose, text: String) -> Self {
-        let (font_size, color) = (TEXT_PX, VEHICLE_COLOR);
+    /// A text above a place, of this opacity; it is drawn on black.
+    fn text(mut self, pose: FoxglovePose, above_m: f64, text: String, opacity: f64) -> Self {
+        let position = Vector3 { z: pose.position.z + above_m, ..pose.position };
+        let (pose, font_size) = (FoxglovePose { position, ..pose }, TEXT_PX);
+        let color = Color { a: opacity, ..TEXT_COLOR };
         self.texts.push(FoxgloveText { pose, billboard: true, font_size, scale_invariant: true, color, text });
         self
     }
@@ -376,9 +414,16 @@ mod tests {
         };
         let epoch = Epoch::new(1, NodeName::from_static("edge"));
         let landmarks = vec![state("p0"), state("p1")];
-        let map = GlobalMap { landmarks, objects: vec![car], ..GlobalMap::new(&epoch, 1, Timestamp(1)) };
-        let entities = style.map(&map).entities;
-        assert_eq!(entities.iter().map(|entity| entity.arrows.len()).collect::<Vec<_>>(), [0, 1, 0]);
+        let map = GlobalMap { landmarks, ..GlobalMap::new(&epoch, 1, Timestamp(1)) };
+        let mut lost = FusedObject::new(Uuid::max(), "car", 0.06, 9.0, 9.0, Covariance::isotropic(20.0));
+        lost.existence = Some(0.06);
+        let map = GlobalMap { objects: vec![car, lost], ..map };
+        let SceneUpdate { deletions, entities } = style.map(&map);
+        assert_eq!(deletions[0].kind, DELETE_ALL, "what left the map is not shown on");
+        assert_eq!(entities.iter().map(|entity| entity.cylinders.len()).collect::<Vec<_>>(), [0, 0, 1, 0]);
+        assert!(entities[3].spheres[0].color.a < 0.1);
+        assert!(entities[2].texts[0].pose.position.z > 1.5, "above the block");
+        assert_eq!(entities.iter().map(|entity| entity.arrows.len()).collect::<Vec<_>>(), [0, 1, 0, 0]);
         let facing = entities[1].arrows[0].pose.orientation;
         assert!((2.0 * facing.z.atan2(facing.w) - FRAC_PI_2).abs() < 1e-9);
         let block = &entities[2].cubes[0];
