@@ -165,10 +165,11 @@ impl RunArguments {
     }
 }
 
+/// Leaves what was stated. A table without keys would hide that a file has something else in its place.
 fn remove_nulls(value: &mut Value) {
     if let Value::Object(keys) = value {
-        keys.retain(|_, value| !value.is_null());
         keys.values_mut().for_each(remove_nulls);
+        keys.retain(|_, value| !value.is_null() && value.as_object().is_none_or(|table| !table.is_empty()));
     }
 }
 
@@ -247,6 +248,13 @@ pub(super) async fn input_ended() {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_table_of_flags_that_were_not_given_hides_nothing_in_the_file() {
+        let mut keys = json!({ "name": null, "mqtt": { "broker": "edge:1883" }, "dashboard": { "listen": null } });
+        remove_nulls(&mut keys);
+        assert_eq!(keys, json!({ "mqtt": { "broker": "edge:1883" } }));
+    }
 
     #[test]
     fn an_observer_leaves_the_addresses_in_the_file_to_the_node_they_are_for() {
