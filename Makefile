@@ -14,7 +14,7 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -59,9 +59,12 @@ eval-tracks: setup ## tracks in generated traffic beside single vehicles and lat
 eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI, WILDTRACK, CF, SP
 	@test -n "$(DIR)" || { echo "make eval-real DIR=... : a directory with the data that docs/measurements.md names"; exit 2; }
 	cargo build --release --locked --bin ecod-node --bin ecod-lab
-	cargo run --quiet --locked --example eval_real -- --program $(BUILD)/release/ecod-node --data "$(DIR)" --work $(BUILD)/eval-real
-	for set in CF CF_amt SP SP_amt; do cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node \
-	    --sets "$(DIR)/truth-inference-at-scale/data/active-crowd-toolkit/$$set" --work $(BUILD)/eval-real/labels || exit; done
+	@status=0; \
+	cargo run --quiet --locked --example eval_real -- --program $(BUILD)/release/ecod-node --data "$(DIR)" --work $(BUILD)/eval-real || status=1; \
+	for set in CF CF_amt SP SP_amt; do \
+	    cargo run --quiet --locked --example eval_labels -- --program $(BUILD)/release/ecod-node \
+	        --sets "$(DIR)/truth-inference-at-scale/data/active-crowd-toolkit/$$set" --work $(BUILD)/eval-real/labels || status=1; \
+	done; exit $$status
 
 eval-city: setup ## nine cells in generated traffic beside one aggregator over everything; the table goes into docs/evaluation.md
 	cargo run --release --quiet --locked --example eval_city -- --write-table docs/evaluation.md
@@ -131,6 +134,12 @@ code-lines: ## count the lines of code of each room, without tests and comments
 
 replay-check: ## prove that replays of a release build have the bytes that the tests of the debug build demand
 	cargo test --locked --release -p ecod --test replays
+
+replay-check-arm64: export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER = aarch64-linux-gnu-gcc
+replay-check-arm64: export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER = qemu-aarch64-static -L /usr/aarch64-linux-gnu
+replay-check-arm64: PACKAGES := build-essential ca-certificates gcc-aarch64-linux-gnu qemu-user-static
+replay-check-arm64: setup ## prove the same of the core built for arm64, under qemu; needs the Rust target aarch64-unknown-linux-gnu
+	cargo test --locked --target aarch64-unknown-linux-gnu -p ecod --test replays
 
 recording-check: PACKAGES += python3-venv
 recording-check: setup ## prove that the Python reader of MCAP reads what nodes record; installs it in a directory of its own
@@ -217,7 +226,7 @@ release: setup ## packages for amd64 and arm64, SBOM, checksums and an apt repos
 	packaging/release
 
 release-check: PACKAGES += debootstrap gnupg
-release-check: setup ## after make release: prove that two clean clones give the same packages (CLONED="ecod-node-edge" only that), and that apt installs target/dist
+release-check: setup ## after make release: prove that a clean clone elsewhere gives the same packages (CLONED="ecod-node-edge" only that), and that apt installs target/dist
 	packaging/check-release $(CLONED)
 	packaging/check-repository
 
