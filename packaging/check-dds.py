@@ -1,5 +1,6 @@
 """Takes what `ecod-interop ros2-live` publishes, as a node of ROS does, and publishes detections for it."""
 
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -52,6 +53,12 @@ class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
 class Pose(IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
     position: Point
     orientation: Quaternion
+
+
+@dataclass
+class PoseStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
+    header: Header
+    pose: Pose
 
 
 @dataclass
@@ -218,6 +225,7 @@ def main():
     reports = reader("ecod/euclid_2/detections", Detection3DArray)
     detections = writer("detections", Detection2DArray if kind == "pictures" else Detection3DArray)
     infos = writer("camera_info", CameraInfo)
+    poses = writer("camera_pose", PoseStamped)
     began, waiting = time.monotonic(), {"map", "report", "transform"}
     while waiting and time.monotonic() < began + 40:
         if kind == "map":
@@ -225,6 +233,12 @@ def main():
         elif kind == "optical":
             # 10 m ahead of the camera, 2 m to its right.
             detections.write(in_space("front_camera_optical_frame", label, 2.0, 0.0, 10.0))
+        elif kind == "driving":
+            # As before, of a camera that swings by 2 m along its axis, to the north.
+            ahead = 2.0 * math.sin(time.monotonic() - began)
+            north = Quaternion(0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
+            poses.write(PoseStamped(header("map"), Pose(Point(5.0, 1.0 + ahead, 0.75), north)))
+            detections.write(in_space("front_camera_optical_frame", label, 2.0, 0.0, 10.0 - ahead))
         else:
             # 1.5 m high and 10 m ahead, 2 m to the right.
             infos.write(optics("front"))

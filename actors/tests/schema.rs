@@ -54,7 +54,7 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
     ];
     let spoken = kinds.iter().map(|topic| topics.path(topic)).chain([topics.clients(&node)]);
     let spoken: BTreeSet<String> =
-        spoken.chain(["map", "vehicles/node", "received/{receiver}"].map(|level| topics.cpm(level))).collect();
+        spoken.chain(["global", "node", "received/{receiver}"].map(|level| topics.cpm(level))).collect();
     let tile: Quadkey = "0".parse().unwrap();
     let of_region = RegionTopicKind::ALL.map(|kind| RegionTopic { tile, cell: NodeName::from_static("cell"), kind });
     let of_vehicle = ReputationTopic { vehicle: node, cell: NodeName::from_static("cell") };

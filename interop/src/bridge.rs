@@ -1,25 +1,28 @@
 //! A cell's maps and reports as collective perception messages, and those of other stations as reports.
 //!
 //! ```text
-//! global_detections   -> cpm/map              the map, by the station of the node that fused it
-//! detections/<node>   -> cpm/vehicles/<node>  a vehicle's own report
+//! global_detections   -> cpm/global  the map, by the station of the node that fused it
+//! detections/<node>   -> cpm/<node>  a vehicle's own report
 //! cpm/received/<name> -> detections/<node>--cpm-<station>
 //! ```
 
 mod sightings;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use ecod_client::{Cell, Error, ForeignMessage, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings};
 
 use self::sightings::Sightings;
-use crate::carrying::{Carry, is_within, until_one_ends};
+use crate::carrying::{Carry, Failures, Refusals, is_within, lock, until_one_ends};
 use crate::cpm::{self, CpmCell, CpmError, ObjectIds, RECEIVED_PART, ReceivedCpm, Segments, StationIds};
 
-/// Maximum number of stations at a time. A node has room for 16 parts.
-const MAX_STATIONS: usize = 12;
+/// Level of the map's topic below `cpm`.
+const MAP_LEVEL: &str = "global";
+
+/// Maximum number of other stations at a time. A node has room for 16 parts.
+const MAX_OTHER_STATIONS: usize = 12;
 
 /// Silence after which a station gives its place to another.
 const STATION_RETENTION: Duration = Duration::from_secs(10);
@@ -29,10 +32,10 @@ const STATION_RETENTION: Duration = Duration::from_secs(10);
 const REPORT_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Most by which a message's time may differ from this machine's. A station's is that of GNSS: no other offset is one of its clock.
-const MAX_CLOCK_DIFFERENCE: Duration = Duration::from_secs(2);
+const MAX_REFERENCE_TIME_DIFFERENCE: Duration = Duration::from_secs(2);
 
-/// Maximum number of receivers whose unusable messages are counted apart.
-const MAX_RECEIVERS: usize = 256;
+/// Name under which refusals are counted when those of many receivers are counted apart.
+const OTHER_RECEIVERS: &str = "others";
 
 /// Age of the cell's description at which it is asked for anew.
 const DESCRIPTION_AGE: Duration = Duration::from_secs(1);
@@ -44,7 +47,8 @@ pub struct CpmBridge {
     described: Mutex<(Instant, Arc<CpmCell>)>,
     numbers: Mutex<StationIds>,
     sightings: Mutex<Sightings>,
-    refusals: Mutex<BTreeMap<(NodeName, CpmRefusal), u64>>,
+    refusals: Refusals<(NodeName, CpmRefusal)>,
+    failures: Failures,
 }
 
 /// Reason why a received message is no report.
@@ -90,7 +94,8 @@ impl CpmBridge {
         })?;
         let described = Mutex::new((Instant::now(), Arc::new(described)));
         let numbers = Mutex::new(StationIds::new(name));
-        Ok(Self { cell, settings, described, numbers, sightings: Mutex::default(), refusals: Mutex::default() })
+        let (sightings, refusals, failures) = (Mutex::default(), Refusals::default(), Failures::default());
+        Ok(Self { cell, settings, described, numbers, sightings, refusals, failures })
     }
 
     /// Carries messages until the connection is closed.
@@ -111,9 +116,9 @@ impl CpmBridge {
         self.cell.close();
     }
 
-    /// Messages that became no report, by receiver and reason.
+    /// Messages that became no report, by receiver and reason; beyond 256 pairs of these, the receiver is `others`.
     pub fn refusals(&self) -> BTreeMap<(NodeName, CpmRefusal), u64> {
-        lock(&self.refusals).clone()
+        self.refusals.counts()
     }
 
     fn send_maps(&self) -> Result<(), Error> {
@@ -124,9 +129,9 @@ impl CpmBridge {
             let Some(number) = number else { continue };
             let (described, now) = (self.described(), Instant::now());
             let sightings = lock(&self.sightings);
-            let encoded = cpm::encode_map(map, &described, number, &mut ids, |at| sightings.is_own(at, now));
+            let encoded = cpm::encode_map(map, &described, number, &mut ids, |at| sightings.is_sighted(at, now));
             drop(sightings);
-            self.send("map", encoded)?;
+            self.send(MAP_LEVEL, encoded)?;
         }
         Ok(())
     }
@@ -135,10 +140,16 @@ impl CpmBridge {
         for report in self.cell.reports() {
             let report: &ObjectReport = &*report?;
             lock(&self.sightings).observe(report, Instant::now());
+            if report.node.as_str() == MAP_LEVEL {
+                if self.failures.begins("reports of global") {
+                    log::warn!("no reports of the node {MAP_LEVEL} are sent: cpm/{MAP_LEVEL} is the map's topic");
+                }
+                continue;
+            }
             let number = (!cpm::is_received(&report.node)).then(|| lock(&self.numbers).of(&report.node)).flatten();
             let Some(number) = number else { continue };
             let encoded = cpm::encode_report(report, &self.described(), number);
-            self.send(&format!("vehicles/{}", report.node), encoded)?;
+            self.send(report.node.as_str(), encoded)?;
         }
         Ok(())
     }
@@ -149,10 +160,13 @@ impl CpmBridge {
                 if message.left_out > 0 {
                     log::debug!("cpm/{level}: no room for {} objects", message.left_out);
                 }
+                self.failures.ends(level);
                 self.cell.publish_cpm(level, message.bytes).map(drop)
             }
             Err(error) => {
-                log::warn!("nothing sent on cpm/{level}: {error}");
+                if self.failures.begins(level) {
+                    log::warn!("nothing sent on cpm/{level} until it is possible again: {error}");
+                }
                 Ok(())
             }
         }
@@ -174,10 +188,10 @@ impl CpmBridge {
         if received.left_out > 0 {
             log::debug!("cpm/received/{}: {} objects without a usable place", message.receiver, received.left_out);
         }
-        if lock(&self.numbers).is_own(received.station_id) {
+        if lock(&self.numbers).contains(received.station_id) {
             return Err(CpmRefusal::Own);
         }
-        if !is_within(capture_time(&received), MAX_CLOCK_DIFFERENCE) {
+        if !is_within(capture_time(&received), MAX_REFERENCE_TIME_DIFFERENCE) {
             return Err(CpmRefusal::Time);
         }
         stations.report(received)
@@ -189,8 +203,14 @@ impl CpmBridge {
         if last.0.elapsed() > DESCRIPTION_AGE {
             last.0 = Instant::now();
             match described(&self.cell) {
-                Ok(Some(present)) => last.1 = Arc::new(present),
-                Ok(None) => log::warn!("the cell has no [origin] any more; the last one is used"),
+                Ok(Some(present)) => {
+                    self.failures.ends("[origin]");
+                    last.1 = Arc::new(present);
+                }
+                Ok(None) if self.failures.begins("[origin]") => {
+                    log::warn!("the cell has no [origin] any more; the last one is used");
+                }
+                Ok(None) => {}
                 Err(error) => log::debug!("description: {error}"),
             }
         }
@@ -199,14 +219,8 @@ impl CpmBridge {
 
     /// Counts a message that became no report, and tells of the first of each kind.
     fn note(&self, receiver: &NodeName, refusal: CpmRefusal) {
-        let mut refusals = lock(&self.refusals);
-        let key = (receiver.clone(), refusal);
-        if refusals.len() >= MAX_RECEIVERS && !refusals.contains_key(&key) {
-            return;
-        }
-        let count = refusals.entry(key).or_default();
-        *count += 1;
-        if *count == 1 {
+        let rest = (NodeName::from_static(OTHER_RECEIVERS), refusal);
+        if let Some((receiver, _)) = self.refusals.note((receiver.clone(), refusal), rest) {
             log::warn!("no report from cpm/received/{receiver}: {refusal}; others like it are only counted");
         }
     }
@@ -247,7 +261,7 @@ impl Stations<'_> {
             if received.objects.is_empty() {
                 return Ok(());
             }
-            if self.connected.len() >= MAX_STATIONS {
+            if self.connected.len() >= MAX_OTHER_STATIONS {
                 return Err(CpmRefusal::TooManyStations);
             }
             let settings = Settings { part: format!("{RECEIVED_PART}{number}"), ..self.settings.clone() };
@@ -261,7 +275,7 @@ impl Stations<'_> {
         let interval = REPORT_INTERVAL * self.connected.len() as u32;
         let Some(station) = self.connected.get_mut(&number) else { return Ok(()) };
         station.heard_at = Instant::now();
-        let Some(whole) = station.segments.join(received) else { return Ok(()) };
+        let Some(whole) = station.segments.join(received)? else { return Ok(()) };
         if station.reported_at.is_some_and(|reported_at| reported_at.elapsed() < interval) {
             return Err(CpmRefusal::TooOften);
         }
@@ -273,10 +287,6 @@ impl Stations<'_> {
 
 fn capture_time(received: &ReceivedCpm) -> SystemTime {
     SystemTime::UNIX_EPOCH + Duration::from_micros(received.captured_at.micros())
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

@@ -1,6 +1,9 @@
-//! Bridges carry each kind of message on a thread of its own, and take messages only of their own time.
+//! Bridges carry each kind of message on a thread of its own, and take messages only of their own time. They count what they
+//! refuse, and tell of each kind once.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, SystemTime};
 
@@ -29,6 +32,54 @@ pub(crate) fn is_within(time: SystemTime, difference: Duration) -> bool {
     earlier.unwrap_or_else(|later| later.duration()) <= difference
 }
 
+/// What a mutex guards, also after a panic elsewhere.
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Numbers of what was refused, by kind.
+pub(crate) struct Refusals<K>(Mutex<BTreeMap<K, u64>>);
+
+impl<K> Default for Refusals<K> {
+    fn default() -> Self {
+        Self(Mutex::default())
+    }
+}
+
+impl<K: Clone + Ord> Refusals<K> {
+    /// Maximum number of kinds that are counted apart.
+    const MAX_KINDS: usize = 256;
+
+    /// Counts one, beyond [`Self::MAX_KINDS`] as one of `rest`. Gives the kind for the log if it is the first of it.
+    pub(crate) fn note(&self, kind: K, rest: K) -> Option<K> {
+        let mut counts = lock(&self.0);
+        let has_room = counts.len() < Self::MAX_KINDS || counts.contains_key(&kind);
+        let kind = if has_room { kind } else { rest };
+        let count = counts.entry(kind.clone()).or_default();
+        *count += 1;
+        (*count == 1).then_some(kind)
+    }
+
+    pub(crate) fn counts(&self) -> BTreeMap<K, u64> {
+        lock(&self.0).clone()
+    }
+}
+
+/// Names of what fails at present: the log tells of each once, until it is well again.
+#[derive(Default)]
+pub(crate) struct Failures(Mutex<BTreeSet<String>>);
+
+impl Failures {
+    /// True if this begins to fail.
+    pub(crate) fn begins(&self, name: &str) -> bool {
+        lock(&self.0).insert(name.to_owned())
+    }
+
+    pub(crate) fn ends(&self, name: &str) {
+        lock(&self.0).remove(name);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     #![allow(clippy::panic)]
@@ -53,5 +104,23 @@ mod tests {
         is_closed.store(false, Ordering::Relaxed);
         let refuse = || Err("refused");
         assert_eq!(until_one_ends(vec![Box::new(wait), Box::new(wait), Box::new(refuse)], close), Err("refused"));
+    }
+
+    #[test]
+    fn all_refusals_are_counted_and_the_first_of_each_kind_is_told() {
+        let refusals = Refusals::default();
+        let told: Vec<_> = (0..1000).chain(0..1000).filter_map(|kind| refusals.note(kind, 9999)).collect();
+        assert_eq!(told, (0..256).chain([9999]).collect::<Vec<_>>());
+        let counts = refusals.counts();
+        assert_eq!((counts.values().sum::<u64>(), counts.len(), counts[&9999]), (2000, 257, 1488));
+    }
+
+    #[test]
+    fn a_failure_is_told_once_until_all_is_well() {
+        let failures = Failures::default();
+        let told = |name| [failures.begins(name), failures.begins(name)];
+        assert_eq!((told("a"), told("b")), ([true, false], [true, false]));
+        failures.ends("a");
+        assert_eq!((told("a"), told("b")), ([true, false], [false, false]));
     }
 }

@@ -101,6 +101,9 @@ pub enum CpmError {
     /// A reference position more than 100 km from the cell's origin.
     #[error("more than 100 km from the cell's origin")]
     TooFar,
+    /// More objects than a report may have: [`Limits::objects`](ecod::wire::Limits::objects).
+    #[error("more objects than a report may have")]
+    TooManyObjects,
     /// A time before 2004.
     #[error("a time before 2004")]
     NoTime,

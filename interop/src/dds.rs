@@ -10,9 +10,10 @@ mod detections;
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
-use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::sync::Mutex;
+use std::time::{Duration, Instant, SystemTime};
 
+use ecod::perception::pose_history::PoseHistory;
 use ecod_client::{Cell, Error, GlobalMap, ObjectReport, Settings};
 use futures::channel::oneshot;
 use futures::executor::block_on_stream;
@@ -28,12 +29,13 @@ use rustdds::{
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::carrying::{Carry, is_within, until_one_ends};
+use crate::carrying::{Carry, Refusals, is_within, lock, until_one_ends};
 use crate::ros2::{
-    CameraInfo, Definition, Detection2DArray, Detection3DArray, RosMessage, RosSink, encode, put_map, put_report,
+    CameraInfo, Definition, Detection2DArray, Detection3DArray, PoseStamped, RosMessage, RosSink, encode, put_map,
+    put_report,
 };
-use detections::place_in_pictures;
 pub use detections::{InputRefusal, RosCamera};
+use detections::{place_in_pictures, pose_in_map};
 
 /// Part of the node's name in which detections are reported.
 const PART: &str = "ros2";
@@ -45,7 +47,7 @@ const DEPTH: i32 = 10;
 const SILENCE: Duration = Duration::from_secs(60);
 
 /// Most by which a stamp may differ from this machine's time.
-const MAX_CLOCK_DIFFERENCE: Duration = Duration::from_secs(10);
+const MAX_STAMP_DIFFERENCE: Duration = Duration::from_secs(10);
 
 /// Domain, network and input of a bridge.
 #[derive(Debug, Clone, Default)]
@@ -56,8 +58,22 @@ pub struct RosSettings {
     pub networks: Vec<IpAddr>,
     /// Topics of a detector, if its detections are to be reported.
     pub input: Option<DetectorTopics>,
+    /// Topic of `geometry_msgs/PoseStamped` with the poses of a detector's camera that moves.
+    pub pose_topic: Option<String>,
     /// The detector's camera.
     pub camera: RosCamera,
+}
+
+impl RosSettings {
+    /// All topics that are taken from ROS.
+    fn taken(&self) -> impl Iterator<Item = &String> {
+        let (detections, optics) = match &self.input {
+            Some(DetectorTopics::InSpace(topic)) => (Some(topic), None),
+            Some(DetectorTopics::InPictures(topic, optics)) => (Some(topic), Some(optics)),
+            None => (None, None),
+        };
+        detections.into_iter().chain(optics).chain(&self.pose_topic)
+    }
 }
 
 /// Topics of a detector, such as `/detections`.
@@ -75,6 +91,9 @@ pub enum RosBridgeError {
     /// No part in the DDS domain, or a topic that is not possible there.
     #[error("DDS: {0}; is the domain right, and the network up?")]
     Dds(String),
+    /// A topic below `/ecod`, which a bridge publishes. As reports, what a cell says would confirm itself.
+    #[error("{0} is no detector's topic: below /ecod are those of bridges, by which a cell would confirm itself")]
+    OwnTopic(String),
     /// No part in the cell.
     #[error(transparent)]
     Cell(#[from] Error),
@@ -91,11 +110,12 @@ pub struct RosBridge {
     cell: Cell,
     camera: RosCamera,
     input: Option<DetectorTopics>,
+    pose_topic: Option<String>,
     participant: DomainParticipant,
     /// Ends the loop over the detector's messages when dropped.
     closing: Mutex<Option<oneshot::Sender<()>>>,
     closed: Mutex<Option<oneshot::Receiver<()>>>,
-    refusals: Mutex<BTreeMap<InputRefusal, u64>>,
+    refusals: Refusals<InputRefusal>,
 }
 
 /// A message of a detector.
@@ -103,6 +123,7 @@ enum Taken {
     InSpace(Detection3DArray),
     InPicture(Detection2DArray),
     Optics(Box<CameraInfo>),
+    Pose(PoseStamped),
     Closed,
 }
 
@@ -110,8 +131,11 @@ impl RosBridge {
     /// Connects to a cell and joins a domain.
     ///
     /// # Errors
-    /// [`RosBridgeError`] if either is not possible.
+    /// [`RosBridgeError`] if either is not possible, or a topic to be taken is one of a bridge.
     pub fn connect(settings: Settings, ros: RosSettings) -> Result<Self, RosBridgeError> {
+        if let Some(own) = ros.taken().find(|topic| topic.trim_start_matches('/').starts_with("ecod/")) {
+            return Err(RosBridgeError::OwnTopic(own.clone()));
+        }
         let cell = Cell::connect(Settings { part: PART.to_owned(), ..settings })?;
         let mut participant = DomainParticipantBuilder::new(ros.domain);
         if !ros.networks.is_empty() {
@@ -123,10 +147,11 @@ impl RosBridge {
             cell,
             camera: ros.camera,
             input: ros.input,
+            pose_topic: ros.pose_topic,
             participant,
             closing: Mutex::new(Some(closing)),
             closed: Mutex::new(Some(closed)),
-            refusals: Mutex::default(),
+            refusals: Refusals::default(),
         })
     }
 
@@ -146,12 +171,12 @@ impl RosBridge {
     /// Ends the connections, and with them [`RosBridge::run`].
     pub fn close(&self) {
         self.cell.close();
-        self.closing.lock().unwrap_or_else(PoisonError::into_inner).take();
+        lock(&self.closing).take();
     }
 
     /// Messages and objects of the detector that were not reported, by reason.
     pub fn refusals(&self) -> BTreeMap<InputRefusal, u64> {
-        self.refusals.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.refusals.counts()
     }
 
     fn send_maps(&self) -> Result<(), RosBridgeError> {
@@ -173,8 +198,7 @@ impl RosBridge {
     }
 
     fn take_detections(&self) -> Result<(), RosBridgeError> {
-        let closed = self.closed.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let Some(closed) = closed else { return Ok(()) };
+        let Some(closed) = lock(&self.closed).take() else { return Ok(()) };
         let mut streams = vec![closed.map(|_| Taken::Closed).into_stream().boxed()];
         match &self.input {
             Some(DetectorTopics::InSpace(topic)) => streams.push(self.read(topic, Taken::InSpace)?),
@@ -184,19 +208,30 @@ impl RosBridge {
             }
             None => {}
         }
-        let mut optics = None;
+        if let Some(topic) = &self.pose_topic {
+            streams.push(self.read(topic, Taken::Pose)?);
+        }
+        let (mut optics, mut poses) = (None, self.pose_topic.as_ref().map(|_| PoseHistory::default()));
         for taken in block_on_stream(select_all(streams)) {
             let placed = match taken {
-                Taken::InSpace(detections) => self.camera.place(&detections),
-                Taken::InPicture(detections) => place_in_pictures(&self.camera, &detections, optics.as_deref()),
+                Taken::InSpace(detections) => self.camera.place(&detections, poses.as_ref()),
+                Taken::InPicture(detections) => {
+                    place_in_pictures(&self.camera, &detections, optics.as_deref(), poses.as_ref())
+                }
                 Taken::Optics(info) => {
                     optics = Some(info);
+                    continue;
+                }
+                Taken::Pose(stamped) => {
+                    if let Some(poses) = &mut poses {
+                        self.take_pose(&stamped, poses);
+                    }
                     continue;
                 }
                 Taken::Closed => break,
             };
             let (frame, unplaced) = match placed {
-                Ok((frame, _)) if !is_within(frame.captured_at, MAX_CLOCK_DIFFERENCE) => {
+                Ok((frame, _)) if !is_within(frame.captured_at, MAX_STAMP_DIFFERENCE) => {
                     self.note(InputRefusal::BadTime);
                     continue;
                 }
@@ -216,6 +251,18 @@ impl RosBridge {
             }
         }
         Ok(())
+    }
+
+    /// Takes a pose of the camera, if it is one of this time and later than those before.
+    fn take_pose(&self, stamped: &PoseStamped, poses: &mut PoseHistory) {
+        let taken = pose_in_map(stamped).and_then(|(at, pose)| {
+            let is_near = is_within(SystemTime::UNIX_EPOCH + Duration::from_micros(at.micros()), MAX_STAMP_DIFFERENCE);
+            let is_taken = is_near && poses.push(at, pose);
+            if is_taken { Ok(()) } else { Err(InputRefusal::BadPoseTime) }
+        });
+        if let Err(refusal) = taken {
+            self.note(refusal);
+        }
     }
 
     /// Messages of a topic of ROS; those that cannot be decoded are counted.
@@ -245,10 +292,7 @@ impl RosBridge {
 
     /// Counts something that is not reported, and tells of the first of each kind.
     fn note(&self, refusal: InputRefusal) {
-        let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
-        let count = refusals.entry(refusal).or_default();
-        *count += 1;
-        if *count == 1 {
+        if let Some(refusal) = self.refusals.note(refusal, refusal) {
             log::warn!("not reported from ROS: {refusal}; others like it are only counted");
         }
     }

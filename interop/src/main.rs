@@ -23,8 +23,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Maps and reports of the cell as ETSI CPM on `cpm/map` and `cpm/vehicles/<node>`; CPMs on `cpm/received/<name>` as
-    /// reports.
+    /// Maps and reports of the cell as ETSI CPM on `cpm/global` and `cpm/<node>`; CPMs on `cpm/received/<name>` as reports.
     Cpm(Connection),
     /// A log as MCAP of profile ros2: detections, markers, poses of cameras, pictures.
     #[cfg(feature = "ros2")]
@@ -51,18 +50,21 @@ struct RosOptions {
     /// Address of this machine in a network to take part in; may be given several times. Default: in all.
     #[arg(long, value_name = "ADDRESS")]
     network: Vec<std::net::IpAddr>,
-    /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in that of a camera with a --pose.
+    /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in that of a camera with a --pose or --pose-topic.
     #[arg(long, value_name = "TOPIC", conflicts_with = "detections_2d")]
     detections_3d: Option<String>,
     /// Topic of vision_msgs/Detection2DArray: boxes in pictures without distortion.
-    #[arg(long, value_name = "TOPIC", requires_all = ["camera_info", "pose"])]
+    #[arg(long, value_name = "TOPIC", requires_all = ["camera_info", "camera_pose"])]
     detections_2d: Option<String>,
     /// Topic of sensor_msgs/CameraInfo: the optics of these pictures.
     #[arg(long, value_name = "TOPIC", requires = "detections_2d")]
     camera_info: Option<String>,
     /// Pose of the camera: metres east and north, degrees counter-clockwise from east.
-    #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose)]
+    #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose, group = "camera_pose")]
     pose: Option<Pose>,
+    /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x ahead.
+    #[arg(long, value_name = "TOPIC", group = "camera_pose")]
+    pose_topic: Option<String>,
     /// Height of the camera above the ground in metres; boxes are then also ranged by the ground.
     #[arg(long, value_parser = height)]
     height_m: Option<f64>,
@@ -94,7 +96,8 @@ impl RosOptions {
         let in_pictures = self.detections_2d.zip(self.camera_info);
         let in_pictures = in_pictures.map(|(topic, optics)| DetectorTopics::InPictures(topic, optics));
         let input = self.detections_3d.map(DetectorTopics::InSpace).or(in_pictures);
-        let ros = RosSettings { domain: self.domain, networks: self.network, input, camera };
+        let pose_topic = self.pose_topic;
+        let ros = RosSettings { domain: self.domain, networks: self.network, input, pose_topic, camera };
         Ok((self.connection.settings(), ros))
     }
 }
@@ -187,7 +190,12 @@ fn main() -> ExitCode {
 fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String> {
     let bytes = std::fs::read(log).map_err(|error| format!("{}: {error}", log.display()))?;
     let file = std::fs::File::create_new(output).map_err(|error| format!("{}: {error}", output.display()))?;
-    let done = ecod_interop::ros2::convert(&bytes, file).map_err(|error| format!("{}: {error}", log.display()))?;
+    let done = ecod_interop::ros2::convert(&bytes, file).map_err(|error| {
+        // A part of a file, and in the way of the next try.
+        let removed = std::fs::remove_file(output).err();
+        let left = removed.map(|error| format!("; {} is left there: {error}", output.display())).unwrap_or_default();
+        format!("{} to {}: {error}{left}", log.display(), output.display())
+    })?;
     log::info!("{} messages written, {} of other kinds, {} unusable", done.written, done.passed_over, done.unusable);
     if done.is_cut {
         log::warn!("{} ends in the middle or is damaged there", log.display());

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use ecod::model::names::Label;
-use ecod::wire::{FusedObject, GlobalMap, LandmarkState, PerceivedObject};
+use ecod::wire::{FusedObject, LandmarkState, PerceivedObject};
 
 /// An object in the cell's frame: metres and radians, `covariance_m2` as `[xx, xy, yy]`, `size_m` as length and width.
 #[derive(Debug, Clone)]
@@ -54,7 +54,7 @@ impl<'a> From<&'a PerceivedObject> for CellObject<'a> {
 impl<'a> CellObject<'a> {
     /// Objects of a map and what stands at its known locations, each with its id.
     #[cfg(feature = "ros2")]
-    pub(crate) fn all_of(map: &'a GlobalMap) -> impl Iterator<Item = (Self, String)> {
+    pub(crate) fn all_of(map: &'a ecod::wire::GlobalMap) -> impl Iterator<Item = (Self, String)> {
         let objects = map.objects.iter().map(|object| (object.into(), object.id.to_string()));
         objects.chain(map.landmarks.iter().filter_map(|place| Some((Self::at(place)?, place.id.to_string()))))
     }

@@ -29,7 +29,7 @@ use transforms::TFMessage;
 pub use log::{Conversion, ConversionError, convert};
 pub(crate) use messages::{Definition, Header};
 #[cfg(feature = "dds")]
-pub(crate) use messages::{RosMessage, RosPose, encode};
+pub(crate) use messages::{PoseStamped, RosMessage, RosPose, encode};
 #[cfg(feature = "dds")]
 pub(crate) use pictured::Detection2DArray;
 

@@ -5,6 +5,7 @@
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use ecod::wire::{CellDescription, ContentHash, Encoding, encode};
@@ -15,7 +16,7 @@ use ecod_client::{
     Cell, Error, Frame, GeographicOrigin, NodeName, ObjectReport, PerceivedObject, Role, Settings, Timestamp, Tls, now,
 };
 use ecod_interop::bridge::{CpmBridge, CpmRefusal};
-use ecod_interop::cpm::{self, CpmCell, CpmError, ReceivedCpm};
+use ecod_interop::cpm::{self, CpmCell, CpmError, ReceivedCpm, StationIds};
 use rumqttc::{Client, Event, Incoming, MqttOptions, QoS};
 use tokio::runtime::Runtime;
 
@@ -165,12 +166,12 @@ fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
         }
         let Ok(Event::Incoming(Incoming::Publish(message))) = event else { continue };
         match message.topic.strip_prefix("ecod/v1/lot-1/cpm/") {
-            Some("map") => {
+            Some("global") => {
                 of_map = Some(cpm::decode(&message.payload, &ORIGIN).unwrap());
                 let topic = "ecod/v1/lot-1/cpm/received/echo";
                 client.publish(topic, QoS::AtMostOnce, false, message.payload).unwrap();
             }
-            Some("vehicles/euclid") => of_vehicle = Some(cpm::decode(&message.payload, &ORIGIN).unwrap()),
+            Some("euclid") => of_vehicle = Some(cpm::decode(&message.payload, &ORIGIN).unwrap()),
             Some(level) => assert!(level.starts_with("received/"), "{level}"),
             None => panic!("{}", message.topic),
         }
@@ -216,6 +217,51 @@ fn there_is_room_for_twelve_stations_at_a_time_and_for_the_present() {
         }
         std::thread::sleep(Duration::from_millis(200));
     }
+    bridge.close();
+    thread.join().unwrap().unwrap();
+}
+
+#[test]
+fn the_topic_of_the_map_has_no_reports_of_a_node_with_its_name() {
+    let edge = Edge::start(None);
+    edge.describe(DESCRIPTION);
+    let bridge = Arc::new(CpmBridge::connect(edge.settings.clone()).unwrap());
+    let running = Arc::clone(&bridge);
+    let thread = std::thread::spawn(move || running.run());
+    let (client, mut connection) = edge.stranger("roadside");
+    client.subscribe("ecod/v1/lot-1/cpm/+", QoS::AtMostOnce).unwrap();
+    let vehicles = ["global", "euclid"].map(|node| {
+        Cell::connect(Settings { node: node.into(), part: String::new(), ..edge.settings.clone() }).unwrap()
+    });
+    let is_done = Arc::new(AtomicBool::new(false));
+    let until = Arc::clone(&is_done);
+    let talk = std::thread::spawn(move || {
+        while !until.load(Ordering::Relaxed) {
+            for vehicle in &vehicles {
+                vehicle.report(Frame::new(Vec::new())).unwrap();
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    });
+    let of_edge = StationIds::new(NodeName::from_static("lot-1")).of(&NodeName::from_static("edge")).unwrap();
+    let (began, mut stations, mut of_euclid) = (Instant::now(), BTreeSet::new(), 0);
+    for event in connection.iter() {
+        assert!(began.elapsed() < SOON, "{stations:?} {of_euclid}");
+        let Ok(Event::Incoming(Incoming::Publish(message))) = event else { continue };
+        match message.topic.strip_prefix("ecod/v1/lot-1/cpm/") {
+            Some("global") => {
+                stations.insert(cpm::decode(&message.payload, &ORIGIN).unwrap().station_id);
+            }
+            Some("euclid") => of_euclid += 1,
+            topic => panic!("{topic:?}"),
+        }
+        if stations.contains(&of_edge) && of_euclid >= 10 {
+            break;
+        }
+    }
+    is_done.store(true, Ordering::Relaxed);
+    talk.join().unwrap();
+    assert_eq!(stations, BTreeSet::from([of_edge]));
     bridge.close();
     thread.join().unwrap().unwrap();
 }

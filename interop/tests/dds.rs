@@ -15,12 +15,12 @@ use ecod::perception::projection::{ObjectSize, ObjectSizes, ProjectionConfig};
 use ecod_actors::node;
 use ecod_actors::node::config::NodeConfig;
 use ecod_client::{Cell, Frame, NodeName, PerceivedObject, Role, Settings, WirePose};
-use ecod_interop::dds::{DetectorTopics, RosBridge, RosCamera, RosSettings};
+use ecod_interop::dds::{DetectorTopics, RosBridge, RosBridgeError, RosCamera, RosSettings};
 use tokio::runtime::Runtime;
 
 /// Runs a bridge beside an edge to which a vehicle reports. It ends once Python has published such detections, and found an
 /// object of this label at this place of the map.
-fn exchange(kind: &str, input: DetectorTopics, camera: RosCamera, (label, x_m, y_m): (&str, f64, f64)) {
+fn exchange(kind: &str, ros: RosSettings, (label, x_m, y_m): (&str, f64, f64)) {
     let python = std::env::var("DDS_PYTHON").unwrap();
     let loopback = SocketAddr::from(([127, 0, 0, 1], 0));
     let mut config = NodeConfig {
@@ -39,7 +39,6 @@ fn exchange(kind: &str, input: DetectorTopics, camera: RosCamera, (label, x_m, y
     let settings = Settings { broker, cell: "lot-1".into(), node: "edge".into(), ..Settings::default() };
     let vehicle = Settings { node: "euclid-2".into(), part: String::new(), ..settings.clone() };
     let vehicle = Cell::connect(vehicle).unwrap();
-    let ros = RosSettings { input: Some(input), camera, ..RosSettings::default() };
     let bridge = RosBridge::connect(settings, ros).unwrap();
     let is_done = AtomicBool::new(false);
     thread::scope(|scope| {
@@ -59,7 +58,7 @@ fn exchange(kind: &str, input: DetectorTopics, camera: RosCamera, (label, x_m, y
         bridge.close();
         carried.join().unwrap().unwrap();
         assert!(run.status.success(), "{}{:?}", String::from_utf8_lossy(&run.stderr), bridge.refusals());
-        assert!(bridge.refusals().is_empty() || kind == "pictures", "{:?}", bridge.refusals());
+        assert!(bridge.refusals().is_empty() || ["pictures", "driving"].contains(&kind), "{:?}", bridge.refusals());
         print!("{}", String::from_utf8_lossy(&run.stdout));
     });
     runtime.block_on(handle.stop());
@@ -79,19 +78,45 @@ fn camera() -> RosCamera {
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
 fn detections_in_the_map_become_objects_there() {
     let input = DetectorTopics::InSpace("/detections".to_owned());
-    exchange("map", input, RosCamera::default(), ("truck", 12.0, -5.0));
+    exchange("map", RosSettings { input: Some(input), ..RosSettings::default() }, ("truck", 12.0, -5.0));
 }
 
 #[test]
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
 fn detections_before_a_camera_are_placed_by_its_pose() {
     let input = DetectorTopics::InSpace("detections".to_owned());
-    exchange("optical", input, camera(), ("truck", 7.0, 11.0));
+    let ros = RosSettings { input: Some(input), camera: camera(), ..RosSettings::default() };
+    exchange("optical", ros, ("truck", 7.0, 11.0));
+}
+
+#[test]
+#[ignore = "needs a network of its own and Python packages: `make dds-check`"]
+fn detections_before_a_camera_that_moves_are_placed_by_its_poses() {
+    let input = Some(DetectorTopics::InSpace("/detections".to_owned()));
+    let camera = RosCamera { pose: None, ..camera() };
+    let ros = RosSettings { input, pose_topic: Some("/camera_pose".to_owned()), camera, ..RosSettings::default() };
+    exchange("driving", ros, ("truck", 7.0, 11.0));
 }
 
 #[test]
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
 fn boxes_in_pictures_are_placed_by_the_optics_and_the_ground() {
     let input = DetectorTopics::InPictures("/detections".to_owned(), "/camera_info".to_owned());
-    exchange("pictures", input, camera(), ("post", 7.0, 11.0));
+    let ros = RosSettings { input: Some(input), camera: camera(), ..RosSettings::default() };
+    exchange("pictures", ros, ("post", 7.0, 11.0));
+}
+
+#[test]
+fn topics_of_the_bridge_itself_are_no_detectors() {
+    let optics = || "/camera_info".to_owned();
+    let inputs = [
+        (Some(DetectorTopics::InSpace("/ecod/map/detections".to_owned())), None),
+        (Some(DetectorTopics::InPictures("ecod/euclid/detections".to_owned(), optics())), None),
+        (Some(DetectorTopics::InSpace("/detections".to_owned())), Some("/ecod/pose".to_owned())),
+    ];
+    for (input, pose_topic) in inputs {
+        let ros = RosSettings { input, pose_topic, ..RosSettings::default() };
+        let refused = RosBridge::connect(Settings::default(), ros).err();
+        assert!(matches!(refused, Some(RosBridgeError::OwnTopic(_))), "{refused:?}");
+    }
 }

@@ -124,6 +124,27 @@ fn a_picture_of_the_camera_is_the_same_picture_and_has_its_optics() {
 }
 
 #[test]
+fn what_is_no_log_leaves_no_output_in_the_way_of_the_next_try() {
+    let directory = tempfile::tempdir().unwrap();
+    let (log, output) = (directory.path().join("log.mcap"), directory.path().join("ros2.mcap"));
+    let run = || {
+        let program =
+            Command::new(env!("CARGO_BIN_EXE_ecod-interop")).arg("ros2").args([&log, &output]).output().unwrap();
+        (program.status.code(), String::from_utf8(program.stderr).unwrap())
+    };
+    std::fs::write(&log, "a letter, and no log of a node").unwrap();
+    for _ in 0..2 {
+        let (code, said) = run();
+        assert!(code == Some(2) && said.contains("log.mcap") && !output.exists(), "{code:?} {said}");
+    }
+    std::fs::write(&log, camera_log()).unwrap();
+    assert_eq!(run().0, Some(0));
+    let first = std::fs::read(&output).unwrap();
+    assert!(!first.is_empty() && run().0 == Some(2), "another's file is left alone");
+    assert_eq!(std::fs::read(&output).unwrap(), first);
+}
+
+#[test]
 #[ignore = "needs Python packages, which `make ros2-check` installs"]
 fn readers_of_ros_read_it_and_write_the_same_bytes() {
     let python = std::env::var("ROS2_PYTHON").unwrap();

@@ -76,7 +76,7 @@ impl Topics {
         format!("{}/nodes/{node}/clients", self.root)
     }
 
-    /// A topic of ETSI's collective perception messages (CPM), such as `ecod/v1/lot-1/cpm/map`.
+    /// A topic of ETSI's collective perception messages (CPM), such as `ecod/v1/lot-1/cpm/global`.
     pub fn cpm(&self, level: &str) -> String {
         format!("{}/cpm/{level}", self.root)
     }

@@ -39,7 +39,7 @@ impl Sightings {
     }
 
     /// False for a place at which foreign stations alone can have detected an object.
-    pub(super) fn is_own(&self, [x_m, y_m]: [f64; 2], now: Instant) -> bool {
+    pub(super) fn is_sighted(&self, [x_m, y_m]: [f64; 2], now: Instant) -> bool {
         let is_alone = self.foreign.is_none_or(|heard| now.duration_since(heard) >= FOREIGN_FOR);
         let mut recent = self.own.values().filter(|(at, _)| now.duration_since(*at) < SIGHTED_FOR);
         is_alone
@@ -62,12 +62,12 @@ mod tests {
         };
         let (start, mut sightings) = (Instant::now(), Sightings::default());
         let after = |seconds: u64| start + Duration::from_secs(seconds);
-        assert!(sightings.is_own([50.0, 0.0], start), "no other station is heard");
+        assert!(sightings.is_sighted([50.0, 0.0], start), "no other station is heard");
         sightings.observe(&report("edge--cpm-4711", 50.0), start);
         let pose = Some(WirePose::new(20.0, 0.0, 0.0));
         sightings.observe(&ObjectReport { pose, ..report("edge--front", 10.0) }, start);
         let own = |sightings: &Sightings, seconds| {
-            [10.0, 14.0, 20.0, 50.0].map(|x| sightings.is_own([x, 0.0], after(seconds)))
+            [10.0, 14.0, 20.0, 50.0].map(|x| sightings.is_sighted([x, 0.0], after(seconds)))
         };
         assert_eq!(own(&sightings, 1), [true, true, true, false]);
         assert_eq!(own(&sightings, 3), [false; 4], "the cell has lost both");

@@ -9,7 +9,7 @@ use ecod::model::geometry::Covariance;
 use ecod::model::names::Label;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
-use ecod::wire::PerceivedObject;
+use ecod::wire::{Limits, PerceivedObject};
 
 use super::frame::MessageFrame;
 use super::{
@@ -55,6 +55,9 @@ pub fn decode(bytes: &[u8], origin: &GeographicOrigin) -> Result<ReceivedCpm, Cp
             let container = container.perceived_objects.0;
             all += container.len();
             objects.extend(container.iter().filter_map(|object| perceived(object, &frame, position_error)));
+            if objects.len() > Limits::default().objects {
+                return Err(CpmError::TooManyObjects);
+            }
         }
     }
     Ok(ReceivedCpm {

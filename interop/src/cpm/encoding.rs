@@ -25,7 +25,7 @@ const MAX_OBJECTS: usize = 255;
 /// Greatest age that a message states, in milliseconds: at least so old.
 const MAX_AGE_MS: u16 = 1500;
 
-/// A map as the message of a roadside unit: its objects, and known locations at which a road user stands. `is_own` tells by
+/// A map as the message of a roadside unit: its objects, and known locations at which a road user stands. `is_sighted` tells by
 /// position (metres) whether the cell itself knows of an object there; the others are left out.
 ///
 /// # Errors
@@ -35,14 +35,14 @@ pub fn encode_map(
     cell: &CpmCell,
     station_id: u32,
     ids: &mut ObjectIds,
-    is_own: impl Fn([f64; 2]) -> bool,
+    is_sighted: impl Fn([f64; 2]) -> bool,
 ) -> Result<EncodedCpm, CpmError> {
-    let own = map.objects.iter().filter(|object| is_own([object.x_m, object.y_m]));
-    let objects = own.map(|object| {
+    let sighted = map.objects.iter().filter(|object| is_sighted([object.x_m, object.y_m]));
+    let objects = sighted.map(|object| {
         let (age_ms, delta_ms) = (age_ms(object, map), delta_ms(object));
         (object.id, CpmObject { age_ms, delta_ms, ..CpmObject::now(object.into()) })
     });
-    let at_places = map.landmarks.iter().filter(|place| is_own([place.x_m, place.y_m])).filter_map(|place| {
+    let at_places = map.landmarks.iter().filter(|place| is_sighted([place.x_m, place.y_m])).filter_map(|place| {
         let object = CellObject::at(place)?;
         classes::road_user(object.label)?;
         Some((Uuid::new_v5(&Uuid::NAMESPACE_OID, place.id.as_bytes()), CpmObject::now(object)))

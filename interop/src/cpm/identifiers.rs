@@ -15,8 +15,8 @@ pub fn is_received(node: &NodeName) -> bool {
 
 /// Station numbers of the nodes of a cell. Each part of a node, such as its second camera, is a station of its own.
 ///
-/// A number is the first four bytes of the name-based UUID (version 5) of `<cell>/<node>` in the namespace of URLs, so that
-/// it is the same in every run. Where two nodes collide, the later gets the next free number.
+/// A number is the first four bytes of the name-based UUID (version 5) of `<cell>/<node>` in the namespace of URLs. It is the
+/// same in every run. Where two nodes collide, the later gets the next free number.
 #[derive(Debug)]
 pub struct StationIds {
     cell: NodeName,
@@ -26,7 +26,7 @@ pub struct StationIds {
 }
 
 /// Maximum number of nodes with a number.
-const MAX_STATIONS: usize = 4096;
+const MAX_NUMBERED_NODES: usize = 4096;
 
 impl StationIds {
     /// Numbers for a cell of this name.
@@ -39,9 +39,11 @@ impl StationIds {
         if let Some(number) = self.by_name.get(node) {
             return Some(*number);
         }
-        if self.by_name.len() >= MAX_STATIONS {
+        if self.by_name.len() >= MAX_NUMBERED_NODES {
             if !std::mem::replace(&mut self.is_full, true) {
-                log::warn!("nothing sent of {node}, nor of later names: {MAX_STATIONS} nodes have station numbers");
+                log::warn!(
+                    "nothing sent of {node}, nor of later names: {MAX_NUMBERED_NODES} nodes have station numbers"
+                );
             }
             return None;
         }
@@ -55,7 +57,7 @@ impl StationIds {
     }
 
     /// True if a node here has the number.
-    pub fn is_own(&self, number: u32) -> bool {
+    pub fn contains(&self, number: u32) -> bool {
         self.used.contains(&number)
     }
 }

@@ -147,7 +147,7 @@ fn a_node_has_the_same_station_number_in_every_run() {
     let of_gauss = one.of(&gauss).unwrap();
     assert_ne!(of_gauss, one.of(&euclid).unwrap());
     assert_eq!(one.of(&euclid), other.of(&euclid));
-    assert!(one.is_own(of_gauss) && !other.is_own(of_gauss));
+    assert!(one.contains(of_gauss) && !other.contains(of_gauss));
 }
 
 #[test]

@@ -5,7 +5,9 @@ use std::time::{Duration, SystemTime};
 
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::geometry::Pose;
+use ecod::model::time::Timestamp;
 use ecod::perception::camera::{Intrinsics, Mount};
+use ecod::perception::pose_history::PoseHistory;
 use ecod::perception::projection::{Projection, ProjectionConfig, ProjectionError};
 use ecod::wire::PerceivedObject;
 use ecod_client::{Frame, Label};
@@ -13,13 +15,13 @@ use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
 
 use crate::ros2::{
     CameraInfo, Detection2DArray, Detection3D, Detection3DArray, Header, ObjectHypothesis, ObjectHypothesisWithPose,
-    RosPose,
+    PoseStamped, RosPose,
 };
 
 /// A detector's camera.
 #[derive(Debug, Clone)]
 pub struct RosCamera {
-    /// Pose of the camera in the cell's frame; `None` if it is not known.
+    /// Pose of a camera that stands, in the cell's frame; `None` if it is not known.
     pub pose: Option<Pose>,
     /// Height and attitude of the camera.
     pub mount: Mount,
@@ -43,9 +45,15 @@ pub enum InputRefusal {
     /// Not a message of the topic's type.
     #[error("a message that cannot be decoded")]
     Malformed,
-    /// Positions relative to a camera whose pose was not given.
-    #[error("a frame other than `map`, and no --pose of the camera")]
+    /// Positions relative to a camera whose pose at that time is not known.
+    #[error("a frame other than `map`, and no --pose of the camera, or none near the stamp on the --pose-topic")]
     NoPose,
+    /// A pose of the camera that is none in the cell's frame.
+    #[error("a pose of the camera that is not in the frame `map`, or has no orientation")]
+    BadPose,
+    /// A pose of the camera with the stamp of another time, or out of order.
+    #[error("a pose of the camera that is not later than the one before, or more than 10 s from this machine's time")]
+    BadPoseTime,
     /// Boxes in pictures whose optics are not known.
     #[error("boxes before a CameraInfo, or one without focal lengths")]
     NoOptics,
@@ -68,9 +76,22 @@ type Placed = (Frame, Vec<InputRefusal>);
 
 impl RosCamera {
     /// Places detections in space: in the frame `map`, in that of the camera, or in its optical one (REP 103).
-    pub(super) fn place(&self, detections: &Detection3DArray) -> Result<Placed, InputRefusal> {
-        let to_map = self.to_map(&detections.header)?;
-        self.frame(&detections.header, detections.detections.iter().map(|detection| self.object(detection, &to_map)))
+    /// A camera that moves is where `poses` have it.
+    pub(super) fn place(
+        &self,
+        detections: &Detection3DArray,
+        poses: Option<&PoseHistory>,
+    ) -> Result<Placed, InputRefusal> {
+        let (captured_at, pose) = self.at(&detections.header, poses)?;
+        let to_map = self.to_map(&detections.header, pose)?;
+        let objects = detections.detections.iter().map(|detection| self.object(detection, &to_map));
+        Ok(self.frame(captured_at, pose, objects))
+    }
+
+    /// The time of a header, and the camera's pose then.
+    fn at(&self, header: &Header, poses: Option<&PoseHistory>) -> Result<(Timestamp, Option<Pose>), InputRefusal> {
+        let captured_at = header.time().ok_or(InputRefusal::BadTime)?;
+        Ok((captured_at, poses.map_or(self.pose, |poses| poses.at(captured_at))))
     }
 
     fn object(&self, detection: &Detection3D, to_map: &ToMap) -> Result<PerceivedObject, InputRefusal> {
@@ -93,16 +114,14 @@ impl RosCamera {
         })
     }
 
-    /// Reports objects that are fit for it, at the time of the header.
+    /// Reports objects that are fit for it.
     fn frame(
         &self,
-        header: &Header,
+        captured_at: Timestamp,
+        pose: Option<Pose>,
         objects: impl Iterator<Item = Result<PerceivedObject, InputRefusal>>,
-    ) -> Result<Placed, InputRefusal> {
-        let micros = header.stamp.micros().ok_or(InputRefusal::BadTime)?;
-        // A stamp of zero is one that nobody set.
-        let since_epoch = (micros > 0).then(|| Duration::from_micros(micros));
-        let captured_at = since_epoch.map_or_else(SystemTime::now, |since_epoch| SystemTime::UNIX_EPOCH + since_epoch);
+    ) -> Placed {
+        let captured_at = SystemTime::UNIX_EPOCH + Duration::from_micros(captured_at.micros());
         let (mut placed, mut refused) = (Vec::new(), Vec::new());
         for object in objects {
             match object {
@@ -111,8 +130,8 @@ impl RosCamera {
                 Err(refusal) => refused.push(refusal),
             }
         }
-        let pose = self.pose.map(|pose| self.mount.stated_pose(&pose));
-        Ok((Frame { captured_at, pose, ..Frame::new(placed) }, refused))
+        let pose = pose.map(|pose| self.mount.stated_pose(&pose));
+        (Frame { captured_at, pose, ..Frame::new(placed) }, refused)
     }
 
     /// An object without a place: label and confidence of the best hypothesis, and those of all if there are several.
@@ -132,11 +151,11 @@ impl RosCamera {
         Ok(PerceivedObject { label, confidence, scores, ..PerceivedObject::default() })
     }
 
-    fn to_map(&self, header: &Header) -> Result<ToMap, InputRefusal> {
+    fn to_map(&self, header: &Header, pose: Option<Pose>) -> Result<ToMap, InputRefusal> {
         if header.frame_id == "map" {
             return Ok(ToMap { origin: Pose::new(0.0, 0.0, 0.0), turn: Matrix3::identity(), is_optical: false });
         }
-        let origin = self.pose.ok_or(InputRefusal::NoPose)?;
+        let origin = pose.ok_or(InputRefusal::NoPose)?;
         let is_optical = ["_optical", "_optical_frame"].iter().any(|suffix| header.frame_id.ends_with(suffix));
         // From x ahead, y left, z up to x right, y down, z ahead.
         let body_to_optical = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
@@ -146,13 +165,26 @@ impl RosCamera {
     }
 }
 
-/// Places boxes in pictures of which the distortion has been removed.
+/// Time and pose of a camera, whose x axis is its own (REP 103).
+pub(super) fn pose_in_map(stamped: &PoseStamped) -> Result<(Timestamp, Pose), InputRefusal> {
+    let at = stamped.header.time().ok_or(InputRefusal::BadPoseTime)?;
+    let RosPose { position, orientation } = stamped.pose;
+    let ahead = orientation.rotation().map(|turn| turn * Vector3::x());
+    let ahead = ahead.filter(|_| stamped.header.frame_id == "map").ok_or(InputRefusal::BadPose)?;
+    let pose = Pose::new(position.x, position.y, ahead.y.atan2(ahead.x));
+    let is_finite = [position.x, position.y, pose.heading_rad].into_iter().all(f64::is_finite);
+    if is_finite { Ok((at, pose)) } else { Err(InputRefusal::BadPose) }
+}
+
+/// Places boxes in pictures of which the distortion has been removed, by the rules of [`RosCamera::place`].
 pub(super) fn place_in_pictures(
     camera: &RosCamera,
     detections: &Detection2DArray,
     optics: Option<&CameraInfo>,
+    poses: Option<&PoseHistory>,
 ) -> Result<Placed, InputRefusal> {
-    let pose = camera.pose.ok_or(InputRefusal::NoPose)?;
+    let (captured_at, pose) = camera.at(&detections.header, poses)?;
+    let pose = pose.ok_or(InputRefusal::NoPose)?;
     let intrinsics = optics.and_then(CameraInfo::intrinsics).ok_or(InputRefusal::NoOptics)?;
     let projection = Projection::new(camera.projection.clone(), intrinsics, camera.mount);
     let objects = detections.detections.iter().map(|detection| {
@@ -170,7 +202,7 @@ pub(super) fn place_in_pictures(
         let placed = placed.map_err(|error: ProjectionError| InputRefusal::NoPosition(error.as_str()))?;
         Ok(PerceivedObject { scores, ..placed })
     });
-    camera.frame(&detections.header, objects)
+    Ok(camera.frame(captured_at, Some(pose), objects))
 }
 
 impl CameraInfo {
@@ -256,7 +288,7 @@ mod tests {
     }
 
     fn only(camera: &RosCamera, message: &Detection3DArray) -> PerceivedObject {
-        let (frame, refused) = camera.place(message).unwrap();
+        let (frame, refused) = camera.place(message, None).unwrap();
         assert_eq!(refused, []);
         assert_eq!(frame.captured_at, SystemTime::UNIX_EPOCH + Duration::from_micros(1_000_000_005));
         frame.objects.into_iter().next().unwrap()
@@ -330,7 +362,7 @@ mod tests {
         let mount = Mount { height_m: Some(1.5), ..Mount::default() };
         let camera = RosCamera { mount, ..camera() };
         let place = |boxes: &Detection2DArray, optics| {
-            let (frame, refused) = place_in_pictures(&camera, boxes, Some(optics)).unwrap();
+            let (frame, refused) = place_in_pictures(&camera, boxes, Some(optics), None).unwrap();
             assert_eq!(refused, []);
             (frame.objects[0].x_m, frame.objects[0].y_m)
         };
@@ -344,19 +376,65 @@ mod tests {
         }
     }
 
+    fn pose_at(frame: &str, seconds: u32, x: f64, yaw_rad: f64) -> PoseStamped {
+        let (sin, cos) = (yaw_rad / 2.0).sin_cos();
+        let text = format!(
+            r#"{{"header": {{"stamp": {{"sec": {seconds}, "nanosec": 0}}, "frame_id": "{frame}"}},
+                "pose": {{"position": {{"x": {x}, "y": 1, "z": 0.7}}, "orientation": {{"x": 0, "y": 0, "z": {sin}, "w": {cos}}}}}}}"#
+        );
+        serde_json::from_str(&text).unwrap()
+    }
+
+    #[test]
+    fn a_camera_that_moves_is_where_it_was_at_the_stamp() {
+        let mut poses = PoseHistory::default();
+        for (seconds, x, yaw_rad) in [(999, 4.0, FRAC_PI_2), (1000, 5.0, FRAC_PI_2), (1001, 205.0, FRAC_PI_2)] {
+            let (at, pose) = pose_in_map(&pose_at("map", seconds, x, yaw_rad)).unwrap();
+            assert!(poses.push(at, pose));
+        }
+        // 5 µs after the second pose, at 200 m/s; the pose of the settings is that of no camera that moves.
+        let moving = RosCamera { pose: Some(Pose::new(99.0, 99.0, 0.0)), ..camera() };
+        let (frame, refused) = moving.place(&message("front", [10.0, -2.0, 0.5], [0.0; 3], 0.0), Some(&poses)).unwrap();
+        assert_eq!(refused, []);
+        let (stated, object) = (frame.pose.unwrap(), &frame.objects[0]);
+        let all = [stated.x_m, stated.y_m, stated.heading_rad, object.x_m, object.y_m];
+        let expected = [5.001, 1.0, FRAC_PI_2, 7.001, 11.0];
+        assert!(all.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-6), "{all:?}");
+        let mut late = message("front", [10.0, -2.0, 0.5], [0.0; 3], 0.0);
+        late.header = pose_at("front", 1002, 0.0, 0.0).header;
+        assert_eq!(moving.place(&late, Some(&poses)).err(), Some(InputRefusal::NoPose));
+        let boxes = Detection2DArray { header: late.header, detections: Vec::new() };
+        let optics = CameraInfo::default();
+        assert_eq!(place_in_pictures(&moving, &boxes, Some(&optics), Some(&poses)).err(), Some(InputRefusal::NoPose));
+        late.header = Header { frame_id: "map".to_owned(), ..boxes.header };
+        assert_eq!(moving.place(&late, Some(&poses)).unwrap().0.pose, None, "no place is relative to the camera");
+    }
+
+    #[test]
+    fn a_pose_is_one_in_the_map_with_a_direction() {
+        let refusal = |stamped: &PoseStamped| pose_in_map(stamped).err();
+        assert_eq!(refusal(&pose_at("odom", 1000, 1.0, 0.0)), Some(InputRefusal::BadPose));
+        let mut unset = pose_at("map", 1000, 1.0, 0.0);
+        unset.pose.orientation.w = 0.0;
+        assert_eq!(refusal(&unset), Some(InputRefusal::BadPose));
+        let mut nowhere = pose_at("map", 1000, 1.0, 0.0);
+        nowhere.pose.position.x = f64::NAN;
+        assert_eq!(refusal(&nowhere), Some(InputRefusal::BadPose));
+    }
+
     #[test]
     fn what_cannot_be_placed_is_refused_by_reason() {
         let nowhere = RosCamera { pose: None, ..camera() };
-        let refusal = |message: &Detection3DArray| nowhere.place(message).map(|(_, refused)| refused);
+        let refusal = |message: &Detection3DArray| nowhere.place(message, None).map(|(_, refused)| refused);
         assert_eq!(refusal(&message("front", [1.0, 0.0, 0.0], [0.1; 3], 0.0)), Err(InputRefusal::NoPose));
         assert_eq!(refusal(&message("map", [1e300, 0.0, 0.0], [0.1; 3], 0.0)), Ok(vec![InputRefusal::Report]));
         let mut unknown = message("map", [1.0, 0.0, 0.0], [0.1; 3], 0.0);
         unknown.detections[0].results.clear();
         assert_eq!(refusal(&unknown), Ok(vec![InputRefusal::NoClass]));
         let boxes = Detection2DArray { header: unknown.header, detections: Vec::new() };
-        assert_eq!(place_in_pictures(&camera(), &boxes, None).err(), Some(InputRefusal::NoOptics));
+        assert_eq!(place_in_pictures(&camera(), &boxes, None, None).err(), Some(InputRefusal::NoOptics));
         assert_eq!(
-            place_in_pictures(&camera(), &boxes, Some(&CameraInfo::default())).err(),
+            place_in_pictures(&camera(), &boxes, Some(&CameraInfo::default()), None).err(),
             Some(InputRefusal::NoOptics)
         );
     }

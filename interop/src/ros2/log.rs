@@ -9,7 +9,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Limits, decode, decode_report};
 use mcap::records::MessageHeader;
-use mcap::{Compression, MessageStream, WriteOptions, Writer};
+use mcap::{Compression, McapError, MessageStream, WriteOptions, Writer};
 use serde::{Deserialize, Serialize};
 
 use super::camera::{CameraInfo, RosImage};
@@ -19,9 +19,9 @@ use super::{RosSink, put_map, put_report, ros_name};
 /// A log that cannot be converted.
 #[derive(Debug, thiserror::Error)]
 pub enum ConversionError {
-    /// It cannot be read as MCAP from some place on, or the output not written.
+    /// It is no MCAP, or the output cannot be written.
     #[error(transparent)]
-    Mcap(#[from] mcap::McapError),
+    Mcap(#[from] McapError),
     /// A message that has no form in CDR.
     #[error(transparent)]
     Cdr(#[from] cdr_encoding::Error),
@@ -69,15 +69,19 @@ struct LoggedOptics {
 /// Writes a log as MCAP of profile `ros2`.
 ///
 /// # Errors
-/// [`ConversionError`] if nothing can be read, or the output not written.
+/// [`ConversionError`] if this is no log, or the output cannot be written.
 pub fn convert<W: Write + Seek>(log: &[u8], output: W) -> Result<Conversion, ConversionError> {
     let options = WriteOptions::new().profile("ros2").compression(Some(Compression::Zstd));
     let mut output = RosLogWriter { writer: Writer::with_options(output, options)?, channels: BTreeMap::new() };
     let mut done = Conversion::default();
     for message in MessageStream::new_with_options(log, mcap::read::Options::IgnoreEndMagic.into())? {
-        let Ok(message) = message else {
-            done.is_cut = true;
-            break;
+        let message = match message {
+            Ok(message) => message,
+            Err(error @ McapError::BadMagic) => return Err(error.into()),
+            Err(_) => {
+                done.is_cut = true;
+                break;
+            }
         };
         let at = Stamps { log: message.log_time, publish: message.publish_time };
         let (kind, name) = message.channel.topic.split_once('/').unwrap_or((&message.channel.topic, ""));

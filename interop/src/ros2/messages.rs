@@ -48,7 +48,7 @@ pub(crate) struct RosTime {
 impl RosTime {
     /// Microseconds since 1970; `None` before.
     #[cfg(feature = "dds")]
-    pub(crate) fn micros(self) -> Option<u64> {
+    fn micros(self) -> Option<u64> {
         Some(u64::try_from(self.sec).ok()? * 1_000_000 + u64::from(self.nanosec) / 1000)
     }
 
@@ -66,6 +66,13 @@ pub(crate) struct Header {
 }
 
 impl Header {
+    /// The time of the stamp, or now for one that nobody set; `None` before 1970.
+    #[cfg(feature = "dds")]
+    pub(crate) fn time(&self) -> Option<Timestamp> {
+        let micros = self.stamp.micros()?;
+        Some(if micros > 0 { Timestamp(micros) } else { ecod_client::now() })
+    }
+
     pub(super) fn in_map(time: Timestamp) -> Self {
         Self { stamp: RosTime::of(time), frame_id: "map".to_owned() }
     }
@@ -104,4 +111,16 @@ impl RosQuaternion {
 pub(crate) struct RosPose {
     pub(crate) position: RosVector,
     pub(crate) orientation: RosQuaternion,
+}
+
+#[cfg(feature = "dds")]
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct PoseStamped {
+    pub(crate) header: Header,
+    pub(crate) pose: RosPose,
+}
+
+#[cfg(feature = "dds")]
+impl RosMessage for PoseStamped {
+    const NAME: &'static str = "geometry_msgs/msg/PoseStamped";
 }

@@ -67,6 +67,16 @@ fn at(x: i32, y: i32) -> cdd::PerceivedObject {
 
 fn message(
     objects: Vec<cdd::PerceivedObject>,
+    error: (u16, u16, u16),
+    segment: Option<(u8, u8)>,
+    time: u64,
+) -> Vec<u8> {
+    message_of(vec![objects], error, segment, time)
+}
+
+/// A message with these containers of objects.
+fn message_of(
+    containers: Vec<Vec<cdd::PerceivedObject>>,
     (major, minor, direction): (u16, u16, u16),
     segment: Option<(u8, u8)>,
     time: u64,
@@ -88,10 +98,12 @@ fn message(
         cdd::MessageSegmentationInfo::new(cdd::CardinalNumber3b(total), cdd::OrdinalNumber3b(this))
     });
     let management = pdu::ManagementContainer::new(cdd::TimestampIts(time), position, segment, None);
-    let container = PerceivedObjectContainer::new(cdd::CardinalNumber1B(9), PerceivedObjects(objects));
-    let data = Any::new(rasn::uper::encode(&container).unwrap());
-    let container = pdu::WrappedCpmContainer::new(pdu::PERCEIVED_OBJECT_CONTAINER, data);
-    let containers = pdu::ConstraintWrappedCpmContainers(pdu::WrappedCpmContainers(vec![container]));
+    let containers = containers.into_iter().map(|objects| {
+        let container = PerceivedObjectContainer::new(cdd::CardinalNumber1B(9), PerceivedObjects(objects));
+        let data = Any::new(rasn::uper::encode(&container).unwrap());
+        pdu::WrappedCpmContainer::new(pdu::PERCEIVED_OBJECT_CONTAINER, data)
+    });
+    let containers = pdu::ConstraintWrappedCpmContainers(pdu::WrappedCpmContainers(containers.collect()));
     let header = cdd::ItsPduHeader {
         protocol_version: cdd::OrdinalNumber1B(2),
         message_id: cdd::MessageId(14),
@@ -309,12 +321,29 @@ fn segments_are_joined_and_a_message_that_lacks_one_is_dropped() {
         decode(&message(vec![at(x, 0), at(131_071, 0)], HALF_METRE, Some((this, 2)), time), &ORIGIN).unwrap()
     };
     let mut segments = Segments::default();
-    assert_eq!(segments.join(segment(100, 1, TIME)), None);
-    assert_eq!(segments.join(segment(300, 2, TIME + 100)), None, "the first of this time is missing");
-    let whole = segments.join(segment(200, 1, TIME + 100)).unwrap();
+    assert_eq!(segments.join(segment(100, 1, TIME)), Ok(None));
+    assert_eq!(segments.join(segment(300, 2, TIME + 100)), Ok(None), "the first of this time is missing");
+    let whole = segments.join(segment(200, 1, TIME + 100)).unwrap().unwrap();
     let places: Vec<_> = whole.objects.iter().map(|object| object.x_m.round()).collect();
     assert_eq!((places, whole.left_out), (vec![2.0, 3.0], 2));
-    assert_eq!(segments.join(segment(100, 2, TIME)), None, "what was joined is gone");
+    assert_eq!(segments.join(segment(100, 2, TIME)), Ok(None), "what was joined is gone");
     let single = decode(&message(vec![at(500, 0)], HALF_METRE, None, TIME), &ORIGIN).unwrap();
-    assert_eq!(segments.join(single.clone()), Some(single));
+    assert_eq!(segments.join(single.clone()), Ok(Some(single)));
+}
+
+#[test]
+fn segments_with_more_objects_than_a_report_may_have_are_dropped() {
+    let objects = |number: usize| vec![at(100, 0); number];
+    let segment = |this, number| decode(&message(objects(number), HALF_METRE, Some((this, 8)), TIME), &ORIGIN).unwrap();
+    let mut segments = Segments::default();
+    for this in 1..=4 {
+        assert_eq!(segments.join(segment(this, 255)), Ok(None));
+    }
+    assert_eq!(segments.join(segment(5, 4)), Ok(None), "1024 objects");
+    assert_eq!(segments.join(segment(6, 1)), Err(CpmError::TooManyObjects));
+    let joined: Vec<_> = (1..=8).map(|this| segments.join(segment(this, 1)).unwrap()).collect();
+    assert_eq!(joined.last().unwrap().as_ref().unwrap().objects.len(), 8, "those before are gone");
+    let containers = |number| message_of(vec![objects(255); number], HALF_METRE, None, TIME);
+    assert_eq!(decode(&containers(4), &ORIGIN).map(|received| received.objects.len()), Ok(1020));
+    assert_eq!(decode(&containers(5), &ORIGIN), Err(CpmError::TooManyObjects));
 }
