@@ -15,7 +15,7 @@ use std::time::{Duration, Instant, SystemTime};
 use ecod_client::{Cell, Error, ForeignMessage, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings};
 
 use self::sightings::Sightings;
-use crate::carrying::{Carry, Failures, Refusals, is_within, lock, until_one_ends};
+use crate::carrying::{Carry, Failures, RefusalCounts, is_within, lock, until_one_ends};
 use crate::cpm::{self, CpmCell, CpmError, ObjectIds, RECEIVED_PART, ReceivedCpm, Segments, StationIds};
 
 /// Level of the map's topic below `cpm`.
@@ -47,7 +47,7 @@ pub struct CpmBridge {
     described: Mutex<(Instant, Arc<CpmCell>)>,
     numbers: Mutex<StationIds>,
     sightings: Mutex<Sightings>,
-    refusals: Refusals<(NodeName, CpmRefusal)>,
+    refusals: RefusalCounts<(NodeName, CpmRefusal)>,
     failures: Failures,
 }
 
@@ -94,7 +94,7 @@ impl CpmBridge {
         })?;
         let described = Mutex::new((Instant::now(), Arc::new(described)));
         let numbers = Mutex::new(StationIds::new(name));
-        let (sightings, refusals, failures) = (Mutex::default(), Refusals::default(), Failures::default());
+        let (sightings, refusals, failures) = (Mutex::default(), RefusalCounts::default(), Failures::default());
         Ok(Self { cell, settings, described, numbers, sightings, refusals, failures })
     }
 

@@ -38,15 +38,15 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Numbers of what was refused, by kind.
-pub(crate) struct Refusals<K>(Mutex<BTreeMap<K, u64>>);
+pub(crate) struct RefusalCounts<K>(Mutex<BTreeMap<K, u64>>);
 
-impl<K> Default for Refusals<K> {
+impl<K> Default for RefusalCounts<K> {
     fn default() -> Self {
         Self(Mutex::default())
     }
 }
 
-impl<K: Clone + Ord> Refusals<K> {
+impl<K: Clone + Ord> RefusalCounts<K> {
     /// Maximum number of kinds that are counted apart.
     const MAX_KINDS: usize = 256;
 
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn all_refusals_are_counted_and_the_first_of_each_kind_is_told() {
-        let refusals = Refusals::default();
+        let refusals = RefusalCounts::default();
         let told: Vec<_> = (0..1000).chain(0..1000).filter_map(|kind| refusals.note(kind, 9999)).collect();
         assert_eq!(told, (0..256).chain([9999]).collect::<Vec<_>>());
         let counts = refusals.counts();

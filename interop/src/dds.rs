@@ -29,7 +29,7 @@ use rustdds::{
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::carrying::{Carry, Refusals, is_within, lock, until_one_ends};
+use crate::carrying::{Carry, RefusalCounts, is_within, lock, until_one_ends};
 use crate::ros2::{
     CameraInfo, Definition, Detection2DArray, Detection3DArray, PoseStamped, RosMessage, RosSink, encode, put_map,
     put_report,
@@ -115,7 +115,7 @@ pub struct RosBridge {
     /// Ends the loop over the detector's messages when dropped.
     closing: Mutex<Option<oneshot::Sender<()>>>,
     closed: Mutex<Option<oneshot::Receiver<()>>>,
-    refusals: Refusals<InputRefusal>,
+    refusals: RefusalCounts<InputRefusal>,
 }
 
 /// A message of a detector.
@@ -151,7 +151,7 @@ impl RosBridge {
             participant,
             closing: Mutex::new(Some(closing)),
             closed: Mutex::new(Some(closed)),
-            refusals: Refusals::default(),
+            refusals: RefusalCounts::default(),
         })
     }
 

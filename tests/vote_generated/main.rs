@@ -67,6 +67,11 @@ impl Score {
         [self.online, self.passes, self.passes_beside_online].iter().any(Difference::falls_short)
     }
 
+    /// Whether any difference is below the tolerance, by chance or not.
+    fn is_below(&self) -> bool {
+        [self.online, self.passes, self.passes_beside_online].iter().any(|difference| difference.points() < -TOLERANCE)
+    }
+
     fn row(&self, number: u64, kind: &Kind) -> String {
         let of = |d: Difference| format!("{:+.2} ± {:.2}", d.points(), d.standard_error());
         let (majority, online, passes) = (self.majority, of(self.online), of(self.passes));
@@ -159,6 +164,8 @@ fn check(numbers: &[u64], items: usize) {
         scores.values().map(|score| of(score).points()).sum::<f64>() / scores.len() as f64
     };
     println!("{} sets: online {:+.2}, passes {:+.2} points", scores.len(), mean(|s| s.online), mean(|s| s.passes));
+    let below = scores.values().filter(|score| score.is_below()).count();
+    println!("{below} of {} sets are below by more than {TOLERANCE} points, chance included", scores.len());
     let short: Vec<_> = scores
         .iter()
         .filter(|(_, score)| score.falls_short())

@@ -56,9 +56,9 @@ impl ImageRecorder {
         if frame.captured_at < self.due {
             return;
         }
-        // By whole periods: a frame that comes a little early does not cost the next one its place.
+        // By whole periods, so that frames that come unevenly are not lost; anew after a pause.
         let next = self.due + self.period;
-        self.due = if next <= frame.captured_at { frame.captured_at + self.period } else { next };
+        self.due = if next + self.period <= frame.captured_at { frame.captured_at + self.period } else { next };
         match image_codec::encode_jpeg(&frame.image, JPEG_QUALITY) {
             Ok(jpeg) => {
                 let size = ImageSize::of(&frame.image);
