@@ -137,7 +137,7 @@ replay-check: ## prove that replays of a release build have the bytes that the t
 
 replay-check-arm64: export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER = aarch64-linux-gnu-gcc
 replay-check-arm64: export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUNNER = qemu-aarch64-static -L /usr/aarch64-linux-gnu
-replay-check-arm64: PACKAGES := build-essential ca-certificates gcc-aarch64-linux-gnu qemu-user-static
+replay-check-arm64: PACKAGES := build-essential ca-certificates gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user-static
 replay-check-arm64: setup ## prove the same of the core built for arm64, under qemu; needs the Rust target aarch64-unknown-linux-gnu
 	cargo test --locked --target aarch64-unknown-linux-gnu -p ecod --test replays
 
