@@ -1,7 +1,8 @@
 //! WILDTRACK (Chavdarova et al., CVPR 2018): seven cameras around a square, with boxes that ReST keeps of MVDeTr.
 //!
 //! The 40 frames of its test part, two a second. Each camera reports the feet of its boxes on the ground, and its own pose,
-//! at which it stands. MVDeTr finds people in all images together, so the cameras' errors are not independent. The truth of MVDet has no identities.
+//! at which it stands. MVDeTr finds people in all images together, so the cameras' errors are not independent. The truth of
+//! MVDet has no identities.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -32,7 +32,7 @@ pub(crate) fn is_within(time: SystemTime, difference: Duration) -> bool {
     earlier.unwrap_or_else(|later| later.duration()) <= difference
 }
 
-/// What a mutex guards, also after a panic elsewhere.
+/// The value that a mutex guards, also after a panic elsewhere.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

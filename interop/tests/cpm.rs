@@ -6,6 +6,7 @@ use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use ecod::wire::{CellDescription, ContentHash, Encoding, encode};
@@ -79,6 +80,14 @@ impl Edge {
             std::thread::sleep(Duration::from_millis(20));
         }
     }
+
+    /// A bridge that runs beside the edge of the described cell.
+    fn bridge(&self) -> (Arc<CpmBridge>, JoinHandle<Result<(), Error>>) {
+        self.describe(DESCRIPTION);
+        let bridge = Arc::new(CpmBridge::connect(self.settings.clone()).unwrap());
+        let running = Arc::clone(&bridge);
+        (bridge, std::thread::spawn(move || running.run()))
+    }
 }
 
 impl Drop for Edge {
@@ -121,10 +130,7 @@ fn foreign_cpm(at: Timestamp, station: u32) -> Vec<u8> {
 #[test]
 fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
     let edge = Edge::start(None);
-    edge.describe(DESCRIPTION);
-    let bridge = Arc::new(CpmBridge::connect(edge.settings.clone()).unwrap());
-    let running = Arc::clone(&bridge);
-    let thread = std::thread::spawn(move || running.run());
+    let (bridge, thread) = edge.bridge();
     let (client, mut connection) = edge.stranger("roadside");
     client.subscribe("ecod/v1/lot-1/cpm/#", QoS::AtMostOnce).unwrap();
     // A vehicle without a node beside the foreign station.
@@ -200,10 +206,7 @@ fn a_map_goes_out_as_cpm_and_a_foreign_cpm_becomes_an_object_on_the_map() {
 #[test]
 fn there_is_room_for_twelve_stations_at_a_time_and_for_the_present() {
     let edge = Edge::start(None);
-    edge.describe(DESCRIPTION);
-    let bridge = Arc::new(CpmBridge::connect(edge.settings.clone()).unwrap());
-    let running = Arc::clone(&bridge);
-    let thread = std::thread::spawn(move || running.run());
+    let (bridge, thread) = edge.bridge();
     let radio = Cell::connect(edge.settings.clone()).unwrap();
     let yesterday = Timestamp(now().micros() - 86_400_000_000);
     let expected = [("13", CpmRefusal::TooManyStations), ("1", CpmRefusal::TooOften), ("recorded", CpmRefusal::Time)];
@@ -224,10 +227,7 @@ fn there_is_room_for_twelve_stations_at_a_time_and_for_the_present() {
 #[test]
 fn the_topic_of_the_map_has_no_reports_of_a_node_with_its_name() {
     let edge = Edge::start(None);
-    edge.describe(DESCRIPTION);
-    let bridge = Arc::new(CpmBridge::connect(edge.settings.clone()).unwrap());
-    let running = Arc::clone(&bridge);
-    let thread = std::thread::spawn(move || running.run());
+    let (bridge, thread) = edge.bridge();
     let (client, mut connection) = edge.stranger("roadside");
     client.subscribe("ecod/v1/lot-1/cpm/+", QoS::AtMostOnce).unwrap();
     let vehicles = ["global", "euclid"].map(|node| {

@@ -67,7 +67,7 @@ impl Score {
         [self.online, self.passes, self.passes_beside_online].iter().any(Difference::falls_short)
     }
 
-    /// Whether any difference is below the tolerance, by chance or not.
+    /// True if any difference is below the tolerance, by chance or not.
     fn is_below(&self) -> bool {
         [self.online, self.passes, self.passes_beside_online].iter().any(|difference| difference.points() < -TOLERANCE)
     }

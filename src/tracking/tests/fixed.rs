@@ -57,8 +57,8 @@ struct Common {
     delay_s: f64,
 }
 
-/// What all corrections have in common, and the largest difference between what two cameras are still wrong by, each at
-/// the centre of its rotation: metres and radians.
+/// The common part of all corrections, and the largest remaining error between two cameras, each at the centre of its
+/// rotation: metres and radians.
 fn common_and_rest(tracker: &Tracker, round: &TracksRound, cameras: &[Camera]) -> (Common, f64, f64) {
     let mut common = Common::default();
     let mut rests = Vec::new();
