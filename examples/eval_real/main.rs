@@ -6,8 +6,6 @@
 //! DIR holds copies of public repositories, named as they are there; `docs/measurements.md` has the list. What is missing
 //! is named, and makes the program fail after all others were judged.
 
-#[path = "../eval_tracks/baselines.rs"]
-mod baselines;
 mod foot_points;
 mod ground_camera;
 mod kitti;

@@ -13,11 +13,11 @@ use anyhow::Context;
 use ecod::model::geometry::Pose;
 use ecod::model::names::NodeName;
 use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
+use ecod_lab::eval::baselines::{LatestReports, NearestTracker, suppressed};
 use ecod_lab::eval::formats::time_of;
 use nalgebra::{Matrix2, Matrix3, Point2, Vector3};
 use serde_json::Value;
 
-use super::baselines::{Latest, Tracker, suppressed};
 use super::ground_camera::GroundCamera;
 use super::{Recording, write_reports};
 
@@ -87,7 +87,7 @@ impl Wildtrack {
         let to_ground = to_ground.context("a homography has no inverse")?;
         let (mut places, mut all, mut late_fusion) = (String::new(), String::new(), String::new());
         let (mut alone, mut reported) = (vec![String::new(); to_ground.len()], Vec::new());
-        let (mut latest, mut tracker) = (Latest::default(), Tracker::default());
+        let (mut latest, mut tracker) = (LatestReports::default(), NearestTracker::default());
         for (number, (frame, boxes)) in (1..).zip(&self.boxes) {
             for place in self.positions.get(frame).into_iter().flatten() {
                 writeln!(places, "{}", line(number, 1.0, place))?;

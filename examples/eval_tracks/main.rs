@@ -7,7 +7,6 @@
 //! of them. `--reliability` draws how often ECOD's objects are right by what they state. `--recordings` writes reports and truth of every scene, and the maps of late fusion, for `ecod-node replay` and
 //! `ecod-lab eval`.
 
-mod baselines;
 mod plot;
 mod reliability;
 
@@ -27,13 +26,12 @@ use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind};
+use ecod_lab::eval::baselines::{LatestReports, NearestTracker, found, suppressed};
 use ecod_lab::eval::tracks::{AP_DISTANCES_M, ReliabilityBins, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
 use ecod_lab::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use uuid::Uuid;
-
-use baselines::{Latest, Tracker, found, suppressed};
 
 const TUNING: Range<u64> = 1..5;
 const REPORT: Range<u64> = 1001..1005;
@@ -43,7 +41,7 @@ const OBSERVERS: [usize; 7] = [1, 2, 4, 8, 16, 32, 50];
 pub(crate) const METHODS: [&str; 4] = ["best vehicle", "union", "late fusion", "ecod"];
 
 /// Columns of the table.
-pub(crate) const FIGURES: [&str; 11] = [
+pub(crate) const FIGURES: [&str; 12] = [
     "AP@0.5",
     "AP@1",
     "AP@2",
@@ -53,14 +51,15 @@ pub(crate) const FIGURES: [&str; 11] = [
     "HOTA",
     "IDF1",
     "calibration error",
+    "of existence",
     "best threshold",
     "switches per object",
 ];
 
 /// Number of figures that are percentages; they come first.
-const PERCENTAGES: usize = 9;
+const PERCENTAGES: usize = 10;
 
-/// The figures of one method, in the order of [`FIGURES`].
+/// The figures of one method, in the order of [`FIGURES`]; NaN where there is none.
 pub(crate) type Figures = [f64; FIGURES.len()];
 
 const USAGE: &str = "eval_tracks [--seeds tuning|report] [--count N] [--seconds S] [--observers 2,4,8] [--write-table FILE] \
@@ -155,8 +154,8 @@ fn run(
     let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth)?)?;
     let judge = || TrackEvaluation::new(truth.clone());
     let (mut union, mut late, mut ours) = (judge(), judge(), judge());
-    let (mut union_tracker, mut late_tracker) = (Tracker::default(), Tracker::default());
-    let mut latest = Latest::default();
+    let (mut union_tracker, mut late_tracker) = (NearestTracker::default(), NearestTracker::default());
+    let mut latest = LatestReports::default();
     for map in maps(recording, &mut |event| match event {
         Event::Report(report) => latest.report(report),
         Event::Due(at) => {
@@ -215,7 +214,7 @@ fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<G
 
 /// One vehicle by itself, at the times of its captures: nothing takes time.
 fn alone(recording: &TrafficRecording, name: &NodeName, mut judge: TrackEvaluation) -> TrackScores {
-    let mut tracker = Tracker::default();
+    let mut tracker = NearestTracker::default();
     let mut own: Vec<_> = recording.reports.iter().map(|arrived| &arrived.report).filter(|r| r.node == *name).collect();
     own.sort_by_key(|report| report.captured_at_us);
     for report in own {
@@ -229,8 +228,10 @@ fn figures(scores: &TrackScores, truth_ids: usize) -> Figures {
     let [a, b, c, d] = scores.ap_pct.map(Option::unwrap_or_default);
     let rest = [scores.best_f1_pct, at.moda_pct, at.hota_pct, at.idf1_pct, scores.calibration.confidence.ece_pct];
     let [f1, moda, hota, idf1, error] = rest.map(Option::unwrap_or_default);
+    let of_existence =
+        scores.calibration.existence.as_ref().and_then(|existence| existence.ece_pct).unwrap_or(f64::NAN);
     let switches = at.id_switches as f64 / truth_ids.max(1) as f64;
-    [a, b, c, d, f1, moda, hota, idf1, error, at.threshold, switches]
+    [a, b, c, d, f1, moda, hota, idf1, error, of_existence, at.threshold, switches]
 }
 
 /// Where a recording is written to, line by line.
@@ -315,7 +316,8 @@ fn main() -> anyhow::Result<()> {
         }
         for (method, figures) in METHODS.iter().zip(&mean) {
             let (shares, others) = figures.split_at(PERCENTAGES);
-            let shares = shares.iter().map(|figure| format!("{figure:.1}"));
+            let shares =
+                shares.iter().map(|figure| if figure.is_nan() { "–".to_owned() } else { format!("{figure:.1}") });
             let cells: Vec<String> = shares.chain(others.iter().map(|figure| format!("{figure:.2}"))).collect();
             let row = format!("| {name} | {method} | {} |\n", cells.join(" | "));
             print!("{row}");

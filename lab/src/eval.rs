@@ -8,6 +8,7 @@
 //! Call [`Evaluation::fused`] with every line of a replay's output and, for the baselines, [`Evaluation::report`] with
 //! every report, in any order; then [`Evaluation::result`].
 
+pub mod baselines;
 pub mod formats;
 pub mod tracks;
 mod truth;

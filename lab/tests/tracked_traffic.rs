@@ -1,19 +1,15 @@
 //! Tracking of generated traffic: better than late fusion, and the better for what detectors say beside positions.
 
-#[path = "../../examples/eval_tracks/baselines.rs"]
-mod baselines;
-
 use std::sync::Arc;
 
 use ecod::aggregator::{Aggregator, Algorithms, FusionConfig};
 use ecod::model::names::NodeName;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind};
+use ecod_lab::eval::baselines::{LatestReports, NearestTracker, suppressed};
 use ecod_lab::eval::tracks::{TrackEvaluation, TrackTruth};
 use ecod_lab::traffic::{SaidConfig, SensorConfig, TrafficConfig, TrafficRecording, TruthFrame, generate};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-
-use baselines::{Latest, Tracker, suppressed};
 
 const SEED: u64 = 2001;
 
@@ -57,7 +53,7 @@ fn traffic_is_tracked_better_than_late_fusion_does_it() {
         let recording = recording_of(&config);
         let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap();
         let (mut ours, mut late) = (TrackEvaluation::new(truth.clone()), TrackEvaluation::new(truth));
-        let (mut latest, mut tracker) = (Latest::default(), Tracker::default());
+        let (mut latest, mut tracker) = (LatestReports::default(), NearestTracker::default());
         fuse(&recording, |report, map| {
             report.into_iter().for_each(|report| latest.report(report));
             if let Some(map) = map {
@@ -150,7 +146,7 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 3] {
         [a, b, c, d, e, f]
     };
     let mut late = TrackEvaluation::new(truth.clone());
-    let (mut latest, mut tracker) = (Latest::default(), Tracker::default());
+    let (mut latest, mut tracker) = (LatestReports::default(), NearestTracker::default());
     let ours = [true, false].map(|align| {
         let mut config = FusionConfig::default();
         config.tracks.align = align;

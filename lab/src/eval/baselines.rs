@@ -10,8 +10,9 @@ use std::time::Duration;
 use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::wire::ObjectReport;
-use ecod_lab::eval::tracks::SaidObject;
 use nalgebra::{Point2, Vector2};
+
+use super::tracks::SaidObject;
 
 /// Age beyond which a vehicle's last report is not used.
 const MAX_AGE: Duration = Duration::from_millis(300);
@@ -25,20 +26,20 @@ const PATIENCE: Duration = Duration::from_millis(500);
 
 /// An object that was found, with its score.
 #[derive(Debug, Clone)]
-pub(crate) struct Found {
+pub struct FoundObject {
     label: Label,
     score: f64,
     position: Point2<f64>,
 }
 
 /// All that one report says, the vehicle itself too if its pose is known.
-pub(crate) fn found(report: &ObjectReport) -> Vec<Found> {
-    let objects = report.objects.iter().map(|object| Found {
+pub fn found(report: &ObjectReport) -> Vec<FoundObject> {
+    let objects = report.objects.iter().map(|object| FoundObject {
         label: object.label.clone(),
         score: object.confidence,
         position: Point2::new(object.x_m, object.y_m),
     });
-    let own = report.pose.filter(|_| report.moving != Some(false)).map(|pose| Found {
+    let own = report.pose.filter(|_| report.moving != Some(false)).map(|pose| FoundObject {
         label: Label::new_static("car"),
         score: 1.0,
         position: Point2::new(pose.x_m, pose.y_m),
@@ -48,11 +49,11 @@ pub(crate) fn found(report: &ObjectReport) -> Vec<Found> {
 
 /// The last reports of all vehicles.
 #[derive(Debug, Default)]
-pub(crate) struct Latest(BTreeMap<NodeName, (Timestamp, Vec<Found>)>);
+pub struct LatestReports(BTreeMap<NodeName, (Timestamp, Vec<FoundObject>)>);
 
-impl Latest {
+impl LatestReports {
     /// Takes a report, unless a later one is there already.
-    pub(crate) fn report(&mut self, report: &ObjectReport) {
+    pub fn report(&mut self, report: &ObjectReport) {
         let last = self.0.entry(report.node.clone()).or_default();
         if report.captured_at_us > last.0 {
             *last = (report.captured_at_us, found(report));
@@ -60,20 +61,21 @@ impl Latest {
     }
 
     /// Objects that all vehicles found.
-    pub(crate) fn union(&self, now: Timestamp) -> Vec<Found> {
+    pub fn union(&self, now: Timestamp) -> Vec<FoundObject> {
         let fresh = self.0.values().filter(|(captured, _)| now.since(*captured) <= MAX_AGE);
         fresh.flat_map(|(_, found)| found.iter().cloned()).collect()
     }
 }
 
 /// Of those of one label near each other, the one with the highest score.
-pub(crate) fn suppressed(mut found: Vec<Found>) -> Vec<Found> {
+pub fn suppressed(mut found: Vec<FoundObject>) -> Vec<FoundObject> {
     found.sort_by(|a, b| b.score.total_cmp(&a.score));
-    let mut kept: Vec<Found> = Vec::new();
+    let mut kept: Vec<FoundObject> = Vec::new();
     for candidate in found {
         let limit_m = if candidate.label == "car" { SAME_CAR_M } else { SAME_OTHER_M };
-        let is_same =
-            |other: &Found| other.label == candidate.label && (other.position - candidate.position).norm() < limit_m;
+        let is_same = |other: &FoundObject| {
+            other.label == candidate.label && (other.position - candidate.position).norm() < limit_m
+        };
         if !kept.iter().any(is_same) {
             kept.push(candidate);
         }
@@ -83,13 +85,13 @@ pub(crate) fn suppressed(mut found: Vec<Found>) -> Vec<Found> {
 
 /// Gives identities to what is found.
 #[derive(Debug, Default)]
-pub(crate) struct Tracker {
-    tracks: Vec<Track>,
+pub struct NearestTracker {
+    tracks: Vec<NearestTrack>,
     identities: u32,
 }
 
 #[derive(Debug)]
-struct Track {
+struct NearestTrack {
     id: u32,
     label: Label,
     position: Point2<f64>,
@@ -97,9 +99,9 @@ struct Track {
     at: Timestamp,
 }
 
-impl Tracker {
+impl NearestTracker {
     /// Takes what is there at a time.
-    pub(crate) fn track(&mut self, at: Timestamp, found: &[Found]) -> Vec<SaidObject> {
+    pub fn track(&mut self, at: Timestamp, found: &[FoundObject]) -> Vec<SaidObject> {
         self.tracks.retain(|track| at.since(track.at) <= PATIENCE);
         let mut pairs = Vec::new();
         for (number, track) in self.tracks.iter().enumerate() {
@@ -129,15 +131,21 @@ impl Tracker {
         identified.collect()
     }
 
-    fn begin(&mut self, at: Timestamp, Found { label, position, .. }: &Found) -> u32 {
+    fn begin(&mut self, at: Timestamp, FoundObject { label, position, .. }: &FoundObject) -> u32 {
         let id = self.identities;
         self.identities += 1;
-        self.tracks.push(Track { id, label: label.clone(), position: *position, velocity: Vector2::zeros(), at });
+        self.tracks.push(NearestTrack {
+            id,
+            label: label.clone(),
+            position: *position,
+            velocity: Vector2::zeros(),
+            at,
+        });
         id
     }
 }
 
-impl Track {
+impl NearestTrack {
     fn follow(&mut self, at: Timestamp, position: Point2<f64>) -> u32 {
         let passed_s = at.since(self.at).as_secs_f64();
         if passed_s > 0.0 {
