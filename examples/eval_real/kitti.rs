@@ -47,7 +47,8 @@ pub(super) fn convert(
         }
         fs::write(own_detections.join(&file), merged)?;
     }
-    let (truth, detections) = (FileFormat::Kitti.read(&own_truth)?, FileFormat::Kitti.read(&own_detections)?);
+    let (truth, detections) =
+        (FileFormat::Kitti.read(&own_truth, None)?, FileFormat::Kitti.read(&own_detections, None)?);
     let mut reports = Vec::new();
     for (number, (truth, detections)) in truth.iter().zip(&detections).enumerate() {
         reports.extend(detections.reports(number, 10.0, &NodeName::from_static("kitti"), truth.last()));

@@ -5,6 +5,7 @@ mod columns;
 mod convert;
 mod demo;
 mod eval;
+mod files;
 mod report;
 mod street;
 mod testbed;

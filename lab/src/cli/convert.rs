@@ -3,12 +3,12 @@
 use std::io::Write as _;
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod::model::names::NodeName;
 use ecod_actors::cli::{Failure, lines};
 
-use super::eval::frame_rate;
+use super::files::{camera, frame_rate, read};
 use crate::eval::formats::FileFormat;
 
 /// Flags of `convert`.
@@ -18,8 +18,11 @@ pub(super) struct ConvertArguments {
     #[arg(long, value_enum, value_name = "FORM")]
     format: FileFormat,
     /// A vehicle, and the file of its detections or a directory with one for each sequence; may be given several times
-    #[arg(long, value_name = "NAME=FILE", required = true, value_parser = vehicle)]
+    #[arg(long, value_name = "NAME=FILE", required = true, value_parser = of_vehicle)]
     vehicle: Vec<(NodeName, PathBuf)>,
+    /// A vehicle, and its configuration (TOML) with the camera whose boxes are in its file; may be given several times
+    #[arg(long, value_name = "NAME=FILE", value_parser = of_vehicle)]
+    config: Vec<(NodeName, PathBuf)>,
     /// Frames a second
     #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = frame_rate)]
     frame_rate: f64,
@@ -28,16 +31,21 @@ pub(super) struct ConvertArguments {
     output: PathBuf,
 }
 
-fn vehicle(text: &str) -> Result<(NodeName, PathBuf), String> {
+fn of_vehicle(text: &str) -> Result<(NodeName, PathBuf), String> {
     let (name, file) = text.split_once('=').ok_or("is not NAME=FILE, such as euclid=det.txt")?;
     Ok((NodeName::new(name).map_err(|error| error.to_string())?, file.into()))
 }
 
 pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
-    let ConvertArguments { format, vehicle, frame_rate, output } = arguments;
+    let ConvertArguments { format, vehicle, config, frame_rate, output } = arguments;
+    if let Some((other, _)) = config.iter().find(|(name, _)| vehicle.iter().all(|(vehicle, _)| vehicle != name)) {
+        return Err(Failure::usage(anyhow!("--config is of {other}, of which no --vehicle is given")));
+    }
     let mut reports = Vec::new();
     for (name, path) in vehicle {
-        for (place, sequence) in format.read(path).map_err(Failure::usage)?.iter().enumerate() {
+        let config = config.iter().find(|(of, _)| of == name).map(|(_, path)| path.as_path());
+        let camera = camera(config)?;
+        for (place, sequence) in read(*format, path, camera.as_ref())?.iter().enumerate() {
             reports.extend(sequence.reports(place, *frame_rate, name, sequence.last()));
         }
     }

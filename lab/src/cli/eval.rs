@@ -17,6 +17,7 @@ use ecod_actors::cli::{Failure, cell};
 use serde::Deserialize;
 
 use super::columns::columns;
+use super::files::frame_rate;
 use super::write_json;
 use crate::eval::formats::FileFormat;
 use crate::eval::tracks::TrackTruth;
@@ -36,7 +37,8 @@ pub(super) struct EvalArguments {
     /// The reports that were replayed, for majority vote and every vehicle alone
     #[arg(long, value_name = "FILE")]
     reports: Option<PathBuf>,
-    /// Configuration of the cell (TOML), to place reported objects that name no location and for synonyms
+    /// Configuration of the cell (TOML), to place reported objects that name no location and for synonyms; with --format, of the
+    /// vehicle whose camera took the images, to place boxes
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Form of a benchmark's files, or of all files in a directory
@@ -48,12 +50,6 @@ pub(super) struct EvalArguments {
     /// Write the results to this file (JSON)
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-}
-
-/// Frames a second of files of benchmarks.
-pub(super) fn frame_rate(text: &str) -> Result<f64, String> {
-    let rate = text.parse().ok().filter(|rate| (0.01..=1000.0).contains(rate));
-    rate.ok_or_else(|| "is no number from 0.01 to 1000".to_owned())
 }
 
 /// Longest line of output in bytes: the last of several passes is one line.

@@ -1,10 +1,12 @@
-//! Files of benchmarks, as truth and as what a tracker or a detector said: KITTI tracking and MOTChallenge.
+//! Files of benchmarks, as truth and as what a tracker or a detector said: KITTI tracking, MOTChallenge and COCO.
 //!
-//! Frames are numbered in these files; frame n is n periods after the first. Positions are on the ground, in metres. A
-//! directory is a sequence for each file, by name, a thousand seconds apart.
+//! Frames are numbered in these files; frame n is n periods after the first. Positions are on the ground, in metres; boxes in an
+//! image are placed there by the camera that took it. A directory is a sequence for each file, by name, a thousand seconds apart.
 
+mod coco;
 mod kitti;
 mod mot;
+mod standing_camera;
 #[cfg(test)]
 mod tests;
 
@@ -14,10 +16,13 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::ValueEnum;
+use ecod::model::detection::BoundingBox;
 use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
-use ecod::wire::{ObjectReport, PerceivedObject};
+use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
 use nalgebra::Point2;
+
+pub use standing_camera::StandingCamera;
 
 /// Time between the beginnings of two sequences.
 const SEQUENCE_US: u64 = 1_000_000_000;
@@ -27,8 +32,10 @@ const SEQUENCE_US: u64 = 1_000_000_000;
 pub enum FileFormat {
     /// KITTI tracking: label_02 and results, or AB3DMOT's detections; the frame of the vehicle, x forward, y left
     Kitti,
-    /// MOTChallenge with positions on the ground (columns 8 and 9), as 3D MOT 2015 has them
+    /// MOTChallenge: positions on the ground (columns 8 and 9), as 3D MOT 2015 has them, or boxes of the camera in --config
     Mot,
+    /// COCO: a dataset with annotations, or results; image n is frame n, with boxes of the camera in --config
+    Coco,
 }
 
 /// An object in a frame.
@@ -36,13 +43,31 @@ pub enum FileFormat {
 pub struct FileObject {
     /// Its identity in its sequence; none for detections.
     pub id: Option<i64>,
-    /// Its class.
-    pub label: Label,
-    /// Confidence, 0 to 1; of truth, 1.
-    pub score: f64,
-    /// Its place on the ground in metres.
-    pub position: Point2<f64>,
+    /// Its class, its confidence (of truth, 1) and its place on the ground.
+    pub object: PerceivedObject,
 }
+
+/// An object as its file says it.
+#[derive(Debug, Clone, PartialEq)]
+struct ParsedObject {
+    id: Option<i64>,
+    label: Label,
+    /// Confidence, 0 to 1 unless it is log-odds; of truth, 1.
+    score: f64,
+    place: FilePlace,
+}
+
+/// Where a file has an object.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum FilePlace {
+    /// On the ground, in metres.
+    Ground(Point2<f64>),
+    /// In the image.
+    Image(BoundingBox),
+}
+
+/// The objects of every frame that has any, or that the file lists, by its number.
+type ParsedFrames = BTreeMap<u64, Vec<ParsedObject>>;
 
 /// The objects of every frame that has any, by its number.
 pub type Frames = BTreeMap<u64, Vec<FileObject>>;
@@ -56,6 +81,10 @@ pub struct Sequence {
     pub first: u64,
     /// Its frames.
     pub frames: Frames,
+    /// The pose of the camera that placed the objects.
+    pub pose: Option<WirePose>,
+    /// Boxes without a place on the ground, by reason.
+    pub discarded: BTreeMap<&'static str, u64>,
 }
 
 impl Sequence {
@@ -73,12 +102,9 @@ impl Sequence {
         last: u64,
     ) -> impl Iterator<Item = ObjectReport> {
         (self.first..=last).map(move |frame| {
-            let objects = self.frames.get(&frame).into_iter().flatten();
-            let of = |FileObject { label, score, position, .. }: &FileObject| {
-                PerceivedObject::new(label.clone(), *score, position.x, position.y)
-            };
+            let objects = self.frames.get(&frame).into_iter().flatten().map(|object| object.object.clone()).collect();
             let at = time_of(number, frame, frame_rate_hz);
-            ObjectReport { objects: objects.map(of).collect(), ..ObjectReport::new(node.clone(), frame, at) }
+            ObjectReport { objects, pose: self.pose, ..ObjectReport::new(node.clone(), frame, at) }
         })
     }
 }
@@ -96,48 +122,55 @@ pub struct LineError {
 }
 
 impl FileFormat {
-    /// Reads a file, or all `.txt` files of a directory.
+    /// Reads a file, or all of a directory with the ending of the form. Boxes are those of `camera`.
     ///
     /// # Errors
     /// Naming file, line and field.
-    pub fn read(self, path: &Path) -> anyhow::Result<Vec<Sequence>> {
-        files(path)?.iter().map(|file| self.sequence(file)).collect()
+    pub fn read(self, path: &Path, camera: Option<&StandingCamera>) -> anyhow::Result<Vec<Sequence>> {
+        let ending = if self == Self::Coco { "json" } else { "txt" };
+        files(path, ending)?.iter().map(|file| self.sequence(file, camera)).collect()
     }
 
-    /// Reads a file.
-    ///
-    /// # Errors
-    /// Naming file, line and field.
-    pub fn sequence(self, file: &Path) -> anyhow::Result<Sequence> {
+    fn sequence(self, file: &Path, camera: Option<&StandingCamera>) -> anyhow::Result<Sequence> {
         let text = fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
-        let frames = self.parse(&text).with_context(|| file.display().to_string())?;
+        let parsed = self.parse(&text, camera.is_some()).with_context(|| file.display().to_string())?;
         let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let first = match self {
             Self::Kitti => 0,
             Self::Mot => 1,
+            Self::Coco => parsed.keys().next().copied().unwrap_or_default(),
         };
-        Ok(Sequence { name, first, frames })
+        let sequence = Sequence { name, first, frames: Frames::new(), pose: None, discarded: BTreeMap::new() };
+        Ok(standing_camera::placed(parsed, camera, sequence))
     }
 
-    /// Reads the text of a file.
-    ///
-    /// # Errors
-    /// [`LineError`] naming line and field.
-    pub fn parse(self, text: &str) -> Result<Frames, LineError> {
-        let mut frames = Frames::new();
+    /// Reads the text of a file; one with boxes needs a camera.
+    fn parse(self, text: &str, has_camera: bool) -> anyhow::Result<ParsedFrames> {
+        let mut frames = match self {
+            Self::Coco => coco::frames(text, has_camera)?,
+            _ => self.lines(text, has_camera)?,
+        };
+        as_probabilities(&mut frames);
+        Ok(frames)
+    }
+
+    fn lines(self, text: &str, has_camera: bool) -> Result<ParsedFrames, LineError> {
+        let mut frames = ParsedFrames::new();
         for (number, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
             let cells = Cells::new(number + 1, line);
-            let object = match self {
-                Self::Kitti => kitti::object(&cells)?,
-                Self::Mot => mot::object(&cells)?,
-            };
+            let object = if self == Self::Kitti { kitti::object(&cells)? } else { mot::object(&cells, has_camera)? };
             if let Some((frame, object)) = object {
                 frames.entry(frame).or_default().push(object);
             }
         }
-        as_probabilities(&mut frames);
         Ok(frames)
     }
+}
+
+/// The number of a frame, if it is plausible.
+fn frame_number(number: i64) -> Option<u64> {
+    // Beyond this, the times of two sequences would meet.
+    (0..100_000_000).contains(&number).then_some(number as u64)
 }
 
 /// The time of a frame.
@@ -146,22 +179,22 @@ pub fn time_of(sequence: usize, frame: u64, frame_rate_hz: f64) -> Timestamp {
 }
 
 /// Scores that are none of 0 to 1 are taken for log-odds: their order stays.
-fn as_probabilities(frames: &mut Frames) {
+fn as_probabilities(frames: &mut ParsedFrames) {
     let mut scores: Vec<&mut f64> = frames.values_mut().flatten().map(|object| &mut object.score).collect();
     if scores.iter().any(|score| !(0.0..=1.0).contains(&**score)) {
         scores.iter_mut().for_each(|score| **score = 1.0 / (1.0 + (-**score).exp()));
     }
 }
 
-fn files(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+fn files(path: &Path, ending: &str) -> anyhow::Result<Vec<PathBuf>> {
     if !path.is_dir() {
         return Ok(vec![path.to_owned()]);
     }
     let entries = fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let is_text = |file: &PathBuf| file.extension().is_some_and(|extension| extension == "txt");
-    let mut files: Vec<PathBuf> = entries.filter_map(Result::ok).map(|entry| entry.path()).filter(is_text).collect();
+    let has_ending = |file: &PathBuf| file.extension().is_some_and(|extension| extension == ending);
+    let mut files: Vec<PathBuf> = entries.filter_map(Result::ok).map(|entry| entry.path()).filter(has_ending).collect();
     files.sort();
-    if files.is_empty() { bail!("there is no .txt file in {}", path.display()) } else { Ok(files) }
+    if files.is_empty() { bail!("there is no .{ending} file in {}", path.display()) } else { Ok(files) }
 }
 
 /// The cells of a line, separated by commas or else by blanks.
@@ -200,9 +233,7 @@ impl<'a> Cells<'a> {
 
     fn frame(&self) -> Result<u64, LineError> {
         let frame = self.integer(1, "frame")?;
-        // Beyond this, the times of two sequences would meet.
-        let is_plausible = (0..100_000_000).contains(&frame);
-        if is_plausible { Ok(frame as u64) } else { Err(self.error(1, "frame", format!("{frame} is out of bounds"))) }
+        frame_number(frame).ok_or_else(|| self.error(1, "frame", format!("{frame} is out of bounds")))
     }
 
     fn error(&self, column: usize, name: &str, fault: String) -> LineError {

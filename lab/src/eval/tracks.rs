@@ -296,10 +296,10 @@ impl TrackEvaluation {
                     next += 1;
                     SaidObject {
                         id: object.id.map_or(next, |id| *ids.entry((number, id)).or_insert(next)),
-                        label: object.label.clone(),
-                        score: object.score,
+                        label: object.object.label.clone(),
+                        score: object.object.confidence,
                         existence: None,
-                        position: object.position,
+                        position: Point2::new(object.object.x_m, object.object.y_m),
                     }
                 });
                 said.insert(time_of(number, *frame, frame_rate_hz), objects.collect());

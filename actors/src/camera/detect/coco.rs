@@ -4,7 +4,7 @@
 //! outputs.
 
 mod anchors;
-pub(super) mod labels;
+pub mod labels;
 
 use std::path::PathBuf;
 

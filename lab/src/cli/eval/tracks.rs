@@ -9,6 +9,7 @@ use ecod_actors::cli::{Failure, lines};
 use serde::Serialize;
 
 use super::{EvalArguments, columns, read_output, write_json};
+use crate::cli::files;
 use crate::eval::formats::FileFormat;
 use crate::eval::tracks::{TrackEvaluation, TrackScores, TrackTruth};
 use crate::report::tracks::{tables, without_map};
@@ -27,9 +28,10 @@ pub(super) fn run(arguments: &EvalArguments, text: &str) -> Result<(), Failure> 
 
 /// Judges by the truth in files of a benchmark: maps, or files of the same form.
 pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result<(), Failure> {
-    let EvalArguments { truth: path, input, frame_rate, .. } = arguments;
-    let mut truth = format.read(path).map_err(Failure::usage)?;
-    let said = if is_of_maps(input)? { None } else { Some(format.read(input).map_err(Failure::usage)?) };
+    let EvalArguments { truth: path, input, frame_rate, config, .. } = arguments;
+    let camera = files::camera(config.as_deref())?;
+    let mut truth = files::read(format, path, camera.as_ref())?;
+    let said = if is_of_maps(input)? { None } else { Some(files::read(format, input, camera.as_ref())?) };
     if let Some(said) = said.as_ref().filter(|said| said.len() > 1 || truth.len() > 1) {
         // Part of the sequences may be judged.
         truth.retain(|sequence| said.iter().any(|other| other.name == sequence.name));
@@ -78,7 +80,7 @@ fn judge_maps(arguments: &EvalArguments, mut evaluation: TrackEvaluation) -> Res
 }
 
 fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Result<(), Failure> {
-    if arguments.reports.is_some() || arguments.config.is_some() {
+    if arguments.reports.is_some() || (arguments.config.is_some() && arguments.format.is_none()) {
         return Err(Failure::usage(anyhow!("--reports and --config are for a truth of locations")));
     }
     let scores = evaluation.result();

@@ -9,14 +9,14 @@
 use ecod::model::names::Label;
 use nalgebra::Point2;
 
-use super::{Cells, FileObject, LineError};
+use super::{Cells, FilePlace, LineError, ParsedObject};
 
 /// The classes that the benchmark judges. Others, such as vans, are left out.
 const CLASSES: [&str; 3] = ["Pedestrian", "Car", "Cyclist"];
 
-pub(super) fn object(cells: &Cells) -> Result<Option<(u64, FileObject)>, LineError> {
+pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineError> {
     let frame = cells.frame()?;
-    let position = |x: usize| Ok(Point2::new(cells.number(x + 2, "z")?, -cells.number(x, "x")?));
+    let place = |x: usize| Ok(FilePlace::Ground(Point2::new(cells.number(x + 2, "z")?, -cells.number(x, "x")?)));
     if cells.has_commas {
         let number = cells.integer(2, "type")?;
         let label = usize::try_from(number - 1).ok().and_then(|place| CLASSES.get(place));
@@ -24,13 +24,12 @@ pub(super) fn object(cells: &Cells) -> Result<Option<(u64, FileObject)>, LineErr
         let label = Label::new_static(label.ok_or_else(unknown)?);
         // PointRCNN's scores are log-odds.
         let score = 1.0 / (1.0 + (-cells.number(7, "score")?).exp());
-        let object = FileObject { id: None, label, score, position: position(11)? };
-        return Ok(Some((frame, object)));
+        return Ok(Some((frame, ParsedObject { id: None, label, score, place: place(11)? })));
     }
     let id = cells.integer(2, "track")?;
     let class = cells.text(3, "type")?;
     let Some(label) = CLASSES.into_iter().find(|known| *known == class) else { return Ok(None) };
     let has_score = cells.cells.len() > 17;
     let score = if has_score { cells.number(18, "score")? } else { 1.0 };
-    Ok(Some((frame, FileObject { id: Some(id), label: Label::new_static(label), score, position: position(14)? })))
+    Ok(Some((frame, ParsedObject { id: Some(id), label: Label::new_static(label), score, place: place(14)? })))
 }

@@ -1,3 +1,7 @@
+use std::fs;
+
+use tempfile::TempDir;
+
 use super::*;
 
 /// Frame, identity, label, score and position.
@@ -5,8 +9,34 @@ type Row<'a> = (u64, Option<i64>, &'a str, f64, f64, f64);
 
 fn positions(frames: &Frames) -> Vec<Row<'_>> {
     let flat = frames.iter().flat_map(|(frame, objects)| objects.iter().map(move |object| (*frame, object)));
-    flat.map(|(frame, o)| (frame, o.id, o.label.as_str(), o.score, o.position.x, o.position.y)).collect()
+    flat.map(|(frame, FileObject { id, object })| {
+        (frame, *id, object.label.as_str(), object.confidence, object.x_m, object.y_m)
+    })
+    .collect()
 }
+
+/// What a file with that text has.
+fn read(format: FileFormat, text: &str, camera: Option<&StandingCamera>) -> anyhow::Result<Sequence> {
+    let folder = TempDir::new()?;
+    let file = folder.path().join("file");
+    fs::write(&file, text)?;
+    Ok(format.read(&file, camera)?.remove(0))
+}
+
+/// A camera 4 m up that looks north from (10, -5), level; a pixel is 1/500 ahead.
+fn camera() -> StandingCamera {
+    let folder = TempDir::new().unwrap();
+    let file = folder.path().join("camera.toml");
+    let keys = "[pose]\nx_m = 10.0\ny_m = -5.0\nheading_deg = 90.0\n\
+                [camera]\nsource = { kind = \"images\", path = \"frames\" }\ndetector = { kind = \"coco\" }\nmount = { height_m = 4.0 }\n\
+                optics = { width_px = 1000, height_px = 800, horizontal_fov_deg = 90.0 }\n\
+                projection = { ranging = \"ground\" }\n";
+    fs::write(&file, keys).unwrap();
+    StandingCamera::load(&file).unwrap()
+}
+
+/// A box whose lower edge is that of something on the ground 20 m ahead of the camera and 2 m to its right.
+const BOX_AT_12_15: &str = "[540.0, 450.0, 20.0, 50.0]";
 
 #[test]
 fn kittis_labels_and_results_are_in_the_frame_of_the_vehicle() {
@@ -14,7 +44,7 @@ fn kittis_labels_and_results_are_in_the_frame_of_the_vehicle() {
                 0 2 Van 0 0 -1.7 296.7 161.7 455.2 292.3 2.0 1.8 4.4 -4.5 1.8 13.4 -2.1\n\
                 0 3 Car 0 0 -1.7 296.7 161.7 455.2 292.3 1.5 1.6 3.9 -4.5 1.8 13.4 -2.1\n\n\
                 2 3 Car 0 0 -1.7 296.7 161.7 455.2 292.3 1.5 1.6 3.9 -4.0 1.8 14.0 -2.1 0.7\n";
-    let frames = FileFormat::Kitti.parse(text).unwrap();
+    let frames = read(FileFormat::Kitti, text, None).unwrap().frames;
     assert_eq!(
         positions(&frames),
         [(0, Some(3), "Car", 1.0, 13.4, 4.5), (2, Some(3), "Car", 0.7, 14.0, 4.0)],
@@ -28,7 +58,7 @@ fn scores_of_detectors_become_probabilities_in_the_same_order() {
         format!("{frame},{kind},1,2,3,4,{score},1.5,1.6,3.9,2.9,1.6,6.4,-1.5,-2.0\n")
     };
     let text = line(0, 2, 0.0) + &line(0, 1, 12.0) + &line(4, 3, -0.8);
-    let frames = FileFormat::Kitti.parse(&text).unwrap();
+    let frames = read(FileFormat::Kitti, &text, None).unwrap().frames;
     let found = positions(&frames);
     assert_eq!(found[0], (0, None, "Car", 0.5, 6.4, -2.9));
     assert!((found[1].2, found[2].2) == ("Pedestrian", "Cyclist") && found[1].3 > 0.99 && found[2].3 < 0.5);
@@ -37,7 +67,7 @@ fn scores_of_detectors_become_probabilities_in_the_same_order() {
 #[test]
 fn positions_of_mot_challenge_are_those_on_the_ground() {
     let text = "1,-1,912,484,97,109,0.5,3.5,-2.25,0\n2,7,912,484,97,109,1,4,5,0\n2,8,912,484,97,109,0,4,5,0\n";
-    let frames = FileFormat::Mot.parse(text).unwrap();
+    let frames = read(FileFormat::Mot, text, None).unwrap().frames;
     assert_eq!(positions(&frames), [(1, None, "person", 0.5, 3.5, -2.25), (2, Some(7), "person", 1.0, 4.0, 5.0)]);
 }
 
@@ -51,9 +81,55 @@ fn line_and_field_of_what_cannot_be_read_are_named() {
         (FileFormat::Kitti, "0,2,1,2,3,4,nan,1,1,1,1,1,1", "line 1: column 7 (score): \"nan\" is no number"),
         (FileFormat::Mot, "1.5,1,1,2,3,4,1,1,1,1", "line 1: column 1 (frame): 1.5 is no whole number"),
         (FileFormat::Mot, "1,1,1,2,3,4,1,1,1", "line 1: column 8 (x): is no position on the ground"),
-        (FileFormat::Mot, "1,1,1,2,3,4,1,-1,-1,-1", "line 1: column 8 (x): -1 is no position on the ground"),
+        (FileFormat::Mot, "1,1,1,2,3,4,1,-1,-1,-1", "line 1: column 8 (x): is no position on the ground"),
+        (FileFormat::Coco, "[]", "boxes in an image have no place on the ground: give their camera with --config"),
     ] {
-        let said = format.parse(text).unwrap_err().to_string();
+        let said = read(format, text, None).unwrap_err().root_cause().to_string();
+        assert!(said.starts_with(fault), "{text}: {said}");
+    }
+}
+
+#[test]
+fn boxes_of_coco_and_of_mot_challenge_are_placed_by_their_camera() {
+    let camera = camera();
+    let dataset = format!(
+        "{{\"images\": [{{\"id\": 7}}, {{\"id\": 8}}], \"categories\": [{{\"id\": 1, \"name\": \"van\"}}], \"annotations\": [\
+         {{\"image_id\": 8, \"category_id\": 1, \"bbox\": {BOX_AT_12_15}, \"track_id\": 3}}, \
+         {{\"image_id\": 8, \"category_id\": 1, \"bbox\": {BOX_AT_12_15}, \"iscrowd\": 1}}]}}"
+    );
+    let results = format!("[{{\"image_id\": 8, \"category_id\": 3, \"bbox\": {BOX_AT_12_15}, \"score\": 0.5}}]");
+    let lines = "8,-1,540,450,20,50,0.5,-1,-1,-1\n9,-1,540,350,20,40,0.5\n".to_owned();
+    for (format, text, id, label, score, first) in [
+        (FileFormat::Coco, dataset, Some(3), "van", 1.0, 7),
+        (FileFormat::Coco, results, None, "car", 0.5, 8),
+        (FileFormat::Mot, lines, None, "person", 0.5, 1),
+    ] {
+        let sequence = read(format, &text, Some(&camera)).unwrap();
+        let [(frame, is, named, said, x_m, y_m)] = positions(&sequence.frames)[..] else { panic!("{sequence:?}") };
+        assert_eq!((sequence.first, frame, is, named, said), (first, 8, id, label, score));
+        // The middle of an object is behind where it touches the ground.
+        assert!((x_m - 12.0).abs() < 0.5 && (15.0..17.5).contains(&y_m), "({x_m}, {y_m})");
+        assert!(sequence.frames[&8][0].object.covariance_m2.is_some() && sequence.pose.unwrap().y_m == -5.0);
+        let above = if format == FileFormat::Mot { Some(&1) } else { None };
+        assert_eq!(sequence.discarded.get("above_horizon"), above, "the second box of the lines stands in the sky");
+    }
+}
+
+#[test]
+fn what_cannot_be_read_of_coco_is_named_by_its_path() {
+    let camera = camera();
+    for (text, fault) in [
+        (r#"[{"image_id": 1, "category_id": 3, "bbox": [1, 2, 3]}]"#, "[0].bbox: invalid length 3"),
+        (r#"[{"image_id": 1, "category_id": 3, "bbox": [1, 2, 0, 4]}]"#, "[0].bbox: [1.0, 2.0, 0.0, 4.0] is no box"),
+        (r#"[{"image_id": 1, "category_id": 12, "bbox": [1, 2, 3, 4]}]"#, "[0].category_id: 12 is no known category"),
+        (r#"[{"image_id": -1, "category_id": 3, "bbox": [1, 2, 3, 4]}]"#, "[0].image_id: -1 is out of bounds"),
+        (r#"{"images": [], "categories": [{"id": 1, "name": ""}], "annotations": []}"#, "categories[0].name:"),
+        (
+            r#"{"images": [], "categories": [], "annotations": [{"image_id": 1, "category_id": 3, "bbox": [1, 2, 3, 4]}]}"#,
+            "annotations[0].category_id: 3 is no known category",
+        ),
+    ] {
+        let said = read(FileFormat::Coco, text, Some(&camera)).unwrap_err().root_cause().to_string();
         assert!(said.starts_with(fault), "{text}: {said}");
     }
 }

@@ -11,7 +11,7 @@ pub(in super::super) fn all() -> impl Iterator<Item = (usize, &'static str)> {
 }
 
 /// Name of the class with that id, if it is in use.
-pub(in super::super) fn name(id: usize) -> Option<&'static str> {
+pub fn name(id: usize) -> Option<&'static str> {
     NAMES.get(id.checked_sub(1)?).copied().filter(|name| !name.is_empty())
 }
 
