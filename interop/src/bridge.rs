@@ -7,7 +7,9 @@
 //! ```
 
 mod sightings;
+mod stations;
 
+use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
@@ -15,21 +17,12 @@ use std::time::{Duration, Instant, SystemTime};
 use ecod_client::{Cell, Error, ForeignMessage, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings};
 
 use self::sightings::Sightings;
+use self::stations::StationPlaces;
 use crate::carrying::{Carry, Failures, RefusalCounts, is_within, lock, until_one_ends};
 use crate::cpm::{self, CpmCell, CpmError, ObjectIds, RECEIVED_PART, ReceivedCpm, Segments, StationIds};
 
 /// Level of the map's topic below `cpm`.
 const MAP_LEVEL: &str = "global";
-
-/// Maximum number of other stations at a time. A node has room for 16 parts.
-const MAX_OTHER_STATIONS: usize = 12;
-
-/// Silence after which a station gives its place to another.
-const STATION_RETENTION: Duration = Duration::from_secs(10);
-
-/// Time between two reports of all stations together. The node's door takes 50 reports a second of all its programs, and a vehicle's
-/// own detector needs most of them.
-const REPORT_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Most by which a message's time may differ from this machine's. A station's is that of GNSS: no other offset is one of its clock.
 const MAX_REFERENCE_TIME_DIFFERENCE: Duration = Duration::from_secs(2);
@@ -60,12 +53,15 @@ pub enum CpmRefusal {
     /// It has the station number of a node of this cell: an echo.
     #[error("a station number of this cell")]
     Own,
-    /// It is of another time, as a recorded message is, or this machine's clock is wrong.
-    #[error("a time more than 2 s from this machine's")]
+    /// It is of another time, as a recorded message is, or one without leap seconds, or this machine's clock is wrong.
+    #[error("a time more than 2 s from this machine's, which 5 s of missing leap seconds are, too")]
     Time,
     /// The station's messages come more often than there is room for beside other stations and the node itself.
     #[error("more often than can be reported")]
     TooOften,
+    /// Another receiver brings the station already.
+    #[error("a station that another receiver brings")]
+    OtherReceiver,
     /// As many stations as there is room for were heard lately.
     #[error("too many stations")]
     TooManyStations,
@@ -125,7 +121,7 @@ impl CpmBridge {
         let mut ids = ObjectIds::default();
         for map in self.cell.maps() {
             let map: &GlobalMap = &*map?;
-            let number = lock(&self.numbers).of(&map.aggregator);
+            let number = lock(&self.numbers).of(&map.aggregator, Instant::now());
             let Some(number) = number else { continue };
             let (described, now) = (self.described(), Instant::now());
             let sightings = lock(&self.sightings);
@@ -146,7 +142,9 @@ impl CpmBridge {
                 }
                 continue;
             }
-            let number = (!cpm::is_received(&report.node)).then(|| lock(&self.numbers).of(&report.node)).flatten();
+            let number = (!cpm::is_received(&report.node))
+                .then(|| lock(&self.numbers).of(&report.node, Instant::now()))
+                .flatten();
             let Some(number) = number else { continue };
             let encoded = cpm::encode_report(report, &self.described(), number);
             self.send(report.node.as_str(), encoded)?;
@@ -173,7 +171,8 @@ impl CpmBridge {
     }
 
     fn take_received(&self) -> Result<(), Error> {
-        let mut stations = Stations { settings: &self.settings, connected: BTreeMap::new() };
+        let mut stations =
+            Stations { settings: &self.settings, places: StationPlaces::default(), connected: BTreeMap::new() };
         for message in self.cell.received_cpms() {
             let message: &ForeignMessage = &*message?;
             if let Err(refusal) = self.take(&mut stations, message) {
@@ -188,13 +187,13 @@ impl CpmBridge {
         if received.left_out > 0 {
             log::debug!("cpm/received/{}: {} objects without a usable place", message.receiver, received.left_out);
         }
-        if lock(&self.numbers).contains(received.station_id) {
+        if lock(&self.numbers).contains(received.station_id, Instant::now()) {
             return Err(CpmRefusal::Own);
         }
         if !is_within(capture_time(&received), MAX_REFERENCE_TIME_DIFFERENCE) {
             return Err(CpmRefusal::Time);
         }
-        stations.report(received)
+        stations.report(&message.receiver, received)
     }
 
     /// The cell as it was described a second ago at most; the last known state while it cannot be had.
@@ -217,11 +216,11 @@ impl CpmBridge {
         Arc::clone(&last.1)
     }
 
-    /// Counts a message that became no report, and tells of the first of each kind.
+    /// Counts a message that became no report.
     fn note(&self, receiver: &NodeName, refusal: CpmRefusal) {
         let rest = (NodeName::from_static(OTHER_RECEIVERS), refusal);
-        if let Some((receiver, _)) = self.refusals.note((receiver.clone(), refusal), rest) {
-            log::warn!("no report from cpm/received/{receiver}: {refusal}; others like it are only counted");
+        if let Some(((receiver, _), count)) = self.refusals.note((receiver.clone(), refusal), rest) {
+            log::warn!("no report from cpm/received/{receiver}: {refusal}; {count} so far");
         }
     }
 }
@@ -242,44 +241,39 @@ fn vacancy_signs(description: &str) -> BTreeSet<Label> {
 /// Connections in which stations report.
 struct Stations<'a> {
     settings: &'a Settings,
+    places: StationPlaces,
     connected: BTreeMap<u32, Station>,
 }
 
 struct Station {
     cell: Cell,
-    heard_at: Instant,
-    reported_at: Option<Instant>,
     segments: Segments,
 }
 
 impl Stations<'_> {
-    fn report(&mut self, received: ReceivedCpm) -> Result<(), CpmRefusal> {
-        let number = received.station_id;
-        self.connected.retain(|other, station| *other == number || station.heard_at.elapsed() < STATION_RETENTION);
-        if !self.connected.contains_key(&number) {
-            // A place is for those who have something to say.
-            if received.objects.is_empty() {
-                return Ok(());
-            }
-            if self.connected.len() >= MAX_OTHER_STATIONS {
-                return Err(CpmRefusal::TooManyStations);
-            }
-            let settings = Settings { part: format!("{RECEIVED_PART}{number}"), ..self.settings.clone() };
-            let cell = Cell::connect(settings).map_err(|error| {
-                log::debug!("{RECEIVED_PART}{number}: {error}");
-                CpmRefusal::NotConnected
-            })?;
-            let station = Station { cell, heard_at: Instant::now(), reported_at: None, segments: Segments::default() };
-            self.connected.insert(number, station);
+    fn report(&mut self, receiver: &NodeName, received: ReceivedCpm) -> Result<(), CpmRefusal> {
+        let (number, now) = (received.station_id, Instant::now());
+        // A place is for those who have something to say.
+        if received.objects.is_empty() && !self.places.has(number) {
+            return Ok(());
         }
-        let interval = REPORT_INTERVAL * self.connected.len() as u32;
-        let Some(station) = self.connected.get_mut(&number) else { return Ok(()) };
-        station.heard_at = Instant::now();
+        self.places.enter(number, receiver, now)?;
+        self.connected.retain(|other, _| self.places.has(*other));
+        let station = match self.connected.entry(number) {
+            Entry::Occupied(station) => station.into_mut(),
+            Entry::Vacant(place) => {
+                let settings = Settings { part: format!("{RECEIVED_PART}{number}"), ..self.settings.clone() };
+                let cell = Cell::connect(settings).map_err(|error| {
+                    log::debug!("{RECEIVED_PART}{number}: {error}");
+                    CpmRefusal::NotConnected
+                })?;
+                place.insert(Station { cell, segments: Segments::default() })
+            }
+        };
         let Some(whole) = station.segments.join(received)? else { return Ok(()) };
-        if station.reported_at.is_some_and(|reported_at| reported_at.elapsed() < interval) {
+        if !self.places.take_room(number, now) {
             return Err(CpmRefusal::TooOften);
         }
-        station.reported_at = Some(Instant::now());
         let frame = Frame { captured_at: capture_time(&whole), ..Frame::new(whole.objects) };
         station.cell.report(frame).map(drop).map_err(|_| CpmRefusal::Report)
     }

@@ -1,5 +1,5 @@
 //! Bridges carry each kind of message on a thread of its own, and take messages only of their own time. They count what they
-//! refuse, and tell of each kind once.
+//! refuse, and tell of each kind at once and then ever more rarely.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -50,14 +50,15 @@ impl<K: Clone + Ord> RefusalCounts<K> {
     /// Maximum number of kinds that are counted apart.
     const MAX_KINDS: usize = 256;
 
-    /// Counts one, beyond [`Self::MAX_KINDS`] as one of `rest`. Gives the kind for the log if it is the first of it.
-    pub(crate) fn note(&self, kind: K, rest: K) -> Option<K> {
+    /// Counts one, beyond [`Self::MAX_KINDS`] as one of `rest`. Gives kind and count for the log when the count is a power of ten.
+    pub(crate) fn note(&self, kind: K, rest: K) -> Option<(K, u64)> {
         let mut counts = lock(&self.0);
         let has_room = counts.len() < Self::MAX_KINDS || counts.contains_key(&kind);
         let kind = if has_room { kind } else { rest };
         let count = counts.entry(kind.clone()).or_default();
         *count += 1;
-        (*count == 1).then_some(kind)
+        let is_told = 10u64.pow(count.ilog10()) == *count;
+        is_told.then_some((kind, *count))
     }
 
     pub(crate) fn counts(&self) -> BTreeMap<K, u64> {
@@ -107,10 +108,11 @@ mod tests {
     }
 
     #[test]
-    fn all_refusals_are_counted_and_the_first_of_each_kind_is_told() {
+    fn all_refusals_are_counted_and_the_powers_of_ten_of_each_kind_are_told() {
         let refusals = RefusalCounts::default();
         let told: Vec<_> = (0..1000).chain(0..1000).filter_map(|kind| refusals.note(kind, 9999)).collect();
-        assert_eq!(told, (0..256).chain([9999]).collect::<Vec<_>>());
+        let first = (0..256).map(|kind| (kind, 1));
+        assert_eq!(told, first.chain([1, 10, 100, 1000].map(|count| (9999, count))).collect::<Vec<_>>());
         let counts = refusals.counts();
         assert_eq!((counts.values().sum::<u64>(), counts.len(), counts[&9999]), (2000, 257, 1488));
     }

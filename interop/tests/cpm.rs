@@ -243,7 +243,8 @@ fn the_topic_of_the_map_has_no_reports_of_a_node_with_its_name() {
             std::thread::sleep(Duration::from_millis(50));
         }
     });
-    let of_edge = StationIds::new(NodeName::from_static("lot-1")).of(&NodeName::from_static("edge")).unwrap();
+    let of_edge =
+        StationIds::new(NodeName::from_static("lot-1")).of(&NodeName::from_static("edge"), Instant::now()).unwrap();
     let (began, mut stations, mut of_euclid) = (Instant::now(), BTreeSet::new(), 0);
     for event in connection.iter() {
         assert!(began.elapsed() < SOON, "{stations:?} {of_euclid}");

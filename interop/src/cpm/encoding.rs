@@ -1,5 +1,7 @@
 //! Messages of maps and reports.
 
+use std::collections::BTreeMap;
+
 use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd as cdd;
 use c_its_parser::standards::cpm_2_1_1::cpm_originating_station_containers::{
     OriginatingRsuContainer, OriginatingVehicleContainer,
@@ -21,6 +23,9 @@ use crate::object::CellObject;
 
 /// Maximum number of objects in a message.
 const MAX_OBJECTS: usize = 255;
+
+/// Width of a tile in metres: from its centre to the far corner of the next is less than a message can state.
+const TILE_M: f64 = 600.0;
 
 /// Greatest age that a message states, in milliseconds: at least so old.
 const MAX_AGE_MS: u16 = 1500;
@@ -221,15 +226,22 @@ fn uper<T: rasn::Encode>(value: &T) -> Result<Vec<u8>, CpmError> {
     rasn::uper::encode(value).map_err(|_| CpmError::Unencodable)
 }
 
-/// The origin if all objects are near enough, or else the middle between the outermost.
+/// The centre of the tile that, with its neighbours, holds most objects; of several, the nearest to the origin. All objects of
+/// these nine tiles are near enough for a message.
 fn centre(sources: &[CpmObject<'_>]) -> (f64, f64) {
-    let middle = |axis: fn(&CpmObject<'_>) -> f64| {
-        let all = || sources.iter().map(axis);
-        let (least, most) = (all().fold(f64::INFINITY, f64::min), all().fold(f64::NEG_INFINITY, f64::max));
-        let is_near = sources.is_empty() || (least > -900.0 && most < 900.0);
-        if is_near { 0.0 } else { (least + most) / 2.0 }
-    };
-    (middle(|source| source.object.position_m[0]), middle(|source| source.object.position_m[1]))
+    let mut counts: BTreeMap<(i64, i64), usize> = BTreeMap::new();
+    for [x_m, y_m] in sources.iter().map(|source| source.object.position_m) {
+        let [column, row] = [x_m, y_m].map(|metres| (metres / TILE_M).round() as i64);
+        for near in (0..9).map(|place| (column + place % 3 - 1, row + place / 3 - 1)) {
+            *counts.entry(near).or_default() += 1;
+        }
+    }
+    let from_origin = |(column, row): (i64, i64)| (column as f64).hypot(row as f64);
+    let best = counts.into_iter().max_by(|(at, count), (other, most)| {
+        count.cmp(most).then_with(|| from_origin(*other).total_cmp(&from_origin(*at)))
+    });
+    let (column, row) = best.map_or((0, 0), |(at, _)| at);
+    (column as f64 * TILE_M, row as f64 * TILE_M)
 }
 
 fn coordinate(metres: f64, variance_m2: Option<f64>) -> Option<cdd::CartesianCoordinateWithConfidence> {

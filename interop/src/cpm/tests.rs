@@ -1,6 +1,7 @@
 #![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use std::f64::consts::{PI, TAU};
+use std::time::{Duration, Instant};
 
 use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd as cdd;
 use c_its_parser::standards::cpm_2_1_1::cpm_pdu_descriptions::{
@@ -144,10 +145,11 @@ fn a_node_has_the_same_station_number_in_every_run() {
     let numbers = || StationIds::new(NodeName::from_static("lot-1"));
     let (euclid, gauss) = (NodeName::from_static("euclid"), NodeName::from_static("gauss"));
     let (mut one, mut other) = (numbers(), numbers());
-    let of_gauss = one.of(&gauss).unwrap();
-    assert_ne!(of_gauss, one.of(&euclid).unwrap());
-    assert_eq!(one.of(&euclid), other.of(&euclid));
-    assert!(one.contains(of_gauss) && !other.contains(of_gauss));
+    let now = Instant::now();
+    let of_gauss = one.of(&gauss, now).unwrap();
+    assert_ne!(of_gauss, one.of(&euclid, now).unwrap());
+    assert_eq!(one.of(&euclid, now), other.of(&euclid, now));
+    assert!(one.contains(of_gauss, now) && !other.contains(of_gauss, now));
 }
 
 #[test]
@@ -183,14 +185,19 @@ fn of_too_many_objects_the_surest_are_sent() {
 }
 
 #[test]
-fn a_map_far_from_the_origin_has_its_reference_position_among_its_objects() {
-    let far = map(vec![fused(1, 5000.0), fused(2, 5800.0), fused(3, 9000.0)], Vec::new());
-    let message = encode_map(&far, &cell(30.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
-    assert_eq!(message.left_out, 2, "the middle is 2 km from the outermost");
-    let near = map(vec![fused(1, 5000.0), fused(2, 5800.0)], Vec::new());
-    let message = encode_map(&near, &cell(30.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
-    let objects = decode(&message.bytes, &origin(30.0)).unwrap().objects;
-    assert!((objects[0].x_m - 5000.0).abs() < 0.01 && (objects[1].x_m - 5800.0).abs() < 0.01);
+fn the_reference_position_is_where_most_objects_are() {
+    let sent = |places: &[f64]| {
+        let objects = (1..).zip(places).map(|(id, x_m)| fused(id, *x_m)).collect();
+        let message =
+            encode_map(&map(objects, Vec::new()), &cell(45.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
+        let objects = decode(&message.bytes, &origin(45.0)).unwrap().objects;
+        (objects.iter().map(|object| object.x_m.round()).collect::<Vec<_>>(), message.left_out)
+    };
+    assert_eq!(sent(&[5000.0, 5800.0, 9000.0]), (vec![5000.0, 5800.0], 1), "far from the origin");
+    assert_eq!(sent(&[-890.0, 20.0, 890.0]), (vec![-890.0, 20.0, 890.0], 0), "all about the origin");
+    for far_m in [3000.0, -3000.0, 1e8] {
+        assert_eq!(sent(&[far_m, 0.0]), (vec![0.0], 1), "one object that is far costs no other its place");
+    }
 }
 
 #[test]
@@ -323,10 +330,23 @@ fn parts_that_report_received_messages_are_told_from_others() {
 }
 
 #[test]
-fn there_are_station_numbers_for_so_many_names() {
-    let mut numbers = StationIds::new(NodeName::from_static("lot-1"));
+fn there_are_station_numbers_for_so_many_names_that_are_heard() {
+    let (mut numbers, start) = (StationIds::new(NodeName::from_static("lot-1")), Instant::now());
     let name = |index: u32| NodeName::new(format!("node-{index}")).unwrap();
-    let all: BTreeSet<_> = (0..4096).map(|index| numbers.of(&name(index)).unwrap()).collect();
-    assert_eq!((all.len(), numbers.of(&name(4096))), (4096, None));
-    assert!(numbers.of(&name(7)).is_some());
+    let all: BTreeSet<_> = (0..4096).map(|index| numbers.of(&name(index), start).unwrap()).collect();
+    assert_eq!((all.len(), numbers.of(&name(4096), start)), (4096, None));
+    let later = start + Duration::from_secs(59);
+    let of_seven = numbers.of(&name(7), later).unwrap();
+    let much_later = start + Duration::from_secs(61);
+    assert!(numbers.of(&name(4096), much_later).is_some(), "silent nodes make room");
+    assert!(numbers.contains(of_seven, much_later));
+    assert!(!numbers.contains(of_seven, later + Duration::from_secs(61)), "a silent node's number is no echo");
+}
+
+#[test]
+fn a_vehicle_that_invents_parts_takes_no_others_numbers() {
+    let (mut numbers, now) = (StationIds::new(NodeName::from_static("lot-1")), Instant::now());
+    let part = |index: u32| NodeName::new(format!("evil--{index}")).unwrap();
+    assert_eq!((0..500).filter_map(|index| numbers.of(&part(index), now)).count(), 17);
+    assert!(numbers.of(&NodeName::from_static("euclid"), now).is_some());
 }
