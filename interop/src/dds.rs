@@ -9,14 +9,17 @@
 mod detections;
 
 use std::collections::BTreeMap;
-use std::net::IpAddr;
-use std::sync::Mutex;
+use std::net::{IpAddr, UdpSocket};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
 use std::time::{Duration, Instant, SystemTime};
 
 use ecod::perception::pose_history::PoseHistory;
 use ecod_client::{Cell, Error, GlobalMap, ObjectReport, Settings};
 use futures::channel::oneshot;
 use futures::executor::block_on_stream;
+use futures::future::ready;
 use futures::stream::{BoxStream, select_all};
 use futures::{FutureExt, StreamExt};
 use rustdds::bytes::Bytes;
@@ -35,7 +38,7 @@ use crate::ros2::{
     put_report,
 };
 pub use detections::{InputRefusal, RosCamera};
-use detections::{place_in_pictures, pose_in_map};
+use detections::{RefusedInput, place_in_pictures, pose_in_map};
 
 /// Part of the node's name in which detections are reported.
 const PART: &str = "ros2";
@@ -49,10 +52,16 @@ const SILENCE: Duration = Duration::from_secs(60);
 /// Most by which a stamp may differ from this machine's time.
 const MAX_STAMP_DIFFERENCE: Duration = Duration::from_secs(10);
 
+/// The last domain that has ports of UDP.
+pub const MAX_DOMAIN: u16 = 232;
+
+/// Time after which the log tells of topics of the detector on which nothing came.
+const PATIENCE: Duration = Duration::from_secs(10);
+
 /// Domain, network and input of a bridge.
 #[derive(Debug, Clone, Default)]
 pub struct RosSettings {
-    /// Number of the domain, `ROS_DOMAIN_ID`.
+    /// Number of the domain, `ROS_DOMAIN_ID`, at most [`MAX_DOMAIN`].
     pub domain: u16,
     /// Addresses of this machine's networks; empty for all.
     pub networks: Vec<IpAddr>,
@@ -91,6 +100,12 @@ pub enum RosBridgeError {
     /// No part in the DDS domain, or a topic that is not possible there.
     #[error("DDS: {0}; is the domain right, and the network up?")]
     Dds(String),
+    /// A domain beyond the last.
+    #[error("domain {0} is none of 0 to {MAX_DOMAIN}")]
+    Domain(u16),
+    /// A network in which this machine has no part.
+    #[error("network {0}: no address of this machine; `ip address` shows them")]
+    Network(IpAddr),
     /// A topic below `/ecod`, which a bridge publishes. As reports, what a cell says would confirm itself.
     #[error("{0} is no detector's topic: below /ecod are those of bridges, by which a cell would confirm itself")]
     OwnTopic(String),
@@ -115,7 +130,15 @@ pub struct RosBridge {
     /// Ends the loop over the detector's messages when dropped.
     closing: Mutex<Option<oneshot::Sender<()>>>,
     closed: Mutex<Option<oneshot::Receiver<()>>>,
+    inputs: Mutex<Vec<DetectorInput>>,
     refusals: RefusalCounts<InputRefusal>,
+}
+
+/// A topic that is taken from ROS.
+struct DetectorInput {
+    topic: String,
+    kind: &'static str,
+    heard: Arc<AtomicBool>,
 }
 
 /// A message of a detector.
@@ -124,6 +147,8 @@ enum Taken {
     InPicture(Detection2DArray),
     Optics(Box<CameraInfo>),
     Pose(PoseStamped),
+    /// The detector had time to begin.
+    Patience,
     Closed,
 }
 
@@ -135,6 +160,12 @@ impl RosBridge {
     pub fn connect(settings: Settings, ros: RosSettings) -> Result<Self, RosBridgeError> {
         if let Some(own) = ros.taken().find(|topic| topic.trim_start_matches('/').starts_with("ecod/")) {
             return Err(RosBridgeError::OwnTopic(own.clone()));
+        }
+        if ros.domain > MAX_DOMAIN {
+            return Err(RosBridgeError::Domain(ros.domain));
+        }
+        if let Some(other) = ros.networks.iter().find(|address| UdpSocket::bind((**address, 0)).is_err()) {
+            return Err(RosBridgeError::Network(*other));
         }
         let cell = Cell::connect(Settings { part: PART.to_owned(), ..settings })?;
         let mut participant = DomainParticipantBuilder::new(ros.domain);
@@ -151,6 +182,7 @@ impl RosBridge {
             participant,
             closing: Mutex::new(Some(closing)),
             closed: Mutex::new(Some(closed)),
+            inputs: Mutex::default(),
             refusals: RefusalCounts::default(),
         })
     }
@@ -199,7 +231,14 @@ impl RosBridge {
 
     fn take_detections(&self) -> Result<(), RosBridgeError> {
         let Some(closed) = lock(&self.closed).take() else { return Ok(()) };
+        let (over, patience) = oneshot::channel();
+        thread::spawn(move || {
+            thread::sleep(PATIENCE);
+            // The bridge may be closed.
+            let _ = over.send(());
+        });
         let mut streams = vec![closed.map(|_| Taken::Closed).into_stream().boxed()];
+        streams.push(patience.map(|_| Taken::Patience).into_stream().boxed());
         match &self.input {
             Some(DetectorTopics::InSpace(topic)) => streams.push(self.read(topic, Taken::InSpace)?),
             Some(DetectorTopics::InPictures(topic, optics)) => {
@@ -214,6 +253,10 @@ impl RosBridge {
         let (mut optics, mut poses) = (None, self.pose_topic.as_ref().map(|_| PoseHistory::default()));
         for taken in block_on_stream(select_all(streams)) {
             let placed = match taken {
+                Taken::Patience => {
+                    self.tell_of_silence();
+                    continue;
+                }
                 Taken::InSpace(detections) => self.camera.place(&detections, poses.as_ref()),
                 Taken::InPicture(detections) => {
                     place_in_pictures(&self.camera, &detections, optics.as_deref(), poses.as_ref())
@@ -232,7 +275,7 @@ impl RosBridge {
             };
             let (frame, unplaced) = match placed {
                 Ok((frame, _)) if !is_within(frame.captured_at, MAX_STAMP_DIFFERENCE) => {
-                    self.note(InputRefusal::BadTime);
+                    self.note(InputRefusal::BadTime.with(seconds(frame.captured_at)));
                     continue;
                 }
                 Ok(placed) => placed,
@@ -243,10 +286,7 @@ impl RosBridge {
             };
             unplaced.into_iter().for_each(|refusal| self.note(refusal));
             match self.cell.report(frame) {
-                Err(Error::Invalid(cause)) => {
-                    log::debug!("{cause}");
-                    self.note(InputRefusal::Report);
-                }
+                Err(Error::Invalid(cause)) => self.note(InputRefusal::Report.with(cause)),
                 sent => drop(sent?),
             }
         }
@@ -258,7 +298,7 @@ impl RosBridge {
         let taken = pose_in_map(stamped).and_then(|(at, pose)| {
             let is_near = is_within(SystemTime::UNIX_EPOCH + Duration::from_micros(at.micros()), MAX_STAMP_DIFFERENCE);
             let is_taken = is_near && poses.push(at, pose);
-            if is_taken { Ok(()) } else { Err(InputRefusal::BadPoseTime) }
+            if is_taken { Ok(()) } else { Err(InputRefusal::BadPoseTime.into()) }
         });
         if let Err(refusal) = taken {
             self.note(refusal);
@@ -277,25 +317,46 @@ impl RosBridge {
         let subscriber = self.participant.create_subscriber(&qos).map_err(RosBridgeError::dds)?;
         let reader: DataReader<M> =
             subscriber.create_datareader_no_key_cdr(&topic, Some(qos)).map_err(RosBridgeError::dds)?;
-        let samples = reader.async_sample_stream().filter_map(move |sample| async move {
-            match sample {
+        let heard = Arc::new(AtomicBool::new(false));
+        lock(&self.inputs).push(DetectorInput { topic: name.to_owned(), kind: M::NAME, heard: Arc::clone(&heard) });
+        let samples = reader.async_sample_stream().filter_map(move |sample| {
+            heard.store(true, Ordering::Relaxed);
+            let taken = match sample {
                 Ok(sample) => Some(taken(sample.into_value())),
                 Err(error) => {
-                    log::debug!("a message that cannot be read: {error}");
-                    self.note(InputRefusal::Malformed);
+                    self.note(InputRefusal::Malformed.with(error));
                     None
                 }
-            }
+            };
+            ready(taken)
         });
         Ok(samples.boxed())
     }
 
-    /// Counts something that is not reported, and tells of the first of each kind.
-    fn note(&self, refusal: InputRefusal) {
-        if let Some(refusal) = self.refusals.note(refusal, refusal) {
-            log::warn!("not reported from ROS: {refusal}; others like it are only counted");
+    /// Tells of topics on which nothing came.
+    fn tell_of_silence(&self) {
+        for DetectorInput { topic, kind, heard } in lock(&self.inputs).iter() {
+            if !heard.load(Ordering::Relaxed) {
+                log::warn!(
+                    "nothing on {topic} in {PATIENCE:?}: are topic, type ({kind}), domain and network those of its node?"
+                );
+            }
         }
     }
+
+    /// Counts something that is not reported.
+    fn note(&self, refused: RefusedInput) {
+        let RefusedInput { refusal, detail } = refused;
+        if let Some((refusal, count)) = self.refusals.note(refusal, refusal) {
+            log::warn!("not reported from ROS: {refusal}{detail}; {count} so far");
+        }
+    }
+}
+
+/// A time, for the log.
+fn seconds(time: SystemTime) -> String {
+    let since_1970 = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    format!("{:.3} s since 1970", since_1970.as_secs_f64())
 }
 
 fn qos(reliability: Reliability) -> QosPolicies {

@@ -1,11 +1,15 @@
 //! Program `ecod-interop`: bridges between a cell and the languages of others.
 
+#[cfg(feature = "ros2")]
+use std::fmt::Display;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 use ecod_client::{Settings, Tls};
 use ecod_interop::bridge::CpmBridge;
+#[cfg(feature = "ros2")]
+use ecod_interop::ros2::{Conversion, RosLog};
 #[cfg(feature = "dds")]
 use {
     ecod::model::geometry::Pose,
@@ -28,7 +32,7 @@ enum Command {
     /// A log as MCAP of profile ros2: detections, markers, poses of cameras, pictures.
     #[cfg(feature = "ros2")]
     Ros2 {
-        /// Log that a node recorded (MCAP).
+        /// Log that a node recorded (MCAP), or a directory of them: all become one file.
         log: PathBuf,
         /// File to be written.
         output: PathBuf,
@@ -44,17 +48,17 @@ enum Command {
 struct RosOptions {
     #[command(flatten)]
     connection: Connection,
-    /// Domain of DDS.
-    #[arg(long, env = "ROS_DOMAIN_ID", default_value_t = 0)]
+    /// Domain of DDS, 0 to 232.
+    #[arg(long, env = "ROS_DOMAIN_ID", default_value = "0", value_parser = domain)]
     domain: u16,
-    /// Address of this machine in a network to take part in; may be given several times. Default: in all.
+    /// Address of this machine in a network in which to announce itself; may be given several times. Default: in all.
     #[arg(long, value_name = "ADDRESS")]
     network: Vec<std::net::IpAddr>,
     /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in that of a camera with a --pose or --pose-topic.
-    #[arg(long, value_name = "TOPIC", conflicts_with = "detections_2d")]
+    #[arg(long, value_name = "TOPIC", group = "detections")]
     detections_3d: Option<String>,
     /// Topic of vision_msgs/Detection2DArray: boxes in pictures without distortion.
-    #[arg(long, value_name = "TOPIC", requires_all = ["camera_info", "camera_pose"])]
+    #[arg(long, value_name = "TOPIC", group = "detections", requires_all = ["camera_info", "camera_pose"])]
     detections_2d: Option<String>,
     /// Topic of sensor_msgs/CameraInfo: the optics of these pictures.
     #[arg(long, value_name = "TOPIC", requires = "detections_2d")]
@@ -63,7 +67,7 @@ struct RosOptions {
     #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose, group = "camera_pose")]
     pose: Option<Pose>,
     /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x ahead.
-    #[arg(long, value_name = "TOPIC", group = "camera_pose")]
+    #[arg(long, value_name = "TOPIC", group = "camera_pose", requires = "detections")]
     pose_topic: Option<String>,
     /// Height of the camera above the ground in metres; boxes are then also ranged by the ground.
     #[arg(long, value_parser = height)]
@@ -100,6 +104,12 @@ impl RosOptions {
         let ros = RosSettings { domain: self.domain, networks: self.network, input, pose_topic, camera };
         Ok((self.connection.settings(), ros))
     }
+}
+
+/// A number of a domain; of an empty variable the default one.
+#[cfg(feature = "dds")]
+fn domain(text: &str) -> Result<u16, String> {
+    if text.is_empty() { Ok(0) } else { text.parse().map_err(|_| "must be a number from 0 to 232".to_owned()) }
 }
 
 #[cfg(feature = "dds")]
@@ -165,7 +175,7 @@ impl Connection {
 }
 
 fn main() -> ExitCode {
-    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or("info,rustdds=warn")).init();
+    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or("info,rustdds=error")).init();
     let ended = match Cli::parse().command {
         Command::Cpm(connection) => {
             CpmBridge::connect(connection.settings()).and_then(|bridge| bridge.run()).map_err(|error| error.to_string())
@@ -188,17 +198,41 @@ fn main() -> ExitCode {
 
 #[cfg(feature = "ros2")]
 fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String> {
-    let bytes = std::fs::read(log).map_err(|error| format!("{}: {error}", log.display()))?;
-    let file = std::fs::File::create_new(output).map_err(|error| format!("{}: {error}", output.display()))?;
-    let done = ecod_interop::ros2::convert(&bytes, file).map_err(|error| {
+    let logs = logs(log)?;
+    let at_output = |error: &dyn Display| format!("{}: {error}", output.display());
+    let file = std::fs::File::create_new(output).map_err(|error| at_output(&error))?;
+    let write = || {
+        let mut converted = RosLog::new(file).map_err(|error| at_output(&error))?;
+        for log in &logs {
+            let at_log = |error: &dyn Display| format!("{}: {error}", log.display());
+            let file = std::fs::File::open(log).map_err(|error| at_log(&error))?;
+            converted.add(std::io::BufReader::new(file)).map_err(|error| at_log(&error))?;
+        }
+        converted.finish().map_err(|error| format!("{}: {error}", log.display()))
+    };
+    let done = write().map_err(|error| {
         // A part of a file, and in the way of the next try.
         let removed = std::fs::remove_file(output).err();
         let left = removed.map(|error| format!("; {} is left there: {error}", output.display())).unwrap_or_default();
-        format!("{} to {}: {error}{left}", log.display(), output.display())
+        format!("{error}{left}")
     })?;
-    log::info!("{} messages written, {} of other kinds, {} unusable", done.written, done.passed_over, done.unusable);
-    if done.is_cut {
-        log::warn!("{} ends in the middle or is damaged there", log.display());
+    let Conversion { written, passed_over, unusable, cut } = done;
+    log::info!("{written} messages written, {passed_over} of other kinds, {unusable} unusable");
+    if cut > 0 {
+        log::warn!("{cut} of {} logs end before their last messages; what is before that is written", logs.len());
     }
     Ok(())
+}
+
+/// A log, or those of a directory in the order of their names.
+#[cfg(feature = "ros2")]
+fn logs(path: &std::path::Path) -> Result<Vec<PathBuf>, String> {
+    if !path.is_dir() {
+        return Ok(vec![path.to_owned()]);
+    }
+    let entries = std::fs::read_dir(path).map_err(|error| format!("{}: {error}", path.display()))?;
+    let is_log = |file: &PathBuf| file.extension().is_some_and(|ending| ending == "mcap");
+    let mut logs: Vec<_> = entries.filter_map(Result::ok).map(|entry| entry.path()).filter(is_log).collect();
+    logs.sort();
+    if logs.is_empty() { Err(format!("{}: there is no .mcap file", path.display())) } else { Ok(logs) }
 }

@@ -26,7 +26,7 @@ pub(crate) use detections::{Detection3D, ObjectHypothesis, ObjectHypothesisWithP
 use markers::MarkerArray;
 use transforms::TFMessage;
 
-pub use log::{Conversion, ConversionError, convert};
+pub use log::{Conversion, ConversionError, RosLog};
 pub(crate) use messages::{Definition, Header};
 #[cfg(feature = "dds")]
 pub(crate) use messages::{PoseStamped, RosMessage, RosPose, encode};

@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
 use std::collections::BTreeMap;
-use std::io::Cursor;
+use std::io::{Cursor, Seek, Write};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::Command;
@@ -14,8 +14,15 @@ use ecod_actors::node;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::observe::recorder::{RecordConfig, files};
 use ecod_client::{Cell, Frame, NodeName, PerceivedObject, Role, Settings, WirePose};
-use ecod_interop::ros2::convert;
+use ecod_interop::ros2::{Conversion, ConversionError, RosLog};
 use tokio::runtime::Runtime;
+
+/// Writes a log as MCAP of profile `ros2`.
+fn convert(log: &[u8], output: impl Write + Seek) -> Result<Conversion, ConversionError> {
+    let mut converted = RosLog::new(output)?;
+    converted.add(log)?;
+    converted.finish()
+}
 
 /// Has a vehicle report a car to an edge until the map has it for a second; gives the edge's log.
 fn log(directory: &Path) -> Vec<u8> {
@@ -57,7 +64,7 @@ fn a_log_has_detections_markers_and_poses_for_ros() {
     let log = log(directory.path());
     let mut bytes = Vec::new();
     let done = convert(&log, Cursor::new(&mut bytes)).unwrap();
-    assert!(done.written > 20 && done.unusable == 0 && !done.is_cut, "{done:?}");
+    assert!(done.written > 20 && done.unusable == 0 && done.cut == 0, "{done:?}");
     let mut counts = BTreeMap::<_, u32>::new();
     for message in mcap::MessageStream::new(&bytes).unwrap() {
         let channel = message.unwrap().channel;
@@ -75,11 +82,21 @@ fn a_log_has_detections_markers_and_poses_for_ros() {
             ("/tf", "tf2_msgs/msg/TFMessage"),
         ]
     );
-    // Of a short log, most bytes may be the schemas at its end: in a quarter are all messages, or few. In the first bytes is none.
-    for (bytes, most) in [(log.len() / 4, done.written), (100, 0)] {
-        let cut = convert(&log[..bytes], Cursor::new(Vec::new())).unwrap();
-        assert!(cut.is_cut && cut.written <= most && cut.unusable == 0, "{bytes} {cut:?} {done:?}");
+    // Logs of a drive become one. What is before the end of one that is cut is there.
+    let mut all = RosLog::new(Cursor::new(Vec::new())).unwrap();
+    let quarter = &log[..log.len() / 4];
+    for part in [&log, quarter, &log] {
+        all.add(&part[..]).unwrap();
     }
+    let all = all.finish().unwrap();
+    assert!(
+        all.cut == 1 && all.unusable == 0 && (2 * done.written..=3 * done.written).contains(&all.written),
+        "{all:?} {done:?}"
+    );
+    assert!(matches!(convert(&log[..100], Cursor::new(Vec::new())), Err(ConversionError::Empty(0))));
+    assert!(matches!(convert(b"[camera]", Cursor::new(Vec::new())), Err(ConversionError::NoLog)));
+    let endless = [&log[..8], &[1, 255, 255, 255, 255, 255, 255, 255, 255]].concat();
+    assert!(matches!(convert(&endless, Cursor::new(Vec::new())), Err(ConversionError::Empty(0))));
 }
 
 /// A log with the optics of a camera, a picture, and one that is none.

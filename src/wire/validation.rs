@@ -185,7 +185,11 @@ impl PerceivedObject {
         self.check_fields().map_err(|(_, reason)| reason)
     }
 
-    fn check_fields(&self) -> Result<(), (&'static str, RejectReason)> {
+    /// Checks as [`Self::validate`] does.
+    ///
+    /// # Errors
+    /// The first field that is not valid.
+    pub fn check_fields(&self) -> Result<(), (&'static str, RejectReason)> {
         let of = |field| move |reason| (field, reason);
         check_coordinate(self.x_m).map_err(of("x_m"))?;
         check_coordinate(self.y_m).map_err(of("y_m"))?;

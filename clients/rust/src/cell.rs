@@ -359,7 +359,9 @@ impl<M> Iterator for Messages<M> {
             }
             if waited >= SILENCE && !is_told {
                 is_told = true;
-                log::warn!("{}", silence());
+                // Maps never end, and a lost connection has a remedy; vehicles and other stations may have nothing to say.
+                let is_fault = !state.is_connected() || self.filter.contains("/global_");
+                log::log!(if is_fault { log::Level::Warn } else { log::Level::Debug }, "{}", silence());
             }
             let left = self.timeout.map_or(PATIENCE, |timeout| timeout.saturating_sub(waited).min(PATIENCE));
             state = self.shared.wait(state, left);

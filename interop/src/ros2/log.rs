@@ -1,25 +1,38 @@
 //! Logs of a node as MCAP of profile `ros2`.
 
-use std::collections::BTreeMap;
-use std::io::{Seek, Write};
+use std::collections::{BTreeMap, HashMap};
+use std::io::{Read, Seek, Write};
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{GlobalMap, Limits, decode, decode_report};
-use mcap::records::MessageHeader;
-use mcap::{Compression, McapError, MessageStream, WriteOptions, Writer};
+use mcap::records::{MessageHeader, Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::{Compression, McapError, WriteOptions, Writer};
 use serde::{Deserialize, Serialize};
 
 use super::camera::{CameraInfo, RosImage};
 use super::messages::{Definition, Header, RosTime, encode};
 use super::{RosSink, put_map, put_report, ros_name};
 
+/// Maximum length of a record: a chunk, or a map of the largest cells.
+const MAX_RECORD_BYTES: usize = 1 << 28;
+
 /// A log that cannot be converted.
 #[derive(Debug, thiserror::Error)]
 pub enum ConversionError {
-    /// It is no MCAP, or the output cannot be written.
+    /// It has no MCAP's first bytes.
+    #[error("is no MCAP, as logs of nodes are")]
+    NoLog,
+    /// Nothing was written.
+    #[error("no map, report or picture of a node is there, {0} messages of other kinds")]
+    Empty(u64),
+    /// It cannot be read.
+    #[error(transparent)]
+    Unreadable(#[from] std::io::Error),
+    /// The output cannot be written.
     #[error(transparent)]
     Mcap(#[from] McapError),
     /// A message that has no form in CDR.
@@ -36,8 +49,8 @@ pub struct Conversion {
     pub passed_over: u64,
     /// Messages that are not as a node writes them.
     pub unusable: u64,
-    /// True if the log ends in the middle, as that of a killed node does.
-    pub is_cut: bool,
+    /// Logs that end before their last messages, as that of a killed node does, or are damaged.
+    pub cut: u64,
 }
 
 /// The picture of a log, as Foxglove has it.
@@ -66,40 +79,90 @@ struct LoggedOptics {
     p: [f64; 12],
 }
 
-/// Writes a log as MCAP of profile `ros2`.
-///
-/// # Errors
-/// [`ConversionError`] if this is no log, or the output cannot be written.
-pub fn convert<W: Write + Seek>(log: &[u8], output: W) -> Result<Conversion, ConversionError> {
-    let options = WriteOptions::new().profile("ros2").compression(Some(Compression::Zstd));
-    let mut output = RosLogWriter { writer: Writer::with_options(output, options)?, channels: BTreeMap::new() };
-    let mut done = Conversion::default();
-    for message in MessageStream::new_with_options(log, mcap::read::Options::IgnoreEndMagic.into())? {
-        let message = match message {
-            Ok(message) => message,
-            Err(error @ McapError::BadMagic) => return Err(error.into()),
-            Err(_) => {
-                done.is_cut = true;
-                break;
-            }
-        };
-        let at = Stamps { log: message.log_time, publish: message.publish_time };
-        let (kind, name) = message.channel.topic.split_once('/').unwrap_or((&message.channel.topic, ""));
-        let mut output = TimedOutput { output: &mut output, at };
-        let is_written = match kind {
-            "global_detections" => output.map(&message.data)?,
-            "detections" => output.report(name, &message.data)?,
-            "camera" => output.image(name, &message.data)?,
-            "camera_calibration" => output.optics(name, &message.data)?,
-            _ => {
-                done.passed_over += 1;
-                continue;
-            }
-        };
-        *(if is_written { &mut done.written } else { &mut done.unusable }) += 1;
+/// Logs of a node, written as one MCAP of profile `ros2`.
+pub struct RosLog<W: Write + Seek> {
+    output: RosLogWriter<W>,
+    done: Conversion,
+}
+
+impl<W: Write + Seek> RosLog<W> {
+    /// Begins an MCAP.
+    ///
+    /// # Errors
+    /// [`ConversionError`] if the output cannot be written.
+    pub fn new(output: W) -> Result<Self, ConversionError> {
+        let options = WriteOptions::new().profile("ros2").compression(Some(Compression::Zstd));
+        let output = RosLogWriter { writer: Writer::with_options(output, options)?, channels: BTreeMap::new() };
+        Ok(Self { output, done: Conversion::default() })
     }
-    output.writer.finish()?;
-    Ok(done)
+
+    /// Writes the messages of a log.
+    ///
+    /// # Errors
+    /// [`ConversionError`] if this is no log, or the output cannot be written.
+    pub fn add(&mut self, mut log: impl Read) -> Result<(), ConversionError> {
+        let options =
+            LinearReaderOptions::default().with_skip_end_magic(true).with_record_length_limit(MAX_RECORD_BYTES);
+        let mut reader = LinearReader::new_with_options(options);
+        let (mut topics, mut is_complete) = (HashMap::<u16, String>::new(), false);
+        while let Some(event) = reader.next_event() {
+            let record = match event {
+                Ok(LinearReadEvent::ReadRequest(wanted)) => {
+                    let read = log.read(reader.insert(wanted))?;
+                    reader.notify_read(read);
+                    continue;
+                }
+                Ok(LinearReadEvent::Record { opcode: op::DATA_END, .. }) => {
+                    is_complete = true;
+                    break;
+                }
+                Ok(LinearReadEvent::Record { opcode, data }) => mcap::parse_record(opcode, data),
+                Err(McapError::BadMagic) => return Err(ConversionError::NoLog),
+                Err(error) => Err(error),
+            };
+            match record {
+                Ok(Record::Channel(channel)) => drop(topics.insert(channel.id, channel.topic)),
+                Ok(Record::Message { header, data }) => {
+                    let topic = topics.get(&header.channel_id).map(String::as_str).unwrap_or_default();
+                    let at = Stamps { log: header.log_time, publish: header.publish_time };
+                    self.put(topic, at, &data)?;
+                }
+                Ok(_) => {}
+                Err(error) => {
+                    log::warn!("a log is damaged, what is behind that is left out: {error}");
+                    break;
+                }
+            }
+        }
+        self.done.cut += u64::from(!is_complete);
+        Ok(())
+    }
+
+    fn put(&mut self, topic: &str, at: Stamps, data: &[u8]) -> Result<(), ConversionError> {
+        let (kind, name) = topic.split_once('/').unwrap_or((topic, ""));
+        let mut output = TimedOutput { output: &mut self.output, at };
+        let is_written = match kind {
+            "global_detections" => output.map(data)?,
+            "detections" => output.report(name, data)?,
+            "camera" => output.image(name, data)?,
+            "camera_calibration" => output.optics(name, data)?,
+            _ => {
+                self.done.passed_over += 1;
+                return Ok(());
+            }
+        };
+        *(if is_written { &mut self.done.written } else { &mut self.done.unusable }) += 1;
+        Ok(())
+    }
+
+    /// Ends the MCAP.
+    ///
+    /// # Errors
+    /// [`ConversionError`] if it cannot be written, or no message of a node's log was found.
+    pub fn finish(mut self) -> Result<Conversion, ConversionError> {
+        self.output.writer.finish()?;
+        if self.done.written == 0 { Err(ConversionError::Empty(self.done.passed_over)) } else { Ok(self.done) }
+    }
 }
 
 /// Times of a log's message in nanoseconds.
