@@ -86,7 +86,7 @@ fn a_log_has_detections_markers_and_poses_for_ros() {
     let mut all = RosLog::new(Cursor::new(Vec::new())).unwrap();
     let quarter = &log[..log.len() / 4];
     for part in [&log, quarter, &log] {
-        all.add(&part[..]).unwrap();
+        all.add(part).unwrap();
     }
     let all = all.finish().unwrap();
     assert!(
