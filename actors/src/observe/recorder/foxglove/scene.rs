@@ -125,8 +125,11 @@ const VEHICLE: f64 = 2.0;
 const FACING: f64 = 1.5;
 const TEXT: f64 = 1.2;
 
-/// Probability that there is an object, below which no ellipse is drawn: that of a track that is nearly lost covers the map.
+/// Confidence below which no ellipse is drawn: that of a track that is nearly lost covers the map.
 const LIKELY: f64 = 0.5;
+
+/// Least opacity of a text, at which it can still be read.
+const MIN_TEXT_OPACITY: f64 = 0.25;
 
 /// Maximum height in metres of an object with a size.
 const MAX_HEIGHT_M: f64 = 1.5;
@@ -204,11 +207,11 @@ impl SceneStyle {
                 Some(size_m) => (entity.block(pose, size_m, color), MAX_HEIGHT_M),
                 None => (entity.ball(pose, self.object_m, color), 0.0),
             };
-            let is_likely = existence >= LIKELY;
+            let is_likely = object.confidence >= LIKELY;
             let position = [object.x_m, object.y_m];
             let entity = if is_likely { entity.ellipse(position, &object.covariance(), color) } else { entity };
             entity
-                .text(pose, height_m + TEXT * self.object_m, object.label.to_string(), existence)
+                .text(pose, height_m + TEXT * self.object_m, object.label.to_string(), existence.max(MIN_TEXT_OPACITY))
                 .note("confidence", object.confidence.to_string())
                 .note("contributors", listed(&object.contributors))
         });
@@ -417,13 +420,14 @@ mod tests {
         let map = GlobalMap { landmarks, ..GlobalMap::new(&epoch, 1, Timestamp(1)) };
         let mut lost = FusedObject::new(Uuid::max(), "car", 0.06, 9.0, 9.0, Covariance::isotropic(20.0));
         lost.existence = Some(0.06);
-        let map = GlobalMap { objects: vec![car, lost], ..map };
+        let unplaced = FusedObject { confidence: 0.41, existence: Some(0.78), ..lost.clone() };
+        let map = GlobalMap { objects: vec![car, lost, unplaced], ..map };
         let SceneUpdate { deletions, entities } = style.map(&map);
         assert_eq!(deletions[0].kind, DELETE_ALL, "what left the map is not shown on");
-        assert_eq!(entities.iter().map(|entity| entity.cylinders.len()).collect::<Vec<_>>(), [0, 0, 1, 0]);
-        assert!(entities[3].spheres[0].color.a < 0.1);
+        assert_eq!(entities.iter().map(|entity| entity.cylinders.len()).collect::<Vec<_>>(), [0, 0, 1, 0, 0]);
+        assert!(entities[3].spheres[0].color.a < 0.1 && entities[3].texts[0].color.a == MIN_TEXT_OPACITY);
         assert!(entities[2].texts[0].pose.position.z > 1.5, "above the block");
-        assert_eq!(entities.iter().map(|entity| entity.arrows.len()).collect::<Vec<_>>(), [0, 1, 0, 0]);
+        assert_eq!(entities.iter().map(|entity| entity.arrows.len()).collect::<Vec<_>>(), [0, 1, 0, 0, 0]);
         let facing = entities[1].arrows[0].pose.orientation;
         assert!((2.0 * facing.z.atan2(facing.w) - FRAC_PI_2).abs() < 1e-9);
         let block = &entities[2].cubes[0];
