@@ -78,7 +78,7 @@ pub enum InputRefusal {
     Report,
 }
 
-/// What is not reported, and the value for which it is not.
+/// A message or an object that is not reported, and the refused value.
 #[derive(Debug)]
 pub(super) struct RefusedInput {
     pub(super) refusal: InputRefusal,

@@ -44,7 +44,7 @@ pub struct FileObject {
     /// Its identity in its sequence; none for detections.
     pub id: Option<i64>,
     /// Its class, its confidence (of truth, 1) and its place on the ground.
-    pub object: PerceivedObject,
+    pub perceived: PerceivedObject,
 }
 
 /// An object as its file says it.
@@ -102,7 +102,8 @@ impl Sequence {
         last: u64,
     ) -> impl Iterator<Item = ObjectReport> {
         (self.first..=last).map(move |frame| {
-            let objects = self.frames.get(&frame).into_iter().flatten().map(|object| object.object.clone()).collect();
+            let objects =
+                self.frames.get(&frame).into_iter().flatten().map(|object| object.perceived.clone()).collect();
             let at = time_of(number, frame, frame_rate_hz);
             ObjectReport { objects, pose: self.pose, ..ObjectReport::new(node.clone(), frame, at) }
         })

@@ -296,10 +296,10 @@ impl TrackEvaluation {
                     next += 1;
                     SaidObject {
                         id: object.id.map_or(next, |id| *ids.entry((number, id)).or_insert(next)),
-                        label: object.object.label.clone(),
-                        score: object.object.confidence,
+                        label: object.perceived.label.clone(),
+                        score: object.perceived.confidence,
                         existence: None,
-                        position: Point2::new(object.object.x_m, object.object.y_m),
+                        position: Point2::new(object.perceived.x_m, object.perceived.y_m),
                     }
                 });
                 said.insert(time_of(number, *frame, frame_rate_hz), objects.collect());

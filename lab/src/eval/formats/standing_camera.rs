@@ -48,8 +48,8 @@ pub(super) fn placed(frames: ParsedFrames, camera: Option<&StandingCamera>, mut 
         for ParsedObject { id, label, score, place } in objects {
             match place {
                 FilePlace::Ground(position) => {
-                    let object = PerceivedObject::new(label, score, position.x, position.y);
-                    placed.push(FileObject { id, object });
+                    let perceived = PerceivedObject::new(label, score, position.x, position.y);
+                    placed.push(FileObject { id, perceived });
                 }
                 FilePlace::Image(bounding_box) => {
                     ids.push(id);
@@ -61,7 +61,7 @@ pub(super) fn placed(frames: ParsedFrames, camera: Option<&StandingCamera>, mut 
             let report = perception.report(boxes, Timestamp::default());
             sequence.pose = report.pose;
             let ids = perception.reported().iter().map(|index| ids[*index]);
-            placed.extend(ids.zip(report.objects).map(|(id, object)| FileObject { id, object }));
+            placed.extend(ids.zip(report.objects).map(|(id, perceived)| FileObject { id, perceived }));
         }
         sequence.frames.insert(number, placed);
     }

@@ -9,13 +9,13 @@ type Row<'a> = (u64, Option<i64>, &'a str, f64, f64, f64);
 
 fn positions(frames: &Frames) -> Vec<Row<'_>> {
     let flat = frames.iter().flat_map(|(frame, objects)| objects.iter().map(move |object| (*frame, object)));
-    flat.map(|(frame, FileObject { id, object })| {
-        (frame, *id, object.label.as_str(), object.confidence, object.x_m, object.y_m)
+    flat.map(|(frame, FileObject { id, perceived })| {
+        (frame, *id, perceived.label.as_str(), perceived.confidence, perceived.x_m, perceived.y_m)
     })
     .collect()
 }
 
-/// What a file with that text has.
+/// The sequence of a file with that text.
 fn read(format: FileFormat, text: &str, camera: Option<&StandingCamera>) -> anyhow::Result<Sequence> {
     let folder = TempDir::new()?;
     let file = folder.path().join("file");
@@ -109,7 +109,7 @@ fn boxes_of_coco_and_of_mot_challenge_are_placed_by_their_camera() {
         assert_eq!((sequence.first, frame, is, named, said), (first, 8, id, label, score));
         // The middle of an object is behind where it touches the ground.
         assert!((x_m - 12.0).abs() < 0.5 && (15.0..17.5).contains(&y_m), "({x_m}, {y_m})");
-        assert!(sequence.frames[&8][0].object.covariance_m2.is_some() && sequence.pose.unwrap().y_m == -5.0);
+        assert!(sequence.frames[&8][0].perceived.covariance_m2.is_some() && sequence.pose.unwrap().y_m == -5.0);
         let above = if format == FileFormat::Mot { Some(&1) } else { None };
         assert_eq!(sequence.discarded.get("above_horizon"), above, "the second box of the lines stands in the sky");
     }

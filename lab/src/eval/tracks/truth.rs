@@ -131,9 +131,9 @@ impl TrackTruth {
                 let objects = sequence.frames.get(&frame).map(Vec::as_slice).unwrap_or_default();
                 let fields = objects.iter().map(|object| ObjectFields {
                     id: object.id.map(|id| Id::Text(format!("{number}/{id}"))),
-                    label: object.object.label.to_string(),
-                    x_m: object.object.x_m,
-                    y_m: object.object.y_m,
+                    label: object.perceived.label.to_string(),
+                    x_m: object.perceived.x_m,
+                    y_m: object.perceived.y_m,
                 });
                 let place = format!("sequence {}, frame {frame}", sequence.name);
                 let objects = self::objects(fields.collect(), &place, &mut ids)?;
