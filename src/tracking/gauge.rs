@@ -1,22 +1,23 @@
 //! Gauge of the registration: a shift, a rotation and a delay that the errors of all observers have in common.
 //!
 //! Observers find their errors relative to each other. A motion of all together changes no residual, so nothing but
-//! unequal gains decides on it, and it would wander without end. Therefore an update leaves the common motion of
-//! observers that correspond, directly or through others, as it was. It fades with the errors themselves: those of
-//! observers that leave or join do not move the map at once.
+//! unequal gains decides on it, and it would wander without end. Therefore a round leaves the common motion of
+//! observers that correspond, directly or through others, as it was, but for fading with the mean of the errors: those of
+//! observers that leave or join do not move the map at once. If each faded by itself, those that last would take over
+//! the errors of those that fade.
 
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
 use super::registration::BiasPrior;
-use super::sensors::{SensorId, Sensors};
+use super::sensors::{SensorId, SensorModel, Sensors};
 
-/// Changes of all errors in a round, and the groups of observers that correspond.
+/// Errors before a round, and the groups of observers that correspond.
 #[derive(Debug, Default)]
 pub(super) struct Gauge {
     /// By sensor: the next one towards the representative of its group.
     towards: Vec<usize>,
-    /// By sensor.
-    changes: Vec<Vector4<f64>>,
+    /// By sensor that reported: its error before, and the part of an error that is left after that time.
+    before: Vec<Option<(Vector4<f64>, f64)>>,
 }
 
 impl Gauge {
@@ -26,20 +27,32 @@ impl Gauge {
         self.towards[one] = other;
     }
 
-    /// Adds a change of an observer's error.
-    pub(super) fn note(&mut self, sensor: SensorId, change: Vector4<f64>) {
+    /// Notes an observer's error before it is estimated anew, and the part of it that is left after that time.
+    pub(super) fn note(&mut self, sensor: SensorId, error: Vector4<f64>, kept: f64) {
         self.group(sensor.number());
-        self.changes[sensor.number()] += change;
+        self.before[sensor.number()].get_or_insert((error, 1.0)).1 *= kept;
     }
 
     /// Takes the common motion of each group back.
     pub(super) fn hold(mut self, sensors: &mut Sensors, prior: &BiasPrior) {
         let known = self.towards.len();
+        let observers = || sensors.iter().filter(|sensor| sensor.id.number() < known);
+        let weight = |sensor: &SensorModel| sensors.fleet.trust(sensor.id) * sensor.registration.weight(prior);
+        let mut kept = vec![(0.0, 0.0); known];
+        for sensor in observers() {
+            let (group, weight) = (self.group(sensor.id.number()), weight(sensor));
+            if let Some((_, of_sensor)) = self.before[sensor.id.number()] {
+                kept[group] = (kept[group].0 + weight * of_sensor, kept[group].1 + weight);
+            }
+        }
         let mut sums = vec![MotionSums::default(); known];
-        for sensor in sensors.iter().filter(|sensor| sensor.id.number() < known) {
-            let number = sensor.id.number();
-            let weight = sensors.fleet.trust(sensor.id) * sensor.registration.weight(prior);
-            sums[self.group(number)].add(&sensor.registration.pivot(), &self.changes[number], weight, prior);
+        for sensor in observers() {
+            let (number, registration) = (sensor.id.number(), &sensor.registration);
+            let group = self.group(number);
+            let kept = kept[group].0 / kept[group].1.max(f64::MIN_POSITIVE);
+            let change =
+                self.before[number].map_or_else(Vector4::zeros, |(error, _)| registration.error() - error * kept);
+            sums[group].add(&registration.pivot(), &change, weight(sensor), prior);
         }
         let common: Vec<Option<Motion>> = sums.iter().map(MotionSums::motion).collect();
         for sensor in sensors.iter_mut().filter(|sensor| sensor.id.number() < known) {
@@ -54,7 +67,7 @@ impl Gauge {
         let known = self.towards.len();
         if sensor >= known {
             self.towards.extend(known..=sensor);
-            self.changes.resize(sensor + 1, Vector4::zeros());
+            self.before.resize(sensor + 1, None);
         }
         while self.towards[sensor] != sensor {
             self.towards[sensor] = self.towards[self.towards[sensor]];

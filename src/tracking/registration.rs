@@ -79,8 +79,9 @@ pub(super) fn register(
         let samples = frame.samples.iter();
         pairs.extend(samples.filter_map(|sample| Correspondence::of(sample, &frame, tracks, sensors, &mut gauge)));
         if let Some(sensor) = sensors.get_mut(frame.sensor) {
-            let change = sensor.registration.observe(frame.at, frame.delay_s, &pairs, &prior);
-            gauge.note(frame.sensor, change);
+            let error = sensor.registration.error;
+            let kept = sensor.registration.observe(frame.at, frame.delay_s, &pairs, &prior);
+            gauge.note(frame.sensor, error, kept);
         }
     }
     gauge.hold(sensors, &prior);
@@ -187,6 +188,11 @@ impl Registration {
         self.stood_s = passed_s.map_or(0.0, |passed_s| self.stood_s + passed_s);
     }
 
+    /// Offset east and north in metres, rotation in radians, and delay of the stamps in seconds.
+    pub(super) fn error(&self) -> Vector4<f64> {
+        self.error
+    }
+
     /// Centre of the rotation, metres.
     pub(super) fn pivot(&self) -> Vector2<f64> {
         self.pivot
@@ -241,13 +247,12 @@ impl Registration {
         (self.covariance.m11 + self.covariance.m22 + rotation_and_delay) / 2.0
     }
 
-    /// Updates the estimate; returns its change. The references hold for `at`, which is the report's stamp less
-    /// `delay_s`.
-    fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) -> Vector4<f64> {
-        self.fade(at, prior);
-        let predicted = self.error;
+    /// Updates the estimate; returns the part of the error before that was left at `at`. The references hold for `at`,
+    /// which is the report's stamp less `delay_s`.
+    fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) -> f64 {
+        let kept = self.fade(at, prior);
         self.fit(delay_s, pairs, prior);
-        self.error - predicted
+        kept
     }
 
     fn fit(&mut self, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) {
@@ -284,14 +289,15 @@ impl Registration {
         self.error.w = self.error.w.clamp(-max_s, max_s);
     }
 
-    /// Predicts the errors at `at`: they decay, and their covariance returns to the prior.
-    fn fade(&mut self, at: Timestamp, prior: &BiasPrior) {
+    /// Predicts the errors at `at`: they decay, and their covariance returns to the prior. Returns the part that is left.
+    fn fade(&mut self, at: Timestamp, prior: &BiasPrior) -> f64 {
         let stood = 1.0 + self.stood_s / STANDS_S;
         let kept = (-at.since(self.at).as_secs_f64() / (prior.memory_s * stood * stood)).exp();
         self.error *= kept;
         self.covariance = self.covariance * (kept * kept) + prior.covariance() * (1.0 - kept * kept);
         self.pairs *= kept;
         self.at = self.at.max(at);
+        kept
     }
 
     /// The correction for the map; `None` with too few correspondences.

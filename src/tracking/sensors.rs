@@ -18,8 +18,11 @@ use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::wire::{ForeignVotes, ObjectReport, PerceivedObject, WirePose};
 
-/// Distance of the median of a vehicle's detections from where it was, as a share of its range, up to which it stays.
+/// Distance of a vehicle, or of the median of its detections, from where it was, as a share of its range, up to which it
+/// stays.
 const STAYS: f64 = 0.25;
+/// The same of the detections of a vehicle that declares to stand: they come and go.
+const DECLARED_STAYS: f64 = 1.0;
 
 /// Time after which a vehicle that states no pose and stays is known to stand.
 const STAYS_FOR: Duration = Duration::from_secs(120);
@@ -240,19 +243,22 @@ impl SensorModel {
         has_jumped
     }
 
-    /// True if the vehicle is known to be where it was at the report before. Estimates of the pose of one that drives, and
-    /// even waits, differ from report to report. Without a pose, it declares that it does not move, or its detections stay
-    /// about a place for longer than any signal is red.
+    /// True if the vehicle is known to be where it was at the report before. It declares that it does not move, as long as
+    /// that agrees with its places. Or it states the same pose: estimates of one that drives, and even waits, differ from
+    /// report to report. Or, without a pose, its detections stay about a place for longer than any signal is red.
     fn stands(&mut self, report: &ObjectReport, at: Timestamp) -> bool {
         let (place, since) = self.place;
         let centre = self.coverage.centre().unwrap_or(place);
-        if (centre - place).norm() > STAYS * self.coverage.range_m() {
+        let is_declared = report.moving == Some(false);
+        let stays = if is_declared && report.pose.is_none() { DECLARED_STAYS } else { STAYS };
+        if (centre - place).norm() > stays * self.coverage.range_m() {
             self.place = (centre, at);
         }
-        match (report.pose, self.pose) {
-            (None, None) => report.moving == Some(false) || at.since(since) > STAYS_FOR && self.place.1 == since,
+        let is_still = match (report.pose, self.pose) {
+            (None, None) => at.since(since) > STAYS_FOR,
             (pose, before) => pose == before,
-        }
+        };
+        self.place.1 == since && (is_declared || is_still)
     }
 }
 

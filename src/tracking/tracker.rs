@@ -238,13 +238,7 @@ struct Captured {
 
 /// The report with the `wanted` objects only.
 fn only(report: &ObjectReport, wanted: impl Fn(&PerceivedObject) -> bool) -> Arc<ObjectReport> {
-    let objects = report.objects.iter().filter(|object| wanted(object)).cloned().collect();
-    let ObjectReport { pose, view, frame_yaw_rate_radps, .. } = *report;
-    Arc::new(ObjectReport {
-        pose,
-        view,
-        frame_yaw_rate_radps,
-        objects,
-        ..ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us)
-    })
+    let mut report = report.clone();
+    report.objects.retain(wanted);
+    Arc::new(report)
 }
