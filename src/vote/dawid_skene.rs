@@ -1,10 +1,12 @@
 //! Probability of each label given the votes: the model of Dawid & Skene (1979) with hierarchical priors.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::config::WeightedConfig;
 use super::confusion::{Confusion, LabelIndex};
 use super::likelihood::{LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability};
+use crate::model::names::Label;
+use crate::reputation::RememberedVotes;
 use crate::wire::ForeignVotes;
 
 /// Evidence about one vehicle.
@@ -184,6 +186,7 @@ impl DawidSkene {
         let kept = (-predicted / SAVING_MEMORY_VOTES).exp();
         let saved = free.log_probability - tied.log_probability;
         self.saving = (kept * self.saving.0 + saved, kept * self.saving.1 + predicted);
+        self.inherited_saving = (kept * self.inherited_saving.0, kept * self.inherited_saving.1);
         if self.coupling() == Coupling::Free { free } else { tied }
     }
 
@@ -216,18 +219,32 @@ impl DawidSkene {
         judged
     }
 
-    /// Replaces the evidence on the coupling that comes from a ledger. It holds (correct, incorrect) by vehicle and label.
-    pub(super) fn inherit_coupling(&mut self, vehicles: impl Iterator<Item = Vec<(f64, f64)>>) {
+    /// Replaces the evidence on the coupling that comes from a ledger, which counts right and wrong votes of each vehicle by
+    /// stated label. Under equal accuracy on all classes, Bayes' rule still makes a rare label right less often than a
+    /// frequent one. Rates by label count as far as they explain more than that, and more than chance does: the Bayes factor
+    /// by Laplace's approximation (Kass & Raftery 1995).
+    pub(super) fn inherit_coupling<'a>(&mut self, vehicles: impl Iterator<Item = &'a RememberedVotes> + Clone) {
         self.inherited_saving = (0.0, 0.0);
+        let mut right: BTreeMap<&Label, f64> = BTreeMap::new();
+        for (label, (correct, _)) in vehicles.clone().flatten() {
+            *right.entry(label).or_default() += correct;
+        }
+        let all: f64 = right.values().map(|correct| correct + 1.0).sum();
+        let wrong_labels = right.len().saturating_sub(1).max(1) as f64;
+        let prior = self.config.class_prior_votes;
         for labels in vehicles {
-            let (correct, votes) = labels.iter().fold((0.0, 0.0), |(c, n), label| (c + label.0, n + label.0 + label.1));
-            let rate = (correct + self.config.assumed_accuracy) / (votes + 1.0);
-            let prior = self.config.class_prior_votes;
-            for (correct, incorrect) in labels {
-                let own = (correct + prior * rate) / (correct + incorrect + prior);
-                let saved = correct * (own / rate).ln() + incorrect * ((1.0 - own) / (1.0 - rate)).ln();
-                self.inherited_saving.0 += saved;
-                self.inherited_saving.1 += correct + incorrect;
+            let (correct, votes) =
+                labels.values().fold((0.0, 0.0), |(c, n), label| (c + label.0, n + label.0 + label.1));
+            let accuracy = (correct + self.config.assumed_accuracy) / (votes + 1.0);
+            for (label, &(correct, incorrect)) in labels {
+                let share = (right[label] + 1.0) / all;
+                let (right, wrong) = (accuracy * share, (1.0 - accuracy) * (1.0 - share) / wrong_labels);
+                let tied = (right / (right + wrong)).clamp(1e-6, 1.0 - 1e-6);
+                let votes = correct + incorrect;
+                let own = (correct + prior * tied) / (votes + prior);
+                let saved = correct * (own / tied).ln() + incorrect * ((1.0 - own) / (1.0 - tied)).ln();
+                self.inherited_saving.0 += saved - (votes / prior).ln_1p() / 2.0;
+                self.inherited_saving.1 += votes;
             }
         }
     }

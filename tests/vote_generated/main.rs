@@ -149,8 +149,8 @@ fn score(number: u64, items: usize) -> Score {
     Score { majority: majority.points(), online, passes, passes_beside_online }
 }
 
-/// Scores sets on all processors; prints those that fall short and the means.
-fn check(numbers: &[u64], items: usize) {
+/// Scores sets on all processors; prints those that fall short and the means. Returns the numbers of the former.
+fn short_of(numbers: &[u64], items: usize) -> Vec<u64> {
     let threads = thread::available_parallelism().map_or(1, usize::from);
     let of_thread = |thread: usize| {
         let numbers = numbers.iter().skip(thread).step_by(threads);
@@ -173,19 +173,19 @@ fn check(numbers: &[u64], items: usize) {
         .collect();
     let rows: Vec<_> = short.iter().map(|(_, row)| row.as_str()).collect();
     println!("{} of {} sets fall short:\n{}", short.len(), scores.len(), rows.join("\n"));
-    let unknown: Vec<_> = short.iter().filter(|(number, _)| !KNOWN_SHORT.contains(number)).collect();
-    assert!(unknown.is_empty(), "{unknown:#?}");
+    short.into_iter().map(|(number, _)| number).collect()
 }
 
 #[test]
-fn unbalanced_classes_few_labels_and_lazy_annotators_leave_votes_at_least_as_right_as_the_majority() {
+fn no_more_of_a_ninth_of_the_generated_sets_than_known_are_judged_worse_than_by_the_majority() {
     // Each balance meets each habit about once in 56; every ninth meets all of both.
     let numbers: Vec<u64> = (1..SETS).step_by(9).collect();
-    check(&numbers, 600);
+    let unknown: Vec<_> = short_of(&numbers, 600).into_iter().filter(|n| !KNOWN_SHORT.contains(n)).collect();
+    assert!(unknown.is_empty(), "{unknown:?}");
 }
 
 #[test]
 #[ignore = "takes minutes; `make eval-generated`"]
-fn no_more_generated_sets_than_known_are_judged_worse_than_by_the_majority() {
-    check(&(0..SETS).collect::<Vec<_>>(), 1000);
+fn just_the_known_of_the_generated_sets_are_judged_worse_than_by_the_majority() {
+    assert_eq!(short_of(&(0..SETS).collect::<Vec<_>>(), 1000), KNOWN_SHORT);
 }

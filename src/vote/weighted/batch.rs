@@ -29,7 +29,8 @@ impl WeightedVoting {
         let before = self.log_probability();
         (0..passes).for_each(|_| self.judge_together());
         let after = self.log_probability();
-        let votes: usize = self.landmarks.values().map(|landmark_votes| landmark_votes.votes.len()).sum();
+        let judged = self.landmarks.values().filter(|landmark_votes| landmark_votes.has_several_voters());
+        let votes: usize = judged.map(|landmark_votes| landmark_votes.votes.len()).sum();
         if before - after > MAX_LOSS * votes as f64 {
             (self.model, self.calibration, self.landmarks) = in_turn;
             // By their order in time, labels that lead by little stay.

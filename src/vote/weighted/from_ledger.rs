@@ -32,7 +32,7 @@ impl WeightedVoting {
         self.take_over_labels(&known, limits.max_labels);
         // Evidence that is no longer in the ledger does not count any more.
         self.model.vehicles.iter_mut().for_each(|vehicle| vehicle.inherited = Confusion::default());
-        self.model.inherit_coupling(known.iter().map(|(_, labels)| labels.values().copied().collect()));
+        self.model.inherit_coupling(known.iter().map(|(_, labels)| labels));
         for (node, labels) in known {
             let mut inherited = Confusion::default();
             for (label, (correct, incorrect)) in labels {
