@@ -191,6 +191,44 @@ fn detections_in_files_of_benchmarks_are_replayed_as_reports() {
     assert!(broken.status.code() == Some(2) && said_by(&broken).contains("is not NAME=FILE"), "{}", said_by(&broken));
 }
 
+/// Two vehicles, one of which detects nothing in the first sequence, and truth of one sequence more.
+#[test]
+fn sequences_have_the_numbers_of_their_names_and_maps_need_truth_of_just_these() {
+    let folder = TempDir::new().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let each = |place: &str| (1..=20).map(|frame| format!("{frame},1,0,0,9,9,0.9,{place},0\n")).collect::<String>();
+    for (name, place) in [
+        ("left/a.txt", "3,4"),
+        ("left/b.txt", "5,6"),
+        ("right/b.txt", "5,6"),
+        ("truth/a.txt", "3,4"),
+        ("truth/b.txt", "5,6"),
+        ("more/a.txt", "3,4"),
+        ("more/aa.txt", "9,9"),
+        ("more/b.txt", "5,6"),
+    ] {
+        fs::create_dir_all(path(name).parent().unwrap()).unwrap();
+        fs::write(path(name), each(place)).unwrap();
+    }
+    let [reports, maps, result] = ["reports.jsonl", "maps.jsonl", "result.json"].map(path);
+    let [left, right] = ["left", "right"].map(|name| format!("{name}={}", text(&path(name))));
+    let flags = ["convert", "--format", "mot", "--vehicle", &left, "--vehicle", &right, "--output", text(&reports)];
+    let run = ecod_lab(&flags);
+    assert!(run.status.success(), "{}", said_by(&run));
+    let lines = replay(ReplayConfig::default(), &reports).0;
+    fs::write(&maps, lines.iter().map(|line| serde_json::to_string(line).unwrap() + "\n").collect::<String>()).unwrap();
+    let judge = |truth: &Path| {
+        let flags = ["eval", "--format", "mot", "--truth", text(truth), "--input", text(&maps), "--out", text(&result)];
+        ecod_lab(&flags)
+    };
+    let run = judge(&path("truth"));
+    assert!(run.status.success(), "{}", said_by(&run));
+    let judged: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
+    assert_eq!(judged["tracks"]["at_best_f1"]["false_alarms"].as_u64(), Some(0), "{judged}");
+    let run = judge(&path("more"));
+    assert!(run.status.code() == Some(2) && said_by(&run).contains("has 3 sequences"), "{}", said_by(&run));
+}
+
 #[test]
 fn a_truth_without_identities_judges_none() {
     let folder = TempDir::new().unwrap();

@@ -1,5 +1,6 @@
 //! `ecod-lab convert`: detections in files of benchmarks as reports, for `ecod-node replay`.
 
+use std::collections::BTreeSet;
 use std::io::Write as _;
 use std::path::PathBuf;
 
@@ -9,7 +10,7 @@ use ecod::model::names::NodeName;
 use ecod_actors::cli::{Failure, lines};
 
 use super::files::{camera, frame_rate, read};
-use crate::eval::formats::FileFormat;
+use crate::eval::formats::{FileFormat, Sequence};
 
 /// Flags of `convert`.
 #[derive(Debug, Args)]
@@ -36,17 +37,32 @@ fn of_vehicle(text: &str) -> Result<(NodeName, PathBuf), String> {
     Ok((NodeName::new(name).map_err(|error| error.to_string())?, file.into()))
 }
 
+/// The number of a sequence among those of all vehicles, by name. A vehicle's only file is the first sequence, whatever its
+/// name, if no vehicle has several.
+fn number_of<'a>(name: &str, vehicles: impl Iterator<Item = &'a Vec<Sequence>>) -> usize {
+    let (mut names, mut are_several) = (BTreeSet::new(), false);
+    for sequences in vehicles {
+        are_several |= sequences.len() > 1;
+        names.extend(sequences.iter().map(|sequence| sequence.name.as_str()));
+    }
+    if are_several { names.range(..name).count() } else { 0 }
+}
+
 pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
     let ConvertArguments { format, vehicle, config, frame_rate, output } = arguments;
     if let Some((other, _)) = config.iter().find(|(name, _)| vehicle.iter().all(|(vehicle, _)| vehicle != name)) {
         return Err(Failure::usage(anyhow!("--config is of {other}, of which no --vehicle is given")));
     }
-    let mut reports = Vec::new();
+    let mut of_vehicles = Vec::new();
     for (name, path) in vehicle {
         let config = config.iter().find(|(of, _)| of == name).map(|(_, path)| path.as_path());
-        let camera = camera(config)?;
-        for (place, sequence) in read(*format, path, camera.as_ref())?.iter().enumerate() {
-            reports.extend(sequence.reports(place, *frame_rate, name, sequence.last()));
+        of_vehicles.push((name, read(*format, path, camera(config)?.as_ref(), *frame_rate)?));
+    }
+    let mut reports = Vec::new();
+    for (name, sequences) in &of_vehicles {
+        for sequence in sequences {
+            let number = number_of(&sequence.name, of_vehicles.iter().map(|(_, sequences)| sequences));
+            reports.extend(sequence.reports(number, *frame_rate, name, sequence.last()));
         }
     }
     reports.sort_by_key(|report| report.captured_at_us);

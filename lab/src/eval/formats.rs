@@ -81,7 +81,7 @@ pub struct Sequence {
     pub first: u64,
     /// Its frames.
     pub frames: Frames,
-    /// The pose of the camera that placed the objects.
+    /// The pose of the camera that placed the objects; it stands.
     pub pose: Option<WirePose>,
     /// Boxes without a place on the ground, by reason.
     pub discarded: BTreeMap<&'static str, u64>,
@@ -105,7 +105,8 @@ impl Sequence {
             let objects =
                 self.frames.get(&frame).into_iter().flatten().map(|object| object.perceived.clone()).collect();
             let at = time_of(number, frame, frame_rate_hz);
-            ObjectReport { objects, pose: self.pose, ..ObjectReport::new(node.clone(), frame, at) }
+            let moving = self.pose.map(|_| false);
+            ObjectReport { objects, pose: self.pose, moving, ..ObjectReport::new(node.clone(), frame, at) }
         })
     }
 }
@@ -129,12 +130,17 @@ impl FileFormat {
     /// Naming file, line and field.
     pub fn read(self, path: &Path, camera: Option<&StandingCamera>) -> anyhow::Result<Vec<Sequence>> {
         let ending = if self == Self::Coco { "json" } else { "txt" };
-        files(path, ending)?.iter().map(|file| self.sequence(file, camera)).collect()
+        let files = files(path, ending)?;
+        let parse = |file: &PathBuf| {
+            let text = fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
+            self.parse(&text, camera.is_some()).with_context(|| file.display().to_string())
+        };
+        let mut parsed = files.iter().map(parse).collect::<anyhow::Result<Vec<_>>>()?;
+        as_probabilities(&mut parsed);
+        Ok(files.iter().zip(parsed).map(|(file, frames)| self.sequence(file, frames, camera)).collect())
     }
 
-    fn sequence(self, file: &Path, camera: Option<&StandingCamera>) -> anyhow::Result<Sequence> {
-        let text = fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
-        let parsed = self.parse(&text, camera.is_some()).with_context(|| file.display().to_string())?;
+    fn sequence(self, file: &Path, parsed: ParsedFrames, camera: Option<&StandingCamera>) -> Sequence {
         let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let first = match self {
             Self::Kitti => 0,
@@ -142,17 +148,15 @@ impl FileFormat {
             Self::Coco => parsed.keys().next().copied().unwrap_or_default(),
         };
         let sequence = Sequence { name, first, frames: Frames::new(), pose: None, discarded: BTreeMap::new() };
-        Ok(standing_camera::placed(parsed, camera, sequence))
+        standing_camera::placed(parsed, camera, sequence)
     }
 
     /// Reads the text of a file; one with boxes needs a camera.
     fn parse(self, text: &str, has_camera: bool) -> anyhow::Result<ParsedFrames> {
-        let mut frames = match self {
+        Ok(match self {
             Self::Coco => coco::frames(text, has_camera)?,
             _ => self.lines(text, has_camera)?,
-        };
-        as_probabilities(&mut frames);
-        Ok(frames)
+        })
     }
 
     fn lines(self, text: &str, has_camera: bool) -> Result<ParsedFrames, LineError> {
@@ -170,7 +174,6 @@ impl FileFormat {
 
 /// The number of a frame, if it is plausible.
 fn frame_number(number: i64) -> Option<u64> {
-    // Beyond this, the times of two sequences would meet.
     (0..100_000_000).contains(&number).then_some(number as u64)
 }
 
@@ -179,11 +182,37 @@ pub fn time_of(sequence: usize, frame: u64, frame_rate_hz: f64) -> Timestamp {
     Timestamp(sequence as u64 * SEQUENCE_US + (frame as f64 * 1e6 / frame_rate_hz).round() as u64)
 }
 
-/// Scores that are none of 0 to 1 are taken for log-odds: their order stays.
-fn as_probabilities(frames: &mut ParsedFrames) {
-    let mut scores: Vec<&mut f64> = frames.values_mut().flatten().map(|object| &mut object.score).collect();
+/// The number of the sequence that lasts at that time.
+pub fn sequence_at(time: Timestamp) -> usize {
+    (time.0 / SEQUENCE_US) as usize
+}
+
+/// Checks that none of several sequences lasts into the next one.
+///
+/// # Errors
+/// Naming the sequence and its last frame.
+pub fn check_lengths(sequences: &[Sequence], frame_rate_hz: f64) -> anyhow::Result<()> {
+    for Sequence { name, .. } in
+        sequences.iter().filter(|sequence| time_of(0, sequence.last(), frame_rate_hz).0 >= SEQUENCE_US)
+    {
+        if sequences.len() > 1 {
+            let seconds = SEQUENCE_US / 1_000_000;
+            bail!("{name} lasts for more than the {seconds} s of a sequence in a directory; give its file by itself");
+        }
+    }
+    Ok(())
+}
+
+/// Log-odds beyond which probabilities would be too near to 0 or 1 to be told apart.
+const MAX_LOG_ODDS: f64 = 30.0;
+
+/// If any score is not within 0 to 1, all are taken for log-odds, scaled down if they are too large. Their order stays.
+fn as_probabilities(files: &mut [ParsedFrames]) {
+    let objects = files.iter_mut().flat_map(BTreeMap::values_mut).flatten();
+    let mut scores: Vec<&mut f64> = objects.map(|object| &mut object.score).collect();
     if scores.iter().any(|score| !(0.0..=1.0).contains(&**score)) {
-        scores.iter_mut().for_each(|score| **score = 1.0 / (1.0 + (-**score).exp()));
+        let most = scores.iter().map(|score| score.abs()).fold(MAX_LOG_ODDS, f64::max);
+        scores.iter_mut().for_each(|score| **score = 1.0 / (1.0 + (-**score * MAX_LOG_ODDS / most).exp()));
     }
 }
 

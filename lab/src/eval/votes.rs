@@ -1,4 +1,4 @@
-//! Baselines: the vehicles' votes without fusion.
+//! Votes of the vehicles, without fusion: their majority, and each vehicle alone.
 
 use std::collections::BTreeMap;
 

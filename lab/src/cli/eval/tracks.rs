@@ -1,5 +1,6 @@
 //! Objects that move, judged by where they were.
 
+use std::collections::BTreeSet;
 use std::io::BufRead;
 use std::path::Path;
 
@@ -10,7 +11,7 @@ use serde::Serialize;
 
 use super::{EvalArguments, columns, read_output, write_json};
 use crate::cli::files;
-use crate::eval::formats::FileFormat;
+use crate::eval::formats::{FileFormat, sequence_at};
 use crate::eval::tracks::{TrackEvaluation, TrackScores, TrackTruth};
 use crate::report::tracks::{tables, without_map};
 
@@ -23,15 +24,16 @@ struct Judged {
 pub(super) fn run(arguments: &EvalArguments, text: &str) -> Result<(), Failure> {
     let path = &arguments.truth;
     let truth = TrackTruth::parse(text).with_context(|| format!("truth {}", path.display())).map_err(Failure::usage)?;
-    judge_maps(arguments, TrackEvaluation::new(truth))
+    judge_maps(arguments, TrackEvaluation::new(truth), None)
 }
 
 /// Judges by the truth in files of a benchmark: maps, or files of the same form.
 pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result<(), Failure> {
     let EvalArguments { truth: path, input, frame_rate, config, .. } = arguments;
     let camera = files::camera(config.as_deref())?;
-    let mut truth = files::read(format, path, camera.as_ref())?;
-    let said = if is_of_maps(input)? { None } else { Some(files::read(format, input, camera.as_ref())?) };
+    let read = |path: &Path| files::read(format, path, camera.as_ref(), *frame_rate);
+    let mut truth = read(path)?;
+    let said = if is_of_maps(input)? { None } else { Some(read(input)?) };
     if let Some(said) = said.as_ref().filter(|said| said.len() > 1 || truth.len() > 1) {
         // Part of the sequences may be judged.
         truth.retain(|sequence| said.iter().any(|other| other.name == sequence.name));
@@ -40,11 +42,12 @@ pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result
             return Err(Failure::usage(anyhow!(what)));
         }
     }
+    let sequences = truth.len();
     let truth = TrackTruth::from_sequences(&truth, *frame_rate);
     let truth = truth.with_context(|| format!("truth {}", path.display())).map_err(Failure::usage)?;
     let mut evaluation = TrackEvaluation::new(truth);
     match said {
-        None => judge_maps(arguments, evaluation),
+        None => judge_maps(arguments, evaluation, Some(sequences)),
         Some(said) => {
             evaluation.sequences(&said, *frame_rate);
             print_scores(arguments, evaluation)
@@ -65,16 +68,27 @@ fn is_of_maps(input: &Path) -> Result<bool, Failure> {
     Ok(begin.trim_ascii_start().starts_with(b"{"))
 }
 
-fn judge_maps(arguments: &EvalArguments, mut evaluation: TrackEvaluation) -> Result<(), Failure> {
-    let mut maps = 0u64;
+/// Judges maps. Those of `sequences`, which only their number tells apart, must be of as many.
+fn judge_maps(
+    arguments: &EvalArguments,
+    mut evaluation: TrackEvaluation,
+    sequences: Option<usize>,
+) -> Result<(), Failure> {
+    let mut mapped = BTreeSet::new();
     read_output(&arguments.input, |line| {
         if let FusedLine::Map(map) = line {
             evaluation.map(&map);
-            maps += 1;
+            mapped.insert(sequence_at(map.fused_at_us));
         }
     })?;
-    if maps == 0 {
-        return Err(anyhow!("there is no map in {}", arguments.input.display()).into());
+    let (truth, input) = (arguments.truth.display(), arguments.input.display());
+    if mapped.is_empty() {
+        return Err(anyhow!("there is no map in {input}").into());
+    }
+    if let Some(sequences) = sequences.filter(|sequences| *sequences > 1 && *sequences != mapped.len()) {
+        let mapped = mapped.len();
+        let what = format!("{truth} has {sequences} sequences, and {input} maps of {mapped}: give truth of just these");
+        return Err(Failure::usage(anyhow!(what)));
     }
     print_scores(arguments, evaluation)
 }

@@ -62,6 +62,10 @@ fn scores_of_detectors_become_probabilities_in_the_same_order() {
     let found = positions(&frames);
     assert_eq!(found[0], (0, None, "Car", 0.5, 6.4, -2.9));
     assert!((found[1].2, found[2].2) == ("Pedestrian", "Cyclist") && found[1].3 > 0.99 && found[2].3 < 0.5);
+    let percent = line(0, 2, 97.0) + &line(1, 2, 98.0) + &line(2, 2, 40.0);
+    let found = read(FileFormat::Kitti, &percent, None).unwrap().frames;
+    let [first, second, third] = [0, 1, 2].map(|frame| found[&frame][0].perceived.confidence);
+    assert!(second > first && first > third, "{first} {second} {third}");
 }
 
 #[test]
@@ -109,7 +113,11 @@ fn boxes_of_coco_and_of_mot_challenge_are_placed_by_their_camera() {
         assert_eq!((sequence.first, frame, is, named, said), (first, 8, id, label, score));
         // The middle of an object is behind where it touches the ground.
         assert!((x_m - 12.0).abs() < 0.5 && (15.0..17.5).contains(&y_m), "({x_m}, {y_m})");
-        assert!(sequence.frames[&8][0].perceived.covariance_m2.is_some() && sequence.pose.unwrap().y_m == -5.0);
+        assert!(sequence.frames[&8][0].perceived.covariance_m2.is_some());
+        let node = NodeName::from_static("post");
+        for report in sequence.reports(0, 10.0, &node, 8) {
+            assert_eq!((report.pose.map(|pose| pose.y_m), report.moving), (Some(-5.0), Some(false)));
+        }
         let above = if format == FileFormat::Mot { Some(&1) } else { None };
         assert_eq!(sequence.discarded.get("above_horizon"), above, "the second box of the lines stands in the sky");
     }
