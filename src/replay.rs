@@ -277,7 +277,7 @@ impl Replay {
         let Some((number, mut line)) = self.ahead.pop_front() else { return output };
         let is_plausible = self.clock.is_plausible(line.at, self.ahead.iter().map(|(_, line)| line.at));
         if !is_plausible && self.config.passes.is_none() {
-            self.reject(number, flaw::of_unused(RejectReason::FromTheFuture));
+            self.reject(number, flaw::of_time_ahead(line.at != line.report.captured_at_us));
             return output;
         }
         let before = self.clock.now();

@@ -18,10 +18,16 @@ pub(super) fn of_line(text: &[u8], reason: RejectReason, limits: &Limits) -> Fla
     Flaw::of_json(text, reason, limits).unwrap_or_else(of_envelope)
 }
 
+/// The flaw of a line whose time, that of its receipt or else of its capture, no later line bears out.
+pub(super) fn of_time_ahead(is_of_receipt: bool) -> Flaw {
+    let field = if is_of_receipt { "received_at_us" } else { "captured_at_us" };
+    Flaw::new(RejectReason::FromTheFuture, field, "is ahead of most of the lines after it")
+}
+
 /// The flaw of a readable line that the aggregator did not use.
 pub(super) fn of_unused(reason: RejectReason) -> Flaw {
     let (field, fault) = match reason {
-        RejectReason::FromTheFuture => ("captured_at_us", "is ahead of most of the lines after it"),
+        RejectReason::FromTheFuture => ("captured_at_us", "is ahead of the line's time"),
         RejectReason::Stale => ("captured_at_us", "is too long before the line's time"),
         RejectReason::OutOfOrder => ("captured_at_us", "is not later than in an earlier line of this node"),
         RejectReason::TooManyVehicles => ("node", "is one vehicle too many"),
