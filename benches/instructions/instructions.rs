@@ -3,6 +3,7 @@
 #![allow(missing_docs, reason = "the macros write items without")]
 
 use std::hint::black_box;
+use std::sync::Arc;
 
 use ecod::leadership::election::{Election, ElectionEffect, ElectionInput};
 use ecod::model::detection::Detection;
@@ -11,6 +12,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::pace::Pace;
 use ecod::perception::projection::{Cut, Projection};
+use ecod::tracking::Tracker;
 use ecod::vote::Vote;
 use ecod::wire::{Encoding, Limits, ObjectReport, decode_report};
 use ecod_instructions as workload;
@@ -33,6 +35,16 @@ fn pace_round((mut pace, reports, now): (Pace, Vec<ObjectReport>, Timestamp)) ->
     }
     black_box(pace.close(now));
     pace
+}
+
+#[library_benchmark]
+#[bench::of_1024_objects(workload::tracks())]
+fn tracks_round((mut tracker, reports, now): (Tracker, Vec<Arc<ObjectReport>>, Timestamp)) -> Tracker {
+    for report in reports {
+        black_box(tracker.observe(report, now));
+    }
+    black_box(tracker.close(now));
+    tracker
 }
 
 #[library_benchmark]
@@ -62,6 +74,6 @@ fn election_step((mut election, beat, now): (Election, ElectionInput, Timestamp)
 
 library_benchmark_group!(
     name = core,
-    benchmarks = [projection, pace_round, vote_round, decode_32_objects, election_step]
+    benchmarks = [projection, pace_round, tracks_round, vote_round, decode_32_objects, election_step]
 );
 main!(library_benchmark_groups = core);

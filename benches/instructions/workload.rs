@@ -13,6 +13,8 @@ use ecod::pace::{Pace, PaceConfig};
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::landmark::{Landmark, LandmarkIndex};
 use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
+use ecod::reputation::ReputationConfig;
+use ecod::tracking::{Tracker, TracksConfig};
 use ecod::vote::{Vote, VoteConfig};
 use ecod::wire::{Encoding, ObjectReport, PerceivedObject, Role, SCHEMA_VERSION, WirePose, encode};
 use nalgebra::Point2;
@@ -59,6 +61,34 @@ pub fn pace() -> (Pace, Vec<ObjectReport>, Timestamp) {
     }
     now = now + Duration::from_millis(100);
     (pace, reports(10, now), now)
+}
+
+/// Tracks after twenty rounds, and the reports of the next: 32 vehicles, 32 objects each, of 256 that stand nine metres apart.
+pub fn tracks() -> (Tracker, Vec<Arc<ObjectReport>>, Timestamp) {
+    let mut tracker = Tracker::new(TracksConfig::default(), ReputationConfig::default());
+    let apart = |object: PerceivedObject| PerceivedObject {
+        landmark: None,
+        x_m: 3.0 * object.x_m,
+        y_m: 3.0 * object.y_m,
+        ..object
+    };
+    let reports = |round: usize, now: Timestamp| {
+        let of_round = reports(round, now).into_iter();
+        let unposed = of_round.map(|report| ObjectReport {
+            pose: None,
+            objects: report.objects.into_iter().map(apart).collect(),
+            ..ObjectReport::new(report.node, report.seq, now)
+        });
+        unposed.map(Arc::new).collect::<Vec<_>>()
+    };
+    let mut now = NOON;
+    for round in 0..20 {
+        now = now + Duration::from_millis(100);
+        reports(round, now).into_iter().for_each(|report| assert!(tracker.observe(report, now)));
+        tracker.close(now);
+    }
+    now = now + Duration::from_millis(100);
+    (tracker, reports(20, now), now)
 }
 
 /// VOTE after ten rounds, and the votes of the next: 32 vehicles, 32 votes each on 256 locations.
