@@ -225,6 +225,14 @@ fn sequences_have_the_numbers_of_their_names_and_maps_need_truth_of_just_these()
     assert!(run.status.success(), "{}", said_by(&run));
     let judged: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
     assert_eq!(judged["tracks"]["at_best_f1"]["false_alarms"].as_u64(), Some(0), "{judged}");
+    let over = text(&path("left/a.txt")).to_owned();
+    for (flags, fault) in [
+        (["--vehicle", &left, "--vehicle", &left, "--output", text(&reports)], "names left twice"),
+        (["--vehicle", &left, "--vehicle", &right, "--output", &over], "a.txt is to be both read and written"),
+    ] {
+        let run = ecod_lab(&[&["convert", "--format", "mot"][..], &flags].concat());
+        assert!(run.status.code() == Some(2) && said_by(&run).contains(fault), "{}", said_by(&run));
+    }
     let run = judge(&path("more"));
     assert!(run.status.code() == Some(2) && said_by(&run).contains("has 3 sequences"), "{}", said_by(&run));
 }

@@ -53,6 +53,15 @@ pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
     if let Some((other, _)) = config.iter().find(|(name, _)| vehicle.iter().all(|(vehicle, _)| vehicle != name)) {
         return Err(Failure::usage(anyhow!("--config is of {other}, of which no --vehicle is given")));
     }
+    let mut names = BTreeSet::new();
+    if let Some((name, _)) = vehicle.iter().find(|(name, _)| !names.insert(name)) {
+        return Err(Failure::usage(anyhow!("--vehicle names {name} twice: a vehicle has one file or directory")));
+    }
+    let mut inputs = Vec::new();
+    for (_, path) in vehicle {
+        inputs.extend(format.files(path).map_err(Failure::usage)?);
+    }
+    lines::check_apart(output, &inputs).map_err(Failure::usage)?;
     let mut of_vehicles = Vec::new();
     for (name, path) in vehicle {
         let config = config.iter().find(|(of, _)| of == name).map(|(_, path)| path.as_path());
@@ -66,7 +75,6 @@ pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
         }
     }
     reports.sort_by_key(|report| report.captured_at_us);
-    let inputs: Vec<_> = vehicle.iter().map(|(_, path)| path.clone()).collect();
     let mut sink = lines::create(output, &inputs).map_err(Failure::usage)?;
     let mut write = || -> std::io::Result<()> {
         for report in &reports {

@@ -70,7 +70,11 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     let path = &arguments.truth;
     if let Some(out) = &arguments.out {
         let reports = arguments.reports.iter();
-        let inputs: Vec<_> = [path, &arguments.input].into_iter().chain(reports).collect();
+        let mut inputs: Vec<_> = [path, &arguments.input].into_iter().chain(reports).cloned().collect();
+        for directory in [path, &arguments.input].into_iter().filter(|input| input.is_dir()) {
+            let files = arguments.format.map(|format| format.files(directory)).transpose().map_err(Failure::usage)?;
+            inputs.extend(files.unwrap_or_default());
+        }
         lines::check_apart(out, &inputs).map_err(Failure::usage)?;
     }
     if let Some(format) = arguments.format {

@@ -124,13 +124,32 @@ pub struct LineError {
 }
 
 impl FileFormat {
+    /// The file, or all of a directory with the ending of the form, by name.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn files(self, path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+        if !path.is_dir() {
+            return Ok(vec![path.to_owned()]);
+        }
+        let ending = if self == Self::Coco { "json" } else { "txt" };
+        let entries = fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let has_ending = |file: &PathBuf| file.extension().is_some_and(|extension| extension == ending);
+        let mut files: Vec<PathBuf> =
+            entries.filter_map(Result::ok).map(|entry| entry.path()).filter(has_ending).collect();
+        files.sort();
+        if files.is_empty() { bail!("there is no .{ending} file in {}", path.display()) } else { Ok(files) }
+    }
+
     /// Reads a file, or all of a directory with the ending of the form. Boxes are those of `camera`.
     ///
     /// # Errors
     /// Naming file, line and field.
     pub fn read(self, path: &Path, camera: Option<&StandingCamera>) -> anyhow::Result<Vec<Sequence>> {
-        let ending = if self == Self::Coco { "json" } else { "txt" };
-        let files = files(path, ending)?;
+        if self == Self::Kitti && camera.is_some() {
+            bail!("positions of KITTI are those of its vehicle: they need no --config");
+        }
+        let files = self.files(path)?;
         let parse = |file: &PathBuf| {
             let text = fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
             self.parse(&text, camera.is_some()).with_context(|| file.display().to_string())
@@ -172,9 +191,9 @@ impl FileFormat {
     }
 }
 
-/// The number of a frame, if it is plausible.
+/// The number of a frame, if it is plausible. All frames up to the last make a report, also those without objects.
 fn frame_number(number: i64) -> Option<u64> {
-    (0..100_000_000).contains(&number).then_some(number as u64)
+    (0..1_000_000).contains(&number).then_some(number as u64)
 }
 
 /// The time of a frame.
@@ -203,28 +222,24 @@ pub fn check_lengths(sequences: &[Sequence], frame_rate_hz: f64) -> anyhow::Resu
     Ok(())
 }
 
-/// Log-odds beyond which probabilities would be too near to 0 or 1 to be told apart.
+/// Log-odds beyond which they are compressed, and the most that comes of it: otherwise probabilities would be too near to 1 to
+/// be told apart.
+const LARGE_LOG_ODDS: f64 = 20.0;
 const MAX_LOG_ODDS: f64 = 30.0;
 
-/// If any score is not within 0 to 1, all are taken for log-odds, scaled down if they are too large. Their order stays.
+/// If any score is not within 0 to 1, all are taken for log-odds. Their order stays.
 fn as_probabilities(files: &mut [ParsedFrames]) {
     let objects = files.iter_mut().flat_map(BTreeMap::values_mut).flatten();
     let mut scores: Vec<&mut f64> = objects.map(|object| &mut object.score).collect();
     if scores.iter().any(|score| !(0.0..=1.0).contains(&**score)) {
-        let most = scores.iter().map(|score| score.abs()).fold(MAX_LOG_ODDS, f64::max);
-        scores.iter_mut().for_each(|score| **score = 1.0 / (1.0 + (-**score * MAX_LOG_ODDS / most).exp()));
+        scores.iter_mut().for_each(|score| **score = 1.0 / (1.0 + (-compressed(**score)).exp()));
     }
 }
 
-fn files(path: &Path, ending: &str) -> anyhow::Result<Vec<PathBuf>> {
-    if !path.is_dir() {
-        return Ok(vec![path.to_owned()]);
-    }
-    let entries = fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let has_ending = |file: &PathBuf| file.extension().is_some_and(|extension| extension == ending);
-    let mut files: Vec<PathBuf> = entries.filter_map(Result::ok).map(|entry| entry.path()).filter(has_ending).collect();
-    files.sort();
-    if files.is_empty() { bail!("there is no .{ending} file in {}", path.display()) } else { Ok(files) }
+fn compressed(log_odds: f64) -> f64 {
+    let beyond = (log_odds.abs() - LARGE_LOG_ODDS).max(0.0) / LARGE_LOG_ODDS;
+    let most = MAX_LOG_ODDS - LARGE_LOG_ODDS;
+    log_odds.clamp(-LARGE_LOG_ODDS, LARGE_LOG_ODDS) + log_odds.signum() * most * (1.0 - 1.0 / (1.0 + beyond))
 }
 
 /// The cells of a line, separated by commas or else by blanks.

@@ -22,8 +22,7 @@ pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineE
         let label = usize::try_from(number - 1).ok().and_then(|place| CLASSES.get(place));
         let unknown = || cells.error(2, "type", format!("{number} is none of 1 to {}", CLASSES.len()));
         let label = Label::new_static(label.ok_or_else(unknown)?);
-        // PointRCNN's scores are log-odds.
-        let score = 1.0 / (1.0 + (-cells.number(7, "score")?).exp());
+        let score = cells.number(7, "score")?;
         return Ok(Some((frame, ParsedObject { id: None, label, score, place: place(11)? })));
     }
     let id = cells.integer(2, "track")?;
