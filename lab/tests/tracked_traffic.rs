@@ -224,7 +224,7 @@ fn assert_better(scene: &str, figures: [[f64; 6]; 4]) {
 }
 
 #[test]
-fn alignment_costs_cameras_whose_poses_are_right_nothing() {
+fn alignment_costs_cameras_whose_poses_are_right_nothing_and_they_are_better_together() {
     assert_best("0.02 m", means(|seed| two_posts(seed, 0.02)));
 }
 

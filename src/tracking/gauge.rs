@@ -2,7 +2,7 @@
 //!
 //! Observers find their errors relative to each other. A motion of all together changes no residual, so nothing but
 //! unequal gains decides on it, and it would wander without end. Therefore a round leaves the common motion of
-//! observers that correspond, directly or through others, as it was, but for fading with the mean of the errors: those of
+//! observers that correspond, directly or through others, as it was. It only fades with the mean of the errors: those of
 //! observers that leave or join do not move the map at once. If each faded by itself, those that last would take over
 //! the errors of those that fade.
 
@@ -38,21 +38,22 @@ impl Gauge {
         let known = self.towards.len();
         let observers = || sensors.iter().filter(|sensor| sensor.id.number() < known);
         let weight = |sensor: &SensorModel| sensors.fleet.trust(sensor.id) * sensor.registration.weight(prior);
+        // Those that were silent have not faded yet.
+        let before = |before: &[Option<(Vector4<f64>, f64)>], sensor: &SensorModel| {
+            before[sensor.id.number()].unwrap_or((sensor.registration.error(), 1.0))
+        };
         let mut kept = vec![(0.0, 0.0); known];
         for sensor in observers() {
             let (group, weight) = (self.group(sensor.id.number()), weight(sensor));
-            if let Some((_, of_sensor)) = self.before[sensor.id.number()] {
-                kept[group] = (kept[group].0 + weight * of_sensor, kept[group].1 + weight);
-            }
+            let (_, of_sensor) = before(&self.before, sensor);
+            kept[group] = (kept[group].0 + weight * of_sensor, kept[group].1 + weight);
         }
         let mut sums = vec![MotionSums::default(); known];
         for sensor in observers() {
-            let (number, registration) = (sensor.id.number(), &sensor.registration);
-            let group = self.group(number);
+            let (group, registration) = (self.group(sensor.id.number()), &sensor.registration);
             let kept = kept[group].0 / kept[group].1.max(f64::MIN_POSITIVE);
-            let change =
-                self.before[number].map_or_else(Vector4::zeros, |(error, _)| registration.error() - error * kept);
-            sums[group].add(&registration.pivot(), &change, weight(sensor), prior);
+            let (error, _) = before(&self.before, sensor);
+            sums[group].add(&registration.pivot(), &(registration.error() - error * kept), weight(sensor), prior);
         }
         let common: Vec<Option<Motion>> = sums.iter().map(MotionSums::motion).collect();
         for sensor in sensors.iter_mut().filter(|sensor| sensor.id.number() < known) {

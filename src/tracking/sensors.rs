@@ -18,11 +18,13 @@ use crate::model::time::Timestamp;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::wire::{ForeignVotes, ObjectReport, PerceivedObject, WirePose};
 
-/// Distance of a vehicle, or of the median of its detections, from where it was, as a share of its range, up to which it
-/// stays.
+/// Distance of a vehicle from where it was, as a share of its range, up to which it stays. Without a pose, it is that of the
+/// median of its detections.
 const STAYS: f64 = 0.25;
 /// The same of the detections of a vehicle that declares to stand: they come and go.
 const DECLARED_STAYS: f64 = 1.0;
+/// Range in metres that counts at least: that of a vehicle that detects nothing shrinks.
+const MIN_RANGE_M: f64 = 10.0;
 
 /// Time after which a vehicle that states no pose and stays is known to stand.
 const STAYS_FOR: Duration = Duration::from_secs(120);
@@ -251,7 +253,7 @@ impl SensorModel {
         let centre = self.coverage.centre().unwrap_or(place);
         let is_declared = report.moving == Some(false);
         let stays = if is_declared && report.pose.is_none() { DECLARED_STAYS } else { STAYS };
-        if (centre - place).norm() > stays * self.coverage.range_m() {
+        if (centre - place).norm() > stays * self.coverage.range_m().max(MIN_RANGE_M) {
             self.place = (centre, at);
         }
         let is_still = match (report.pose, self.pose) {

@@ -131,7 +131,7 @@ fn a_fixed_camera_is_no_object() {
     let mut round = TracksRound::default();
     for frame in 0..20 {
         let pose = Some(WirePose::new(0.0, 0.0, 0.0));
-        // What is at a known place is of no concern here.
+        // An object at a known place is of no concern here.
         let known = PerceivedObject { landmark: Some("gate".into()), ..car(5.0, 5.0) };
         let seen = ObjectReport { pose, moving: Some(false), ..report("mast", frame, vec![car(10.0, 0.2), known]) };
         tracker.observe_only(Arc::new(seen), at(frame), |object| object.landmark.is_none());

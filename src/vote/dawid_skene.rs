@@ -101,6 +101,8 @@ const TIED_PRIOR_FACTOR: f64 = 4.0;
 const MIN_SAVING: f64 = 0.01;
 /// Saving in all, in nats, that may be chance.
 const CHANCE_SAVING: f64 = 5.0;
+/// Probability at least that a vote is wrong, or right, before rates by label in a ledger are compared with it.
+const MIN_WRONG: f64 = 0.01;
 /// Votes over which savings fade to 1/e.
 const SAVING_MEMORY_VOTES: f64 = 20_000.0;
 /// Drop in the rate of right votes that is tolerated.
@@ -219,7 +221,7 @@ impl DawidSkene {
         judged
     }
 
-    /// Replaces the evidence on the coupling that comes from a ledger, which counts right and wrong votes of each vehicle by
+    /// Replaces the evidence on the coupling that comes from a ledger. It counts right and wrong votes of each vehicle by
     /// stated label. Under equal accuracy on all classes, Bayes' rule still makes a rare label right less often than a
     /// frequent one. Rates by label count as far as they explain more than that, and more than chance does: the Bayes factor
     /// by Laplace's approximation (Kass & Raftery 1995).
@@ -229,8 +231,11 @@ impl DawidSkene {
         for (label, (correct, _)) in vehicles.clone().flatten() {
             *right.entry(label).or_default() += correct;
         }
+        if right.len() < 2 {
+            return;
+        }
         let all: f64 = right.values().map(|correct| correct + 1.0).sum();
-        let wrong_labels = right.len().saturating_sub(1).max(1) as f64;
+        let wrong_labels = (right.len() - 1) as f64;
         let prior = self.config.class_prior_votes;
         for labels in vehicles {
             let (correct, votes) =
@@ -238,13 +243,13 @@ impl DawidSkene {
             let accuracy = (correct + self.config.assumed_accuracy) / (votes + 1.0);
             for (label, &(correct, incorrect)) in labels {
                 let share = (right[label] + 1.0) / all;
-                let (right, wrong) = (accuracy * share, (1.0 - accuracy) * (1.0 - share) / wrong_labels);
-                let tied = (right / (right + wrong)).clamp(1e-6, 1.0 - 1e-6);
-                let votes = correct + incorrect;
-                let own = (correct + prior * tied) / (votes + prior);
+                let (if_right, if_wrong) = (accuracy * share, (1.0 - accuracy) * (1.0 - share) / wrong_labels);
+                let tied = (if_right / (if_right + if_wrong)).clamp(MIN_WRONG, 1.0 - MIN_WRONG);
+                let for_label = correct + incorrect;
+                let own = (correct + prior * tied) / (for_label + prior);
                 let saved = correct * (own / tied).ln() + incorrect * ((1.0 - own) / (1.0 - tied)).ln();
-                self.inherited_saving.0 += saved - (votes / prior).ln_1p() / 2.0;
-                self.inherited_saving.1 += votes;
+                self.inherited_saving.0 += saved - (for_label / prior).ln_1p() / 2.0;
+                self.inherited_saving.1 += for_label;
             }
         }
     }

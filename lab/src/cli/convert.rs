@@ -10,7 +10,7 @@ use ecod::model::names::NodeName;
 use ecod_actors::cli::{Failure, lines};
 
 use super::files::{camera, frame_rate, read};
-use crate::eval::formats::{FileFormat, Sequence};
+use crate::eval::formats::{FileFormat, check_lengths};
 
 /// Flags of `convert`.
 #[derive(Debug, Args)]
@@ -37,17 +37,6 @@ fn of_vehicle(text: &str) -> Result<(NodeName, PathBuf), String> {
     Ok((NodeName::new(name).map_err(|error| error.to_string())?, file.into()))
 }
 
-/// The number of a sequence among those of all vehicles, by name. A vehicle's only file is the first sequence, whatever its
-/// name, if no vehicle has several.
-fn number_of<'a>(name: &str, vehicles: impl Iterator<Item = &'a Vec<Sequence>>) -> usize {
-    let (mut names, mut are_several) = (BTreeSet::new(), false);
-    for sequences in vehicles {
-        are_several |= sequences.len() > 1;
-        names.extend(sequences.iter().map(|sequence| sequence.name.as_str()));
-    }
-    if are_several { names.range(..name).count() } else { 0 }
-}
-
 pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
     let ConvertArguments { format, vehicle, config, frame_rate, output } = arguments;
     if let Some((other, _)) = config.iter().find(|(name, _)| vehicle.iter().all(|(vehicle, _)| vehicle != name)) {
@@ -65,12 +54,19 @@ pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
     let mut of_vehicles = Vec::new();
     for (name, path) in vehicle {
         let config = config.iter().find(|(of, _)| of == name).map(|(_, path)| path.as_path());
-        of_vehicles.push((name, read(*format, path, camera(config)?.as_ref(), *frame_rate)?));
+        of_vehicles.push((name, read(*format, path, camera(config)?.as_ref())?));
+    }
+    // A vehicle's only file is the first sequence, whatever its name, if no vehicle has several.
+    let all = || of_vehicles.iter().flat_map(|(_, sequences)| sequences);
+    let mut names = BTreeSet::new();
+    if of_vehicles.iter().any(|(_, sequences)| sequences.len() > 1) {
+        check_lengths(all(), *frame_rate).map_err(Failure::usage)?;
+        names.extend(all().map(|sequence| sequence.name.as_str()));
     }
     let mut reports = Vec::new();
     for (name, sequences) in &of_vehicles {
         for sequence in sequences {
-            let number = number_of(&sequence.name, of_vehicles.iter().map(|(_, sequences)| sequences));
+            let number = names.range(..sequence.name.as_str()).count();
             reports.extend(sequence.reports(number, *frame_rate, name, sequence.last()));
         }
     }

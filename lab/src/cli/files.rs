@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::Context;
 use ecod_actors::cli::Failure;
 
-use crate::eval::formats::{FileFormat, Sequence, StandingCamera, check_lengths};
+use crate::eval::formats::{FileFormat, Sequence, StandingCamera};
 
 /// Parses frames a second.
 pub(super) fn frame_rate(text: &str) -> Result<f64, String> {
@@ -20,14 +20,8 @@ pub(super) fn camera(config: Option<&Path>) -> Result<Option<StandingCamera>, Fa
 }
 
 /// Reads a file, or all of a directory, and says which boxes have no place.
-pub(super) fn read(
-    format: FileFormat,
-    path: &Path,
-    camera: Option<&StandingCamera>,
-    frame_rate_hz: f64,
-) -> Result<Vec<Sequence>, Failure> {
+pub(super) fn read(format: FileFormat, path: &Path, camera: Option<&StandingCamera>) -> Result<Vec<Sequence>, Failure> {
     let sequences = format.read(path, camera).map_err(Failure::usage)?;
-    check_lengths(&sequences, frame_rate_hz).map_err(Failure::usage)?;
     for Sequence { name, discarded, .. } in &sequences {
         for (reason, boxes) in discarded {
             eprintln!("{name}: {boxes} boxes have no place on the ground: {reason}");

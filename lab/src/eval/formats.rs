@@ -11,6 +11,7 @@ mod standing_camera;
 mod tests;
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -137,7 +138,7 @@ impl FileFormat {
         let has_ending = |file: &PathBuf| file.extension().is_some_and(|extension| extension == ending);
         let mut files: Vec<PathBuf> =
             entries.filter_map(Result::ok).map(|entry| entry.path()).filter(has_ending).collect();
-        files.sort();
+        files.sort_by_cached_key(|file| file.file_stem().map(OsStr::to_owned));
         if files.is_empty() { bail!("there is no .{ending} file in {}", path.display()) } else { Ok(files) }
     }
 
@@ -206,18 +207,16 @@ pub fn sequence_at(time: Timestamp) -> usize {
     (time.0 / SEQUENCE_US) as usize
 }
 
-/// Checks that none of several sequences lasts into the next one.
+/// Checks that no sequence, of several, lasts into the next one.
 ///
 /// # Errors
-/// Naming the sequence and its last frame.
-pub fn check_lengths(sequences: &[Sequence], frame_rate_hz: f64) -> anyhow::Result<()> {
+/// Naming the sequence.
+pub fn check_lengths<'a>(sequences: impl IntoIterator<Item = &'a Sequence>, frame_rate_hz: f64) -> anyhow::Result<()> {
     for Sequence { name, .. } in
-        sequences.iter().filter(|sequence| time_of(0, sequence.last(), frame_rate_hz).0 >= SEQUENCE_US)
+        sequences.into_iter().filter(|sequence| sequence_at(time_of(0, sequence.last(), frame_rate_hz)) > 0)
     {
-        if sequences.len() > 1 {
-            let seconds = SEQUENCE_US / 1_000_000;
-            bail!("{name} lasts for more than the {seconds} s of a sequence in a directory; give its file by itself");
-        }
+        let seconds = SEQUENCE_US / 1_000_000;
+        bail!("{name} lasts for more than the {seconds} s of one of several sequences; give its file by itself");
     }
     Ok(())
 }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::io::BufRead;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 use anyhow::{Context, anyhow};
@@ -11,7 +12,7 @@ use serde::Serialize;
 
 use super::{EvalArguments, columns, read_output, write_json};
 use crate::cli::files;
-use crate::eval::formats::{FileFormat, sequence_at};
+use crate::eval::formats::{FileFormat, check_lengths, sequence_at, time_of};
 use crate::eval::tracks::{TrackEvaluation, TrackScores, TrackTruth};
 use crate::report::tracks::{tables, without_map};
 
@@ -31,7 +32,7 @@ pub(super) fn run(arguments: &EvalArguments, text: &str) -> Result<(), Failure> 
 pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result<(), Failure> {
     let EvalArguments { truth: path, input, frame_rate, config, .. } = arguments;
     let camera = files::camera(config.as_deref())?;
-    let read = |path: &Path| files::read(format, path, camera.as_ref(), *frame_rate);
+    let read = |path: &Path| files::read(format, path, camera.as_ref());
     let mut truth = read(path)?;
     let said = if is_of_maps(input)? { None } else { Some(read(input)?) };
     if let Some(said) = said.as_ref().filter(|said| said.len() > 1 || truth.len() > 1) {
@@ -42,7 +43,14 @@ pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result
             return Err(Failure::usage(anyhow!(what)));
         }
     }
-    let sequences = truth.len();
+    let sequences = match &truth[..] {
+        // One may be of any length.
+        [one] => 1..=sequence_at(time_of(0, one.last(), *frame_rate)) + 1,
+        several => {
+            check_lengths(several, *frame_rate).map_err(Failure::usage)?;
+            several.len()..=several.len()
+        }
+    };
     let truth = TrackTruth::from_sequences(&truth, *frame_rate);
     let truth = truth.with_context(|| format!("truth {}", path.display())).map_err(Failure::usage)?;
     let mut evaluation = TrackEvaluation::new(truth);
@@ -72,7 +80,7 @@ fn is_of_maps(input: &Path) -> Result<bool, Failure> {
 fn judge_maps(
     arguments: &EvalArguments,
     mut evaluation: TrackEvaluation,
-    sequences: Option<usize>,
+    sequences: Option<RangeInclusive<usize>>,
 ) -> Result<(), Failure> {
     let mut mapped = BTreeSet::new();
     read_output(&arguments.input, |line| {
@@ -85,8 +93,8 @@ fn judge_maps(
     if mapped.is_empty() {
         return Err(anyhow!("there is no map in {input}").into());
     }
-    if let Some(sequences) = sequences.filter(|sequences| *sequences > 1 && *sequences != mapped.len()) {
-        let mapped = mapped.len();
+    if let Some(sequences) = sequences.filter(|sequences| !sequences.contains(&mapped.len())) {
+        let (sequences, mapped) = (sequences.end(), mapped.len());
         let what = format!("{truth} has {sequences} sequences, and {input} maps of {mapped}: give truth of just these");
         return Err(Failure::usage(anyhow!(what)));
     }
