@@ -212,13 +212,14 @@ pub fn sequence_at(time: Timestamp) -> usize {
 /// # Errors
 /// Naming the sequence.
 pub fn check_lengths<'a>(sequences: impl IntoIterator<Item = &'a Sequence>, frame_rate_hz: f64) -> anyhow::Result<()> {
-    for Sequence { name, .. } in
-        sequences.into_iter().filter(|sequence| sequence_at(time_of(0, sequence.last(), frame_rate_hz)) > 0)
-    {
-        let seconds = SEQUENCE_US / 1_000_000;
-        bail!("{name} lasts for more than the {seconds} s of one of several sequences; give its file by itself");
+    let lasts_on = |sequence: &&Sequence| sequence_at(time_of(0, sequence.last(), frame_rate_hz)) > 0;
+    match sequences.into_iter().find(lasts_on) {
+        Some(Sequence { name, .. }) => {
+            let seconds = SEQUENCE_US / 1_000_000;
+            bail!("{name} lasts for more than the {seconds} s of one of several sequences; give its file by itself")
+        }
+        None => Ok(()),
     }
-    Ok(())
 }
 
 /// Log-odds beyond which they are compressed, and the most that comes of it: otherwise probabilities would be too near to 1 to
