@@ -75,11 +75,11 @@ eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics f
 
 # All programs are built before the first test: those of ecod-lab need ecod-node beside it.
 # Only the tests' own brokers are wanted; a service of that name would hold the port of a node.
-# Most tests wait most of their time.
+# Most tests wait most of their time. TEST_FLAGS=--no-run only builds them.
 test: export RUST_TEST_THREADS ?= $(shell expr 2 '*' $$(nproc))
 test: PACKAGES += libfaketime mosquitto mosquitto-clients nats-server
 test: setup ## all tests
-	cargo test --locked
+	cargo test --locked $(TEST_FLAGS)
 
 test-dashboard: PACKAGES += chromium chromium-driver
 test-dashboard: setup monitoring ## the page in a real browser, with pictures in target/dashboard; installs Chromium

@@ -73,7 +73,7 @@ impl Tracker {
     /// Takes the `wanted` objects of a report: those at no known location.
     pub fn observe_only(
         &mut self,
-        report: Arc<ObjectReport>,
+        mut report: Arc<ObjectReport>,
         captured_at: Timestamp,
         wanted: impl Fn(&PerceivedObject) -> bool,
     ) -> bool {
@@ -81,7 +81,9 @@ impl Tracker {
             self.late += 1;
             return false;
         }
-        let report = if report.objects.iter().all(&wanted) { report } else { only(&report, wanted) };
+        if !report.objects.iter().all(&wanted) {
+            Arc::make_mut(&mut report).objects.retain(wanted);
+        }
         self.pending.push((captured_at, report));
         true
     }
@@ -234,11 +236,4 @@ struct Captured {
     at: Timestamp,
     delay_s: f64,
     report: Arc<ObjectReport>,
-}
-
-/// The report with the `wanted` objects only.
-fn only(report: &ObjectReport, wanted: impl Fn(&PerceivedObject) -> bool) -> Arc<ObjectReport> {
-    let mut report = report.clone();
-    report.objects.retain(wanted);
-    Arc::new(report)
 }

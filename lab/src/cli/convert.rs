@@ -50,7 +50,6 @@ pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
     for (_, path) in vehicle {
         inputs.extend(format.files(path).map_err(Failure::usage)?);
     }
-    lines::check_apart(output, &inputs).map_err(Failure::usage)?;
     let mut of_vehicles = Vec::new();
     for (name, path) in vehicle {
         let config = config.iter().find(|(of, _)| of == name).map(|(_, path)| path.as_path());
