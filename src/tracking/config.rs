@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::registration::BiasPrior;
+use super::pose_bias::BiasPrior;
 use crate::config::{ConfigError, check_range};
 use crate::model::names::{Label, is_label};
 
@@ -144,7 +144,7 @@ impl TracksConfig {
         self.manoeuvre_mps * self.manoeuvre_mps
     }
 
-    /// Standard deviations of pose errors at rest.
+    /// Standard deviations of pose biases at rest.
     pub(super) fn bias_prior(&self) -> BiasPrior {
         BiasPrior {
             offset_m: self.align_offset_m,

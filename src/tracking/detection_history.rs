@@ -5,7 +5,7 @@ use std::time::Duration;
 use smallvec::SmallVec;
 
 use super::existence::SensorHistory;
-use super::sensors::SensorId;
+use super::handles::SensorId;
 use crate::model::time::Timestamp;
 
 /// Maximum number of vehicles in a track's history.

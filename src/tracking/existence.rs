@@ -8,11 +8,11 @@
 //! those of the cell's own tracks ([`BaseRate`]).
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use nalgebra::Vector2;
 
-use super::sensors::SensorId;
-use super::trust::JUDGED_AFTER;
+use super::handles::SensorId;
 use crate::model::time::Timestamp;
 
 /// Time constant in seconds with which evidence fades.
@@ -61,6 +61,9 @@ const LOOKS_NATS: f64 = 0.3;
 /// Log-odds that each nat of a detector's even confidence above the assumed one takes. Such a detector reports more
 /// clutter, and its clutter comes back more often than the rule for the even confidence assumes.
 const EVEN_NATS: f64 = 0.6;
+
+/// Time between judgements of a vehicle's statement about an object.
+pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
 
 /// Minimum number of looks before a vehicle's statement is judged.
 const MIN_JUDGED_LOOKS: u32 = 5;

@@ -15,12 +15,13 @@ use uuid::Uuid;
 
 use super::HandOvers;
 use super::config::TracksConfig;
+use super::existence::JUDGED_AFTER;
+use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::{MERGE_M, measurement};
-use super::sensors::SensorId;
-use super::store::{TrackIndex, TrackStore};
+use super::store::TrackStore;
 use super::track::{MIN_LABEL_SIMILARITY, Track};
-use super::trust::{DormantCounts, Fleet, JUDGED_AFTER, Judgement};
+use super::trust::{DormantCounts, Fleet, Judgement};
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{NeighbourObject, PerceivedObject};

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::store::TrackIndex;
+use super::handles::TrackIndex;
 use super::track::{MIN_LABEL_SIMILARITY, Track};
 use super::update::{ESTABLISHED_HITS, ReportUpdate, TimedDetection};
 use crate::association::{Candidate, ClusterSize, assign};

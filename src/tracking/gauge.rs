@@ -8,8 +8,9 @@
 
 use nalgebra::{Matrix3, Vector2, Vector3, Vector4};
 
-use super::registration::BiasPrior;
-use super::sensors::{SensorId, SensorModel, Sensors};
+use super::handles::SensorId;
+use super::pose_bias::BiasPrior;
+use super::sensors::{SensorModel, Sensors};
 
 /// Errors before a round, and the groups of observers that correspond.
 #[derive(Debug, Default)]
@@ -37,10 +38,10 @@ impl Gauge {
     pub(super) fn hold(mut self, sensors: &mut Sensors, prior: &BiasPrior) {
         let known = self.towards.len();
         let observers = || sensors.iter().filter(|sensor| sensor.id.number() < known);
-        let weight = |sensor: &SensorModel| sensors.fleet.trust(sensor.id) * sensor.registration.weight(prior);
+        let weight = |sensor: &SensorModel| sensors.fleet.trust(sensor.id) * sensor.pose_bias.weight(prior);
         // Those that were silent have not faded yet.
         let before = |before: &[Option<(Vector4<f64>, f64)>], sensor: &SensorModel| {
-            before[sensor.id.number()].unwrap_or((sensor.registration.error(), 1.0))
+            before[sensor.id.number()].unwrap_or((sensor.pose_bias.error(), 1.0))
         };
         let mut kept = vec![(0.0, 0.0); known];
         for sensor in observers() {
@@ -50,15 +51,16 @@ impl Gauge {
         }
         let mut sums = vec![MotionSums::default(); known];
         for sensor in observers() {
-            let (group, registration) = (self.group(sensor.id.number()), &sensor.registration);
+            let (group, pose_bias) = (self.group(sensor.id.number()), &sensor.pose_bias);
             let kept = kept[group].0 / kept[group].1.max(f64::MIN_POSITIVE);
             let (error, _) = before(&self.before, sensor);
-            sums[group].add(&registration.pivot(), &(registration.error() - error * kept), weight(sensor), prior);
+            sums[group].add(&pose_bias.pivot(), &(pose_bias.error() - error * kept), weight(sensor), prior);
         }
         let common: Vec<Option<Motion>> = sums.iter().map(MotionSums::motion).collect();
         for sensor in sensors.iter_mut().filter(|sensor| sensor.id.number() < known) {
             if let Some(common) = &common[self.group(sensor.id.number())] {
-                sensor.registration.take_back(common, prior);
+                let part = common.at(&sensor.pose_bias.pivot());
+                sensor.pose_bias.take_back(&part, prior);
             }
         }
     }
@@ -80,7 +82,7 @@ impl Gauge {
 
 /// Shift, rotation and delay of all observers together.
 #[derive(Debug)]
-pub(super) struct Motion {
+struct Motion {
     about: Vector2<f64>,
     shift: Vector2<f64>,
     rotation_rad: f64,
@@ -89,7 +91,7 @@ pub(super) struct Motion {
 
 impl Motion {
     /// Its part of the error of an observer: offset, rotation and delay.
-    pub(super) fn at(&self, pivot: &Vector2<f64>) -> Vector4<f64> {
+    fn at(&self, pivot: &Vector2<f64>) -> Vector4<f64> {
         let offset = self.shift + quarter_turn(&(pivot - self.about)) * self.rotation_rad;
         Vector4::new(offset.x, offset.y, self.rotation_rad, self.delay_s)
     }

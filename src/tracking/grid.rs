@@ -4,7 +4,7 @@ use hashbrown::HashMap;
 use nalgebra::Vector2;
 use smallvec::SmallVec;
 
-use super::store::TrackIndex;
+use super::handles::TrackIndex;
 
 /// Indexed tracks by the cell they lie in.
 #[derive(Debug, Clone, Default)]

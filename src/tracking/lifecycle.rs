@@ -7,9 +7,10 @@ use nalgebra::Vector2;
 use uuid::Uuid;
 
 use super::config::TracksConfig;
+use super::handles::TrackIndex;
 use super::kinematics::Measurement;
 use super::sensors::Sensors;
-use super::store::{TrackIndex, TrackStore};
+use super::store::TrackStore;
 use super::track::Track;
 use crate::model::geometry::Covariance;
 use crate::model::time::Timestamp;

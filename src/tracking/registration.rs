@@ -1,46 +1,21 @@
-//! Registration: the offset, rotation and delay of each vehicle's pose, estimated from objects that others detect too.
+//! Registration: pose biases of vehicles, estimated from objects that others detect too.
 //!
-//! The errors are a Gauss-Markov process of four states: small, changing slowly, with a known spread at rest. An error
-//! that all vehicles share is not observable; no update changes it ([`Gauge`]), and it decays. Every round is one step of an extended Kalman filter in
-//! information form over all correspondences, reweighted against wrong ones by Cauchy's function (Holland, Welsch,
-//! "Robust regression using iteratively reweighted least-squares", 1977).
-//!
-//! The delay tells the directions of traffic apart: it shifts oncoming objects and overtaking ones in opposite
-//! directions. Without it, two vehicles that each see one direction would take their delays for offsets and pull each
-//! other along without end.
+//! An error that all vehicles share is not observable; no update changes it ([`Gauge`]), and it decays.
 
 use std::time::Duration;
 
-use nalgebra::{Matrix2, Matrix4, Rotation2, Vector2, Vector4};
+use nalgebra::Vector2;
 
 use super::config::TracksConfig;
-use super::gauge::{Gauge, Motion};
-use super::sensors::{SensorId, Sensors};
-use super::store::{TrackIndex, TrackStore};
-use crate::model::geometry::wrap_angle;
+use super::gauge::Gauge;
+use super::handles::{SensorId, TrackIndex};
+use super::pose_bias::Correspondence;
+use super::sensors::Sensors;
+use super::store::TrackStore;
 use crate::model::time::Timestamp;
-use crate::wire::PoseCorrection;
 
 /// Maximum time between two detections of an object that correspond.
 const SIMULTANEOUS: Duration = Duration::from_millis(300);
-
-/// Number of reweighting steps in a round.
-const ITERATIONS: usize = 3;
-
-/// Residual, in standard deviations, at which a correspondence counts half.
-const CAUCHY: f64 = 2.0;
-
-/// Maximum delay, in standard deviations.
-const MAX_DELAY: f64 = 3.0;
-
-/// Time in seconds after which a vehicle that states the same pose is known to stand.
-const STANDS_S: f64 = 1.0;
-
-/// Maximum weight of a vehicle that stands, as a multiple of that of one that moves.
-const MAX_WEIGHT: f64 = 100.0;
-
-/// Minimum number of correspondences of a published correction.
-const MIN_PAIRS: f64 = 3.0;
 
 /// Detections of one report that others may correspond to.
 #[derive(Debug)]
@@ -64,7 +39,7 @@ pub(super) struct RegistrationSample {
 
 /// Updates the registration of every vehicle from the frames of a round.
 ///
-/// Uses simultaneous detections only, so that filter lag is not mistaken for pose error.
+/// Uses simultaneous detections only, so that filter lag is not mistaken for pose bias.
 pub(super) fn register(
     frames: Vec<RegistrationFrame>,
     tracks: &TrackStore,
@@ -79,25 +54,12 @@ pub(super) fn register(
         let samples = frame.samples.iter();
         pairs.extend(samples.filter_map(|sample| Correspondence::of(sample, &frame, tracks, sensors, &mut gauge)));
         if let Some(sensor) = sensors.get_mut(frame.sensor) {
-            let error = sensor.registration.error;
-            let kept = sensor.registration.observe(frame.at, frame.delay_s, &pairs, &prior);
+            let error = sensor.pose_bias.error();
+            let kept = sensor.pose_bias.observe(frame.at, frame.delay_s, &pairs, &prior);
             gauge.note(frame.sensor, error, kept);
         }
     }
     gauge.hold(sensors, &prior);
-}
-
-/// A reported position and the position at which others detected the same object.
-#[derive(Debug, Clone, Copy)]
-struct Correspondence {
-    reported: Vector2<f64>,
-    reference: Vector2<f64>,
-    /// Velocity of the object, m/s.
-    velocity: Vector2<f64>,
-    /// Variance of the difference in each direction that is independent between correspondences, m².
-    variance: f64,
-    /// Variance of the error that the references may share, m².
-    common: f64,
 }
 
 impl Correspondence {
@@ -120,7 +82,7 @@ impl Correspondence {
                 continue;
             }
             sum += (other.position + velocity * (passed_us as f64 * 1e-6)) * trust;
-            common += theirs.registration.variance_at(&sample.reported, &velocity) * trust;
+            common += theirs.pose_bias.variance_at(&sample.reported, &velocity) * trust;
             weight += trust;
             gauge.join(frame.sensor, other.sensor);
         }
@@ -131,280 +93,5 @@ impl Correspondence {
             variance: sample.variance * (1.0 + 1.0 / weight),
             common: common / weight,
         })
-    }
-}
-
-/// Standard deviations of pose errors at rest, and the time over which they change.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct BiasPrior {
-    pub(super) offset_m: f64,
-    pub(super) heading_rad: f64,
-    pub(super) delay_s: f64,
-    pub(super) memory_s: f64,
-}
-
-impl BiasPrior {
-    fn covariance(&self) -> Matrix4<f64> {
-        let deviations = Vector4::new(self.offset_m, self.offset_m, self.heading_rad, self.delay_s);
-        Matrix4::from_diagonal(&deviations.component_mul(&deviations))
-    }
-}
-
-/// Estimated pose error of one vehicle.
-#[derive(Debug, Clone)]
-pub(super) struct Registration {
-    at: Timestamp,
-    /// Centre of the rotation, metres.
-    pivot: Vector2<f64>,
-    /// Offset east and north, rotation, and delay of the stamps in seconds.
-    error: Vector4<f64>,
-    covariance: Matrix4<f64>,
-    /// Fading number of correspondences.
-    pairs: f64,
-    /// Time for which the vehicle has stood where it says, seconds.
-    stood_s: f64,
-}
-
-impl Registration {
-    /// An estimate without correspondences.
-    pub(super) fn new(at: Timestamp, prior: &BiasPrior) -> Self {
-        Self {
-            at,
-            pivot: Vector2::zeros(),
-            error: Vector4::zeros(),
-            covariance: prior.covariance(),
-            pairs: 0.0,
-            stood_s: 0.0,
-        }
-    }
-
-    /// Sets the centre of the rotation; the error goes with the vehicle.
-    pub(super) fn set_pivot(&mut self, pivot: Vector2<f64>) {
-        self.pivot = pivot;
-    }
-
-    /// Notes that the vehicle has stood still for another `passed_s`, or that it moves.
-    pub(super) fn stand(&mut self, passed_s: Option<f64>) {
-        self.stood_s = passed_s.map_or(0.0, |passed_s| self.stood_s + passed_s);
-    }
-
-    /// Offset east and north in metres, rotation in radians, and delay of the stamps in seconds.
-    pub(super) fn error(&self) -> Vector4<f64> {
-        self.error
-    }
-
-    /// Centre of the rotation, metres.
-    pub(super) fn pivot(&self) -> Vector2<f64> {
-        self.pivot
-    }
-
-    /// Weight in what all have in common: the longer an error lasts, the more is known of it.
-    pub(super) fn weight(&self, prior: &BiasPrior) -> f64 {
-        (1.0 + self.stood_s / prior.memory_s).min(MAX_WEIGHT)
-    }
-
-    /// Takes back a motion that the vehicle shares with others.
-    pub(super) fn take_back(&mut self, common: &Motion, prior: &BiasPrior) {
-        self.error -= common.at(&self.pivot);
-        self.limit_delay(prior);
-    }
-
-    /// A function that corrects reported positions.
-    pub(super) fn corrector(&self) -> impl Fn(&Vector2<f64>) -> Vector2<f64> + use<> {
-        let (pivot, rotation, offset) = (self.pivot, self.rotation(), self.error.xy());
-        move |reported| pivot + rotation * (reported - pivot) + offset
-    }
-
-    /// A reported heading, corrected.
-    pub(super) fn correct_heading(&self, heading_rad: f64) -> f64 {
-        wrap_angle(heading_rad + self.error.z)
-    }
-
-    /// A reported velocity, corrected.
-    pub(super) fn correct_velocity(&self, velocity: &Vector2<f64>) -> Vector2<f64> {
-        self.rotation() * velocity
-    }
-
-    fn rotation(&self) -> Rotation2<f64> {
-        Rotation2::new(self.error.z)
-    }
-
-    /// Delay of the vehicle's stamps, seconds: the estimate if its marginal likelihood is greater than that of no delay.
-    ///
-    /// The ratio of the two is that of the densities of no delay before and after the observations (Dickey, "The weighted
-    /// likelihood ratio, linear hypotheses on normal location parameters", 1971). An estimate of little more than noise
-    /// would move reports that were captured together apart.
-    pub(super) fn delay_s(&self, prior: &BiasPrior) -> f64 {
-        let (before, after) = (prior.delay_s * prior.delay_s, self.covariance.m44);
-        let is_delayed = self.error.w * self.error.w > after * (before / after).ln();
-        if is_delayed { self.error.w } else { 0.0 }
-    }
-
-    /// Mean variance of a corrected position in each direction, m², of an object with a velocity in m/s.
-    fn variance_at(&self, reported: &Vector2<f64>, velocity: &Vector2<f64>) -> f64 {
-        let lever = (reported - self.pivot).norm_squared();
-        let rotation_and_delay = lever * self.covariance.m33 + velocity.norm_squared() * self.covariance.m44;
-        (self.covariance.m11 + self.covariance.m22 + rotation_and_delay) / 2.0
-    }
-
-    /// Updates the estimate; returns the part of the error before that was left at `at`. The references hold for `at`,
-    /// which is the report's stamp less `delay_s`.
-    fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) -> f64 {
-        let kept = self.fade(at, prior);
-        self.fit(delay_s, pairs, prior);
-        kept
-    }
-
-    fn fit(&mut self, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) {
-        let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty()) else { return };
-        let predicted = self.error;
-        let mut counted = 0.0;
-        for _ in 0..ITERATIONS {
-            let (rotation, offset) = (self.rotation(), self.error.xy());
-            let mut normal = NormalEquations::default();
-            counted = 0.0;
-            for pair in pairs {
-                let arm = rotation * (pair.reported - self.pivot);
-                let later = pair.velocity * (self.error.w - delay_s);
-                let residual = pair.reference - (self.pivot + arm + offset) - later;
-                let squared = residual.norm_squared() / (pair.variance + pair.common);
-                let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
-                // More references do not reduce the error that they share.
-                let weight = trust / (pair.variance + pair.common * pairs.len() as f64);
-                normal.add(&Matrix2::from_columns(&[Vector2::new(-arm.y, arm.x), pair.velocity]), &residual, weight);
-                counted += trust;
-            }
-            let (information, gradient) = (normal.information(), normal.gradient());
-            let Some(covariance) = (prior_information + information).try_inverse() else { return };
-            self.error = covariance * (prior_information * predicted + information * self.error + gradient);
-            self.limit_delay(prior);
-            self.covariance = (covariance + covariance.transpose()) * 0.5;
-        }
-        self.pairs += counted;
-    }
-
-    /// The stamps of one vehicle must not move the time at which all reports are fused.
-    fn limit_delay(&mut self, prior: &BiasPrior) {
-        let max_s = MAX_DELAY * prior.delay_s;
-        self.error.w = self.error.w.clamp(-max_s, max_s);
-    }
-
-    /// Predicts the errors at `at`: they decay, and their covariance returns to the prior. Returns the part that is left.
-    fn fade(&mut self, at: Timestamp, prior: &BiasPrior) -> f64 {
-        let stood = 1.0 + self.stood_s / STANDS_S;
-        let kept = (-at.since(self.at).as_secs_f64() / (prior.memory_s * stood * stood)).exp();
-        self.error *= kept;
-        self.covariance = self.covariance * (kept * kept) + prior.covariance() * (1.0 - kept * kept);
-        self.pairs *= kept;
-        self.at = self.at.max(at);
-        kept
-    }
-
-    /// The correction for the map; `None` with too few correspondences.
-    pub(super) fn correction(&self) -> Option<PoseCorrection> {
-        (self.pairs >= MIN_PAIRS).then(|| PoseCorrection {
-            about_m: [self.pivot.x, self.pivot.y],
-            dx_m: self.error.x,
-            dy_m: self.error.y,
-            dheading_rad: self.error.z,
-            pairs: self.pairs,
-        })
-    }
-}
-
-/// Sums over correspondences for the normal equations. The derivatives of a residual by the offset are the identity, so
-/// that these blocks are enough.
-#[derive(Default)]
-struct NormalEquations {
-    /// Σw, ΣwD, ΣwDᵀD, Σwr, ΣwDᵀr: weights w, residuals r, derivatives D by rotation and delay.
-    weight: f64,
-    first: Matrix2<f64>,
-    second: Matrix2<f64>,
-    residual: Vector2<f64>,
-    turned: Vector2<f64>,
-}
-
-impl NormalEquations {
-    fn add(&mut self, by_rotation_and_delay: &Matrix2<f64>, residual: &Vector2<f64>, weight: f64) {
-        let weighted = by_rotation_and_delay * weight;
-        self.weight += weight;
-        self.first += weighted;
-        self.second += weighted.tr_mul(by_rotation_and_delay);
-        self.residual += residual * weight;
-        self.turned += weighted.tr_mul(residual);
-    }
-
-    fn information(&self) -> Matrix4<f64> {
-        let mut information = Matrix4::from_diagonal_element(self.weight);
-        information.fixed_view_mut::<2, 2>(0, 2).copy_from(&self.first);
-        information.fixed_view_mut::<2, 2>(2, 0).copy_from(&self.first.transpose());
-        information.fixed_view_mut::<2, 2>(2, 2).copy_from(&self.second);
-        information
-    }
-
-    fn gradient(&self) -> Vector4<f64> {
-        Vector4::new(self.residual.x, self.residual.y, self.turned.x, self.turned.y)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use rand::{RngExt, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-
-    use super::*;
-
-    /// Twelve objects in five seconds of rounds, of which every time other 30 % are paired with a neighbour two to
-    /// four metres away, always on the same side.
-    #[test]
-    fn three_wrong_pairs_in_ten_do_not_mislead() {
-        let prior = BiasPrior { offset_m: 0.5, heading_rad: 0.01, delay_s: 0.02, memory_s: 10.0 };
-        let mut rng = ChaCha8Rng::seed_from_u64(4);
-        let start = Timestamp(1_732_154_400_000_000);
-        let mut registration = Registration::new(start, &prior);
-        let error = Vector2::new(0.6, -0.4);
-        for round in 0..50 {
-            let pair = |n: u32| {
-                let reported = Vector2::new(f64::from(n % 4) * 15.0 - 22.0, f64::from(n / 4) * 20.0 - 20.0);
-                let mut noise = || rng.random_range(-0.2..0.2);
-                let reference = reported + error + Vector2::new(noise(), noise());
-                let wrong = if rng.random_bool(0.3) { rng.random_range(2.0..4.0) } else { 0.0 };
-                let reference = reference + Vector2::new(0.0, wrong);
-                Correspondence { reported, reference, velocity: Vector2::zeros(), variance: 0.04, common: 0.02 }
-            };
-            let pairs: Vec<_> = (0..12).map(pair).collect();
-            registration.observe(Timestamp(start.0 + round * 100_000), 0.0, &pairs, &prior);
-        }
-        let off = registration.corrector()(&Vector2::zeros()) - error;
-        assert!(off.norm() < 0.15, "off by {off:?}");
-        assert!(registration.correction().is_some_and(|correction| correction.dheading_rad.abs() < 0.004));
-    }
-
-    /// Stamps late by `late_s`, and objects of 8 m/s each way, for `seconds` of ten rounds.
-    fn delay_after(seconds: u64, late_s: f64) -> f64 {
-        let prior = BiasPrior { offset_m: 0.5, heading_rad: 0.01, delay_s: 0.02, memory_s: 10.0 };
-        let mut rng = ChaCha8Rng::seed_from_u64(7);
-        let start = Timestamp(1_732_154_400_000_000);
-        let mut registration = Registration::new(start, &prior);
-        for round in 0..10 * seconds {
-            let delay_s = registration.delay_s(&prior);
-            let pair = |n: u32| {
-                let velocity = Vector2::new(if n.is_multiple_of(2) { 8.0 } else { -8.0 }, 0.0);
-                let reported = Vector2::new(f64::from(n) * 10.0 - 30.0, 5.0);
-                let noise = Vector2::new(rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
-                let reference = reported + noise + velocity * (late_s - delay_s);
-                Correspondence { reported, reference, velocity, variance: 0.08, common: 0.02 }
-            };
-            let pairs: Vec<_> = (0..6).map(pair).collect();
-            registration.observe(Timestamp(start.0 + round * 100_000), delay_s, &pairs, &prior);
-        }
-        registration.delay_s(&prior)
-    }
-
-    #[test]
-    fn stamps_are_moved_only_by_a_delay_that_is_likelier_than_none() {
-        assert!((1..5).all(|seconds| delay_after(seconds, 0.0) == 0.0));
-        let found = delay_after(10, 0.05);
-        assert!((found - 0.05).abs() < 0.01, "{found} s");
     }
 }

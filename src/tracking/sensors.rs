@@ -1,4 +1,4 @@
-//! Owner of the sensor models: what is learnt of each vehicle, and the only module that creates a [`SensorId`].
+//! Owner of the sensor models: what is learnt of each vehicle. The only module that creates a [`SensorId`].
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -10,7 +10,8 @@ use super::calibration::DetectionCalibration;
 use super::config::TracksConfig;
 use super::coverage::Coverage;
 use super::existence::{ClutterRates, DetectionRates, LookRates, SensorQuality, USUAL_LOOKS_HZ};
-use super::registration::Registration;
+use super::handles::SensorId;
+use super::pose_bias::PoseBias;
 use super::trust::{DormantCounts, Fleet, TrustCounts};
 use crate::model::geometry::Covariance;
 use crate::model::names::NodeName;
@@ -33,17 +34,6 @@ const STAYS_FOR: Duration = Duration::from_secs(120);
 const MIN_INTERVAL_S: f64 = 0.02;
 const MAX_INTERVAL_S: f64 = 1.0;
 const INTERVAL_GAIN: f64 = 0.2;
-
-/// Number of a vehicle that is heard. [`Sensors::forget_silent`] frees it for another vehicle.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(super) struct SensorId(u32);
-
-impl SensorId {
-    /// Index into tables by vehicle.
-    pub(super) fn number(self) -> usize {
-        self.0 as usize
-    }
-}
 
 /// Models of the vehicles that are heard, and the trust in all.
 #[derive(Debug, Clone)]
@@ -185,7 +175,7 @@ pub(super) struct SensorModel {
     pose: Option<WirePose>,
     /// Place about which the median of its detections stays, metres, and since when.
     place: (Vector2<f64>, Timestamp),
-    pub(super) registration: Registration,
+    pub(super) pose_bias: PoseBias,
     pub(super) noise: NoiseModel,
     pub(super) calibration: DetectionCalibration,
     pub(super) coverage: Coverage,
@@ -202,7 +192,7 @@ impl SensorModel {
             interval_s: None,
             pose: None,
             place: (Vector2::zeros(), at),
-            registration: Registration::new(at, &config.bias_prior()),
+            pose_bias: PoseBias::new(at, &config.bias_prior()),
             noise: NoiseModel::default(),
             calibration: DetectionCalibration::new(config.even_confidence),
             coverage: Coverage::default(),
@@ -234,13 +224,13 @@ impl SensorModel {
         let is_placed = self.coverage.centre().is_some();
         let has_jumped = self.coverage.observe(report);
         if has_jumped {
-            self.registration = Registration::new(at, &config.bias_prior());
+            self.pose_bias = PoseBias::new(at, &config.bias_prior());
         }
         let stands = self.stands(report, at);
-        self.registration.stand(stands.then_some(passed_s));
+        self.pose_bias.stand(stands.then_some(passed_s));
         self.pose = report.pose;
         if let Some(centre) = self.coverage.centre().filter(|_| !stands || !is_placed || has_jumped) {
-            self.registration.set_pivot(centre);
+            self.pose_bias.set_pivot(centre);
         }
         has_jumped
     }

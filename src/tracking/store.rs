@@ -7,20 +7,9 @@ use nalgebra::Vector2;
 
 use super::config::TracksConfig;
 use super::grid::{IndexedTrack, TrackGrid};
-use super::sensors::SensorId;
+use super::handles::{SensorId, TrackIndex};
 use super::track::Track;
 use crate::model::time::Timestamp;
-
-/// Position of a track in the store. [`TrackStore::retain`] invalidates it; nothing keeps one across that call.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct TrackIndex(u32);
-
-impl TrackIndex {
-    /// Number of the track, the oldest first.
-    pub(super) fn number(self) -> u32 {
-        self.0
-    }
-}
 
 /// The tracks, the oldest first, with indexes by position and by vehicle.
 #[derive(Debug, Clone)]

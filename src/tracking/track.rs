@@ -13,10 +13,9 @@ use super::existence::{
     BaseRate, MAX_DENIAL_NATS, SensorHistory, SensorQuality, alone_nats, logistic, persistence_nats,
 };
 use super::grid::IndexedTrack;
+use super::handles::{SensorId, TrackIndex};
 use super::kinematics::{KinematicState, Measurement};
 use super::neighbours::TrackNeighbours;
-use super::sensors::SensorId;
-use super::store::TrackIndex;
 use crate::model::geometry::{Covariance, wrap_angle};
 use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;

@@ -6,9 +6,10 @@ use std::sync::Arc;
 use super::config::TracksConfig;
 use super::existence::BaseRate;
 use super::foreign::ForeignObjects;
+use super::handles::SensorId;
 use super::lifecycle::{adopt_map, merge, prune};
 use super::registration::{RegistrationFrame, register};
-use super::sensors::{SensorId, Sensors};
+use super::sensors::Sensors;
 use super::store::TrackStore;
 use super::track::Track;
 use super::turning::TurningFrame;
@@ -172,7 +173,7 @@ impl Tracker {
             .into_iter()
             .map(|(stamp, report)| {
                 let sensor = self.sensors.by_name(&report.node);
-                let delay_s = sensor.map_or(0.0, |sensor| sensor.registration.delay_s(&prior));
+                let delay_s = sensor.map_or(0.0, |sensor| sensor.pose_bias.delay_s(&prior));
                 let at = stamp.shifted((-delay_s * 1e6) as i64);
                 Captured { at, delay_s, report: self.frame.steady(report, at) }
             })
@@ -226,7 +227,7 @@ impl Tracker {
             return BTreeMap::new();
         }
         let corrections = self.sensors.iter();
-        corrections.filter_map(|sensor| Some((sensor.node.clone(), sensor.registration.correction()?))).collect()
+        corrections.filter_map(|sensor| Some((sensor.node.clone(), sensor.pose_bias.correction()?))).collect()
     }
 }
 

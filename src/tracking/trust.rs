@@ -6,18 +6,14 @@
 //! is a false positive. One vehicle against another settles nothing.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
 
 use super::detection_history::DetectionHistory;
-use super::existence::ExistenceStatement;
-use super::sensors::SensorId;
+use super::existence::{ExistenceStatement, JUDGED_AFTER};
+use super::handles::SensorId;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::ReputationConfig;
 use crate::wire::ForeignVotes;
-
-/// Time between judgements of a vehicle's statement about an object.
-pub(super) const JUDGED_AFTER: Duration = Duration::from_secs(2);
 
 /// Minimum log-odds, by the others' evidence, of an object that exists.
 const EXISTS_NATS: f64 = 2.0;

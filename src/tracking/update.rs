@@ -9,12 +9,13 @@ use super::calibration::log_odds;
 use super::config::TracksConfig;
 use super::existence::{DetectionRates, ExistenceStatement, LookRates};
 use super::foreign::ForeignObjects;
+use super::handles::TrackIndex;
 use super::kinematics::{KinematicState, Measurement};
 use super::lifecycle::track_id;
 use super::occlusion::OcclusionMap;
 use super::registration::RegistrationSample;
 use super::sensors::SensorModel;
-use super::store::{TrackIndex, TrackStore};
+use super::store::TrackStore;
 use super::track::Track;
 use super::trust::{Fleet, Judgement};
 use crate::model::time::Timestamp;
@@ -30,7 +31,7 @@ const MIN_TRUST: f64 = 0.05;
 /// Number of detections from which a track measures the noise of detections.
 const MATURE_HITS: u32 = 8;
 
-/// Number of detections from which a track measures registration and detection rates.
+/// Number of detections from which a track measures pose biases and detection rates.
 pub(super) const ESTABLISHED_HITS: u32 = 5;
 
 /// Maximum number of objects of each neighbouring cell that are compared with a report.
@@ -39,7 +40,7 @@ const MAX_FOREIGN_EACH: usize = 32;
 /// Log-odds of a vehicle's confidence that it exists itself.
 const OWN_NATS: f64 = 4.0;
 
-/// A detection of a report, corrected by the vehicle's registration.
+/// A detection of a report, corrected by the estimated pose bias.
 pub(super) struct TimedDetection<'a> {
     /// Index into the objects of the report.
     pub(super) index: usize,
@@ -136,7 +137,7 @@ impl<'a> ReportUpdate<'a> {
         let Some(pose) = self.report.pose.filter(|_| self.report.moving != Some(false)) else { return };
         let sigma_m = (self.config.vehicle_radius_m / 2.0).max(self.config.noise_floor_m);
         let measurement = Measurement {
-            position: self.sensor.registration.corrector()(&Vector2::new(pose.x_m, pose.y_m)),
+            position: self.sensor.pose_bias.corrector()(&Vector2::new(pose.x_m, pose.y_m)),
             independent: Matrix2::identity() * (sigma_m * sigma_m),
             common_m: self.config.common_m,
         };
@@ -172,7 +173,7 @@ impl<'a> ReportUpdate<'a> {
     fn detections(&self) -> Vec<TimedDetection<'a>> {
         let own = self.report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
         let trust = self.trust.max(MIN_TRUST);
-        let correct = self.sensor.registration.corrector();
+        let correct = self.sensor.pose_bias.corrector();
         let detection = |(index, object): (usize, &'a PerceivedObject)| {
             let reported = Vector2::new(object.x_m, object.y_m);
             let is_itself = own.is_some_and(|own| (own - reported).norm() < self.config.vehicle_radius_m);
@@ -374,11 +375,11 @@ impl TimedDetection<'_> {
     /// Updates velocity, attributes and time of a track.
     fn describe(&self, track: &mut Track, sensor: &SensorModel, at: Timestamp, config: &TracksConfig) {
         if let Some([x, y]) = self.object.velocity_mps {
-            let velocity = sensor.registration.correct_velocity(&Vector2::new(x, y));
+            let velocity = sensor.pose_bias.correct_velocity(&Vector2::new(x, y));
             track.state.update_velocity(at, velocity, VELOCITY_SIGMA_MPS, config.density());
         }
         track.state.limit_speed(config.max_speed_mps);
-        let heading_rad = self.object.heading_rad.map(|heading_rad| sensor.registration.correct_heading(heading_rad));
+        let heading_rad = self.object.heading_rad.map(|heading_rad| sensor.pose_bias.correct_heading(heading_rad));
         track.update_attributes(self.object, heading_rad);
         track.record_hit(at);
     }

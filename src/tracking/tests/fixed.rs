@@ -70,9 +70,8 @@ fn common_and_rest(tracker: &Tracker, round: &TracksRound, cameras: &[Camera]) -
         let offset = Vector2::new(correction.dx_m, correction.dy_m);
         common.offset += offset;
         common.rotation_rad += correction.dheading_rad;
-        let registration = tracker.sensors.by_name(&node).map(|sensor| &sensor.registration);
-        common.delay_s +=
-            registration.map_or(0.0, |registration| registration.delay_s(&TracksConfig::default().bias_prior()));
+        let pose_bias = tracker.sensors.by_name(&node).map(|sensor| &sensor.pose_bias);
+        common.delay_s += pose_bias.map_or(0.0, |pose_bias| pose_bias.delay_s(&TracksConfig::default().bias_prior()));
         rests.push((offset + wrong, correction.dheading_rad + camera.turned_rad));
     }
     let count = rests.len().max(1) as f64;

@@ -2,7 +2,8 @@
 
 use super::*;
 use crate::tracking::detection_history::DetectionHistory;
-use crate::tracking::sensors::{SensorId, Sensors};
+use crate::tracking::handles::SensorId;
+use crate::tracking::sensors::Sensors;
 use crate::tracking::trust::{DormantCounts, TrustCounts};
 
 #[test]

@@ -1,0 +1,24 @@
+//! Handles: small numbers that stand for a vehicle or a track, for as long as its owner says.
+
+/// Number of a vehicle that is heard. `Sensors` alone creates it, and frees it for another vehicle when this one is silent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub(super) struct SensorId(pub(super) u32);
+
+impl SensorId {
+    /// Index into tables by vehicle.
+    pub(super) fn number(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// Position of a track in the store, the oldest first. `TrackStore` alone creates it, and invalidates it whenever it removes
+/// tracks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct TrackIndex(pub(super) u32);
+
+impl TrackIndex {
+    /// Number of the track, the oldest first.
+    pub(super) fn number(self) -> u32 {
+        self.0
+    }
+}
