@@ -12,7 +12,9 @@
 mod foreign;
 mod ledger;
 mod marks;
+mod record;
 mod replication;
+mod signed_evidence;
 mod statements;
 
 use std::collections::BTreeMap;

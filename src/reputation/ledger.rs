@@ -5,21 +5,13 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::marks::Marks;
+use super::record::Record;
 use super::statements::Statements;
 use super::{CellCounts, Counts, Evidence, RememberedVotes, ReputationConfig};
 use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
 use crate::wire::{ForeignVotes, LedgerMark, Reputation};
-
-/// The votes of one vehicle in one lane.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Record {
-    pub(super) labels: BTreeMap<Label, Counts>,
-    /// Their sum.
-    pub(super) sum: Counts,
-    pub(super) marks: Marks,
-}
 
 /// The evidence of all epochs. Serialised, it is the snapshot that is persisted and replicated.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]

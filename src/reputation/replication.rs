@@ -1,9 +1,11 @@
 //! Replication: the ledger in pieces that fit into messages, and its bounds.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
-use super::Counts;
-use super::ledger::{Record, ReputationLedger};
+use super::ledger::ReputationLedger;
+use super::marks::SPACING;
+use super::record::Record;
+use super::{Counts, Evidence};
 use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
 use crate::wire::{LedgerEntry, LedgerMark};
@@ -101,6 +103,56 @@ impl ReputationLedger {
         changed
     }
 
+    /// Every mark, lane by lane.
+    pub fn marks(&self) -> impl Iterator<Item = LedgerMark> {
+        self.records().flat_map(|(lane, node, record)| {
+            record.marks.iter().map(move |(number, counts)| mark(lane, node, number, counts))
+        })
+    }
+
+    /// Sets a mark for a vehicle if its number of votes in a lane is a multiple of [`SPACING`].
+    pub(super) fn reach_mark(&mut self, lane: &Epoch, node: &NodeName, sum: Counts) {
+        if sum.total().is_multiple_of(SPACING) {
+            self.merge_marks([mark(lane, node, sum.total() / SPACING, sum)], Some(lane));
+        }
+    }
+
+    /// The marks that `evidence` reached in a lane; it must be what was recorded there last.
+    pub fn marks_reached(&self, epoch: u64, aggregator: &NodeName, evidence: &[Evidence]) -> Vec<LedgerMark> {
+        let lane = Epoch::new(epoch, aggregator.clone());
+        let mut votes: BTreeMap<&NodeName, u64> = BTreeMap::new();
+        evidence.iter().for_each(|evidence| *votes.entry(&evidence.node).or_default() += 1);
+        let reached = |(node, votes): (&NodeName, u64)| {
+            let record = self.lanes.get(&lane)?.get(node)?;
+            let (number, counts) = record.marks.iter().next_back()?;
+            let is_new = number * SPACING + votes > record.sum.total();
+            is_new.then(|| mark(&lane, node, number, counts))
+        };
+        votes.into_iter().filter_map(reached).collect()
+    }
+
+    /// Takes in marks, within the bounds of [`Self::merge_entries`]; true when that changed anything.
+    pub fn merge_marks(&mut self, marks: impl IntoIterator<Item = LedgerMark>, present: Option<&Epoch>) -> bool {
+        let mut changed = false;
+        for LedgerMark { epoch, aggregator, node, number, correct, incorrect } in marks {
+            let lane = Epoch::new(epoch, aggregator);
+            let known = self.lanes.get(&lane).and_then(|vehicles| vehicles.get(&node));
+            if known.is_some_and(|record| !record.marks.would_keep(number)) || number == 0 {
+                continue;
+            }
+            let is_known = known.is_some_and(|record| record.marks.has(number));
+            if !is_known && !self.make_room(&lane, present) {
+                continue;
+            }
+            let Some(record) = self.record_mut(&lane, &node, None, present) else { continue };
+            let before = record.marks.len();
+            changed |= record.marks.insert(number, Counts { correct, incorrect });
+            let after = record.marks.len();
+            self.resize(&lane.leader, before, after);
+        }
+        changed
+    }
+
     /// Number of lanes.
     pub fn lanes(&self) -> usize {
         self.lanes.len()
@@ -176,6 +228,10 @@ impl ReputationLedger {
         let records = self.lanes.get(lane).into_iter().flat_map(|vehicles| vehicles.values());
         records.map(|record| record.labels.len() + record.marks.len()).sum()
     }
+}
+
+fn mark(lane: &Epoch, node: &NodeName, number: u64, Counts { correct, incorrect }: Counts) -> LedgerMark {
+    LedgerMark { epoch: lane.term, aggregator: lane.leader.clone(), node: node.clone(), number, correct, incorrect }
 }
 
 fn entry(lane: &Epoch, node: &NodeName, label: &Label, Counts { correct, incorrect }: Counts) -> LedgerEntry {

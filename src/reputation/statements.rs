@@ -1,15 +1,7 @@
-//! Signed evidence: the shares that aggregators have signed, kept beside the counts that come from them.
-//!
-//! A node that passes a lane on sends the signed shares of its aggregator. When the certificate of an aggregator is
-//! revoked, its statements go, and the counts with them. Statements on trial count, and are neither passed on nor saved.
+//! Statements: the shares of one lane that its aggregator has signed, without those to which later ones leave nothing to add.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use super::ledger::ReputationLedger;
-use crate::model::epoch::Epoch;
-use crate::model::names::NodeName;
-use crate::model::time::Timestamp;
 use crate::wire::{LedgerShare, MAX_SHARE_ENTRIES};
 
 /// Number of statements of a lane beyond those of the last clearing at which it is cleared again.
@@ -23,26 +15,27 @@ const MAX_COPIES: usize = 4;
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Statements {
     /// The latest last.
-    signed: Vec<Arc<LedgerShare>>,
+    pub(super) signed: Vec<Arc<LedgerShare>>,
     /// Number of statements at which those that add nothing are dropped.
     clear_at: usize,
 }
 
 impl Statements {
-    fn push(&mut self, share: Arc<LedgerShare>, lane_size: usize) {
+    /// Adds a share to a lane that has `lane_size` counts and marks. `adds` takes statements in, the latest first: true if
+    /// that changed anything.
+    pub(super) fn push(&mut self, share: Arc<LedgerShare>, lane_size: usize, adds: impl FnMut(&LedgerShare) -> bool) {
         self.signed.push(share);
         if self.signed.len() >= self.clear_at.max(MAX_NEW) {
-            self.clear(lane_size);
+            self.clear(lane_size, adds);
         }
     }
 
     /// Drops the statements to which later ones leave nothing to add.
-    fn clear(&mut self, lane_size: usize) {
-        let mut later = ReputationLedger::default();
+    fn clear(&mut self, lane_size: usize, mut adds: impl FnMut(&LedgerShare) -> bool) {
         let mut room = MAX_COPIES * (lane_size + MAX_SHARE_ENTRIES);
         let is_needed = |share: &Arc<LedgerShare>| {
             let size = share.entries.len() + share.marks.len();
-            if size > room || !later.merge_share(share, None) {
+            if size > room || !adds(share) {
                 return false;
             }
             room -= size;
@@ -52,96 +45,5 @@ impl Statements {
         kept.reverse();
         self.clear_at = kept.len() * 2 + MAX_NEW;
         self.signed = kept;
-    }
-}
-
-impl ReputationLedger {
-    /// Takes in the counts and marks of a share; true when that changed anything.
-    pub fn merge_share(&mut self, share: &LedgerShare, present: Option<&Epoch>) -> bool {
-        self.merge_entries(share.entries.iter().cloned(), present)
-            | self.merge_marks(share.marks.iter().cloned(), present)
-    }
-
-    /// Takes in a share that its aggregator signed, and keeps it. The signature is verified before; the share is of one
-    /// lane. True when that changed any count or mark.
-    pub fn merge_statement(&mut self, share: &Arc<LedgerShare>, present: Option<&Epoch>) -> bool {
-        let changed = self.merge_share(share, present);
-        if let Some(lane) = share.lane().filter(|lane| self.lanes.contains_key(lane)) {
-            let size = self.size_of(&lane);
-            self.statements.entry(lane).or_default().push(Arc::clone(share), size);
-        }
-        changed
-    }
-
-    /// As [`Self::merge_statement`], on trial until `ends_at`.
-    pub fn merge_on_trial(&mut self, share: &Arc<LedgerShare>, present: Option<&Epoch>, ends_at: Timestamp) -> bool {
-        let changed = self.merge_share(share, present);
-        if let Some(lane) = share.lane().filter(|lane| self.lanes.contains_key(lane)) {
-            let size = self.size_of(&lane);
-            let on_trial = self.on_trial.entry(lane).or_default();
-            on_trial.0.push(Arc::clone(share), size);
-            on_trial.1 = ends_at;
-        }
-        changed
-    }
-
-    /// Ends trials: those that `has_failed` names, whose shares and counts are dropped, and those whose time is over. The
-    /// result is their lanes, and whether each is evidence now.
-    pub fn end_trials(&mut self, now: Timestamp, has_failed: impl Fn(&Epoch) -> bool) -> Vec<(Epoch, bool)> {
-        let mut ended = Vec::new();
-        for (lane, (tried, ends_at)) in std::mem::take(&mut self.on_trial) {
-            if has_failed(&lane) {
-                let kept = self.statements.get(&lane).map(|statements| statements.signed.clone()).unwrap_or_default();
-                self.forget(&lane);
-                kept.iter().for_each(|share| _ = self.merge_statement(share, None));
-                ended.push((lane, false));
-            } else if now >= ends_at {
-                tried.signed.iter().for_each(|share| _ = self.merge_statement(share, None));
-                ended.push((lane, true));
-            } else {
-                self.on_trial.insert(lane, (tried, ends_at));
-            }
-        }
-        ended
-    }
-
-    /// The signed shares behind the lanes of other aggregators, without those on trial.
-    pub fn statements(&self) -> impl Iterator<Item = &Arc<LedgerShare>> {
-        self.statements.values().flat_map(|lane| &lane.signed)
-    }
-
-    /// True if the counts of a lane come from signed shares. Those that this node counted itself do not.
-    pub fn is_stated(&self, lane: &Epoch) -> bool {
-        self.statements.contains_key(lane) || self.on_trial.contains_key(lane)
-    }
-
-    /// Drops what this node counted itself, under the name `aggregator`; true if there was any.
-    pub fn forget_own(&mut self, aggregator: &NodeName) -> bool {
-        let is_own = |lane: &&Epoch| lane.leader == *aggregator && !self.is_stated(lane);
-        let own: Vec<_> = self.lanes.keys().filter(is_own).cloned().collect();
-        own.iter().for_each(|lane| self.forget(lane));
-        !own.is_empty()
-    }
-
-    /// Drops the signed shares that are not valid, and the counts that came by them alone; true if there were any.
-    pub fn retain_statements(&mut self, mut is_valid: impl FnMut(&LedgerShare) -> bool) -> bool {
-        let mut has_dropped = false;
-        let lanes: BTreeSet<_> = self.statements.keys().chain(self.on_trial.keys()).cloned().collect();
-        for lane in lanes {
-            let signed = self.statements.get(&lane).map(|lane| lane.signed.clone()).unwrap_or_default();
-            let (tried, ends_at) = self.on_trial.get(&lane).cloned().unwrap_or_default();
-            if signed.iter().chain(&tried.signed).all(|share| is_valid(share)) {
-                continue;
-            }
-            self.forget(&lane);
-            for share in signed.iter().filter(|share| is_valid(share)) {
-                self.merge_statement(share, None);
-            }
-            for share in tried.signed.iter().filter(|share| is_valid(share)) {
-                self.merge_on_trial(share, None, ends_at);
-            }
-            has_dropped = true;
-        }
-        has_dropped
     }
 }
