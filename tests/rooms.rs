@@ -1,7 +1,6 @@
 //! The rooms of the house: modules of each crate by floor, read from the code. Imports run downward, without a circle.
 //!
-//! A room is a module of a crate's root. A folder that holds folders has rooms of its own: its modules. Files of a
-//! folder without folders may know each other. Tests are left out.
+//! A room is a module of a crate's root. A folder has rooms of its own: its modules. Tests are left out.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -108,12 +107,13 @@ impl House {
         Self { modules, imports }
     }
 
-    /// Modules whose children are rooms: the crates, and folders that hold folders.
+    /// Modules whose children are rooms: the crates and all folders.
     fn parents(&self) -> BTreeSet<Module> {
-        let is_folder =
-            |module: &Module| self.modules.keys().any(|other| other.len() > module.len() && other.starts_with(module));
-        let folders = self.modules.keys().filter(|module| module.len() > 1 && is_folder(module));
-        folders.map(|module| module[..module.len() - 1].to_vec()).collect()
+        self.modules
+            .keys()
+            .filter(|module| module.len() > 1)
+            .map(|module| module[..module.len() - 1].to_vec())
+            .collect()
     }
 
     /// The rooms of a parent, each with the rooms that it imports.
