@@ -308,11 +308,20 @@ fn what_cannot_be_judged_is_said() {
     };
     let (recording, truth, empty) =
         (file("in.jsonl", "{}\n"), file("truth.json", "{\"a\": {}}"), file("empty.jsonl", ""));
+    let unsure = file(
+        "unsure.jsonl",
+        r#"{"schema": 1, "aggregator": "edge", "epoch": 1, "round": 1, "fused_at_us": 1, "landmarks": [], "objects": [
+            {"id": "018f0000-0000-7000-8000-000000000000", "label": "car", "x_m": 0, "y_m": 0,
+             "covariance_m2": [1, 0, 1], "confidence": 1.5, "contributors": []}]}"#
+            .replace('\n', "")
+            .as_str(),
+    );
     let lot = example("recordings/lot_truth.json");
     for (truth, input, code, part) in [
         (Path::new("/no.json"), &recording, 2, "/no.json"),
         (&truth, &recording, 2, "`a` has {}"),
         (&lot, &empty, 1, "no map"),
+        (&lot, &unsure, 1, "the first is line 1: objects[0]: "),
         (&lot, &recording, 1, "1 lines cannot be used, the first is line 1: it is neither a map nor verdicts"),
     ] {
         let run = ecod_lab(&["eval", "--truth", text(truth), "--input", text(input)]);

@@ -109,11 +109,17 @@ fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failu
     let mut read = 0u64;
     let mut unreadable = UnreadableLines::default();
     each_line(path, MAX_LINE_BYTES, |number, line| {
-        match line.map(serde_json::from_slice) {
-            Some(Ok(InputLine::Fused(line))) => take(line),
-            Some(Ok(InputLine::Received { map })) => take(FusedLine::Map(map)),
+        let line = match line.map(serde_json::from_slice) {
+            Some(Ok(InputLine::Fused(line))) => line,
+            Some(Ok(InputLine::Received { map })) => FusedLine::Map(map),
             _ => return unreadable.add(number, "it is neither a map nor verdicts"),
+        };
+        if let FusedLine::Map(GlobalMap { objects, .. }) = &line
+            && let Some((place, reason)) = objects.iter().enumerate().find_map(|(n, o)| Some((n, o.validate().err()?)))
+        {
+            return unreadable.add(number, format!("objects[{place}]: {reason}"));
         }
+        take(line);
         read += 1;
     })?;
     unreadable.print(path);

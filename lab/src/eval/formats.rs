@@ -173,6 +173,7 @@ impl FileFormat {
 
     /// Reads the text of a file; one with boxes needs a camera.
     fn parse(self, text: &str, has_camera: bool) -> anyhow::Result<ParsedFrames> {
+        let text = text.trim_start_matches('\u{feff}');
         Ok(match self {
             Self::Coco => coco::frames(text, has_camera)?,
             _ => self.lines(text, has_camera)?,

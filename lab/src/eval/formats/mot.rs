@@ -12,6 +12,9 @@ use super::{Cells, FilePlace, LineError, ParsedObject};
 /// Width and height in the image count from the left upper corner.
 pub(super) fn object(cells: &Cells, has_camera: bool) -> Result<Option<(u64, ParsedObject)>, LineError> {
     let frame = cells.frame()?;
+    if !cells.has_commas {
+        return Err(cells.error(1, "frame", "is not followed by a comma, as in files of MOTChallenge".into()));
+    }
     let id = Some(cells.integer(2, "track")?).filter(|id| *id >= 0);
     let score = cells.number(7, "score")?;
     let place = match ground(cells)? {

@@ -70,7 +70,7 @@ fn scores_of_detectors_become_probabilities_in_the_same_order() {
 
 #[test]
 fn positions_of_mot_challenge_are_those_on_the_ground() {
-    let text = "1,-1,912,484,97,109,0.5,3.5,-2.25,0\n2,7,912,484,97,109,1,4,5,0\n2,8,912,484,97,109,0,4,5,0\n";
+    let text = "\u{feff}1,-1,912,484,97,109,0.5,3.5,-2.25,0\n2,7,912,484,97,109,1,4,5,0\n2,8,912,484,97,109,0,4,5,0\n";
     let frames = read(FileFormat::Mot, text, None).unwrap().frames;
     assert_eq!(positions(&frames), [(1, None, "person", 0.5, 3.5, -2.25), (2, Some(7), "person", 1.0, 4.0, 5.0)]);
 }
@@ -86,6 +86,7 @@ fn line_and_field_of_what_cannot_be_read_are_named() {
         (FileFormat::Mot, "1.5,1,1,2,3,4,1,1,1,1", "line 1: column 1 (frame): 1.5 is no whole number"),
         (FileFormat::Mot, "1,1,1,2,3,4,1,1,1", "line 1: column 8 (x): is no position on the ground"),
         (FileFormat::Mot, "1,1,1,2,3,4,1,-1,-1,-1", "line 1: column 8 (x): is no position on the ground"),
+        (FileFormat::Mot, "0 2 Van 0 0 -1.7 296.7 161.7", "line 1: column 1 (frame): is not followed by a comma"),
         (FileFormat::Coco, "[]", "boxes in an image have no place on the ground: give their camera with --config"),
     ] {
         let said = read(format, text, None).unwrap_err().root_cause().to_string();
