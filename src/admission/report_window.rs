@@ -57,6 +57,8 @@ pub(crate) struct SenderState {
     pub(crate) misplaced: Duration,
     /// True if another sender uses its name.
     pub(crate) is_shared: bool,
+    /// True if it states that it does not move, and has lately moved.
+    pub(crate) has_moved: bool,
 }
 
 /// The state of admission.
@@ -113,7 +115,10 @@ impl ReportWindow {
         vehicle.last_heard = received_at;
         let admitted = vehicle.admit(report, received_at, bounds, self.offset_before_us);
         match admitted {
-            Ok(_) => (vehicle.candidate, vehicle.untimely_since) = (None, None),
+            Ok(_) => {
+                (vehicle.candidate, vehicle.untimely_since) = (None, None);
+                vehicle.note_standing(report, received_at);
+            }
             Err(RejectReason::Stale | RejectReason::FromTheFuture) => {
                 vehicle.untimely_since.get_or_insert(received_at);
             }
@@ -132,7 +137,8 @@ impl ReportWindow {
     pub(crate) fn sender(&self, name: &NodeName, now: Timestamp) -> SenderState {
         let Some(vehicle) = self.vehicles.get(name) else { return SenderState::default() };
         let misplaced = vehicle.misplaced_since.map_or(Duration::ZERO, |since| now.since(since));
-        SenderState { misplaced, is_shared: vehicle.is_shared() }
+        let has_moved = vehicle.moved_at.is_some_and(|moved_at| now.since(moved_at) < MOVED_LATELY);
+        SenderState { misplaced, is_shared: vehicle.is_shared(), has_moved }
     }
 
     /// Notes if any object of a known sender's report has an effect where it is.
@@ -195,6 +201,9 @@ const RETENTION: Duration = Duration::from_secs(10);
 
 /// Time for which a vehicle's reports are rejected before it counts as untimely; a clock that stepped takes one second.
 const UNTIMELY_TIME: Duration = Duration::from_secs(3);
+
+/// Time for which a sender that states that it does not move has lately moved.
+const MOVED_LATELY: Duration = Duration::from_secs(10);
 
 fn seconds(s: f64) -> i64 {
     (s * 1e6) as i64

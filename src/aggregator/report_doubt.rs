@@ -28,6 +28,8 @@ pub enum ReportDoubt {
     /// For ten seconds no object has been at a known location or, where objects are tracked, near one: positions are in
     /// another unit or frame.
     NoObjectAtLocation,
+    /// It states that it does not move, and its pose does.
+    Moves,
     /// Two senders report under the name: their numbers go back and forth.
     SharedName,
 }
@@ -47,6 +49,7 @@ impl fmt::Display for ReportDoubt {
         match self {
             Self::FarObject { range_m } => write!(f, "an object of its report is {range_m:.0} m from its pose"),
             Self::NoObjectAtLocation => f.write_str("none of its objects is at a known location, or near one"),
+            Self::Moves => f.write_str("it states `moving` = false, and its pose has moved by more than 25 m"),
             Self::SharedName => {
                 f.write_str("two programs report under this name: the numbers `seq` of its reports go back and forth")
             }

@@ -297,7 +297,9 @@ impl FuserState {
     fn note_doubts(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
         for doubt in self.aggregator.doubts(kind, report, received_at) {
             let trouble = match doubt {
-                ReportDoubt::FarObject { .. } | ReportDoubt::NoObjectAtLocation => TroubleKind::Misplaced,
+                ReportDoubt::FarObject { .. } | ReportDoubt::NoObjectAtLocation | ReportDoubt::Moves => {
+                    TroubleKind::Misplaced
+                }
                 ReportDoubt::SharedName => TroubleKind::NameTaken,
             };
             self.counters.troubles().note_about(report.node.as_str(), trouble, &doubt.to_string());

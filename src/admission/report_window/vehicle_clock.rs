@@ -2,6 +2,8 @@
 
 use std::collections::VecDeque;
 
+use nalgebra::Point2;
+
 use crate::admission::live_stream::LiveStream;
 use crate::admission::minimum_delay::MinimumDelay;
 use crate::admission::report_window::Admitted;
@@ -29,6 +31,9 @@ pub(super) struct VehicleClock {
     back_and_forth: u32,
     /// Time since when none of its objects has an effect where it is.
     pub(super) misplaced_since: Option<Timestamp>,
+    /// Where it stands, if it states that it does not move, and when it last was elsewhere.
+    stood_at: Option<Point2<f64>>,
+    pub(super) moved_at: Option<Timestamp>,
 }
 
 /// Time scale of a vehicle's stamps.
@@ -53,6 +58,9 @@ pub(super) struct Bounds {
 
 /// Measure of numbers that go back and forth from which two senders are behind them: some fourteen reports.
 const MIN_BACK_AND_FORTH: u32 = 20;
+
+/// Distance in metres over which estimates of a standing sender's pose scatter.
+const MAX_STANDING_M: f64 = 25.0;
 
 impl Bounds {
     /// Largest delay of a clock that is believed at once.
@@ -87,7 +95,19 @@ impl VehicleClock {
             last_heard: now,
             untimely_since: None,
             misplaced_since: None,
+            stood_at: None,
+            moved_at: None,
             back_and_forth: 0,
+        }
+    }
+
+    /// Notes where a sender is that states that it does not move.
+    pub(super) fn note_standing(&mut self, report: &ObjectReport, at: Timestamp) {
+        let pose = report.pose.filter(|_| report.moving == Some(false));
+        let place = pose.map(|pose| Point2::new(pose.x_m, pose.y_m));
+        match place.zip(self.stood_at) {
+            Some((place, stood_at)) if nalgebra::distance(&place, &stood_at) <= MAX_STANDING_M => {}
+            moved => (self.stood_at, self.moved_at) = (place, moved.map(|_| at)),
         }
     }
 

@@ -208,6 +208,24 @@ fn a_vehicle_whose_objects_are_nowhere_is_named() {
     assert_eq!(told, [far, of("watson", "none of its objects is at a known location, or near one")]);
 }
 
+/// One that states the same and stands, as well as an estimate of its pose does, is not told.
+#[test]
+fn a_vehicle_that_states_that_it_does_not_move_and_moves_is_named() {
+    let mut fuser = standby();
+    for n in 1..=60 {
+        let at = Timestamp(1_795_000_000_000_000 + n * 100_000);
+        for (name, x_m, moving) in
+            [("watson", n as f64, false), ("euclid", (n % 3) as f64, false), ("gauss", n as f64, true)]
+        {
+            let mut report = ObjectReport::new(NodeName::from_static(name), n, at);
+            (report.pose, report.moving) = (Some(WirePose::new(x_m, 0.0, 0.0)), Some(moving));
+            take(&mut fuser, report, at, None);
+        }
+    }
+    let cause = "it states `moving` = false, and its pose has moved by more than 25 m";
+    assert_eq!(troubles(&fuser), [(Some("watson".to_owned()), "misplaced".to_owned(), cause.to_owned())]);
+}
+
 #[test]
 fn locations_that_only_one_side_knows_are_named() {
     let now = Timestamp(1_795_000_000_000_000);
