@@ -159,8 +159,8 @@ impl ForeignReputations {
         self.counts.values().flat_map(BTreeMap::keys).collect()
     }
 
-    /// Judges every cell's word by the own remembered votes about the same vehicles; true if that changes any weight. Two
-    /// vehicles about which it is contradicted halve it, and more do no more.
+    /// Judges every cell's word by the own remembered votes about the same vehicles; true if that changes any weight. One
+    /// contradiction among n judged vehicles takes 1/(n + 2) of it; a half stays.
     pub fn judge(&mut self, own: impl Fn(&NodeName) -> Option<Counts>) -> bool {
         let mut judged = BTreeMap::<&NodeName, [f64; 2]>::new();
         for (vehicle, cells) in &self.counts {

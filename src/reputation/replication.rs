@@ -1,4 +1,4 @@
-//! Replication: the ledger in pieces that fit into messages, and its bounds.
+//! Replication: counts and marks of the ledger in pieces that fit into messages, how they are merged, and their bounds.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -178,7 +178,7 @@ impl ReputationLedger {
 
     /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false if the lanes that are
     /// left do not give way to it.
-    pub(super) fn make_room(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
+    fn make_room(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
         loop {
             let is_new = !self.lanes.contains_key(lane);
             let of_one = self.lanes.keys().filter(|other| other.leader == lane.leader).count();

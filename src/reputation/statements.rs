@@ -1,4 +1,4 @@
-//! Statements: the shares of one lane that its aggregator has signed, without those to which later ones leave nothing to add.
+//! Statements: the signed shares of one lane. Those to which later ones leave nothing to add are dropped from time to time.
 
 use std::sync::Arc;
 
@@ -21,8 +21,8 @@ pub(super) struct Statements {
 }
 
 impl Statements {
-    /// Adds a share to a lane that has `lane_size` counts and marks. `adds` takes statements in, the latest first: true if
-    /// that changed anything.
+    /// Adds a share to a lane that has `lane_size` counts and marks. `adds` merges a statement into evidence that is empty at
+    /// first, the latest statement first: true if that changed anything.
     pub(super) fn push(&mut self, share: Arc<LedgerShare>, lane_size: usize, adds: impl FnMut(&LedgerShare) -> bool) {
         self.signed.push(share);
         if self.signed.len() >= self.clear_at.max(MAX_NEW) {

@@ -143,7 +143,7 @@ impl DetectionCalibration {
     }
 }
 
-/// A deviation, reduced to almost nothing within the tolerance.
+/// A deviation, reduced by a third at the tolerance, and to almost nothing well within it.
 fn beyond_tolerance(deviation: f64, tolerance: f64) -> f64 {
     deviation * (1.0 - (-(deviation / tolerance).powi(2)).exp())
 }

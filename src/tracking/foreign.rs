@@ -1,7 +1,7 @@
 //! Objects of neighbouring cells: they lend identities to tracks, and are judged by what this cell's vehicles see.
 //!
 //! No track is spawned or kept alive by them. A track that begins where such an object is takes over its identity,
-//! velocity, time of first detection, existence and class. Its position is that of the
+//! velocity, heading, size, time of first detection, existence and class. Its position is that of the
 //! detection. Two cells that found one object apart agree on the identity of the older one. Of two that are about as
 //! old, they take the smaller one.
 //!

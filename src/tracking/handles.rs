@@ -1,6 +1,6 @@
 //! Handles: small numbers that stand for a vehicle or a track, for as long as its owner says.
 
-/// Number of a vehicle that is heard. `Sensors` alone creates it, and frees it for another vehicle when this one is silent.
+/// Number of a vehicle that is heard. `Sensors` alone creates it, and frees it for another vehicle when it forgets this one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct SensorId(pub(super) u32);
 
@@ -11,8 +11,8 @@ impl SensorId {
     }
 }
 
-/// Position of a track in the store, the oldest first. `TrackStore` alone creates it, and invalidates it whenever it removes
-/// tracks.
+/// Position of a track in the store. `TrackStore` alone creates it. Nothing keeps one across `TrackStore::retain`, which
+/// invalidates it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct TrackIndex(pub(super) u32);
 

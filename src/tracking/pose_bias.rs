@@ -1,6 +1,6 @@
 //! Pose bias of one vehicle: the offset and the rotation of its pose, and the delay of its stamps.
 //!
-//! The biases are a Gauss-Markov process of four states: small, changing slowly, with a known spread at rest. Every round is
+//! The biases are a Gauss-Markov process of four states: small, changing slowly, with a known spread at rest. Every report is
 //! one step of an extended Kalman filter in information form over all correspondences. It is reweighted against wrong ones
 //! by Cauchy's function (Holland, Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
 //!
@@ -89,7 +89,7 @@ impl PoseBias {
         }
     }
 
-    /// Sets the centre of the rotation; the error goes with the vehicle.
+    /// Sets the centre of the rotation; the bias goes with the vehicle.
     pub(super) fn set_pivot(&mut self, pivot: Vector2<f64>) {
         self.pivot = pivot;
     }

@@ -37,7 +37,7 @@ pub(super) struct RegistrationSample {
     pub(super) variance: f64,
 }
 
-/// Updates the registration of every vehicle from the frames of a round.
+/// Updates the pose bias of every vehicle that reported, from the frames of a round.
 ///
 /// Uses simultaneous detections only, so that filter lag is not mistaken for pose bias.
 pub(super) fn register(

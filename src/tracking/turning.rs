@@ -26,7 +26,7 @@ pub(super) struct TurningFrame {
 }
 
 impl TurningFrame {
-    /// Moves on to `now`, with the yaw rates that vehicles state. The median holds, the lesser of two in the middle: no
+    /// Moves on to `now`, with the yaw rate that each vehicle states. The median holds, the lesser of two in the middle: no
     /// single vehicle turns the frame of others.
     pub(super) fn advance(&mut self, mut stated: Vec<f64>, now: Timestamp) {
         stated.sort_by(f64::total_cmp);

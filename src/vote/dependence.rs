@@ -13,7 +13,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::confusion::LabelIndex;
 
-/// Maximum number of other votes on a landmark that a vote is compared with; bounds the cost of a vote.
+/// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost of a vote.
 const MAX_COMPARED: usize = 8;
 /// The same over stored votes.
 const MAX_COMPARED_STORED: usize = 32;

@@ -129,11 +129,13 @@ fn a_frame_may_turn_with_its_vehicle() {
 }
 
 #[test]
-fn one_vehicle_turns_no_frame_of_others() {
+fn one_vehicle_turns_no_frame_of_others_however_often_it_reports() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..30 {
-        for (node, frame_yaw_rate_radps) in [("euclid", None), ("liar", Some(2.0))] {
+        let reports =
+            [("euclid", None), ("gauss", None), ("liar", Some(2.0)), ("liar", Some(2.1)), ("liar", Some(2.2))];
+        for (node, frame_yaw_rate_radps) in reports {
             let objects = vec![car(0.0, 40.0), car(30.0, 0.0)];
             tracker.observe(ObjectReport { frame_yaw_rate_radps, ..report(node, frame, objects) }, at(frame));
         }

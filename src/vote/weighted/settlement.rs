@@ -65,7 +65,7 @@ impl WeightedVoting {
         self.remove_live(landmark);
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
         if landmark_votes.has_several_voters() {
-            // A vote is judged by the others: a vehicle that decides alone must not prove itself right.
+            // The model judges a vote by the others: a vehicle that decides alone must not prove itself right to it.
             let judged = landmark_votes.votes.iter().filter(|vote| vote.judged);
             let settled: Vec<_> = judged
                 .map(|vote| (*vote, self.model.leave_one_out(&landmark_votes.posterior, &vote.weighted())))

@@ -13,7 +13,7 @@ use super::{Cells, FilePlace, LineError, ParsedObject};
 pub(super) fn object(cells: &Cells, has_camera: bool) -> Result<Option<(u64, ParsedObject)>, LineError> {
     let frame = cells.frame()?;
     if !cells.has_commas {
-        return Err(cells.error(1, "frame", "is not followed by a comma, as in files of MOTChallenge".into()));
+        return Err(cells.error(1, "frame", "is not followed by a comma; files of MOTChallenge have commas".into()));
     }
     let id = Some(cells.integer(2, "track")?).filter(|id| *id >= 0);
     let score = cells.number(7, "score")?;
