@@ -34,6 +34,7 @@ mod slots;
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -144,13 +145,18 @@ pub struct NodeHandle {
 /// Time between two log lines about a node's health.
 const HEALTH_PERIOD: Duration = Duration::from_secs(30);
 
+/// A node that starts. Boxed, it is compiled once, and not again in every program that starts a node.
+pub type Starting = Pin<Box<dyn Future<Output = Result<NodeHandle, NodeError>> + Send>>;
+
 /// Starts a node; `config` is taken as valid.
 ///
 /// # Errors
 /// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
-pub async fn start(config: NodeConfig) -> Result<NodeHandle, NodeError> {
-    let vehicle = VehicleParts::new(&config);
-    start_with((vehicle, Presence::Whole), config).await
+pub fn start(config: NodeConfig) -> Starting {
+    Box::pin(async move {
+        let vehicle = VehicleParts::new(&config);
+        start_with((vehicle, Presence::Whole), config).await
+    })
 }
 
 /// Starts a node of a vehicle as far as its presence goes.
