@@ -146,8 +146,12 @@ impl Tracker {
     pub fn close(&mut self, now: Timestamp) -> TracksRound {
         let pending = std::mem::take(&mut self.pending);
         let oldest_capture = pending.iter().map(|(captured_at, _)| *captured_at).min();
-        let stated = self.stated_yaw_rates(&pending);
-        self.frame.advance(stated, now);
+        for (at, report) in &pending {
+            self.frame.note(report, *at);
+        }
+        let trust =
+            |node: &NodeName| self.sensors.by_name(node).map_or(1.0, |sensor| self.sensors.fleet.trust(sensor.id));
+        self.frame.advance(now, |node| trust(node) > 0.0);
         let (frames, evidence) = self.update(&self.in_order(pending), now);
         if self.config.align {
             register(frames, &self.tracks, &mut self.sensors, &self.config);
@@ -158,20 +162,6 @@ impl Tracker {
         let (mut objects, mut pose_corrections) = (self.objects(now), self.corrections());
         self.frame.restore(now, &mut objects, pose_corrections.values_mut());
         TracksRound { objects, pose_corrections, oldest_capture, evidence }
-    }
-
-    /// The yaw rates of the frame by the latest report of every vehicle that is trusted.
-    fn stated_yaw_rates(&self, pending: &[(Timestamp, Arc<ObjectReport>)]) -> Vec<f64> {
-        let mut latest: BTreeMap<&NodeName, (Timestamp, u64, f64)> = BTreeMap::new();
-        for (at, report) in pending {
-            let stated = (*at, report.seq, report.frame_yaw_rate_radps.unwrap_or(0.0));
-            let known = latest.entry(&report.node).or_insert(stated);
-            if (stated.0, stated.1) > (known.0, known.1) {
-                *known = stated;
-            }
-        }
-        let trust = |node| self.sensors.by_name(node).map_or(1.0, |sensor| self.sensors.fleet.trust(sensor.id));
-        latest.into_iter().filter(|(node, _)| trust(node) > 0.0).map(|(_, (_, _, rate_radps))| rate_radps).collect()
     }
 
     /// The reports of a round in the order of capture, whatever the order of arrival.

@@ -4,12 +4,14 @@
 //! live in a frame with the same origin that does not turn: its angle is the integral of the yaw rates that the reports
 //! state. A report without one states that the frame does not turn.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use nalgebra::{Matrix2, Rotation2, Vector2};
 
 use crate::model::geometry::wrap_angle;
+use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{FusedObject, GlobalMap, ObjectReport, PoseCorrection};
 
@@ -22,25 +24,33 @@ pub(super) struct TurningFrame {
     at: Timestamp,
     angle_rad: f64,
     rate_radps: f64,
-    stated_at: Timestamp,
+    /// By vehicle, the yaw rate of its latest report, with the time and number of that.
+    stated: BTreeMap<NodeName, (Timestamp, u64, f64)>,
 }
 
 impl TurningFrame {
-    /// Moves on to `now`, with the yaw rate that each vehicle states. The median holds, the lesser of two in the middle: no
-    /// single vehicle turns the frame of others.
-    pub(super) fn advance(&mut self, mut stated: Vec<f64>, now: Timestamp) {
-        stated.sort_by(f64::total_cmp);
-        let middle = stated.len().saturating_sub(1) / 2..=stated.len() / 2;
-        let middle = stated.get(middle).unwrap_or_default();
-        let median = middle.iter().copied().min_by(|a, b| a.abs().total_cmp(&b.abs()));
-        let is_held = now.since(self.stated_at) <= HELD;
-        let rate_radps = median.unwrap_or(if is_held { self.rate_radps } else { 0.0 });
+    /// Notes the yaw rate that a report states, captured at `at`.
+    pub(super) fn note(&mut self, report: &ObjectReport, at: Timestamp) {
+        let latest = (at, report.seq, report.frame_yaw_rate_radps.unwrap_or(0.0));
+        let known = self.stated.entry(report.node.clone()).or_insert(latest);
+        if (latest.0, latest.1) > (known.0, known.1) {
+            *known = latest;
+        }
+    }
+
+    /// Moves on to `now`, with the yaw rate that each trusted vehicle stated last. The median holds, the lesser of two in the
+    /// middle: no single vehicle turns the frame of others.
+    pub(super) fn advance(&mut self, now: Timestamp, is_trusted: impl Fn(&NodeName) -> bool) {
+        self.stated.retain(|_, (at, ..)| now.since(*at) <= HELD);
+        let trusted = self.stated.iter().filter(|(node, _)| is_trusted(node));
+        let mut rates: Vec<f64> = trusted.map(|(_, (.., rate_radps))| *rate_radps).collect();
+        rates.sort_by(f64::total_cmp);
+        let middle = rates.len().saturating_sub(1) / 2..=rates.len() / 2;
+        let middle = rates.get(middle).unwrap_or_default();
+        let rate_radps = middle.iter().copied().min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(0.0);
         let passed_s = now.since(self.at).as_secs_f64();
         if self.is_turning() {
             self.angle_rad = wrap_angle(self.angle_rad + (self.rate_radps + rate_radps) / 2.0 * passed_s);
-        }
-        if median.is_some() {
-            self.stated_at = now;
         }
         self.rate_radps = rate_radps;
         self.at = self.at.max(now);
