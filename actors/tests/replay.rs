@@ -188,12 +188,15 @@ fn what_cannot_be_done_is_said_and_changes_no_file() {
         path
     };
     let (recording, typo) = (file("in.jsonl", "{}\n"), file("typo.toml", "[fusion.pace]\ngat_m = 1\n"));
+    let fusion = file("fusion.toml", "[fusion]\n");
+    let fusion = text(&fusion);
     let out = folder.path().join("out.jsonl");
     let (recording, out) = (text(&recording), text(&out));
     for (arguments, code, part) in [
         (vec!["replay", "--input", "/no/such.jsonl", "--output", out], 2, "/no/such.jsonl"),
         (vec!["replay", "--input", "/", "--output", out], 2, "directory"),
         (vec!["replay", "--input", recording, "--output", recording], 2, "both read and written"),
+        (vec!["replay", "--config", fusion, "--input", recording, "--output", fusion], 2, "both read and written"),
         (vec!["replay", "--input", recording, "--output", "/no/such/dir.jsonl"], 2, "/no/such/dir.jsonl"),
         (vec!["replay", "--config", text(&typo), "--input", recording, "--output", out], 2, "fusion.pace.gat_m"),
         (vec!["replay", "--config", "/no.toml", "--input", recording, "--output", out], 2, "/no.toml"),

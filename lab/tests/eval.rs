@@ -308,6 +308,9 @@ fn what_cannot_be_judged_is_said() {
     };
     let (recording, truth, empty) =
         (file("in.jsonl", "{}\n"), file("truth.json", "{\"a\": {}}"), file("empty.jsonl", ""));
+    let frames = file("frames.json", r#"{"frames": [{"t_us": 9000000, "objects": []}]}"#);
+    let map = r#"{"schema": 1, "aggregator": "edge", "epoch": 1, "round": 1, "fused_at_us": 1, "landmarks": [], "objects": []}"#;
+    let map = file("map.jsonl", map);
     let unsure = file(
         "unsure.jsonl",
         r#"{"schema": 1, "aggregator": "edge", "epoch": 1, "round": 1, "fused_at_us": 1, "landmarks": [], "objects": [
@@ -322,6 +325,7 @@ fn what_cannot_be_judged_is_said() {
         (&truth, &recording, 2, "`a` has {}"),
         (&lot, &empty, 1, "no map"),
         (&lot, &unsure, 1, "the first is line 1: objects[0]: "),
+        (&frames, &map, 1, "no map of "),
         (&lot, &recording, 1, "1 lines cannot be used, the first is line 1: it is neither a map nor verdicts"),
     ] {
         let run = ecod_lab(&["eval", "--truth", text(truth), "--input", text(input)]);

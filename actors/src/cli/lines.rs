@@ -2,6 +2,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -36,7 +37,10 @@ pub fn read_line(source: &mut impl BufRead, limit: usize, line: &mut Vec<u8>) ->
     Ok(LineRead::Whole)
 }
 
-/// Opens a file to read.
+/// Some editors begin a text with it.
+const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
+
+/// Opens a file to read, after a byte order mark.
 ///
 /// # Errors
 /// Naming the file.
@@ -48,7 +52,11 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     if file.metadata().is_ok_and(|metadata| metadata.is_dir()) {
         bail!("cannot read {}: it is a directory", path.display());
     }
-    Ok(Box::new(BufReader::with_capacity(1 << 18, file)))
+    let mut source = BufReader::with_capacity(1 << 18, file);
+    if source.fill_buf().is_ok_and(|begin| begin.starts_with(BYTE_ORDER_MARK)) {
+        source.consume(BYTE_ORDER_MARK.len());
+    }
+    Ok(Box::new(source))
 }
 
 /// Checks that an output file is none of `inputs`.
@@ -56,8 +64,10 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
 /// # Errors
 /// Naming the file.
 pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<()> {
-    let ours = fs::canonicalize(path).ok();
-    if ours.is_some() && inputs.iter().any(|input| fs::canonicalize(input).ok() == ours) {
+    // A file may have several names.
+    let file = |path: &Path| fs::metadata(path).ok().map(|metadata| (metadata.dev(), metadata.ino()));
+    let ours = file(path);
+    if ours.is_some() && inputs.iter().any(|input| file(input.as_ref()) == ours) {
         bail!("{} is to be both read and written", path.display());
     }
     Ok(())
@@ -79,6 +89,22 @@ pub fn create(path: &Path, inputs: &[PathBuf]) -> anyhow::Result<Box<dyn Write>>
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_file_by_another_name_is_not_written_while_it_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let [read, linked, hard] = ["read", "linked", "hard"].map(|name| folder.path().join(name));
+        fs::write(&read, "\u{feff}first\n").unwrap();
+        std::os::unix::fs::symlink(&read, &linked).unwrap();
+        fs::hard_link(&read, &hard).unwrap();
+        for name in [&read, &linked, &hard] {
+            let error = create(name, std::slice::from_ref(&read)).err().unwrap().to_string();
+            assert!(error.ends_with("is to be both read and written"), "{error}");
+        }
+        let mut line = String::new();
+        open(&read).unwrap().read_line(&mut line).unwrap();
+        assert_eq!(line, "first\n");
+    }
 
     #[test]
     fn lines_are_bounded_and_the_rest_of_a_large_one_is_passed_over() {

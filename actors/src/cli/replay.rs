@@ -49,9 +49,10 @@ pub(super) struct ReplayArguments {
 pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
     let ReplayArguments { config, input, node, output, passes, max_rejected } = arguments;
     let given = config.as_deref().map(|path| cell(Some(path))).transpose()?;
+    let mut read: Vec<PathBuf> = input.iter().chain(config).cloned().collect();
     if let Some(lines) = input_of_lines(input, node)? {
         let config = ReplayConfig { passes: *passes, ..given.unwrap_or_default() };
-        let usable = replay_lines(config, lines, RoundWriter::create(output, input)?)?;
+        let usable = replay_lines(config, lines, RoundWriter::create(output, &read)?)?;
         return usable.map_or(Ok(()), |usable| usable.check(*max_rejected));
     }
     let Logs { files, unusable } = Logs::find(input, node)?;
@@ -59,7 +60,8 @@ pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
         let why = anyhow!("{:#}: give the configuration of the fusion with --config", anyhow!(unusable));
         return Err(Failure::usage(why));
     }
-    let rounds = RoundWriter::create(output, &files)?;
+    read.extend_from_slice(&files);
+    let rounds = RoundWriter::create(output, &read)?;
     let usable = LogReplay::new(given.as_ref(), *passes).run(&files, rounds)?;
     usable.map_or(Ok(()), |usable| usable.check(*max_rejected))
 }

@@ -69,6 +69,12 @@ pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
             reports.extend(sequence.reports(number, *frame_rate, name, sequence.last()));
         }
     }
+    if reports.is_empty() {
+        return Err(anyhow!("no file has a frame").into());
+    }
+    if reports.iter().all(|report| report.objects.is_empty()) {
+        eprintln!("no report has an object: classes count by the exact names of the form, and boxes need a place");
+    }
     reports.sort_by_key(|report| report.captured_at_us);
     let mut sink = lines::create(output, &inputs).map_err(Failure::usage)?;
     let mut write = || -> std::io::Result<()> {

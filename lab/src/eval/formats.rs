@@ -186,6 +186,13 @@ impl FileFormat {
             let cells = Cells::new(number + 1, line);
             let object = if self == Self::Kitti { kitti::object(&cells)? } else { mot::object(&cells, has_camera)? };
             if let Some((frame, object)) = object {
+                if let FilePlace::Ground(place) = object.place
+                    && let Err((field, _)) =
+                        PerceivedObject::new(object.label.clone(), 1.0, place.x, place.y).check_fields()
+                {
+                    let fault = format!("({}, {}) is out of bounds", place.x, place.y);
+                    return Err(LineError { line: number + 1, field: format!("position ({field})"), fault });
+                }
                 frames.entry(frame).or_default().push(object);
             }
         }

@@ -106,6 +106,14 @@ fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Resul
         return Err(Failure::usage(anyhow!("--reports and --config are for a truth of locations")));
     }
     let scores = evaluation.result();
+    if scores.frames_with_map == 0 {
+        let what = format!(
+            "no map of {} is at the time of any frame of {}",
+            arguments.input.display(),
+            arguments.truth.display()
+        );
+        return Err(anyhow!(what).into());
+    }
     if let Some(warning) = without_map(&scores) {
         eprintln!("{warning}");
     }

@@ -12,6 +12,9 @@ use super::{Cells, FilePlace, LineError, ParsedObject};
 /// Width and height in the image count from the left upper corner.
 pub(super) fn object(cells: &Cells, has_camera: bool) -> Result<Option<(u64, ParsedObject)>, LineError> {
     let frame = cells.frame()?;
+    if frame == 0 {
+        return Err(cells.error(1, "frame", "0 is out of bounds, the first frame is 1".into()));
+    }
     if !cells.has_commas {
         return Err(cells.error(1, "frame", "is not followed by a comma; files of MOTChallenge have commas".into()));
     }

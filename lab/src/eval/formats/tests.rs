@@ -86,7 +86,8 @@ fn line_and_field_of_what_cannot_be_read_are_named() {
         (FileFormat::Mot, "1.5,1,1,2,3,4,1,1,1,1", "line 1: column 1 (frame): 1.5 is no whole number"),
         (FileFormat::Mot, "1,1,1,2,3,4,1,1,1", "line 1: column 8 (x): is no position on the ground"),
         (FileFormat::Mot, "1,1,1,2,3,4,1,-1,-1,-1", "line 1: column 8 (x): is no position on the ground"),
-        (FileFormat::Mot, "0 2 Van 0 0 -1.7 296.7 161.7", "line 1: column 1 (frame): is not followed by a comma"),
+        (FileFormat::Mot, "0,1,10,10,20,40,1,5,6,0", "line 1: column 1 (frame): 0 is out of bounds"),
+        (FileFormat::Mot, "1 2 Van 0 0 -1.7 296.7 161.7", "line 1: column 1 (frame): is not followed by a comma"),
         (FileFormat::Coco, "[]", "boxes in an image have no place on the ground: give their camera with --config"),
     ] {
         let said = read(format, text, None).unwrap_err().root_cause().to_string();
