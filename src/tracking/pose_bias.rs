@@ -14,7 +14,7 @@ use crate::model::geometry::wrap_angle;
 use crate::model::time::Timestamp;
 use crate::wire::PoseCorrection;
 
-/// Number of reweighting steps in a round.
+/// Number of reweighting steps for a report.
 const ITERATIONS: usize = 3;
 
 /// Residual, in standard deviations, at which a correspondence counts half.
