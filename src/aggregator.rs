@@ -46,8 +46,8 @@ use crate::reputation::{Evidence, ReputationLedger};
 use crate::tracking::{HandOvers, Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
-    FusedObject, GlobalMap, LandmarkState, NeighbourObject, ObjectReport, PerceivedObject, RejectReason, ReportKind,
-    Reputation, Verdict, Verdicts,
+    FusedObject, GlobalMap, InvalidEntry, LandmarkState, NeighbourObject, ObjectReport, Payload, PerceivedObject,
+    RejectReason, ReportKind, Reputation, Verdict, Verdicts,
 };
 
 /// A closed round.
@@ -65,6 +65,9 @@ pub struct Fused {
     pub evidence: Vec<Evidence>,
     /// The reputations, with the verdicts of VOTE's `paper` mode: they do not follow from the evidence there.
     pub reputations: Option<BTreeMap<NodeName, Reputation>>,
+    /// Entries that were left out of map and verdicts, because receivers would refuse them: an object that prediction takes
+    /// beyond the bounds of the wire format, for example.
+    pub left_out: Vec<InvalidEntry>,
 }
 
 /// Numbers of reports of detections that a cell with known locations used.
@@ -448,7 +451,7 @@ impl Aggregator {
         evidence.extend(seen);
         let oldest = [pace.as_ref().and_then(|pace| pace.oldest_capture), oldest_capture].into_iter().flatten().min();
         let pace = pace.map(|PaceRound { landmarks, .. }| self.agree(landmarks, verdicts.as_deref(), now));
-        let map = pace.map(|landmarks| GlobalMap {
+        let mut map = pace.map(|landmarks| GlobalMap {
             oldest_capture_us: oldest.map(|oldest| self.in_cell_time(oldest)),
             landmarks,
             neighbour_objects: self.neighbours.shown(&objects, self.tracks.as_ref(), now, self.cell_offset_us),
@@ -456,9 +459,12 @@ impl Aggregator {
             pose_corrections,
             ..GlobalMap::new(&epoch, round, fused_at)
         });
-        let verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
+        let mut verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
+        // What this aggregator publishes passes the check of those who receive it.
+        let mut left_out = map.as_mut().map(Payload::remove_invalid).unwrap_or_default();
+        left_out.extend(verdicts.as_mut().map(Payload::remove_invalid).unwrap_or_default());
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());
-        Some(Fused { epoch, round, map, verdicts, evidence, reputations })
+        Some(Fused { epoch, round, map, verdicts, evidence, reputations, left_out })
     }
 }
 

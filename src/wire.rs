@@ -46,7 +46,7 @@ use uuid::Uuid;
 pub use cell_map::{CellMap, NeighbourObject};
 pub use cell_reputation::{CellReputation, ForeignVotes};
 pub use client_refusals::{ClientRefusal, ClientRefusals};
-pub use codec::{Encoding, decode, decode_report, decode_share, encode};
+pub use codec::{Encoding, decode, decode_entries, decode_report, decode_share, encode};
 pub use description::{CellDescription, ContentHash, DescriptionStamp, DescriptionStatus, InvalidHash};
 pub use flaw::Flaw;
 pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
@@ -57,7 +57,7 @@ pub use reputation_topic::ReputationTopic;
 pub use topic::{ReportKind, Topic, Topics};
 pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
-    InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload,
+    InvalidEntry, InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload,
     check_fused_at,
 };
 

@@ -3,6 +3,7 @@
 #[cfg(feature = "camera")]
 pub mod camera_troubles;
 pub mod counters;
+pub(crate) mod line_throttle;
 #[cfg(feature = "otel")]
 pub mod otlp;
 pub mod spans;

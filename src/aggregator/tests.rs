@@ -1,3 +1,4 @@
+mod accepted_by_receivers;
 mod configure;
 mod foreign;
 mod one_answer;

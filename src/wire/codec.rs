@@ -4,7 +4,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::compact::{self, is_compact};
-use super::{LedgerShare, Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION};
+use super::{InvalidEntry, LedgerShare, Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION};
 use crate::model::names::NodeName;
 
 /// The encoding of a payload.
@@ -35,15 +35,24 @@ pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     bytes
 }
 
-/// Reads any payload whose `schema` is known and checks every value in it.
+/// Reads any payload whose `schema` is known and checks every value in it. Entries that are not valid are left out;
+/// [`decode_entries`] returns them.
 ///
 /// # Errors
 /// The first reason found; see [`RejectReason`].
 pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReason> {
+    decode_entries(bytes, limits).map(|(payload, _)| payload)
+}
+
+/// Reads and checks a payload as [`decode`] does, and returns with it the entries that were left out.
+///
+/// # Errors
+/// The first reason found; see [`RejectReason`].
+pub fn decode_entries<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<(T, Vec<InvalidEntry>), RejectReason> {
     if bytes.len() > T::max_bytes(limits) {
         return Err(RejectReason::TooLarge);
     }
-    let payload: T = read(bytes).map_err(|reason| match schema(bytes) {
+    let mut payload: T = read(bytes).map_err(|reason| match schema(bytes) {
         Some(schema) if schema != SCHEMA_VERSION => RejectReason::UnknownSchema,
         _ => reason,
     })?;
@@ -51,7 +60,8 @@ pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReas
         return Err(RejectReason::UnknownSchema);
     }
     payload.check(limits)?;
-    Ok(payload)
+    let invalid = payload.remove_invalid();
+    Ok((payload, invalid))
 }
 
 /// Reads a report and checks every value in it; `topic_node` is the node named by its topic.

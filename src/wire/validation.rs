@@ -9,11 +9,11 @@ use serde::de::DeserializeOwned;
 
 use super::{
     CellDescription, CellMap, CellReputation, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare,
-    MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason,
+    MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputation,
     Reputations, SCHEMA_VERSION, Trouble, Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;
-use crate::model::names::{Label, is_label, is_plain_text};
+use crate::model::names::{Label, NodeName, is_label, is_plain_text};
 use crate::model::origin::GeographicOrigin;
 use crate::model::time::Timestamp;
 
@@ -56,8 +56,16 @@ const WORLD_BOUND_M: f64 = 1e8;
 /// Fastest object in metres per second.
 const SPEED_BOUND_MPS: f64 = 1e4;
 
-/// Largest size of an object and largest range of a sensor in metres.
-const SIZE_BOUND_M: f64 = 1e5;
+/// Largest size of an object and largest range of a sensor in metres. A number of 11 significant bits: the compact
+/// encoding rounds no smaller size beyond it.
+const SIZE_BOUND_M: f64 = 102_400.0;
+
+/// Largest variance of a position in m²: far more than the square of [`WORLD_BOUND_M`], so that sums and products of
+/// covariances stay finite.
+const VARIANCE_BOUND_M2: f64 = 1e20;
+
+/// Largest age in seconds and largest number of pairs of detections; a power of two, which no encoding rounds up.
+const COUNT_BOUND: f64 = (1u64 << 52) as f64;
 
 /// Largest angle in radians: headings may count full turns.
 const ANGLE_BOUND_RAD: f64 = 1e6;
@@ -81,7 +89,13 @@ pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b
         limits.payload_bytes
     }
 
-    /// Checks every value.
+    /// Removes the entries whose values are not valid, and returns what was removed. One bad entry of a map, of verdicts or
+    /// of reputations costs the others nothing.
+    fn remove_invalid(&mut self) -> Vec<InvalidEntry> {
+        Vec::new()
+    }
+
+    /// Checks every value outside of the entries that [`Self::remove_invalid`] checks.
     ///
     /// # Errors
     /// The first reason found.
@@ -90,8 +104,17 @@ pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b
     }
 }
 
+/// An entry of a map, of verdicts or of reputations that is not valid.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct InvalidEntry {
+    /// The reason for which receivers do not use it.
+    pub reason: RejectReason,
+    /// The nodes whose statements are in the entry.
+    pub contributors: Vec<NodeName>,
+}
+
 macro_rules! payloads {
-    ($($type:ty: at most $max_bytes:ident, checked by $check:path;)*) => {
+    ($($type:ty: at most $max_bytes:ident, checked by $check:path $(, entries by $remove_invalid:path)?;)*) => {
         $(impl Payload for $type {
             fn schema(&self) -> u32 {
                 self.schema
@@ -100,6 +123,10 @@ macro_rules! payloads {
             fn max_bytes(limits: &Limits) -> usize {
                 limits.$max_bytes
             }
+
+            $(fn remove_invalid(&mut self) -> Vec<InvalidEntry> {
+                $remove_invalid(self)
+            })?
 
             fn check(&self, limits: &Limits) -> Result<(), RejectReason> {
                 $check(self, limits)
@@ -110,11 +137,11 @@ macro_rules! payloads {
 
 payloads! {
     ObjectReport: at most payload_bytes, checked by ObjectReport::validate;
-    GlobalMap: at most map_bytes, checked by check_map;
-    CellMap: at most map_bytes, checked by check_cell_map;
+    GlobalMap: at most map_bytes, checked by check_map, entries by invalid_of_map;
+    CellMap: at most map_bytes, checked by check_cell_map, entries by invalid_of_cell_map;
     CellReputation: at most payload_bytes, checked by check_cell_reputation;
-    Verdicts: at most map_bytes, checked by check_verdicts;
-    Reputations: at most map_bytes, checked by check_reputations;
+    Verdicts: at most map_bytes, checked by check_verdicts, entries by invalid_verdicts;
+    Reputations: at most map_bytes, checked by check_reputations, entries by invalid_reputations;
     CellDescription: at most map_bytes, checked by check_description;
     LedgerShare: at most payload_bytes, checked by check_share;
     NodeStatus: at most payload_bytes, checked by check_status;
@@ -215,14 +242,71 @@ pub fn check_fused_at(fused_at: Timestamp, received_at: Timestamp) -> Result<(),
 
 fn check_map(map: &GlobalMap, _: &Limits) -> Result<(), RejectReason> {
     let times = [Some(map.fused_at_us), map.oldest_capture_us];
-    check_integers([map.epoch, map.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))?;
-    map.landmarks.iter().try_for_each(check_landmark)?;
-    map.objects.iter().try_for_each(FusedObject::validate)?;
-    map.neighbour_objects.iter().try_for_each(|neighbour| {
-        check_between(neighbour.age_s, 0.0, f64::MAX)?;
-        neighbour.object.validate()
-    })?;
-    map.pose_corrections.values().try_for_each(check_correction)
+    check_integers([map.epoch, map.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))
+}
+
+fn invalid_of_map(map: &mut GlobalMap) -> Vec<InvalidEntry> {
+    let mut invalid = Vec::new();
+    remove_entries(&mut map.landmarks, check_landmark, |place| &place.contributors, &mut invalid);
+    remove_entries(&mut map.objects, FusedObject::validate, |object| &object.contributors, &mut invalid);
+    remove_entries(
+        &mut map.neighbour_objects,
+        |neighbour| {
+            check_between(neighbour.age_s, 0.0, COUNT_BOUND)?;
+            neighbour.object.validate()
+        },
+        |neighbour| std::slice::from_ref(&neighbour.cell),
+        &mut invalid,
+    );
+    remove_named(&mut map.pose_corrections, check_correction, &mut invalid);
+    invalid
+}
+
+fn invalid_of_cell_map(message: &mut CellMap) -> Vec<InvalidEntry> {
+    invalid_of_map(&mut message.map)
+}
+
+fn invalid_verdicts(verdicts: &mut Verdicts) -> Vec<InvalidEntry> {
+    let mut invalid = Vec::new();
+    remove_entries(&mut verdicts.verdicts, check_verdict, |verdict| &verdict.contributors, &mut invalid);
+    invalid
+}
+
+fn invalid_reputations(reputations: &mut Reputations) -> Vec<InvalidEntry> {
+    let mut invalid = Vec::new();
+    remove_named(&mut reputations.reputations, check_reputation, &mut invalid);
+    invalid
+}
+
+/// Removes the entries of a list that `check` refuses, and adds them to `invalid`.
+fn remove_entries<T>(
+    entries: &mut Vec<T>,
+    check: impl Fn(&T) -> Result<(), RejectReason>,
+    contributors: impl Fn(&T) -> &[NodeName],
+    invalid: &mut Vec<InvalidEntry>,
+) {
+    entries.retain(|entry| match check(entry) {
+        Ok(()) => true,
+        Err(reason) => {
+            invalid.push(InvalidEntry { reason, contributors: contributors(entry).to_vec() });
+            false
+        }
+    });
+}
+
+/// Removes the entries by node that `check` refuses, and adds them to `invalid`.
+fn remove_named<T>(
+    entries: &mut BTreeMap<NodeName, T>,
+    check: impl Fn(&T) -> Result<(), RejectReason>,
+    invalid: &mut Vec<InvalidEntry>,
+) {
+    entries.retain(|node, entry| match check(entry) {
+        Ok(()) => true,
+        Err(reason) => {
+            invalid.push(InvalidEntry { reason, contributors: vec![node.clone()] });
+            false
+        }
+    });
 }
 
 fn check_cell_map(message: &CellMap, limits: &Limits) -> Result<(), RejectReason> {
@@ -239,19 +323,19 @@ fn check_cell_map(message: &CellMap, limits: &Limits) -> Result<(), RejectReason
 }
 
 fn check_verdicts(verdicts: &Verdicts, _: &Limits) -> Result<(), RejectReason> {
-    check_integers([verdicts.epoch, verdicts.round, verdicts.fused_at_us.micros()])?;
-    verdicts.verdicts.iter().try_for_each(check_verdict)
+    check_integers([verdicts.epoch, verdicts.round, verdicts.fused_at_us.micros()])
 }
 
 fn check_reputations(reputations: &Reputations, _: &Limits) -> Result<(), RejectReason> {
-    check_integers([reputations.epoch, reputations.round])?;
-    reputations.reputations.values().try_for_each(|reputation| {
-        check_integers([reputation.correct, reputation.incorrect])?;
-        let foreign = reputation.foreign.unwrap_or_default();
-        check_between(foreign.correct, 0.0, SCORE_BOUND)?;
-        check_between(foreign.incorrect, 0.0, SCORE_BOUND)?;
-        check_between(reputation.score, 0.0, 1.0)
-    })
+    check_integers([reputations.epoch, reputations.round])
+}
+
+fn check_reputation(reputation: &Reputation) -> Result<(), RejectReason> {
+    check_integers([reputation.correct, reputation.incorrect])?;
+    let foreign = reputation.foreign.unwrap_or_default();
+    check_between(foreign.correct, 0.0, SCORE_BOUND)?;
+    check_between(foreign.incorrect, 0.0, SCORE_BOUND)?;
+    check_between(reputation.score, 0.0, 1.0)
 }
 
 fn check_cell_reputation(counts: &CellReputation, _: &Limits) -> Result<(), RejectReason> {
@@ -336,7 +420,7 @@ impl FusedObject {
         self.existence.map_or(Ok(()), check_confidence)?;
         check_motion(self.velocity_mps, self.heading_rad, self.size_m)?;
         check_scores(&self.scores)?;
-        self.age_s.map_or(Ok(()), |age_s| check_between(age_s, 0.0, MAX_INTEGER as f64))?;
+        self.age_s.map_or(Ok(()), |age_s| check_between(age_s, 0.0, COUNT_BOUND))?;
         check_integers(self.first_seen_us.map(Timestamp::micros))?;
         check_labels([&*self.label])
     }
@@ -347,7 +431,7 @@ fn check_correction(correction: &PoseCorrection) -> Result<(), RejectReason> {
     check_place(x_m, y_m)?;
     check_place(correction.dx_m, correction.dy_m)?;
     check_between(correction.dheading_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD)?;
-    check_between(correction.pairs, 0.0, MAX_INTEGER as f64)
+    check_between(correction.pairs, 0.0, COUNT_BOUND)
 }
 
 fn check_view(view: FieldOfView) -> Result<(), RejectReason> {
@@ -400,7 +484,11 @@ fn check_coordinate(coordinate_m: f64) -> Result<(), RejectReason> {
 }
 
 fn check_covariance(covariance: Covariance) -> Result<(), RejectReason> {
-    if covariance.is_valid() { Ok(()) } else { Err(RejectReason::NotFinite) }
+    if covariance.is_valid() && covariance.xx.max(covariance.yy) <= VARIANCE_BOUND_M2 {
+        Ok(())
+    } else {
+        Err(RejectReason::NotFinite)
+    }
 }
 
 fn check_confidence(confidence: f64) -> Result<(), RejectReason> {

@@ -28,7 +28,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::replay::{JournalEvent, TimeUnit};
 use ecod::tracking::TracksLosses;
-use ecod::wire::{GlobalMap, ObjectReport, RejectReason, ReportKind};
+use ecod::wire::{GlobalMap, InvalidEntry, ObjectReport, RejectReason, ReportKind};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::task::AbortHandle;
 
@@ -390,7 +390,8 @@ impl FuserState {
     fn publish(&mut self, fused: Option<Fused>, now: Timestamp) {
         let Some(fused) = fused else { return };
         let _round = self.spans.round(&fused, &std::mem::take(&mut self.reports)).entered();
-        let Fused { epoch, round, map, verdicts, evidence, reputations } = fused;
+        let Fused { epoch, round, map, verdicts, evidence, reputations, left_out } = fused;
+        self.report_left_out(&left_out);
         self.recording.send(now, LogItem::Round(round));
         let has_verdicts = verdicts.is_some();
         if let Some(map) = map {
@@ -406,6 +407,18 @@ impl FuserState {
             self.keeper.send(ReputationKeeperMessage::SetForeign { round, votes });
         }
         self.tell_uplink(now);
+    }
+
+    /// Counts entries that this node left out of its map or verdicts, by the vehicles whose statements are in them.
+    fn report_left_out(&self, left_out: &[InvalidEntry]) {
+        for InvalidEntry { reason, contributors } in left_out {
+            self.counters.count(Event::EntryLeftOut);
+            for vehicle in contributors {
+                self.counters.troubles().note_about_with(vehicle.as_str(), TroubleKind::Misplaced, || {
+                    format!("the map leaves out an object of its reports, which would be out of bounds: {}", reason.in_words())
+                });
+            }
+        }
     }
 
     /// Tells the uplink when a vehicle has come or left.

@@ -29,7 +29,7 @@ use ecod::leadership::node::Input;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::reputation::{Evidence, ReputationConfig};
-use ecod::wire::{LedgerShare, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION};
+use ecod::wire::{LedgerShare, Payload, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
@@ -324,13 +324,14 @@ impl ReputationKeeperState {
         if self.published == now {
             return;
         }
-        let reputations = Reputations {
+        let mut reputations = Reputations {
             schema: SCHEMA_VERSION,
             aggregator: Some(epoch.leader.clone()),
             epoch: epoch.term,
             round: self.last_round,
             reputations: self.arguments.reputations.open().reputations(&self.arguments.reputation),
         };
+        reputations.remove_invalid();
         self.published = now;
         self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
     }

@@ -10,6 +10,7 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry};
 
+use crate::telemetry::line_throttle::LineThrottle;
 #[cfg(feature = "otel")]
 use crate::telemetry::otlp::Export;
 
@@ -73,7 +74,7 @@ pub fn start(format: LogFormat, is_service: bool, level: &str) -> Option<Export>
         LogFormat::Text | LogFormat::Auto => (text(), None),
     };
     let events = filter_fn(|metadata| metadata.is_event()).with_max_level_hint(LevelFilter::TRACE);
-    let mut layers = vec![layer.with_filter(filter.and(events)).boxed()];
+    let mut layers = vec![layer.with_filter(filter.and(events).and(LineThrottle::default())).boxed()];
     let exported = if is_service { export(&mut layers) } else { Ok(None) };
     tracing_subscriber::registry().with(layers).init();
     if let Some(error) = problem {

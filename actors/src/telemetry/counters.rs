@@ -53,6 +53,8 @@ pub enum Event {
     ReportLate,
     /// A new object was not tracked: there are too many tracks, or too many near it.
     ObjectRefused,
+    /// An entry of a map, of verdicts or of reputations was left out, because a value in it is out of bounds.
+    EntryLeftOut,
     /// Verdicts newer than all before were accepted.
     VerdictsAccepted,
     /// Reputations newer than all before were accepted.

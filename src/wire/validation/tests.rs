@@ -7,7 +7,7 @@ use uuid::Uuid;
 use super::*;
 use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
-use crate::wire::{Encoding, ForeignVotes, NeighbourObject, NodeState, Reputation, Role, decode, encode};
+use crate::wire::{Encoding, ForeignVotes, NeighbourObject, NodeState, Reputation, Role, decode, decode_entries, encode};
 
 fn edge() -> NodeName {
     NodeName::from_static("edge")
@@ -116,6 +116,27 @@ fn status() -> NodeStatus {
     }
 }
 
+/// Spoils an entry of a sound payload in every listed way and sends it: that entry alone is left out, and its contributor
+/// named.
+fn each_flawed_entry_is_left_out<T: Payload + PartialEq + std::fmt::Debug>(
+    sound: impl Fn() -> T,
+    without: impl Fn(&T) -> usize,
+    flaws: &[Flaw<T>],
+) {
+    for encoding in [Encoding::Cbor, Encoding::Compact] {
+        for (index, (spoil, expected)) in flaws.iter().enumerate() {
+            let mut payload = sound();
+            spoil(&mut payload);
+            let sent = encode(&payload, encoding);
+            let (received, invalid) = decode_entries::<T>(&sent, &Limits::default()).unwrap();
+            let reasons: Vec<_> = invalid.iter().map(|entry| entry.reason).collect();
+            assert_eq!(reasons, [*expected], "flaw {index} in {encoding:?}");
+            assert_eq!(invalid[0].contributors, [edge()], "flaw {index} in {encoding:?}");
+            assert_eq!(without(&received) + 1, without(&sound()), "flaw {index} in {encoding:?}");
+        }
+    }
+}
+
 /// A change that spoils a payload, and the reason that is then given.
 type Flaw<T> = (fn(&mut T), RejectReason);
 
@@ -144,6 +165,12 @@ fn each_flaw_of_a_map_has_its_reason() {
             (|m| m.round = u64::MAX, RejectReason::OutOfRange),
             (|m| m.fused_at_us = Timestamp(u64::MAX), RejectReason::OutOfRange),
             (|m| m.oldest_capture_us = Some(Timestamp(1 << 53)), RejectReason::OutOfRange),
+        ],
+    );
+    each_flawed_entry_is_left_out(
+        map,
+        |map| map.landmarks.len() + map.objects.len() + map.pose_corrections.len(),
+        &[
             (|m| m.landmarks[0].x_m = f64::NAN, RejectReason::NotFinite),
             (|m| m.landmarks[0].y_m = 1e9, RejectReason::NotFinite),
             (|m| m.landmarks[0].confidence = 1.01, RejectReason::ConfidenceOutOfRange),
@@ -152,6 +179,7 @@ fn each_flaw_of_a_map_has_its_reason() {
             (|m| m.landmarks[0].label = Some("a\tb".into()), RejectReason::InvalidLabel),
             (|m| m.objects[0].x_m = f64::NEG_INFINITY, RejectReason::NotFinite),
             (|m| m.objects[0].covariance_m2 = [-0.1, 0.0, 0.2], RejectReason::NotFinite),
+            (|m| m.objects[0].covariance_m2 = [1e21, 0.0, 0.2], RejectReason::NotFinite),
             (|m| m.objects[0].covariance_m2[1] = f64::INFINITY, RejectReason::NotFinite),
             (|m| m.objects[0].confidence = -0.5, RejectReason::ConfidenceOutOfRange),
             (|m| m.objects[0].label = "x".repeat(65).into(), RejectReason::InvalidLabel),
@@ -177,6 +205,12 @@ fn each_flaw_of_verdicts_has_its_reason() {
         &[
             (|v| v.epoch = 1 << 53, RejectReason::OutOfRange),
             (|v| v.fused_at_us = Timestamp(1 << 53), RejectReason::OutOfRange),
+        ],
+    );
+    each_flawed_entry_is_left_out(
+        verdicts,
+        |verdicts| verdicts.verdicts.len(),
+        &[
             (|v| v.verdicts[0].score = f64::NAN, RejectReason::NotFinite),
             (|v| v.verdicts[0].margin = f64::INFINITY, RejectReason::NotFinite),
             (|v| v.verdicts[0].margin = -0.02, RejectReason::OutOfRange),
@@ -194,10 +228,11 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
     fn edges(reputations: &mut Reputations) -> &mut Reputation {
         reputations.reputations.get_mut(&edge()).unwrap()
     }
-    each_flaw_has_its_reason(
+    each_flaw_has_its_reason(reputations, &[(|r| r.round = 1 << 53, RejectReason::OutOfRange)]);
+    each_flawed_entry_is_left_out(
         reputations,
+        |reputations| reputations.reputations.len(),
         &[
-            (|r| r.round = 1 << 53, RejectReason::OutOfRange),
             (|r| edges(r).score = f64::NAN, RejectReason::NotFinite),
             (|r| edges(r).score = 1.5, RejectReason::OutOfRange),
             (|r| edges(r).score = -0.1, RejectReason::OutOfRange),
@@ -278,16 +313,20 @@ proptest! {
         let first = map.landmarks[0].clone();
         map.landmarks = landmarks.iter().map(|&(x_m, confidence)| LandmarkState { x_m, confidence, ..first.clone() }).collect();
         if let Ok(map) = decode::<GlobalMap>(&encode(&map, Encoding::Cbor), &Limits::default()) {
-            prop_assert!(map.epoch <= MAX_INTEGER && !map.objects[0].label.is_empty());
-            let object = &map.objects[0];
-            prop_assert!(object.covariance_m2.iter().chain([&object.x_m, &object.y_m]).all(|n| n.is_finite()));
+            prop_assert!(map.epoch <= MAX_INTEGER);
+            for object in &map.objects {
+                prop_assert!(!object.label.is_empty());
+                prop_assert!(object.covariance_m2.iter().chain([&object.x_m, &object.y_m]).all(|n| n.is_finite()));
+            }
             prop_assert!(map.landmarks.iter().all(|l| l.x_m.is_finite() && (0.0..=1.0).contains(&l.confidence)));
         }
         let mut verdicts = Verdicts { epoch, ..verdicts() };
         verdicts.verdicts[0] = Verdict { score, margin, votes, landmark: text, ..verdicts.verdicts[0].clone() };
         if let Ok(verdicts) = decode::<Verdicts>(&encode(&verdicts, Encoding::Cbor), &Limits::default()) {
-            let verdict = &verdicts.verdicts[0];
-            prop_assert!(verdict.votes.values().chain([&verdict.score, &verdict.margin]).all(|n| n.is_finite()));
+            let numbers = verdicts.verdicts.iter().flat_map(|verdict| {
+                verdict.votes.values().chain([&verdict.score, &verdict.margin])
+            });
+            prop_assert!(numbers.copied().all(f64::is_finite));
         }
     }
 }
@@ -308,5 +347,7 @@ fn a_map_for_others_is_taken_with_a_place_on_earth_alone() {
     let mut message = cell_map();
     let object = FusedObject { confidence: 2.0, ..message.map.objects[0].clone() };
     message.map.neighbour_objects = vec![NeighbourObject { cell: edge(), age_s: 0.1, object }];
-    assert_eq!(rejected(message), RejectReason::ConfidenceOutOfRange);
+    let invalid = message.remove_invalid();
+    assert_eq!(invalid, [InvalidEntry { reason: RejectReason::ConfidenceOutOfRange, contributors: vec![edge()] }]);
+    assert_eq!(message.map, cell_map().map);
 }

@@ -9,11 +9,16 @@ use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::{Registry, Unit};
 
-/// Registers CPU time, memory and time of start, as far as the operating system tells them.
+use crate::telemetry::line_throttle::lines_left_out;
+
+/// Registers CPU time, memory and time of start, as far as the operating system tells them, and log lines left out.
 pub fn register(registry: &mut Registry, started_at: Timestamp) {
     let started = Gauge::<f64, AtomicU64>::default();
     started.set(started_at.micros() as f64 / 1e6);
     registry.register_with_unit("process_start_time", "Unix time at which the node started", Unit::Seconds, started);
+    let left_out = Counter::<u64>::default();
+    left_out.inc_by(lines_left_out());
+    registry.register("ecod_log_lines_left_out", "Log lines that the throttle of log lines left out", left_out);
     if let Ok(usage) = getrusage(UsageWho::RUSAGE_SELF) {
         let cpu = Counter::<f64, AtomicU64>::default();
         cpu.inc_by(seconds(usage.user_time()) + seconds(usage.system_time()));

@@ -9,7 +9,7 @@ use crate::observe::recorder::CounterReading;
 use crate::telemetry::counters::Event;
 
 /// Events that count as losses.
-const EVENTS: [Event; 25] = [
+const EVENTS: [Event; 26] = [
     Event::PublishRefused,
     Event::PublishTooLarge,
     Event::InboxFull,
@@ -17,6 +17,7 @@ const EVENTS: [Event; 25] = [
     Event::VoteIgnored,
     Event::ReportLate,
     Event::ObjectRefused,
+    Event::EntryLeftOut,
     Event::RecordDropped,
     Event::RecordFailed,
     Event::FrameFailed,

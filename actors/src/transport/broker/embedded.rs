@@ -344,14 +344,14 @@ async fn prepare(
         .max_packet_size(config.packet_bytes())
         .max_connections(config.max_clients)
         .max_mqueue_len(config.max_waiting)
-        .max_subscriptions(MAX_SUBSCRIPTIONS)
         .session_expiry_interval(MAX_SESSION_EXPIRY)
         .max_session_expiry_interval(MAX_SESSION_EXPIRY)
         .handshake_timeout(Duration::from_secs(5));
     let listener = match &policy {
         // Without anonymous clients, rmqtt asks the hooks about each login.
-        Some(_) => listener.laddr((Ipv4Addr::LOCALHOST, 0).into()).allow_anonymous(false),
-        None => listener.laddr(address).max_topic_levels(MAX_TOPIC_LEVELS),
+        // Subscriptions are limited by `SubscriptionQuota`: rmqtt would write a line of the log for each one that it refuses.
+        Some(_) => listener.laddr((Ipv4Addr::LOCALHOST, 0).into()).allow_anonymous(false).max_subscriptions(0),
+        None => listener.laddr(address).max_topic_levels(MAX_TOPIC_LEVELS).max_subscriptions(MAX_SUBSCRIPTIONS),
     };
     let listener = listener.bind().and_then(Listener::tcp)?;
     let own = listener.local_addr()?;

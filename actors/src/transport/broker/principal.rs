@@ -154,12 +154,12 @@ impl PrincipalRegistry {
         }
     }
 
-    /// Subscriptions of all connections of the same principal; 0 where each counts alone.
+    /// Subscriptions of all connections of the same principal, or of this connection where each counts alone.
     pub(super) fn subscriptions(&self, address: Option<SocketAddr>) -> usize {
         let connections = self.connections();
-        let key_of = |registered: &Registered| registered.principal.quota_key.clone();
-        let Some(key) = address.and_then(|address| connections.get(&address).and_then(key_of)) else { return 0 };
-        let own = connections.values().filter(|other| other.principal.quota_key.as_ref() == Some(&key));
+        let Some(connection) = address.and_then(|address| connections.get(&address)) else { return 0 };
+        let Some(key) = &connection.principal.quota_key else { return connection.subscriptions.len() };
+        let own = connections.values().filter(|other| other.principal.quota_key.as_ref() == Some(key));
         own.map(|connection| connection.subscriptions.len()).sum()
     }
 

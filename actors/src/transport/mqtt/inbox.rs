@@ -9,8 +9,8 @@ use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    Flaw, GlobalMap, Limits, NodeState, NodeStatus, RejectReason, ReportKind, Reputations, Topic, Topics, Verdicts,
-    check_fused_at, decode, decode_report, decode_share,
+    Flaw, GlobalMap, InvalidEntry, Limits, NodeState, NodeStatus, Payload, RejectReason, ReportKind, Reputations, Topic,
+    Topics, Verdicts, check_fused_at, decode, decode_entries, decode_report, decode_share,
 };
 use tokio::sync::Semaphore;
 use uuid::Uuid;
@@ -130,7 +130,7 @@ impl Inbox {
                 (Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?)), Origin::Claimed)
             }
             Topic::GlobalDetections => {
-                let map: GlobalMap = decode(payload, &self.limits)?;
+                let map: GlobalMap = self.decode_entries(payload, |map: &GlobalMap| Some(&map.aggregator))?;
                 if map.aggregator == self.node {
                     return Ok(self.echo());
                 }
@@ -139,7 +139,7 @@ impl Inbox {
                 (Incoming::Map(Arc::new(map)), origin)
             }
             Topic::GlobalVerdicts => {
-                let verdicts: Verdicts = decode(payload, &self.limits)?;
+                let verdicts: Verdicts = self.decode_entries(payload, |verdicts: &Verdicts| Some(&verdicts.aggregator))?;
                 if verdicts.aggregator == self.node {
                     return Ok(self.echo());
                 }
@@ -150,7 +150,8 @@ impl Inbox {
             Topic::Cell | Topic::Reputations if payload.is_empty() => return Ok(PacketOutcome::Done),
             Topic::Cell => (Incoming::Description(Arc::new(decode(payload, &self.limits)?)), Origin::Claimed),
             Topic::Reputations => {
-                let reputations: Reputations = decode(payload, &self.limits)?;
+                let reputations: Reputations =
+                    self.decode_entries(payload, |reputations: &Reputations| reputations.aggregator.as_ref())?;
                 if reputations.aggregator.as_ref() == Some(&self.node) {
                     return Ok(self.echo());
                 }
@@ -159,6 +160,25 @@ impl Inbox {
             }
         };
         Ok(self.deliver(via, message, origin, received_at))
+    }
+
+    /// Decodes a map, verdicts or reputations. Entries out of bounds are left out and counted; the rest is used.
+    fn decode_entries<T: Payload>(
+        &self,
+        payload: &[u8],
+        aggregator: impl FnOnce(&T) -> Option<&NodeName>,
+    ) -> Result<T, RejectReason> {
+        let (message, invalid) = decode_entries::<T>(payload, &self.limits)?;
+        let aggregator = aggregator(&message).filter(|aggregator| **aggregator != self.node);
+        if let Some(aggregator) = aggregator {
+            for InvalidEntry { reason, .. } in invalid {
+                self.counters.count(Event::EntryLeftOut);
+                self.counters.reject_message(reason, aggregator.as_str(), || {
+                    format!("an entry that it publishes is not used: {}", reason.in_words())
+                });
+            }
+        }
+        Ok(message)
     }
 
     /// Proof of a round's aggregator; `None` if the broker is not to be believed.
