@@ -5,8 +5,9 @@
 //! candidate set  -> brokers     description, retained on `cell`
 //! ```
 //!
-//! A description is taken if its stamp equals what a node that may lead states about itself. So the body needs no
-//! signature, and nobody else can change the cell. Nodes that never lead follow.
+//! A description is taken if its stamp equals what others state about themselves: an operator's node, or two nodes that
+//! may lead, or the leader where no description is known yet. So the body needs no signature, and no other single member
+//! can change the cell. Nodes that never lead follow.
 //!
 //! Call [`DescriptionExchange::hear`] for every authenticated stamp, [`DescriptionExchange::take`] for every body,
 //! [`DescriptionExchange::lead`] and [`DescriptionExchange::retain`] as leadership and membership change,
@@ -46,6 +47,10 @@ pub const PUBLISH_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Maximum number of doublings: a node that never has the description costs the others little.
 const MAX_DOUBLINGS: u32 = 5;
+
+/// Number of nodes that may lead on whose equal statements a description is taken that no operator's node states, because
+/// it is away. One of them alone cannot change the cell.
+const MIN_WITNESSES: usize = 2;
 
 /// Maximum number of bodies that wait for the word of a candidate; the oldest gives way.
 const MAX_UNPROVEN: usize = 4;
@@ -98,6 +103,8 @@ pub struct DescriptionStatement {
     pub stamp: DescriptionStamp,
     /// True if the node may lead.
     pub may_lead: bool,
+    /// True if the node is an operator's, which may set descriptions.
+    pub may_describe: bool,
     /// Its certificate in base64; none in a cell without certificates.
     pub certificate: Option<String>,
 }
@@ -285,13 +292,13 @@ impl DescriptionExchange {
         highest.min(MAX_INTEGER)
     }
 
-    /// Adopts the greatest body that a candidate states, unless too many were adopted lately.
+    /// Adopts the greatest body that enough candidates state, unless too many were adopted lately.
     fn adopt_proven(&mut self, now: Timestamp) {
         let authors = |stamp: DescriptionStamp| {
             self.statements.iter().filter(move |(_, statement)| statement.may_lead && statement.stamp == stamp)
         };
         let newer = self.unproven.iter().filter(|body| body.stamp() > self.stamp());
-        let proven = newer.filter_map(|body| Some((Arc::clone(body), authors(body.stamp()).next()?.0.clone())));
+        let proven = newer.filter_map(|body| Some((Arc::clone(body), self.witness(authors(body.stamp()))?.clone())));
         let Some((description, node)) = proven.max_by_key(|(body, _)| body.stamp()) else { return };
         let certificates = authors(description.stamp()).filter_map(|(_, statement)| statement.certificate.clone());
         let mut authors: Vec<_> = certificates.take(MAX_AUTHORS + 1).collect();
@@ -307,6 +314,21 @@ impl DescriptionExchange {
         }
         self.adopted.push_back(now);
         self.adopt(AttributedDescription { description, authors }, node);
+    }
+
+    /// The node on whose statement a description is adopted: of those that state it, an operator's, or the leader where no
+    /// description is known yet, or any where there are [`MIN_WITNESSES`].
+    fn witness<'a>(
+        &self,
+        authors: impl Iterator<Item = (&'a NodeName, &'a DescriptionStatement)> + Clone,
+    ) -> Option<&'a NodeName> {
+        let is_leader = |author: &NodeName| self.leader == Leader::Other(author.clone());
+        let has_none = self.current().is_none();
+        let entitled = authors
+            .clone()
+            .find(|(author, statement)| statement.may_describe || has_none && is_leader(author));
+        let many = || authors.clone().nth(MIN_WITNESSES - 1).and_then(|_| authors.clone().next());
+        entitled.or_else(many).map(|(author, _)| author)
     }
 
     fn adopt(&mut self, next: AttributedDescription, stated_by: NodeName) {

@@ -1,5 +1,6 @@
-//! The machine below a node: clock, state files, bounded slots, throttles, installed files.
+//! The machine below a node: clock, files, state files, bounded slots, throttles, installed files.
 
+pub mod bounded_file;
 pub mod cell_clock;
 pub mod clock;
 pub mod content_hash;

@@ -165,7 +165,9 @@ async fn what_is_set_at_one_node_holds_everywhere_within_two_rounds_and_loses_no
     let tracked = "[fusion.tracks]\nmode = \"on\"\n";
     let first = set(described(&["slot-0", "slot-1"], tracked), &euclid).await;
     assert!(
-        first.starts_with("version 1, hash ") && first.ends_with(", known locations: 2, set by euclid\n"),
+        first.starts_with("version 1, hash ")
+            && first.contains(", known locations: 2 (maps of up to ")
+            && first.ends_with(", set by euclid\n"),
         "{first}"
     );
     let reports = [reporting("gauss", &gauss), reporting("euclid", &euclid)];

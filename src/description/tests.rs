@@ -21,7 +21,7 @@ fn node(own: &str) -> DescriptionExchange {
 }
 
 fn word(may_lead: bool, stamp: DescriptionStamp) -> DescriptionStatement {
-    DescriptionStatement { stamp, may_lead, certificate: None }
+    DescriptionStatement { stamp, may_lead, may_describe: may_lead, certificate: None }
 }
 
 fn adopts(effects: &[DescriptionEffect]) -> bool {
@@ -49,6 +49,32 @@ fn a_body_is_taken_on_a_candidates_word_alone_in_either_order() {
         assert_eq!(taken, [Adopt { description: Arc::clone(&new), stated_by: name("edge") }]);
         assert_eq!(euclid.stamp(), new.stamp());
     }
+}
+
+/// Statement of a node that may lead and is no operator's.
+fn candidates(stamp: DescriptionStamp) -> DescriptionStatement {
+    DescriptionStatement { may_describe: false, ..word(true, stamp) }
+}
+
+#[test]
+fn one_candidate_that_is_no_operators_does_not_change_the_cell_and_two_pass_a_description_on() {
+    let saved = DescriptionHistory::of(Some(described(1, "right")));
+    let mut euclid = DescriptionExchange::new(name("euclid"), true, saved);
+    let new = described(2, "new");
+    euclid.take(Arc::clone(&new), at(0));
+    euclid.lead(Some(&name("gauss")), at(1));
+    assert!(!adopts(&euclid.hear(&name("gauss"), candidates(new.stamp()), at(2))), "the leader alone");
+    assert!(!adopts(&euclid.hear(&name("gauss"), candidates(new.stamp()), at(3))), "the same again");
+    assert!(adopts(&euclid.hear(&name("turing"), candidates(new.stamp()), at(4))), "two who have it from its author");
+}
+
+#[test]
+fn a_node_without_a_description_gets_it_from_its_leader_while_the_operators_node_is_away() {
+    let (mut euclid, right) = (node("euclid"), described(6, "right"));
+    euclid.take(Arc::clone(&right), at(0));
+    assert!(!adopts(&euclid.hear(&name("turing"), candidates(right.stamp()), at(1))));
+    euclid.lead(Some(&name("turing")), at(2));
+    assert!(adopts(&euclid.tick(at(3))));
 }
 
 #[test]

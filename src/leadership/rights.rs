@@ -11,25 +11,34 @@ pub struct Rights {
     pub role: Role,
     /// The highest priority.
     pub priority: u8,
+    /// True for an operator's node: it may set the description of the cell.
+    pub may_describe: bool,
 }
 
-/// Rights of a node that is issued a certificate for a role, with the priority that nodes have by default.
+/// Rights of a node that is issued a certificate for a role, with the priority that nodes have by default. The node is no
+/// operator's.
 impl From<Role> for Rights {
     fn from(role: Role) -> Self {
-        Self { role, priority: ElectionConfig::default().priority }
+        Self { role, priority: ElectionConfig::default().priority, may_describe: false }
     }
 }
 
 impl Rights {
     /// The rights of all nodes in a cell without certificates: a node is what it declares.
-    pub const ALL: Self = Self { role: Role::Edge, priority: u8::MAX };
+    pub const ALL: Self = Self { role: Role::Edge, priority: u8::MAX, may_describe: true };
 
     /// The rights of a node that never leads.
-    pub const NONE: Self = Self { role: Role::Cav, priority: 0 };
+    pub const NONE: Self = Self { role: Role::Cav, priority: 0, may_describe: false };
 
     /// True if a node may lead at all.
     pub fn may_lead(self) -> bool {
         self.role != Role::Cav
+    }
+
+    /// The same rights for an operator's node.
+    #[must_use]
+    pub fn of_operator(self) -> Self {
+        Self { may_describe: true, ..self }
     }
 
     /// True if a node may declare this role and priority. A priority says nothing about a node that never leads.
@@ -76,7 +85,7 @@ mod tests {
 
     #[test]
     fn nobody_may_declare_more_than_the_certificate_says() {
-        let auto = Rights { role: Role::Auto, priority: 100 };
+        let auto = Rights { priority: 100, ..Rights::from(Role::Auto) };
         assert!(auto.allow(Role::Auto, 100) && auto.allow(Role::Auto, 7) && auto.allow(Role::Cav, 255));
         assert!(!auto.allow(Role::Auto, 101) && !auto.allow(Role::Edge, 100));
         assert!(Rights::ALL.allow(Role::Edge, 255) && !Rights::NONE.allow(Role::Auto, 0));

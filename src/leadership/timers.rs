@@ -16,6 +16,7 @@
 //! | [`ELECTED_SILENCE`] | 250 ms | above two rounds | one late round is no silence |
 //! | [`SUCCESSOR_CREDIT`] | 500 ms | twice [`ELECTED_SILENCE`] | word of the election comes within it |
 //! | [`EPOCH_MEMORY`] | 3 s | above [`MAX_ROUND_AGE`] and [`SUCCESSOR_CREDIT`] | a forged epoch ends, a queued round does not return |
+//! | [`LEADER_DELAY_MEMORY`] | 10 s | above [`EPOCH_MEMORY`] | leaders that alternate make no old round fresh |
 //! | [`MAX_ROUND_AGE`] | 1 s | above [`MAX_ROUND_WAIT`] | the rest is the way itself |
 //! | [`MAX_ROUND_WAIT`] | 900 ms | above [`SUCCESSOR_CREDIT`] | a failover alone makes no round stale |
 //! | [`MAX_ADOPTED_MAP_AGE`] | 1 s | [`MAX_ROUND_AGE`] | a new leader goes on from maps that others may still accept |
@@ -62,6 +63,9 @@ pub const MAX_ADOPTED_MAP_AGE: Duration = Duration::from_secs(1);
 
 /// Time for which rounds arrive no faster than they were made before their delay counts as that of a live stream.
 pub const LIVE_STREAM_TIME: Duration = Duration::from_millis(150);
+
+/// Time after its last round for which the delay of a leader's rounds is remembered.
+pub const LEADER_DELAY_MEMORY: Duration = Duration::from_secs(10);
 
 /// Time for which the newest round outranks rounds of lower epochs. It bounds how long a forged epoch silences a leader.
 pub const EPOCH_MEMORY: Duration = Duration::from_secs(3);
@@ -265,6 +269,7 @@ mod tests {
             (2 * round, ELECTED_SILENCE, "one late round is no silence"),
             (ELECTED_SILENCE, SUCCESSOR_CREDIT, "word of the election comes in time"),
             (SUCCESSOR_CREDIT, EPOCH_MEMORY, "forged epochs end"),
+            (EPOCH_MEMORY, LEADER_DELAY_MEMORY, "a leader that comes back is known"),
             (MAX_ROUND_AGE, EPOCH_MEMORY, "no queued round returns"),
             (MAX_ROUND_WAIT, MAX_ROUND_AGE, "the way takes the rest"),
             (SUCCESSOR_CREDIT, MAX_ROUND_WAIT, "a failover makes no round stale"),

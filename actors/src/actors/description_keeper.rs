@@ -147,7 +147,9 @@ impl Actor for DescriptionKeeper {
             state.carry_out(effects);
         }
         let effects = match message {
-            DescriptionKeeperMessage::Hear { from, may_lead, stamp } => state.hear(&from, may_lead, stamp, now),
+            DescriptionKeeperMessage::Hear { from, may_lead, may_describe, stamp } => {
+                state.hear(&from, may_lead, may_describe, stamp, now)
+            }
             DescriptionKeeperMessage::Take { delivery } if is_intact(&delivery.message) => {
                 state.exchange.take(Arc::clone(&delivery.message), now)
             }
@@ -187,6 +189,7 @@ impl DescriptionKeeperState {
         &mut self,
         from: &NodeName,
         may_lead: bool,
+        may_describe: bool,
         stamp: DescriptionStamp,
         now: Timestamp,
     ) -> Vec<DescriptionEffect> {
@@ -197,7 +200,7 @@ impl DescriptionKeeperState {
         if self.credentials.is_some() && certificate.is_none() {
             return Vec::new();
         }
-        self.exchange.hear(from, DescriptionStatement { stamp, may_lead, certificate }, now)
+        self.exchange.hear(from, DescriptionStatement { stamp, may_lead, may_describe, certificate }, now)
     }
 
     /// Goes back to the description before those of revoked nodes, when the list has changed. The last word of a node may

@@ -14,6 +14,7 @@ use crate::camera::frame_source::images;
 use crate::camera::image_codec;
 use crate::camera::image_size::ImageSize;
 use crate::camera::lens::Lens;
+use crate::platform::bounded_file;
 
 /// Minimum number of photographs that show the whole board.
 pub const MIN_VIEWS: usize = 5;
@@ -183,7 +184,7 @@ impl Calibration {
     /// # Errors
     /// [`CalibrationError::File`] or [`CalibrationError::Malformed`].
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
-        let text = std::fs::read_to_string(path).map_err(|error| CalibrationError::File(path.to_owned(), error))?;
+        let text = bounded_file::read_text(path).map_err(|error| CalibrationError::File(path.to_owned(), error))?;
         let malformed = |reason| CalibrationError::Malformed(path.to_owned(), reason);
         let read: Self = toml::from_str(&text).map_err(|e| malformed(e.to_string()))?;
         let focal = [read.fx, read.fy].iter().all(|f| f.is_finite() && *f > 0.0);

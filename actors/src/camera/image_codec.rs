@@ -9,6 +9,8 @@ use opencv::core::{Mat, Vec3b};
 use opencv::imgproc;
 use opencv::prelude::*;
 
+use crate::platform::bounded_file;
+
 use super::image_size::ImageSize;
 
 /// Error of reading or writing an image.
@@ -35,12 +37,15 @@ pub enum ImageError {
 /// than the machine has.
 const MAX_DECODED_BYTES: u64 = 320_000_000;
 
+/// Maximum size of an image file in bytes.
+const MAX_FILE_BYTES: u64 = 256 * 1024 * 1024;
+
 /// Reads an image file as [`decode`] does.
 ///
 /// # Errors
 /// [`ImageError::File`] or those of [`decode`].
 pub fn read(path: &Path) -> Result<Mat, ImageError> {
-    decode(&std::fs::read(path)?)
+    decode(&bounded_file::read(path, MAX_FILE_BYTES)?)
 }
 
 /// Image in BMP, JPEG, PNG, PNM or WebP as 8-bit BGR without transparency, turned upright as its EXIF data says.

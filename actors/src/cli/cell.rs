@@ -1,8 +1,6 @@
 //! `ecod-node cell`: the settings that all nodes of a cell share, at the door of one of them.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::Read;
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -18,6 +16,7 @@ use uuid::Uuid;
 
 use super::{Failure, print};
 use crate::node::config::{NodeConfig, SharedConfig};
+use crate::platform::bounded_file;
 use crate::transport::mqtt::MqttVersion;
 use crate::transport::mqtt::connection::{Client, Connection, MaxQos, Packet, Retention, open};
 use crate::transport::pki::{BrokerTrust, OBSERVER_MARK};
@@ -78,10 +77,14 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
     match command {
         CellCommand::Set { file, door } => {
             let text = read(file)?;
-            let places = SharedConfig::parse(&text).map_err(Failure::usage)?.landmarks.len();
+            let shared = SharedConfig::parse(&text).map_err(Failure::usage)?;
+            let (places, cost) = (shared.landmarks.len(), shared.cost());
             let described = DoorClient::open(door).await?.set(&text).await?;
             let CellDescription { version, hash, set_by, .. } = described;
-            Ok(print(&format!("version {version}, hash {hash}, known locations: {places}, set by {set_by}\n"))?)
+            let cost = format!("maps of up to {} bytes, {:.0} bytes/s", cost.map_bytes, cost.bytes_per_s);
+            Ok(print(&format!(
+                "version {version}, hash {hash}, known locations: {places} ({cost}), set by {set_by}\n"
+            ))?)
         }
         CellCommand::Show { door } => Ok(print(&DoorClient::open(door).await?.show().await?)?),
         CellCommand::Diff { file, door } => {
@@ -110,10 +113,9 @@ fn read(file: &Path) -> Result<String, Failure> {
 
 /// The text of a file that is small enough for a description; no more of a larger one is read.
 fn read_bounded(file: &Path) -> anyhow::Result<String> {
-    let mut bytes = Vec::new();
-    File::open(file)?.take(MAX_DESCRIPTION_BYTES as u64 + 1).read_to_end(&mut bytes)?;
-    ensure!(bytes.len() <= MAX_DESCRIPTION_BYTES, "a description has at most {MAX_DESCRIPTION_BYTES} bytes");
-    Ok(String::from_utf8(bytes)?)
+    let text = bounded_file::read_text(file)?;
+    ensure!(text.len() <= MAX_DESCRIPTION_BYTES, "a description has at most {MAX_DESCRIPTION_BYTES} bytes");
+    Ok(text)
 }
 
 /// A program's connection to a node.

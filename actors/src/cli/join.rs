@@ -9,7 +9,6 @@ use std::time::Duration;
 use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod::leadership::Rights;
-use ecod::leadership::election::ElectionConfig;
 use ecod::model::names::NodeName;
 use ecod::wire::Role;
 use nix::ifaddrs::getifaddrs;
@@ -22,6 +21,7 @@ use tokio::time::Instant;
 use super::pki::role_named;
 use super::{Failure, print, run};
 use crate::node::config::NodeConfig;
+use crate::platform::bounded_file;
 use crate::platform::clock;
 use crate::transport::gossip::DEFAULT_PORT;
 use crate::transport::invitation::{CityFiles, Host, Token, Visit, Welcome, redeem};
@@ -51,9 +51,13 @@ pub(super) struct InviteArguments {
     /// Names of the nodes that may join, each on the machine that gets its token
     #[arg(required = true, value_name = "NAME")]
     names: Vec<NodeName>,
-    /// Highest role of these nodes; with `cav` they can never lead, with `auto` not as an edge
-    #[arg(long, default_value = "auto", value_parser = ["auto", "cav", "edge"])]
+    /// Highest role of these nodes: `auto` may take over the lead, `edge` is preferred for it, `cav` never leads. Invite at
+    /// least one `auto`, so that the cell goes on without its first machine
+    #[arg(long, default_value = "cav", value_parser = ["auto", "cav", "edge"])]
     role: String,
+    /// These nodes are an operator's: the cell's description may be set there
+    #[arg(long)]
+    operator: bool,
     /// Hours for which this command waits for them
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=720))]
     hours: u32,
@@ -124,10 +128,10 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
     };
     let mut authority = authority.map_err(|error| anyhow!(error))?;
     let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
-    authority.issue(name, rights(role), valid, now).map_err(|error| anyhow!(error))?;
+    authority.issue(name, Rights::from(role).of_operator(), valid, now).map_err(|error| anyhow!(error))?;
     let (certificate, key) = authority.files_of(name);
     let read =
-        |path: PathBuf| std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()));
+        |path: PathBuf| bounded_file::read_text(&path).with_context(|| format!("cannot read {}", path.display()));
     let key_text = read(key.clone())?;
     let welcome = Welcome {
         cell: cell.clone(),
@@ -185,7 +189,8 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
         let mut host = Host::new(authority, directory.cell_key()?, seeds, city)?;
         let role = role_named(&arguments.role);
         for name in &arguments.names {
-            let token = host.invite(name, rights(role), addresses.clone())?;
+            let rights = Rights { may_describe: arguments.operator, ..Rights::from(role) };
+            let token = host.invite(name, rights, addresses.clone())?;
             print(&format!("on {name}'s machine:\n\n    sudo ecod-node join {token}\n\n"))?;
         }
         let reached: Vec<String> = addresses.iter().map(ToString::to_string).collect();
@@ -265,10 +270,6 @@ fn read_token(argument: &str) -> anyhow::Result<Token> {
         std::io::stdin().read_line(&mut line)?;
     }
     Ok(line.parse()?)
-}
-
-fn rights(role: Role) -> Rights {
-    Rights { role, priority: ElectionConfig::default().priority }
 }
 
 /// A key of 64 hexadecimal digits.

@@ -1,8 +1,8 @@
 //! Files of lines, read in bounded memory; `-` stands for standard input and output.
 
 use std::fs::{self, File};
-use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
-use std::os::unix::fs::MetadataExt;
+use std::io::{self, BufRead, BufReader, BufWriter, IsTerminal, Read, Write};
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -49,8 +49,13 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
         return Ok(Box::new(io::stdin().lock()));
     }
     let file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
-    if file.metadata().is_ok_and(|metadata| metadata.is_dir()) {
+    let kind = file.metadata().with_context(|| format!("cannot read {}", path.display()))?.file_type();
+    if kind.is_dir() {
         bail!("cannot read {}: it is a directory", path.display());
+    }
+    // A pipe ends with its writer; a device may never end.
+    if kind.is_block_device() || kind.is_char_device() && !file.is_terminal() {
+        bail!("cannot read {}: it is a device, not a file", path.display());
     }
     let mut source = BufReader::with_capacity(1 << 18, file);
     if source.fill_buf().is_ok_and(|begin| begin.starts_with(BYTE_ORDER_MARK)) {

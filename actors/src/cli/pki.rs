@@ -41,6 +41,9 @@ pub(super) enum PkiCommand {
         /// Highest priority of the node in the election, its key `election.priority`
         #[arg(long, default_value_t = ElectionConfig::default().priority)]
         priority: u8,
+        /// The node is an operator's: the cell's description may be set there
+        #[arg(long)]
+        operator: bool,
         /// Validity of the certificate in days
         #[arg(long, default_value_t = DEFAULT_DAYS, value_parser = clap::value_parser!(u32).range(1..=3650))]
         days: u32,
@@ -119,7 +122,7 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
         }
         PkiCommand::Issue { ca, node, role, priority, days } => {
             let mut authority = open(&ca.dir, false)?;
-            let rights = Rights { role: role_named(role), priority: *priority };
+            let rights = Rights { role: role_named(role), priority: *priority, may_describe: *operator };
             authority.issue(node, rights, validity(*days), now).map_err(failure)?;
             configuration(&authority, node)
         }

@@ -1,4 +1,4 @@
-//! Messages to the actor of this name.
+//! Requests to the actor `DescriptionKeeper`, from the election, the gateway and the node's local broker.
 
 use std::sync::Arc;
 
@@ -16,6 +16,8 @@ pub enum DescriptionKeeperMessage {
         from: NodeName,
         /// True if it may lead.
         may_lead: bool,
+        /// True if it is an operator's, which may set descriptions.
+        may_describe: bool,
         /// The version and hash that it has.
         stamp: DescriptionStamp,
     },

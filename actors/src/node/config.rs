@@ -34,6 +34,7 @@ use crate::camera::config::CameraConfig;
 use crate::camera::vehicle_pose::PoseConfig;
 use crate::observe::dashboard::DashboardConfig;
 use crate::observe::recorder::RecordConfig;
+use crate::platform::bounded_file;
 use crate::transport::broker::BrokerConfig;
 use crate::transport::gossip::MembershipConfig;
 use crate::transport::mqtt::{DataPlane, MqttConfig, Security, SecurityError};
@@ -159,6 +160,28 @@ pub enum LoadError {
     OutOfRange(#[from] ConfigError),
 }
 
+/// Last line of a configuration that `init` or `join` has written.
+pub(crate) const END_OF_CONFIGURATION: &str = "# end of node.toml";
+
+/// Checks that a configuration is a file with content, and not cut off: `init` and `join` say in the file how it ends.
+fn check_whole(path: &std::path::Path) -> Result<(), LoadError> {
+    let text = bounded_file::read_text(path);
+    let text = text.map_err(|source| LoadError::Unreadable { path: path.into(), source })?;
+    let path = path.display();
+    if text.trim().is_empty() {
+        let remedy = "write its keys, or start the node without `--config`";
+        return Err(LoadError::Malformed(format!("the configuration {path} is empty: {remedy}")));
+    }
+    let names_end = text.lines().any(|line| line.starts_with('#') && line.contains(&format!("`{END_OF_CONFIGURATION}`")));
+    if names_end && !text.lines().any(|line| line.trim_end() == END_OF_CONFIGURATION) {
+        let remedy = "restore the file, or run `ecod-node join` again with a new token";
+        return Err(LoadError::Malformed(format!(
+            "the configuration {path} is cut off: its line `{END_OF_CONFIGURATION}` is missing: {remedy}"
+        )));
+    }
+    Ok(())
+}
+
 impl NodeConfig {
     /// Reads the file, if any, lays the environment and `flags` over it, and checks the result.
     ///
@@ -167,7 +190,7 @@ impl NodeConfig {
     pub fn load(file: Option<&std::path::Path>, flags: &impl Serialize) -> Result<Self, LoadError> {
         let mut stated = Figment::new();
         if let Some(path) = file {
-            std::fs::metadata(path).map_err(|source| LoadError::Unreadable { path: path.into(), source })?;
+            check_whole(path)?;
             stated = stated.merge(Toml::file_exact(path));
         }
         let stated = stated.merge(environment()).merge(Serialized::defaults(flags));
@@ -190,7 +213,7 @@ impl NodeConfig {
     /// # Errors
     /// [`LoadError`] naming the file, or the key, the value and what is allowed.
     pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
-        let text = std::fs::read_to_string(file);
+        let text = bounded_file::read_text(file);
         let text = text.map_err(|source| LoadError::Unreadable { path: file.into(), source })?;
         if let Ok(shared) = SharedConfig::parse(&text) {
             let mut config = Self::default();

@@ -8,6 +8,7 @@ use ecod::wire::{CellDescription, DescriptionStatus, Limits, Payload, SCHEMA_VER
 use super::NodeError;
 use super::config::NodeConfig;
 use crate::observe::readiness::{SharedFacts, patience};
+use crate::platform::bounded_file;
 use crate::platform::content_hash::{content_hash, is_intact};
 use crate::platform::state_file::StateFile;
 
@@ -33,7 +34,7 @@ impl HeldDescription {
         let Some(path) = config.description.as_ref().filter(|_| config.may_lead()) else {
             return Ok(Self { description: saved.map(Arc::new), problem: None });
         };
-        let text = std::fs::read_to_string(path)
+        let text = bounded_file::read_text(path)
             .map_err(|error| NodeError::Failed(format!("key `description`: {}: {error}", path.display())))?;
         if let Some(saved) = saved {
             if saved.text != text {

@@ -9,7 +9,7 @@
 //! it. Files of early versions are JSON alone; they are read as they are, and get a checksum when they are next written.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Read, Write};
+use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
@@ -17,6 +17,8 @@ use ecod::model::names::NodeName;
 use ring::digest::{SHA256, digest};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+
+use crate::platform::bounded_file;
 
 /// File of one kind of state of a node.
 #[derive(Debug, Clone)]
@@ -58,16 +60,14 @@ impl StateFile {
 
     /// The state written last, if it is undamaged and `is_ours`. Any other content is set aside with a warning.
     pub fn load<T: DeserializeOwned>(&self, is_ours: impl FnOnce(&T) -> bool) -> Option<T> {
-        let mut bytes = Vec::new();
-        let read = File::open(&self.path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
-        match read {
-            Ok(_) => {}
+        let bytes = match bounded_file::read(&self.path, MAX_BYTES) {
+            Ok(bytes) => bytes,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return None,
             Err(error) => {
                 tracing::warn!(path = %self.path.display(), %error, "state not read");
                 return None;
             }
-        }
+        };
         let why = match parse(&bytes) {
             Ok(state) if is_ours(&state) => return Some(state),
             Ok(_) => "it belongs to another node or version".into(),

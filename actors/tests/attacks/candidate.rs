@@ -15,7 +15,7 @@ use tokio::time::sleep;
 
 use crate::cell::{CANDIDATE, CELL, LEADER, Target};
 use crate::client::{log_in, publish, send_for_ever};
-use crate::description::set_and_undone;
+use crate::description::set_without_right;
 use crate::insider::Insider;
 use crate::row::{Means, Row, UNHARMED};
 use crate::shares::inverted;
@@ -82,7 +82,7 @@ pub(crate) const ROWS: &[Row] = &[
         deeds: (5, "looks"),
         bar: UNHARMED,
         quick: false,
-        run: |target| Box::pin(set_and_undone(target)),
+        run: |target| Box::pin(set_without_right(target)),
     },
 ];
 

@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
+use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::Role;
@@ -156,7 +157,8 @@ impl Cell {
         let seeds: Vec<SocketAddr> = addresses.iter().map(|(_, gossip)| *gossip).collect();
         let mut nodes = Vec::new();
         for (index, ((name, role), (broker, gossip))) in NODES.into_iter().zip(addresses).enumerate() {
-            let mut tls = issue(&mut authority, name, role)?;
+            let rights = Rights { may_describe: name == LEADER, ..Rights::from(role) };
+            let mut tls = issue(&mut authority, name, rights)?;
             let directory = home.join(name);
             fs::create_dir(&directory)?;
             if name == LEADER {
@@ -360,9 +362,9 @@ fn grey_frame() -> Vec<u8> {
     [header.as_bytes(), &vec![128; width * height * 3]].concat()
 }
 
-fn issue(authority: &mut Authority, name: &str, role: Role) -> anyhow::Result<TlsConfig> {
+fn issue(authority: &mut Authority, name: &str, rights: impl Into<Rights>) -> anyhow::Result<TlsConfig> {
     let name = NodeName::new(name)?;
-    authority.issue(&name, role, Duration::from_secs(86_400), clock::now())?;
+    authority.issue(&name, rights, Duration::from_secs(86_400), clock::now())?;
     let (certificate, key) = authority.files_of(&name);
     Ok(TlsConfig {
         ca: authority.ca(),

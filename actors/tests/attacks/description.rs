@@ -1,9 +1,8 @@
-//! A description that a candidate sets, and that goes with its certificate.
+//! A description that a candidate sets without the right to do so.
 
 use std::fs;
 use std::path::Path;
 use std::process::Command;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{bail, ensure};
@@ -11,24 +10,19 @@ use ecod::description::MAX_VERSION_STEP;
 use ecod::leadership::election::Body;
 use ecod::model::names::NodeName;
 use ecod::wire::{CellDescription, Encoding, Role, SCHEMA_VERSION, encode};
-use ecod_actors::platform::clock;
 use ecod_actors::platform::content_hash::content_hash;
-use ecod_actors::transport::pki::Authority;
 use tokio::task::spawn_blocking;
 use tokio::time::sleep;
 
 use crate::candidate::{join, publish_for_ever};
-use crate::cell::{CANDIDATE, CELL, LANDMARK, LEADER, NODES, OBSERVED, Target, program};
+use crate::cell::{CELL, LANDMARK, LEADER, NODES, OBSERVED, Target, program};
 use crate::client::publish;
 
 /// Maximum time until all nodes have a description.
 const PATIENCE: Duration = Duration::from_secs(6);
 
-/// Longest time from a changed revocation list until no node uses anything of the revoked one.
-const GONE_WITHIN: Duration = Duration::from_secs(2);
-
-/// The attacker never stops. The owner revokes its certificate: the right description counts again, and stays.
-pub(crate) async fn set_and_undone(target: Target) -> anyhow::Result<()> {
+/// The attacker never stops. All nodes use the right description all the time.
+pub(crate) async fn set_without_right(target: Target) -> anyhow::Result<()> {
     let file = target.home.join("right.toml");
     fs::write(&file, LANDMARK)?;
     cell(&target, LEADER, &["set".as_ref(), &file]).await?;
@@ -39,10 +33,9 @@ pub(crate) async fn set_and_undone(target: Target) -> anyhow::Result<()> {
     let set_by = NodeName::from_static(LEADER);
     let hash = content_hash(&set_by, &text);
     let forged = CellDescription { schema: SCHEMA_VERSION, version: 1 + MAX_VERSION_STEP, hash, set_by, text };
-    let attack = set_for_ever(Target { deeds: Arc::default(), ..target.clone() }, &forged);
     tokio::select! {
-        ended = attack => ended,
-        undone = undo(&target, &forged, &right) => undone,
+        ended = set_for_ever(target.clone(), &forged) => ended,
+        changed = watch(&target, &right) => changed,
     }
 }
 
@@ -54,16 +47,11 @@ async fn set_for_ever(target: Target, forged: &CellDescription) -> anyhow::Resul
     tokio::try_join!(member.repeat(1, None, status), publish_for_ever(&target, &packet)).map(drop)
 }
 
-/// One deed is a look at the cell, in which all nodes use the right description and no other.
-async fn undo(target: &Target, forged: &CellDescription, right: &str) -> anyhow::Result<()> {
-    used_by_all(target, &forged.hash.to_string()).await?;
-    Authority::open(&target.home.join("pki"))?.revoke(&NodeName::from_static(CANDIDATE), clock::now())?;
-    fs::copy(target.home.join("pki/revoked.pem"), target.home.join(LEADER).join("revoked.pem"))?;
-    sleep(GONE_WITHIN).await;
+/// Fails as soon as a node does not use the right description.
+async fn watch(target: &Target, right: &str) -> anyhow::Result<()> {
     loop {
         let shown = cell(target, OBSERVED, &["show".as_ref()]).await?;
         ensure!(is_used_by_all(&shown, right), "the right description does not count: {shown}");
-        target.did(1);
         sleep(Duration::from_millis(500)).await;
     }
 }

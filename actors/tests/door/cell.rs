@@ -103,7 +103,7 @@ impl Cell {
         config.dashboard.enabled = false;
         if let Some(authority) = &mut self.authority {
             let (node, year) = (NodeName::new(name).unwrap(), Duration::from_secs(365 * 86_400));
-            authority.issue(&node, Rights { role, priority: u8::MAX }, year, clock::now()).unwrap();
+            authority.issue(&node, Rights { priority: u8::MAX, ..Rights::from(role) }, year, clock::now()).unwrap();
             config.tls = Some(files(authority, &node));
         }
         adjust(&mut config);

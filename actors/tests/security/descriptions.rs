@@ -1,5 +1,8 @@
 //! A candidate that describes the cell falsely.
 
+use std::time::Duration;
+
+use ecod::leadership::Rights;
 use ecod::wire::Role;
 use ecod_actors::messages::description_keeper::DescriptionKeeperMessage;
 use ecod_actors::node::NodeHandle;
@@ -23,10 +26,11 @@ fn has_place(node: &NodeHandle, place: &str) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_candidate_described_is_gone_when_it_is_revoked_and_the_description_before_counts() {
+async fn what_an_operators_node_described_is_gone_when_it_is_revoked_and_the_description_before_counts() {
     let mut pki = Pki::new();
-    let files = [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Cav)]
-        .map(|(node, role)| pki.issue(node, role, DAY));
+    let operators = [("edge", Role::Edge), ("euclid", Role::Auto)];
+    let [edge, euclid] = operators.map(|(node, role)| pki.issue(node, Rights::from(role).of_operator(), DAY));
+    let files = [edge, euclid, pki.issue("gauss", Role::Cav, DAY)];
     let [edge, euclid, gauss] = start_cell(files).await;
     let all_have = |place: &'static str| [&edge, &gauss].into_iter().all(|node| has_place(node, place));
     describe(&edge, "right");
@@ -40,6 +44,23 @@ async fn what_a_candidate_described_is_gone_when_it_is_revoked_and_the_descripti
     let written = Instant::now();
     until("the right description again", || all_have("right")).await;
     assert!(written.elapsed() < GONE_WITHIN, "{:?}", written.elapsed());
+    for node in [edge, euclid, gauss] {
+        node.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_candidate_that_is_no_operators_changes_no_other_nodes_description() {
+    let mut pki = Pki::new();
+    let edge = pki.issue("edge", Rights::from(Role::Edge).of_operator(), DAY);
+    let files = [edge, pki.issue("euclid", Role::Auto, DAY), pki.issue("gauss", Role::Cav, DAY)];
+    let [edge, euclid, gauss] = start_cell(files).await;
+    describe(&edge, "right");
+    until("the right description", || [&edge, &euclid, &gauss].iter().all(|node| has_place(node, "right"))).await;
+    // Its own door refuses this; a program that was changed does not.
+    describe(&euclid, "false");
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    assert!([&edge, &gauss].iter().all(|node| has_place(node, "right")));
     for node in [edge, euclid, gauss] {
         node.stop().await;
     }

@@ -4,6 +4,7 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
+use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::wire::{Limits, Role, Topics};
 use ecod_actors::platform::clock;
@@ -64,8 +65,8 @@ impl Pki {
     }
 
     /// The files of a new certificate.
-    pub(crate) fn issue(&mut self, name: &str, role: Role, valid: Duration) -> TlsConfig {
-        self.authority.issue(&node(name), role, valid, clock::now()).unwrap();
+    pub(crate) fn issue(&mut self, name: &str, rights: impl Into<Rights>, valid: Duration) -> TlsConfig {
+        self.authority.issue(&node(name), rights, valid, clock::now()).unwrap();
         self.files(&self.authority, name)
     }
 

@@ -424,8 +424,8 @@ fn is_followed(rights: Rights) -> bool {
 #[test]
 fn a_beat_of_a_node_that_may_not_lead_is_not_followed() {
     assert!(is_followed(Rights::ALL));
-    assert!(is_followed(Rights { role: Role::Edge, priority: 100 }));
-    assert!(is_followed(Rights { role: Role::Auto, priority: 50 }), "as an auto node");
+    assert!(is_followed(Rights { priority: 100, ..Rights::from(Role::Edge) }));
+    assert!(is_followed(Rights { priority: 50, ..Rights::from(Role::Auto) }), "as an auto node");
     assert!(!is_followed(Rights::NONE));
 }
 
@@ -455,7 +455,7 @@ fn a_declared_role_beyond_the_certificate_takes_no_lead() {
                 from: name("zeno"),
                 ..scene.message(epoch, Body::Status { over: None, no_login: Vec::new() })
             };
-            let rights = Rights { role, priority: 100 };
+            let rights = Rights { priority: 100, ..Rights::from(role) };
             scene.take(Input::Receive { from: name("zeno"), rights, message });
             scene.run_for(50);
         }

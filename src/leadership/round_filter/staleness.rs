@@ -4,15 +4,17 @@ use std::time::Duration;
 
 use crate::admission::live_stream::LiveStream;
 use crate::admission::minimum_delay::MinimumDelay;
-use crate::leadership::timers::{LIVE_STREAM_TIME, MAX_ROUND_AGE, MAX_ROUND_WAIT};
+use crate::leadership::timers::{LEADER_DELAY_MEMORY, LIVE_STREAM_TIME, MAX_ROUND_AGE, MAX_ROUND_WAIT};
 use crate::model::epoch::Epoch;
+use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
 /// Filter that tells rounds that have just been made from those that waited.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct StalenessFilter {
-    /// The present leadership and its least delay, to which the delay of its rounds is compared.
-    delay: Option<(Epoch, LeadersDelay)>,
+    /// The least delay of each leader whose rounds came in the last [`LEADER_DELAY_MEMORY`], to which the delay of its
+    /// rounds is compared. A leader that leads again has the same clock: leaders that alternate make no old round fresh.
+    delays: Vec<(NodeName, LeadersDelay)>,
     /// Arrival of the last round; before any, the time of the start.
     newest_at: Timestamp,
     /// Arrival of the first round after none had come for [`MAX_ROUND_AGE`].
@@ -81,13 +83,16 @@ impl LeadersDelay {
     }
 }
 
+/// Maximum number of leaders whose delays are remembered; the one whose rounds came longest ago is forgotten.
+const MAX_LEADERS: usize = 8;
+
 /// Change of delay within which the rounds of a leader whose clock was set agree.
 const TOLERANCE_US: i64 = 250_000;
 
 impl StalenessFilter {
     /// A filter of a node that starts: nothing can have waited for it before.
     pub fn new(now: Timestamp) -> Self {
-        Self { delay: None, newest_at: now, resumed_at: None }
+        Self { delays: Vec::new(), newest_at: now, resumed_at: None }
     }
 
     /// True if a round of `epoch`, whose order is right, spent no more than [`MAX_ROUND_WAIT`] in queues. A node that was
@@ -101,13 +106,19 @@ impl StalenessFilter {
             self.resumed_at = Some(received_at);
         }
         // A delay that was not learnt before a silence is none after it: rounds that waited may have begun it.
-        let is_known = |(of, delay): &(Epoch, LeadersDelay)| of == epoch && (delay.is_learnt || !has_resumed);
-        let known = self.delay.take().filter(is_known).map(|(_, delay)| delay);
+        self.delays.retain(|(_, delay)| {
+            (delay.is_learnt || !has_resumed) && received_at.since(delay.last.1) <= LEADER_DELAY_MEMORY
+        });
+        let known = self.delays.iter().position(|(leader, _)| *leader == epoch.leader);
+        let known = known.map(|at| self.delays.remove(at).1);
         let has_waited = self.resumed_at.is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_ROUND_AGE);
         let mut delay = known.unwrap_or_else(|| LeadersDelay::new(!has_waited, fused_at, received_at));
         let waited = delay.observe(fused_at, received_at);
         let is_fresh = delay.is_learnt && waited <= MAX_ROUND_WAIT;
-        self.delay = Some((epoch.clone(), delay));
+        if self.delays.len() == MAX_LEADERS {
+            self.delays.remove(0);
+        }
+        self.delays.push((epoch.leader.clone(), delay));
         is_fresh
     }
 }
@@ -141,6 +152,19 @@ mod tests {
         let mut filter = StalenessFilter::new(ms(60_000));
         assert!(filter.is_fresh(&Epoch::new(3, NodeName::from_static("edge")), ms(0), ms(60_000)));
         assert!(filter.is_fresh(&Epoch::new(4, NodeName::from_static("gauss")), ms(0), ms(60_300)));
+    }
+
+    #[test]
+    fn leaders_that_alternate_make_no_old_round_fresh() {
+        let leaders = ["edge", "gauss"].map(NodeName::from_static);
+        let epoch = |n: u64| Epoch::new(n / 3, leaders[(n / 3 % 2) as usize].clone());
+        let mut filter = StalenessFilter::new(ms(0));
+        // The lead changes after each third round.
+        assert!((0..30).all(|n| filter.is_fresh(&epoch(n), ms(100 * n), ms(100 * n + 2))));
+        // A slow reader gets each round later than the one before, up to 4 s late.
+        let late = |n: u64| 100 * (n - 30);
+        let oldest = (30..70).filter(|n| filter.is_fresh(&epoch(*n), ms(100 * n), ms(100 * n + late(*n))));
+        assert_eq!(oldest.map(late).max(), Some(900));
     }
 
     #[test]

@@ -112,8 +112,13 @@ impl ElectionDriver {
                     if message.from == from {
                         if let Some(stamp) = message.description.as_deref().copied() {
                             let may_lead = rights.limit_role(message.candidacy.role) != Role::Cav;
-                            let from = from.clone();
-                            self.parts.description.send(DescriptionKeeperMessage::Hear { from, may_lead, stamp });
+                            let may_describe = may_lead && rights.may_describe;
+                            self.parts.description.send(DescriptionKeeperMessage::Hear {
+                                from: from.clone(),
+                                may_lead,
+                                may_describe,
+                                stamp,
+                            });
                         }
                         self.cell_time.receive(&message, rights, clock::now());
                     }

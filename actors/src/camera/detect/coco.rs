@@ -19,6 +19,7 @@ use self::anchors::Anchor;
 use super::candidates::{ScoredBox, suppress};
 use super::{Detect, DetectError, bgr};
 use crate::camera::frame::CameraFrame;
+use crate::platform::bounded_file;
 use crate::platform::installed;
 
 /// Configuration of the COCO detector.
@@ -120,7 +121,7 @@ impl CocoDetector {
         let unusable = |reason: String| ModelError::Unusable { path: name.clone(), reason: first_line(reason) };
         // Through a buffer of ours the heap would stay larger by the whole file.
         let net = match file {
-            Some(path) => match std::fs::File::open(&path) {
+            Some(path) => match bounded_file::open(&path) {
                 Ok(_) => dnn::read_net_from_onnx(&path),
                 Err(source) => return Err(ModelError::Unreadable { path, source }),
             },

@@ -26,6 +26,7 @@ use super::candidates::{ScoredBox, suppress};
 use super::{Detect, DetectError, bgr};
 use crate::camera::frame::CameraFrame;
 use crate::camera::image_size::ImageSize;
+use crate::platform::bounded_file;
 
 /// Configuration of the detector of exported models.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -303,7 +304,7 @@ fn names(config: &OnnxConfig, network: &Network) -> Result<(Option<Vec<String>>,
     let (names, path) = match &config.labels {
         Some(path) => {
             let text =
-                std::fs::read_to_string(path).map_err(|source| OnnxError::Unreadable { path: path.clone(), source })?;
+                bounded_file::read_text(path).map_err(|source| OnnxError::Unreadable { path: path.clone(), source })?;
             (Some(labels::read(&text)), path)
         }
         None => (network.metadata("names").map(labels::parse), &config.model),

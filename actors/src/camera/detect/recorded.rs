@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Detect, DetectError};
 use crate::camera::frame::CameraFrame;
+use crate::platform::bounded_file;
 
 /// Where recorded detections come from.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -66,7 +67,7 @@ impl RecordedDetector {
     /// [`RecordingError`] naming the file and the first bad line.
     pub fn open(config: &RecordedConfig) -> Result<Self, RecordingError> {
         let path = &config.path;
-        let text = std::fs::read_to_string(path)
+        let text = bounded_file::read_text(path)
             .map_err(|source| RecordingError::Unreadable { path: path.clone(), source })?;
         let frames = text.lines().enumerate().map(|(index, line)| read_line(path, index + 1, line));
         Ok(Self { frames: frames.collect::<Result<_, _>>()?, looping: config.looping, next: 0 })

@@ -28,6 +28,7 @@ use crate::camera::lens::Lens;
 use crate::camera::mount_calibration::{MeasuredPoint, fit_mount_to_points, mount_table};
 use crate::node;
 use crate::node::config::NodeConfig;
+use crate::platform::bounded_file;
 
 #[derive(Debug, Subcommand)]
 pub(super) enum MountCommand {
@@ -172,7 +173,7 @@ impl MountArguments {
     /// Sets the keys of the mount in the configuration file, whose other lines stay as they are.
     fn write_into(&self, mount: &MountConfig) -> anyhow::Result<()> {
         let place = || format!("cannot write the mount to {}", self.config.display());
-        let text = std::fs::read_to_string(&self.config).with_context(place)?;
+        let text = bounded_file::read_text(&self.config).with_context(place)?;
         let mut document: DocumentMut = text.parse().with_context(place)?;
         let camera = self.table(&mut document).context("its camera is written elsewhere: paste the lines");
         let table = camera.with_context(place)?.entry("mount").or_insert_with(toml_edit::table).as_table_like_mut();
@@ -200,7 +201,7 @@ impl PointsArguments {
         let (config, _, lens) = self.node.load()?;
         let mut stated = self.points.clone();
         if let Some(file) = &self.file {
-            let text = std::fs::read_to_string(file);
+            let text = bounded_file::read_text(file);
             let text = text.with_context(|| format!("cannot read points from {}", file.display()));
             for (number, line) in text.map_err(Failure::usage)?.lines().enumerate() {
                 if !line.trim().is_empty() && !line.trim_start().starts_with('#') {

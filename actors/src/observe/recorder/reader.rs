@@ -11,6 +11,8 @@ use mcap::McapError;
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 
+use crate::platform::bounded_file;
+
 use super::channels::SchemaName;
 use super::log_identity::{LogIdentity, LogIdentityError};
 
@@ -113,7 +115,7 @@ impl LogReader {
     /// [`LogError::Unreadable`].
     pub fn recognises(path: &Path) -> Result<bool, LogError> {
         let mut beginning = Vec::new();
-        let read = File::open(path).and_then(|file| file.take(MAGIC.len() as u64).read_to_end(&mut beginning));
+        let read = bounded_file::open(path).and_then(|file| file.take(MAGIC.len() as u64).read_to_end(&mut beginning));
         read.map_err(|source| LogError::Unreadable { path: path.into(), source })?;
         Ok(beginning == MAGIC)
     }
@@ -123,7 +125,7 @@ impl LogReader {
     /// # Errors
     /// [`LogError::Unreadable`].
     pub fn open(path: &Path) -> Result<Self, LogError> {
-        let file = File::open(path).map_err(|source| LogError::Unreadable { path: path.into(), source })?;
+        let file = bounded_file::open(path).map_err(|source| LogError::Unreadable { path: path.into(), source })?;
         let options = LinearReaderOptions::default()
             .with_skip_end_magic(true)
             .with_prevalidate_chunk_crcs(true)

@@ -5,7 +5,7 @@
 //! | `detections/N`, `detections/N--…`, `vote_detections/N`, `vote_detections/N--…` | the certificate of `N` |
 //! | `ledger/N` | the same, if `N` may lead |
 //! | `nodes/N`, `nodes/N--…` | the certificate of `N`, which its observers share |
-//! | `cell` | nodes that may lead |
+//! | `cell` | nodes that may lead; receivers check who has set it |
 //! | `global_detections`, `global_verdicts`, `reputations` | the leader; without a leader, nodes that may lead |
 //! | anything else | nobody |
 //!

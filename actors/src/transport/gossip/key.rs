@@ -5,6 +5,8 @@ use std::num::NonZeroU32;
 use ecod::model::names::NodeName;
 use ring::{aead, digest, hkdf, hmac, pbkdf2};
 
+use crate::platform::bounded_file;
+
 use super::config::MembershipConfig;
 
 /// One run of a node's membership, drawn at random.
@@ -81,7 +83,7 @@ impl CellKey {
             return Ok(Self::new(config.key.as_ref().map_or("", |key| key.reveal().trim()), cell));
         };
         let text =
-            std::fs::read_to_string(path).map_err(|source| KeyError::Unreadable { path: path.clone(), source })?;
+            bounded_file::read_text(path).map_err(|source| KeyError::Unreadable { path: path.clone(), source })?;
         if text.trim().len() < super::config::MIN_KEY_BYTES {
             return Err(KeyError::TooShort { path: path.clone() });
         }

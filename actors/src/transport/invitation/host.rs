@@ -24,6 +24,7 @@ use super::{
     CONVERSATION_TIME, CityFiles, HOST_NAME, KEPT, MAX_REQUEST_BYTES, Reply, Request, Token, Welcome, read_line,
     write_line,
 };
+use crate::platform::bounded_file;
 use crate::platform::clock;
 use crate::transport::pki::{Authority, AuthorityError, CityTlsConfig, DEFAULT_DAYS, check_name};
 
@@ -196,7 +197,7 @@ impl Host {
         let issued = self.authority.certify(node, rights, valid, now, &signing.public_key);
         let (certificate, serial) = issued.map_err(|error| unusable(&error))?;
         guest.issued = Some(serial.clone());
-        let read = |path: &Path| std::fs::read_to_string(path).map_err(|error| unusable(&error));
+        let read = |path: &Path| bounded_file::read_text(path).map_err(|error| unusable(&error));
         let city = |city: &CityTlsConfig| {
             let list = city.revocation_list.as_deref().ok_or("the city has no revocation list")?;
             Ok::<_, String>(CityFiles { ca: read(&city.ca)?, revocation_list: read(list)? })

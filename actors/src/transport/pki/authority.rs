@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 
 use super::subject::rights_uri;
 use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK};
+use crate::platform::bounded_file;
 use crate::platform::state_file::{content, replace_file, with_checksum};
 
 /// Days for which a node's certificate is valid unless told otherwise.
@@ -396,7 +397,7 @@ fn draw_serial() -> Result<SerialNumber, AuthorityError> {
 }
 
 fn read(path: &Path) -> Result<String, AuthorityError> {
-    fs::read_to_string(path).map_err(|source| AuthorityError::File { path: path.into(), source })
+    bounded_file::read_text(path).map_err(|source| AuthorityError::File { path: path.into(), source })
 }
 
 fn write(path: &Path, text: &str) -> Result<(), AuthorityError> {

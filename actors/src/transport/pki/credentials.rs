@@ -30,6 +30,8 @@ use super::{BROKER_NAME, BrokerTrust, CertificateSubject, InvalidCertificate, MA
 use city_trust::CityAuthorities;
 use issuers::{Issuers, ServingNodes};
 
+use crate::platform::bounded_file;
+
 /// Certificates of a node, reloaded when their files change.
 #[derive(Debug)]
 pub struct Credentials {
@@ -120,6 +122,9 @@ pub enum CredentialsError {
 /// Minimum time between two checks of the files.
 const RELOAD_INTERVAL: Duration = Duration::from_millis(500);
 
+/// Maximum size of a file with certificates, a key or a revocation list, in bytes.
+const MAX_PEM_BYTES: u64 = 16 * 1024 * 1024;
+
 impl LoadedCredentials {
     /// The node that a certificate names, and its rights if the cell has issued it. Its validity is verified elsewhere.
     ///
@@ -152,6 +157,11 @@ impl Credentials {
         }
         let (path, node) = (self.files.certificate.clone(), self.node.clone());
         Err(CredentialsError::Overreached { path, node, role: role_name(role), priority, allowed: rights_uri(rights) })
+    }
+
+    /// True if the node's certificate is an operator's, so that the cell's description may be set here.
+    pub fn may_describe(&self) -> bool {
+        self.current().identity.rights_of(&self.node).may_describe
     }
 
     /// The present content of the files. While they are unusable, which is logged, the content before.
@@ -321,7 +331,7 @@ fn pem<T: PemObject>(key: &'static str, path: &Path) -> Result<Vec<T>, Credentia
 }
 
 fn bytes(key: &'static str, path: &Path) -> Result<Vec<u8>, CredentialsError> {
-    fs::read(path).map_err(|error| file_error(key, path, &error))
+    bounded_file::read(path, MAX_PEM_BYTES).map_err(|error| file_error(key, path, &error))
 }
 
 fn file_error(key: &'static str, path: &Path, reason: &(impl ToString + ?Sized)) -> CredentialsError {

@@ -110,7 +110,8 @@ impl CertificateSubject {
 
 /// The rights in a certificate, as its alternative name of kind URI.
 pub(super) fn rights_uri(rights: Rights) -> String {
-    format!("{RIGHTS_SCHEME}role={};priority={}", role_name(rights.role), rights.priority)
+    let operator = if rights.may_describe { ";operator=yes" } else { "" };
+    format!("{RIGHTS_SCHEME}role={};priority={}{operator}", role_name(rights.role), rights.priority)
 }
 
 pub(super) fn role_name(role: Role) -> &'static str {
@@ -130,7 +131,7 @@ fn parse_rights(text: &str) -> Option<Rights> {
         "edge" => Role::Edge,
         _ => return None,
     };
-    Some(Rights { role, priority: entry("priority")?.parse().ok()? })
+    Some(Rights { role, priority: entry("priority")?.parse().ok()?, may_describe: entry("operator") == Some("yes") })
 }
 
 #[cfg(test)]
@@ -139,8 +140,10 @@ mod tests {
 
     #[test]
     fn rights_are_read_as_they_are_written_and_otherwise_not() {
-        let rights = Rights { role: Role::Auto, priority: 7 };
+        let rights = Rights { priority: 7, ..Rights::from(Role::Auto) };
         assert_eq!(rights_uri(rights), "ecod:role=auto;priority=7");
+        assert_eq!(rights_uri(rights.of_operator()), "ecod:role=auto;priority=7;operator=yes");
+        assert_eq!(parse_rights("role=auto;priority=7;operator=yes"), Some(rights.of_operator()));
         assert_eq!(parse_rights("role=auto;priority=7"), Some(rights));
         assert_eq!(parse_rights("zone=3;priority=7;role=auto"), Some(rights));
         for text in ["", "role=auto", "priority=7", "role=chief;priority=7", "role=auto;priority=256"] {
@@ -166,7 +169,7 @@ mod tests {
         assert_eq!(subject(Vec::new()).unwrap().rights(), Rights::NONE, "a vehicle's");
         assert_eq!(subject(vec![uri("ecod:role=edge;priority=9")]).unwrap().rights(), Rights::NONE, "without a broker");
         let both = subject(vec![broker(), uri("ecod:role=auto;priority=9")]).unwrap();
-        assert_eq!(both.rights(), Rights { role: Role::Auto, priority: 9 });
+        assert_eq!(both.rights(), Rights { priority: 9, ..Rights::from(Role::Auto) });
         assert_eq!(both.rights_of(&NodeName::from_static("edge--top")), Rights::NONE, "an observer's");
         assert_eq!(subject(vec![broker(), uri("ecod:role=chief")]), Err(InvalidCertificate::Rights));
     }

@@ -9,6 +9,7 @@ use rten_tensor::prelude::*;
 
 use super::OnnxError;
 use crate::camera::image_size::ImageSize;
+use crate::platform::bounded_file;
 
 /// One output of a network.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,7 +43,7 @@ impl Network {
     /// # Errors
     /// [`OnnxError`] when the file cannot be read or run, takes something else than an image, or another size.
     pub(super) fn load(path: &Path, told: Option<ImageSize>) -> Result<Self, OnnxError> {
-        std::fs::File::open(path).map_err(|source| OnnxError::Unreadable { path: path.to_owned(), source })?;
+        bounded_file::open(path).map_err(|source| OnnxError::Unreadable { path: path.to_owned(), source })?;
         let model = Model::load_file(path)
             .map_err(|error| OnnxError::NotRunnable { path: path.to_owned(), reason: error.to_string() })?;
         let refused = || OnnxError::UnknownInputs { path: path.to_owned(), inputs: inputs(&model) };

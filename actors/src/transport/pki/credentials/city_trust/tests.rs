@@ -55,7 +55,7 @@ fn certificate(path: PathBuf) -> CertificateDer<'static> {
 fn a_vehicle_of_the_city_takes_part_in_every_cell_and_leads_in_none() {
     let mut city = City::new();
     let [euclid, edge] = ["euclid", "edge"].map(NodeName::from_static);
-    city.city.issue(&euclid, Rights { role: Role::Edge, priority: 255 }, DAY, clock::now()).unwrap();
+    city.city.issue(&euclid, Rights { priority: 255, ..Rights::from(Role::Edge) }, DAY, clock::now()).unwrap();
     for cell in 0..2 {
         city.cells[cell].issue(&edge, Role::Edge, DAY, clock::now()).unwrap();
         let of_edge = city.load(&city.cells[cell], &edge, cell);
