@@ -16,6 +16,7 @@ mod answer;
 mod command;
 mod config;
 mod foreign_view;
+mod map_share;
 mod neighbouring;
 mod report_doubt;
 #[cfg(test)]
@@ -27,9 +28,11 @@ use std::time::Duration;
 
 pub use command::Command;
 pub use config::{Algorithms, FusionConfig};
+pub use map_share::MAX_SOLE_OBJECTS;
 pub use report_doubt::ReportDoubt;
 
 use foreign_view::ForeignView;
+use map_share::limit_shares;
 use nalgebra::Point2;
 use neighbouring::NeighbourView;
 use report_doubt::{MAX_AWAY_M, MIN_MISPLACED};
@@ -65,8 +68,8 @@ pub struct Fused {
     pub evidence: Vec<Evidence>,
     /// The reputations, with the verdicts of VOTE's `paper` mode: they do not follow from the evidence there.
     pub reputations: Option<BTreeMap<NodeName, Reputation>>,
-    /// Entries that were left out of map and verdicts, because receivers would refuse them: an object that prediction takes
-    /// beyond the bounds of the wire format, for example.
+    /// Entries that were left out of map and verdicts: those that receivers would refuse, such as an object that prediction
+    /// takes beyond the bounds of the wire format, and those beyond the share of one vehicle.
     pub left_out: Vec<InvalidEntry>,
 }
 
@@ -446,6 +449,7 @@ impl Aggregator {
         let round = self.take_round_number();
         let fused_at = self.in_cell_time(now);
         let TracksRound { mut objects, pose_corrections, oldest_capture, evidence: seen } = tracks;
+        let mut left_out = limit_shares(&mut objects);
         date_objects(&mut objects, self.cell_offset_us);
         let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
         evidence.extend(seen);
@@ -461,7 +465,7 @@ impl Aggregator {
         });
         let mut verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
         // What this aggregator publishes passes the check of those who receive it.
-        let mut left_out = map.as_mut().map(Payload::remove_invalid).unwrap_or_default();
+        left_out.extend(map.as_mut().map(Payload::remove_invalid).unwrap_or_default());
         left_out.extend(verdicts.as_mut().map(Payload::remove_invalid).unwrap_or_default());
         let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());
         Some(Fused { epoch, round, map, verdicts, evidence, reputations, left_out })

@@ -6,7 +6,7 @@ use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::pace::{Pace, PaceConfig, PaceMode};
 use ecod::perception::landmark::{Landmark, LandmarkIndex, VacancySign};
-use ecod::wire::{LandmarkState, ObjectReport, PerceivedObject};
+use ecod::wire::{FieldOfView, LandmarkState, ObjectReport, PerceivedObject, WirePose};
 use nalgebra::Point2;
 use proptest::prelude::*;
 
@@ -259,4 +259,29 @@ fn flicker_within_the_lead_does_not_change_the_label() {
     assert_eq!(labels(&pace.close(START).landmarks), [Some("car")], "van leads by less than the lead");
     pace.observe(&report("c", vec![object("van", 0.85, 0.0, 0.0)], &[]), START);
     assert_eq!(labels(&pace.close(START).landmarks), [Some("van")]);
+}
+
+/// A car that one vehicle invents, where others look and find nothing; they list what they saw, or state their field of view.
+#[test]
+fn a_sole_claim_against_several_that_look_is_not_published() {
+    let facing = |node: &str, listed: bool| {
+        let seen = listed.then(|| vec!["slot-0".into()]);
+        let pose = Some(WirePose::new(-5.0, 0.0, 0.0));
+        let view = Some(FieldOfView { range_m: 30.0, angle_rad: 1.0 });
+        ObjectReport { seen, pose, view, ..report(node, Vec::new(), &[]) }
+    };
+    for (lookers, listed, expected) in
+        [(1, true, Some("car")), (3, true, None), (4, true, None), (3, false, None), (0, true, Some("car"))]
+    {
+        let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
+        let mut published = Vec::new();
+        for n in 0..30 {
+            pace.observe(&report("mallory", vec![object("car", 1.0, 0.0, 0.0)], &["slot-0"]), frame(n));
+            for looker in 0..lookers {
+                pace.observe(&facing(&format!("honest-{looker}"), listed), frame(n));
+            }
+            published = pace.close(frame(n)).landmarks;
+        }
+        assert_eq!(labels(&published), [expected], "{lookers} look, listed: {listed}");
+    }
 }

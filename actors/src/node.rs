@@ -25,7 +25,7 @@ mod builder;
 #[cfg(feature = "camera")]
 pub mod camera;
 pub mod config;
-mod description;
+pub(crate) mod description;
 mod presence;
 mod restarts;
 pub mod roaming;

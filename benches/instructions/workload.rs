@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::leadership::election::{Body, Candidacy, Election, ElectionConfig, ElectionInput, ElectionMessage, Health};
+use ecod::leadership::election::{Body, Candidacy, Election, ElectionConfig, ElectionInput, ElectionMessage, Health, LifeSign};
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Pose;
@@ -140,7 +140,7 @@ fn beat(seq: u64) -> ElectionInput {
         term: 1,
         epoch: Some(Epoch::new(1, edge)),
         hears_you: true,
-        body: Body::Beat { every_ms: 50, round: seq, followers: 1, after: None, successors },
+        body: Body::Beat { every_ms: 50, round: seq, followers: 1, after: None, successors, life: LifeSign::default() },
         clock: None,
         description: None,
     };

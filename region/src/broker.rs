@@ -1,6 +1,5 @@
 //! Address of a region's broker, and the login there.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,6 +7,7 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use clap::Args;
 use ecod::leadership::BrokerAddress;
+use ecod_actors::platform::bounded_file;
 use ecod_actors::platform::secret::Secret;
 use rumqttc::{MqttOptions, TlsConfiguration, Transport};
 use rustls::pki_types::CertificateDer;
@@ -98,7 +98,7 @@ impl BrokerLogin {
 /// # Errors
 /// When it cannot be read or is empty.
 pub fn read_secret(path: &Path) -> anyhow::Result<Secret> {
-    let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let text = bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
     let line = text.lines().next().unwrap_or_default().trim();
     ensure!(!line.is_empty(), "{} is empty: its first line is to be the secret", path.display());
     Ok(Secret::new(line))

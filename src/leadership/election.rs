@@ -51,6 +51,7 @@ mod clock_stamps;
 mod following;
 mod handover;
 mod interface;
+mod leader_clock;
 mod leading;
 mod liveness;
 mod logins;
@@ -65,7 +66,7 @@ pub use interface::{ElectionEffect, ElectionInput, Health};
 pub(crate) use message::MAX_FIRST_TERM;
 use message::MAX_ROUND_STEP;
 pub use message::{
-    Body, Candidacy, ElectionMessage, MAX_MESSAGE_BYTES, MAX_NO_LOGIN, MAX_ROUND, MAX_SUCCESSORS, MAX_TERM,
+    Body, Candidacy, ElectionMessage, LifeSign, MAX_MESSAGE_BYTES, MAX_NO_LOGIN, MAX_ROUND, MAX_SUCCESSORS, MAX_TERM,
     MAX_TERM_STEP,
 };
 
@@ -74,6 +75,7 @@ use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::wire::{Role, SCHEMA_VERSION};
+use leader_clock::LeaderClock;
 use leading::Leading;
 use liveness::Following;
 use peers::Peers;
@@ -100,6 +102,10 @@ pub struct Election {
     no_login: Vec<NodeName>,
     peers: Peers,
     questions: Questions,
+    /// Clock of the leader that was followed last.
+    leader_clock: Option<LeaderClock>,
+    /// Questions about the leader that wait for its next sign of life: who asked, and the number of the question.
+    waiting_questions: Vec<(NodeName, u64)>,
     state: State,
     effects: Vec<ElectionEffect>,
 }
@@ -157,6 +163,8 @@ impl Election {
             no_login: Vec::new(),
             peers: Peers::new(&config),
             questions: Questions::default(),
+            leader_clock: None,
+            waiting_questions: Vec::new(),
             state: State::Seeking(Seeking::new(now + join, Vec::new(), now)),
             effects: Vec::new(),
             config,
@@ -294,10 +302,12 @@ impl Election {
         match message.body {
             Body::Status { over, no_login } => self.take_status(&from, over.as_ref(), no_login, now),
             Body::Ask { ask } => self.answer(&from, ask, now),
-            Body::LeaderEvidence { ask, age_ms } => self.take_leader_evidence(&from, epoch, ask, age_ms, now),
-            Body::Beat { every_ms, round, followers, after, successors } => {
+            Body::LeaderEvidence { ask, age_ms, life } => {
+                self.take_leader_evidence(&from, epoch, ask, age_ms, life, now);
+            }
+            Body::Beat { every_ms, round, followers, after, successors, life } => {
                 if let Some(epoch) = epoch.filter(|epoch| epoch.leader == from) {
-                    let beat = Beat { epoch, hears_us: hears_you, every_ms, round, followers, after, successors };
+                    let beat = Beat { epoch, hears_us: hears_you, every_ms, round, followers, after, successors, life };
                     self.take_beat(beat, now);
                 }
             }
@@ -485,6 +495,7 @@ struct Beat {
     followers: u8,
     after: Option<Epoch>,
     successors: Vec<NodeName>,
+    life: LifeSign,
 }
 
 /// One step of advertised load, in percent.

@@ -44,6 +44,7 @@
 //! | [`LAST_WORD_TIME`] | 5 s | above `handover` | the last evidence of a leader counts after a handover |
 //! | [`EVIDENCE_TRIAL`] | 20 s | above [`RENEWAL_PAUSE`] and two idle beats | a node follows a false claimant for less |
 //! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from a far future would be the last |
+//! | `LIFE_SIGN_STEP_MS` | 10 ms | below a beat | signs of life are dated closely, and signed rarely |
 //! | [`CLOCK_MEMORY`] | 15 s | above two of `contact_timeout` | the stamps of idle beats and their answers are still compared |
 //! | [`MIN_CLOCK_JUMP`] | 1 s | [`MAX_ROUND_AGE`] | a report's age tells by which time, before or after a jump, it is stamped |
 //! | [`MAX_CLOCK_SLEW`] | 0.5 % | above the drift of two clocks, 0.01 % | the cell's time catches up with the median |
@@ -165,6 +166,12 @@ pub const MAX_RESET_AHEAD: Duration = Duration::from_secs(24 * 3600);
 
 /// Number of round intervals after the last round when rounds no longer count as regular.
 pub(crate) const REGULAR_GAPS: u32 = 8;
+
+/// Step in ms of the time that a leader states in its signs of life: it signs a hundred a second at most.
+pub(crate) const LIFE_SIGN_STEP_MS: u64 = 10;
+
+/// Maximum number of questions about the leader that wait for its next sign of life.
+pub(crate) const MAX_WAITING_QUESTIONS: usize = 64;
 
 /// Beats of the standby for each beat of another successor.
 const NEAR_BEATS: u32 = 8;

@@ -4,7 +4,8 @@
 //! (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, chapter 9.2). Unlike there, a cell has one value per label:
 //!
 //! - A frame that shows label l with confidence c adds c·ln(p_d/p_f) to l and subtracts as much from the other labels.
-//! - A frame without a detection in a landmark that is in view subtracts ln((1−p_f)/(1−p_d)) from all labels.
+//! - A frame without a detection in a landmark that is in view subtracts ln((1−p_f)/(1−p_d)) from all labels. In view is what
+//!   the report lists as `seen`; in a report without a list, what lies in the field of view that it states.
 //! - One vehicle's evidence is bounded, so that a fast or stubborn vehicle does not outvote the others.
 //!
 //! A round adds the vehicles' log-odds: S(ρ,l) = Σ_v L_v(ρ,l), label = argmax S, confidence = e^S(l) / (1 + Σ e^S). This
@@ -29,6 +30,7 @@ use self::consensus::{LabelScores, NamedBelief, WeightedMean};
 use super::assignment::{Pairing, one_to_one};
 use super::grouping::{ByPlace, Grouping, Place, places_after};
 use super::{PaceConfig, PaceRound};
+use crate::model::geometry::Pose;
 use crate::model::names::{Label, NodeName};
 use crate::model::time::Timestamp;
 use crate::perception::landmark::{Landmark, LandmarkCandidate, LandmarkIndex};
@@ -110,16 +112,34 @@ impl BayesPace {
     /// Every place that the vehicle had in view, ascending: those with a detection and those listed as `seen`.
     fn observations<'a>(&self, report: &'a ObjectReport) -> Vec<Observation<'a>> {
         let mut observations = self.associate(&report.objects);
-        let mut expected = 0;
-        observations.extend(report.seen.iter().flatten().filter_map(|id| {
-            let landmark = self.landmarks.position_near(id, expected)?;
-            expected = landmark + 1;
-            Some(Observation { place: Place::object(landmark), found: None })
-        }));
+        let looked_at = |landmark| Observation { place: Place::object(landmark), found: None };
+        match &report.seen {
+            Some(seen) => {
+                let mut expected = 0;
+                observations.extend(seen.iter().filter_map(|id| {
+                    let landmark = self.landmarks.position_near(id, expected)?;
+                    expected = landmark + 1;
+                    Some(looked_at(landmark))
+                }));
+            }
+            None => observations.extend(self.in_stated_view(report).map(looked_at)),
+        }
         // A stable sort: a detection at a place comes before the entry in `seen`.
         observations.sort_by_key(|observation| observation.place);
         observations.dedup_by(|later, kept| later.place == kept.place && later.found.is_none());
         observations
+    }
+
+    /// The landmarks in the field of view that a report states, by their positions in the index.
+    fn in_stated_view(&self, report: &ObjectReport) -> impl Iterator<Item = usize> {
+        let stated = report.pose.zip(report.view);
+        stated.into_iter().flat_map(|(pose, view)| {
+            let pose = Pose::from(pose);
+            self.landmarks.landmarks().iter().enumerate().filter_map(move |(index, landmark)| {
+                let (range_m, bearing_rad) = pose.range_bearing(&landmark.position);
+                (range_m <= view.range_m && bearing_rad.abs() <= view.angle_rad / 2.0).then_some(index)
+            })
+        })
     }
 
     /// The objects at their nearest places, with `one_to_one` settled so that they share none; ascending by place.

@@ -13,6 +13,7 @@
 //! out its effects in their order, and wakes it at its deadline.
 
 mod driver;
+mod life_signs;
 mod probe;
 mod term_writer;
 
@@ -21,6 +22,7 @@ use std::sync::Arc;
 
 use ecod::leadership::Leadership;
 use ecod::leadership::node::{Input, NodeSettings};
+use ecod::model::names::NodeName;
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 
@@ -43,6 +45,7 @@ use crate::platform::state_file::StateFile;
 use crate::telemetry::counters::Counters;
 use crate::transport::broker::Door;
 use crate::transport::gossip::Member;
+use crate::transport::pki::Credentials;
 
 /// Where the parts that the election commands or asks are reached.
 #[derive(Debug, Clone)]
@@ -87,6 +90,10 @@ pub struct LeaderElectionArguments {
     pub leadership: watch::Sender<Leadership>,
     /// Shows the cell's time.
     pub clock: CellClock,
+    /// Name of the cell.
+    pub cell: NodeName,
+    /// The node's certificates.
+    pub credentials: Option<Arc<Credentials>>,
     /// The node's counters.
     pub counters: Arc<Counters>,
 }

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Context, anyhow, ensure};
 use clap::{Args, Subcommand};
+use ecod::description::DescriptionHistory;
 use ecod::leadership::BrokerAddress;
 use ecod::model::names::NodeName;
 use ecod::wire::{CellDescription, ContentHash, Encoding, NodeState, NodeStatus, SCHEMA_VERSION, Topic, Topics};
@@ -16,6 +17,7 @@ use uuid::Uuid;
 
 use super::{Failure, print};
 use crate::node::config::{NodeConfig, SharedConfig};
+use crate::node::description::description_file;
 use crate::platform::bounded_file;
 use crate::transport::mqtt::MqttVersion;
 use crate::transport::mqtt::connection::{Client, Connection, MaxQos, Packet, Retention, open};
@@ -28,6 +30,11 @@ pub(super) enum CellCommand {
     Set {
         /// The description (TOML)
         file: PathBuf,
+        #[command(flatten)]
+        door: DoorArguments,
+    },
+    /// Set the description again that this machine's node had before the present one
+    Undo {
         #[command(flatten)]
         door: DoorArguments,
     },
@@ -77,14 +84,12 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
     match command {
         CellCommand::Set { file, door } => {
             let text = read(file)?;
-            let shared = SharedConfig::parse(&text).map_err(Failure::usage)?;
-            let (places, cost) = (shared.landmarks.len(), shared.cost());
-            let described = DoorClient::open(door).await?.set(&text).await?;
-            let CellDescription { version, hash, set_by, .. } = described;
-            let cost = format!("maps of up to {} bytes, {:.0} bytes/s", cost.map_bytes, cost.bytes_per_s);
-            Ok(print(&format!(
-                "version {version}, hash {hash}, known locations: {places} ({cost}), set by {set_by}\n"
-            ))?)
+            set(DoorClient::open(door).await?, &text).await
+        }
+        CellCommand::Undo { door } => {
+            let client = DoorClient::open(door).await?;
+            let text = text_before(&client.config).map_err(Failure::usage)?;
+            set(client, &text).await
         }
         CellCommand::Show { door } => Ok(print(&DoorClient::open(door).await?.show().await?)?),
         CellCommand::Diff { file, door } => {
@@ -102,6 +107,24 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
             Err(anyhow!("{file} differs from version {version} of the cell's description").into())
         }
     }
+}
+
+/// Sets a description, and prints what it costs.
+async fn set(mut client: DoorClient, text: &str) -> Result<(), Failure> {
+    let shared = SharedConfig::parse(text).map_err(Failure::usage)?;
+    let (places, cost) = (shared.landmarks.len(), shared.cost());
+    let CellDescription { version, hash, set_by, .. } = client.set(text).await?;
+    let cost = format!("maps of up to {} bytes, {:.0} bytes/s", cost.map_bytes, cost.bytes_per_s);
+    Ok(print(&format!("version {version}, hash {hash}, known locations: {places} ({cost}), set by {set_by}\n"))?)
+}
+
+/// The text of the description that this machine's node had before the present one.
+fn text_before(config: &NodeConfig) -> Result<String, anyhow::Error> {
+    let file = description_file(config).context("this node keeps no earlier description: it has no `state_dir`")?;
+    let read = file.peek().with_context(|| format!("no earlier description in {}", file.path().display()));
+    let DescriptionHistory { earlier, .. } = read?;
+    let before = earlier.last().context("this node has had no other description before")?;
+    Ok(before.description.text.clone())
 }
 
 /// The text of a description, whose values are checked.

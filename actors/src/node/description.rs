@@ -80,7 +80,7 @@ impl HeldDescription {
 const MAX_PROBLEM: usize = 500;
 
 /// Where a node keeps the cell's description, if it keeps anything.
-pub(super) fn description_file(config: &NodeConfig) -> Option<StateFile> {
+pub(crate) fn description_file(config: &NodeConfig) -> Option<StateFile> {
     let (directory, name) = (config.state_dir.as_deref()?, config.name.as_ref()?);
     Some(StateFile::new(directory, &config.cell, name, "description"))
 }

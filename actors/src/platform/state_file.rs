@@ -77,6 +77,14 @@ impl StateFile {
         None
     }
 
+    /// The state that another process keeps here. The file stays as it is.
+    ///
+    /// # Errors
+    /// When there is none, or it is damaged.
+    pub fn peek<T: DeserializeOwned>(&self) -> io::Result<T> {
+        parse(&bounded_file::read(&self.path, MAX_BYTES)?).map_err(io::Error::other)
+    }
+
     /// Renames the file to `….set-aside`, with a warning that says why.
     pub fn set_aside(&self, why: &str) {
         let aside = self.path.with_extension("set-aside");

@@ -27,6 +27,11 @@ impl TokenBucket {
 
     /// Takes a token; false when there is none.
     pub(crate) fn allow(&mut self, now: Timestamp) -> bool {
+        self.allow_many(1, now)
+    }
+
+    /// Takes so many tokens at once; false, and none taken, when there are fewer.
+    pub(crate) fn allow_many(&mut self, count: u32, now: Timestamp) -> bool {
         let earned = now.since(self.refilled_at).as_micros() / self.interval.as_micros().max(1);
         let earned = u32::try_from(earned).unwrap_or(u32::MAX);
         self.refilled_at = if self.tokens.saturating_add(earned) >= self.burst {
@@ -35,8 +40,10 @@ impl TokenBucket {
             self.refilled_at + self.interval * earned
         };
         self.tokens = self.tokens.saturating_add(earned).min(self.burst);
-        let allowed = self.tokens > 0;
-        self.tokens = self.tokens.saturating_sub(1);
+        let allowed = self.tokens >= count;
+        if allowed {
+            self.tokens -= count;
+        }
         allowed
     }
 }
@@ -71,8 +78,13 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
 
     /// Takes a token of a source; false when there is none.
     pub fn allow(&mut self, source: &K, now: Timestamp) -> bool {
+        self.allow_many(source, 1, now)
+    }
+
+    /// Takes so many tokens of a source at once; false, and none taken, when there are fewer.
+    pub(crate) fn allow_many(&mut self, source: &K, count: u32, now: Timestamp) -> bool {
         if let Some(throttle) = self.sources.get_mut(source) {
-            return throttle.allow(now);
+            return throttle.allow_many(count, now);
         }
         if self.sources.len() >= self.max_sources {
             self.sources.retain(|_, throttle| !throttle.is_full(now));
@@ -81,7 +93,7 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
             return false;
         }
         let mut throttle = TokenBucket::new(self.burst, self.interval, now);
-        let allowed = throttle.allow(now);
+        let allowed = throttle.allow_many(count, now);
         self.sources.insert(source.clone(), throttle);
         allowed
     }

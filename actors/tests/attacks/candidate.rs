@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::leadership::election::{Body, MAX_TERM};
+use ecod::leadership::election::{Body, LifeSign, MAX_TERM};
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::wire::{Encoding, GlobalMap, MAX_INTEGER, Role, encode};
@@ -76,7 +76,7 @@ pub(crate) const ROWS: &[Row] = &[
         run: |target| Box::pin(forged_evidence(target)),
     },
     Row {
-        attack: "a description that is set again and again, also after the revocation",
+        attack: "a description that is set again and again without the right",
         means: Means::Candidate,
         on_brokers: false,
         deeds: (5, "looks"),
@@ -105,7 +105,7 @@ pub(crate) async fn join(target: &Target, role: Role) -> anyhow::Result<Insider>
 /// Claims a lead that its certificate does not allow.
 async fn beats(target: Target, round: u64) -> anyhow::Result<()> {
     let insider = join(&target, Role::Edge).await?;
-    let beat = Body::Beat { every_ms: 50, round, followers: 9, after: None, successors: Vec::new() };
+    let beat = Body::Beat { every_ms: 50, round, followers: 9, after: None, successors: Vec::new(), life: LifeSign::default() };
     insider.repeat(9, Some(insider.epoch(9)), beat).await
 }
 

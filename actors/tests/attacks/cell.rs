@@ -407,7 +407,8 @@ fn configuration(
              [camera.projection.sizes.default]\nwidth_m = 0.5\nheight_m = 0.5\n"
         );
     }
-    text + LANDMARK
+    // Objects beside the location are tracked, so that attackers can fill the map.
+    text + LANDMARK + "\n[fusion.tracks]\nmode = \"on\"\n"
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use ecod::leadership::election::{Body, MAX_TERM};
+use ecod::leadership::election::{Body, LifeSign, MAX_TERM};
 use ecod::wire::Role;
 use futures_util::future::try_join_all;
 use tokio::net::UdpSocket;
@@ -53,7 +53,7 @@ async fn largest_term(target: Target) -> anyhow::Result<()> {
 
 async fn claims(target: Target) -> anyhow::Result<()> {
     let insider = Insider::join(&target, (NAME, Role::Edge), Some(Arc::clone(&target.foreign))).await?;
-    let beat = Body::Beat { every_ms: 50, round: 1, followers: 9, after: None, successors: Vec::new() };
+    let beat = Body::Beat { every_ms: 50, round: 1, followers: 9, after: None, successors: Vec::new(), life: LifeSign::default() };
     tokio::try_join!(insider.repeat(1 << 20, Some(insider.epoch(1 << 20)), beat), insider.knock()).map(drop)
 }
 

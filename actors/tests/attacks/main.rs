@@ -20,6 +20,7 @@ mod description;
 mod insider;
 mod key_holder;
 mod leader;
+mod reports;
 mod row;
 mod stranger;
 mod vehicle;
@@ -52,7 +53,8 @@ use crate::machine::Machine;
 use crate::row::{Outcome, Row, table};
 
 /// Kinds of attackers.
-const ATTACKERS: [&[Row]; 5] = [stranger::ROWS, key_holder::ROWS, vehicle::ROWS, candidate::ROWS, leader::ROWS];
+const ATTACKERS: [&[Row]; 6] =
+    [stranger::ROWS, key_holder::ROWS, vehicle::ROWS, reports::ROWS, candidate::ROWS, leader::ROWS];
 
 /// Duration of an attack, and of a quick one.
 const ATTACK_TIME: Duration = Duration::from_secs(20);

@@ -65,7 +65,46 @@ fn detection() -> impl Strategy<Value = PerceivedObject> {
         })
 }
 
+/// A number within a bound of the wire format, often at it.
+fn up_to(bound: f64) -> impl Strategy<Value = f64> {
+    prop_oneof![-bound..=bound, -10.0..=10.0, Just(bound), Just(-bound)]
+}
+
+fn extreme_detection() -> impl Strategy<Value = PerceivedObject> {
+    (
+        (up_to(1e8), up_to(1e8), 0.0..=1.0),
+        proptest::option::of(up_to(1e20).prop_map(f64::abs)),
+        proptest::option::of([up_to(1e4), up_to(1e4)]),
+        proptest::option::of(up_to(1e6)),
+        proptest::option::of([up_to(102_400.0).prop_map(f64::abs), up_to(102_400.0).prop_map(f64::abs)]),
+    )
+        .prop_map(|((x_m, y_m, confidence), variance, velocity_mps, heading_rad, size_m)| PerceivedObject {
+            covariance_m2: variance.map(|variance| [variance, 0.0, variance]),
+            velocity_mps,
+            heading_rad,
+            size_m,
+            ..PerceivedObject::new("car", confidence, x_m, y_m)
+        })
+}
+
 proptest! {
+    #[test]
+    fn extreme_objects_of_one_vehicle_cost_the_message_no_others(
+        extreme in proptest::collection::vec(extreme_detection(), 0..4),
+        rotation_deg in -180.0..180.0,
+    ) {
+        let ordinary = (0..5).map(|number| PerceivedObject::new("car", 0.9, 12.0 + 3.0 * f64::from(number), 5.0));
+        let sent = report(ordinary.chain(extreme).collect());
+        prop_assert!(sent.validate(&Limits::default()).is_ok());
+        let message = encode_report(&sent, &cell(rotation_deg), 7).unwrap();
+        let received = decode(&message.bytes, &origin(rotation_deg)).unwrap();
+        prop_assert_eq!(received.objects.len() + message.left_out, sent.objects.len());
+        for object in &sent.objects[..5] {
+            let is_it = |other: &PerceivedObject| (other.x_m - object.x_m).hypot(other.y_m - object.y_m) < 0.009;
+            prop_assert!(received.objects.iter().any(is_it), "{:?} is missing", object);
+        }
+    }
+
     #[test]
     fn a_report_comes_back_within_the_resolution_of_the_standard(
         objects in proptest::collection::vec(detection(), 0..40),

@@ -3,7 +3,6 @@
 mod tracks;
 
 use std::fmt::Display;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
@@ -14,6 +13,7 @@ use ecod::replay::{FusedLine, ReplayConfig, read_report};
 use ecod::wire::{GlobalMap, RejectReason};
 use ecod_actors::cli::lines::{self, LineRead, read_line};
 use ecod_actors::cli::{Failure, cell};
+use ecod_actors::platform::bounded_file;
 use serde::Deserialize;
 
 use super::columns::columns;
@@ -80,7 +80,7 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     if let Some(format) = arguments.format {
         return tracks::run_files(arguments, format);
     }
-    let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
+    let text = bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()));
     let text = text.map_err(Failure::usage)?;
     if TrackTruth::is_in(&text) {
         return tracks::run(arguments, &text);

@@ -1,12 +1,12 @@
 //! `ecod-lab report`: a log as one page, judged by what is true.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
 use ecod_actors::cli::{Failure, PageArguments, page};
 use ecod_actors::observe::report::Report;
+use ecod_actors::platform::bounded_file;
 
 use crate::eval::Truth;
 use crate::eval::tracks::TrackTruth;
@@ -30,7 +30,7 @@ pub(super) fn run(arguments: &LogReportArguments) -> Result<(), Failure> {
 
 /// A report that judges by the truth in this file.
 fn judged(path: &Path) -> anyhow::Result<Report> {
-    let text = fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let text = bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
     let truth = || format!("truth {}", path.display());
     Ok(if TrackTruth::is_in(&text) {
         judged_by_tracks(TrackTruth::parse(&text).with_context(truth)?)

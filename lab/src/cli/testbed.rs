@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod_actors::cli::{Failure, lines, print};
+use ecod_actors::platform::bounded_file;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
@@ -115,7 +116,7 @@ pub(super) fn read(path: &Path) -> anyhow::Result<Testbed> {
 }
 
 fn read_text(path: &Path) -> anyhow::Result<String> {
-    fs::read_to_string(path).with_context(|| format!("cannot read scenes {}", path.display()))
+    bounded_file::read_text(path).with_context(|| format!("cannot read scenes {}", path.display()))
 }
 
 /// The named scene, or all.

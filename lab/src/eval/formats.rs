@@ -21,6 +21,7 @@ use ecod::model::detection::BoundingBox;
 use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::wire::{ObjectReport, PerceivedObject, WirePose};
+use ecod_actors::platform::bounded_file;
 use nalgebra::Point2;
 
 pub use standing_camera::StandingCamera;
@@ -152,7 +153,7 @@ impl FileFormat {
         }
         let files = self.files(path)?;
         let parse = |file: &PathBuf| {
-            let text = fs::read_to_string(file).with_context(|| format!("cannot read {}", file.display()))?;
+            let text = bounded_file::read_text(file).with_context(|| format!("cannot read {}", file.display()))?;
             self.parse(&text, camera.is_some()).with_context(|| file.display().to_string())
         };
         let mut parsed = files.iter().map(parse).collect::<anyhow::Result<Vec<_>>>()?;

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use crate::leadership::election::interface::ElectionEffect;
+use crate::leadership::election::leader_clock::LeaderClock;
 use crate::leadership::election::liveness::Following;
 use crate::leadership::election::message::{Body, ElectionMessage};
 use crate::leadership::election::{Beat, Election, State};
@@ -140,6 +141,8 @@ impl Election {
     fn follow(&mut self, beat: Beat, now: Timestamp) {
         self.epoch = Some(beat.epoch.clone());
         self.learn_round(&beat.epoch.leader, beat.round);
+        self.leader_clock = Some(LeaderClock::of_beat(beat.epoch.clone(), beat.life, now));
+        self.waiting_questions.clear();
         let leader = beat.epoch.leader.clone();
         let beat_interval = Duration::from_millis(beat.every_ms);
         self.state =
@@ -159,6 +162,8 @@ impl Election {
 
     fn refresh(&mut self, beat: Beat, now: Timestamp) {
         self.learn_round(&beat.epoch.leader, beat.round);
+        self.leader_clock = Some(LeaderClock::of_beat(beat.epoch.clone(), beat.life, now));
+        self.answer_waiting(now);
         let State::Following(following) = &mut self.state else { return };
         following.beat_interval = Duration::from_millis(beat.every_ms);
         following.hear(now);

@@ -2,9 +2,9 @@
 
 use std::time::Duration;
 
-use crate::leadership::election::message::{Body, Candidacy, MAX_SUCCESSORS};
+use crate::leadership::election::message::{Body, Candidacy, LifeSign, MAX_SUCCESSORS};
 use crate::leadership::election::{Election, State};
-use crate::leadership::timers::RENEWAL_PAUSE;
+use crate::leadership::timers::{LIFE_SIGN_STEP_MS, RENEWAL_PAUSE};
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
@@ -58,6 +58,12 @@ impl Leading {
     pub(super) fn renewed(&mut self, before: &Self, least: Duration) {
         let is_calm = self.since.since(before.since) > RENEWAL_PAUSE * 6;
         self.pause = if is_calm { least } else { (before.pause * 2).clamp(least, RENEWAL_PAUSE) };
+    }
+
+    /// The sign of life of this leader, unsigned. Beats that are sent at about the same time have the same.
+    fn life_sign(&self, now: Timestamp) -> LifeSign {
+        let led_ms = u64::try_from(now.since(self.since).as_millis()).unwrap_or(u64::MAX);
+        LifeSign { led_ms: led_ms / LIFE_SIGN_STEP_MS * LIFE_SIGN_STEP_MS, signature: None }
     }
 
     /// True if this leader has said that the next round is another node's.
@@ -143,6 +149,7 @@ impl Election {
             followers: u8::try_from(self.peers.followers(&self.id, now)).unwrap_or(u8::MAX),
             after: leading.after.clone(),
             successors: leading.successors.clone(),
+            life: leading.life_sign(now),
         };
         self.send(to, body, now);
     }

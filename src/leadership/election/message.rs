@@ -96,6 +96,19 @@ pub struct Candidacy {
     pub fit: bool,
 }
 
+/// A leader's sign of life, which others can pass on and cannot make: how long it has led, under its signature.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+pub struct LifeSign {
+    /// Time in ms for which the leader has led when it sent this, by its own clock.
+    #[n(0)]
+    pub led_ms: u64,
+    /// Its signature in base64 under its cell, its epoch and `led_ms`; absent in a cell without certificates. The transport
+    /// adds and checks it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[n(1)]
+    pub signature: Option<String>,
+}
+
 /// The protocol. In the quiet, once the leader is known:
 ///
 /// ```text
@@ -108,7 +121,8 @@ pub struct Candidacy {
 ///
 /// ```text
 /// seeker    -> all         Ask
-/// follower  -> seeker      LeaderEvidence     "I heard it 12 ms ago"
+/// follower  -> leader      Ask                where its last sign of life is old
+/// follower  -> seeker      LeaderEvidence     "I heard it 12 ms ago", with its last sign of life
 /// claimant  -> all         Beat      epoch + 1, after = the epoch it succeeds
 /// ```
 ///
@@ -156,6 +170,9 @@ pub enum Body {
         /// Time since the leader was heard, in ms.
         #[n(1)]
         age_ms: u64,
+        /// The last sign of life of the leader of the sender's epoch.
+        #[n(2)]
+        life: LifeSign,
     },
     /// "I lead": the leader's sign of life.
     #[n(3)]
@@ -176,6 +193,9 @@ pub enum Body {
         /// The next leaders, the standby first; at most [`MAX_SUCCESSORS`].
         #[n(4)]
         successors: Vec<NodeName>,
+        /// The leader's sign of life.
+        #[n(5)]
+        life: LifeSign,
     },
     /// "Get ready to lead in my place": to the challenger.
     #[n(4)]
@@ -200,6 +220,24 @@ pub enum Body {
         #[n(1)]
         last_round: u64,
     },
+}
+
+impl LifeSign {
+    /// Maximum length of a signature in base64.
+    const MAX_SIGNATURE: usize = 128;
+
+    /// The bytes that the leader of `epoch` signs in a cell with certificates.
+    pub fn signed_bytes(&self, cell: &NodeName, epoch: &Epoch) -> Vec<u8> {
+        let header = b"ecod leader alive 1\0";
+        let names = [cell.as_str(), epoch.leader.as_str()].map(str::as_bytes);
+        let numbers = [epoch.term, self.led_ms].map(u64::to_be_bytes);
+        [&header[..], names[0], b"\0", names[1], b"\0", &numbers[0], &numbers[1]].concat()
+    }
+
+    fn is_plausible(&self) -> bool {
+        let signature = self.signature.as_ref();
+        self.led_ms <= wire::MAX_INTEGER && signature.is_none_or(|text| text.len() <= Self::MAX_SIGNATURE)
+    }
 }
 
 impl wire::Payload for ElectionMessage {
@@ -240,19 +278,21 @@ impl ElectionMessage {
         let known = |epoch: &Option<Epoch>| epoch.as_ref().is_none_or(|epoch| epoch.term <= self.term);
         let body = match &self.body {
             Body::Status { over, no_login } => known(over) && no_login.len() <= MAX_NO_LOGIN,
-            Body::Beat { every_ms, after, successors, round, .. } => {
+            Body::Beat { every_ms, after, successors, round, life, .. } => {
                 let leads = self.epoch.as_ref().is_some_and(|epoch| epoch.leader == self.from);
                 leads
                     && known(after)
                     && successors.len() <= MAX_SUCCESSORS
                     && (1..=60_000).contains(every_ms)
                     && *round <= MAX_ROUND
+                    && life.is_plausible()
             }
+            Body::LeaderEvidence { life, .. } => life.is_plausible(),
             Body::Resign { epoch, last_round } => {
                 epoch.term <= self.term && epoch.leader == self.from && *last_round <= MAX_ROUND
             }
             Body::Yield { last_round } => *last_round <= MAX_ROUND,
-            Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready => true,
+            Body::Ask { .. } | Body::Offer | Body::Ready => true,
         };
         let clock = self.clock.as_ref().is_none_or(|clock| clock.is_plausible());
         body && clock && self.term <= MAX_TERM && known(&self.epoch)
@@ -276,7 +316,14 @@ mod tests {
             term,
             epoch: Some(Epoch::new(4, NodeName::new(leader).unwrap())),
             hears_you: true,
-            body: Body::Beat { every_ms: 40, round: 88, followers: 31, after: None, successors: vec![] },
+            body: Body::Beat {
+                every_ms: 40,
+                round: 88,
+                followers: 31,
+                after: None,
+                successors: vec![],
+                life: LifeSign::default(),
+            },
             clock: None,
             description: None,
         }
@@ -286,7 +333,8 @@ mod tests {
     fn messages_survive_every_encoding_and_fit_a_packet() {
         let mut message = beat(4, "edge");
         let long = NodeName::new("x".repeat(64)).unwrap();
-        if let Body::Beat { successors, after, .. } = &mut message.body {
+        if let Body::Beat { successors, after, life, .. } = &mut message.body {
+            *life = LifeSign { led_ms: wire::MAX_INTEGER, signature: Some("x".repeat(96)) };
             *successors = vec![long.clone(), long.clone(), long.clone()];
             *after = Some(Epoch::new(3, long));
         }
@@ -317,10 +365,23 @@ mod tests {
                 r#"{"status":{"no_login":["edge"]}}"#,
             ),
             (Body::Ask { ask: 7 }, r#"{"ask":{"ask":7}}"#),
-            (Body::LeaderEvidence { ask: 7, age_ms: 12 }, r#"{"vouch":{"ask":7,"age_ms":12}}"#),
             (
-                Body::Beat { every_ms: 50, round: 88, followers: 3, after: None, successors: Vec::new() },
-                r#"{"beat":{"every_ms":50,"round":88,"followers":3,"successors":[]}}"#,
+                Body::LeaderEvidence { ask: 7, age_ms: 12, life: LifeSign { led_ms: 900, signature: None } },
+                r#"{"vouch":{"ask":7,"age_ms":12,"life":{"led_ms":900}}}"#,
+            ),
+            (
+                Body::Beat {
+                    every_ms: 50,
+                    round: 88,
+                    followers: 3,
+                    after: None,
+                    successors: Vec::new(),
+                    life: LifeSign { led_ms: 900, signature: Some("MEU=".into()) },
+                },
+                concat!(
+                    r#"{"beat":{"every_ms":50,"round":88,"followers":3,"successors":[],"#,
+                    r#""life":{"led_ms":900,"signature":"MEU="}}}"#
+                ),
             ),
             (Body::Offer, r#""offer""#),
             (Body::Ready, r#""ready""#),
@@ -339,7 +400,8 @@ mod tests {
             );
             assert_eq!(json, format!("{envelope}{expected}}}"));
         }
-        let compact = ElectionMessage { body: Body::LeaderEvidence { ask: 7, age_ms: 12 }, ..beat(4, "edge") };
+        let life = LifeSign { led_ms: 900, signature: None };
+        let compact = ElectionMessage { body: Body::LeaderEvidence { ask: 7, age_ms: 12, life }, ..beat(4, "edge") };
         let compact: String = compact.encode(Encoding::Compact).iter().map(|byte| format!("{byte:02x}")).collect();
         assert_eq!(compact, "890164656467651b000627629fb54800098402186401f504f58302070c82046465646765");
     }

@@ -6,8 +6,10 @@ use std::time::Duration;
 use crate::aggregator::round::FirstRound;
 use crate::leadership::election::interface::ElectionEffect;
 use crate::leadership::election::leading::Leading;
-use crate::leadership::election::message::{Body, Candidacy};
+use crate::leadership::election::leader_clock::LeaderClock;
+use crate::leadership::election::message::{Body, Candidacy, LifeSign};
 use crate::leadership::election::{Election, State};
+use crate::leadership::timers::MAX_WAITING_QUESTIONS;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
@@ -105,15 +107,37 @@ impl Election {
         }
     }
 
-    /// Answers a question about the leader: how long ago this node heard it.
+    /// Answers a question about the leader: how long ago this node received something of it, with its last sign of life. One
+    /// that is old convinces nobody: then the leader is asked for another, which answers the question too.
     pub(super) fn answer(&mut self, from: &NodeName, ask: u64, now: Timestamp) {
+        let patience = self.config.response_timeout();
+        let life = self.leader_clock.as_ref().filter(|clock| self.current_epoch().is_some_and(|epoch| clock.is_of(epoch)));
         match &self.state {
-            State::Leading(_) => self.send_beat(from, now),
-            State::Following(following) if now.since(following.evidence_at()) <= self.config.response_timeout() => {
-                let age = now.since(following.evidence_at()).as_micros().div_ceil(1000);
-                self.send(from, Body::LeaderEvidence { ask, age_ms: u64::try_from(age).unwrap_or(u64::MAX) }, now);
+            State::Leading(_) => return self.send_beat(from, now),
+            State::Following(following) if now.since(following.evidence_at()) <= patience => {
+                let (leader, evidence_at) = (following.epoch.leader.clone(), following.evidence_at());
+                let recent = life.filter(|clock| now.since(clock.latest_at()) <= self.config.beat() * 2);
+                if let Some(life) = recent.map(|clock| clock.latest().clone()) {
+                    let age = now.since(evidence_at).as_micros().div_ceil(1000);
+                    let age_ms = u64::try_from(age).unwrap_or(u64::MAX);
+                    return self.send(from, Body::LeaderEvidence { ask, age_ms, life }, now);
+                }
+                self.waiting_questions.retain(|(other, _)| other != from);
+                if leader != *from && self.waiting_questions.len() < MAX_WAITING_QUESTIONS {
+                    self.waiting_questions.push((from.clone(), ask));
+                    let own = self.questions.ask(now);
+                    self.send(&leader, Body::Ask { ask: own }, now);
+                }
             }
-            State::Following(_) | State::Seeking(_) => self.send_status(from, now),
+            State::Following(_) | State::Seeking(_) => {}
+        }
+        self.send_status(from, now);
+    }
+
+    /// Answers the questions that waited for a sign of life of the leader, which has just come.
+    pub(super) fn answer_waiting(&mut self, now: Timestamp) {
+        for (from, ask) in std::mem::take(&mut self.waiting_questions) {
+            self.answer(&from, ask, now);
         }
     }
 
@@ -123,13 +147,20 @@ impl Election {
         epoch: Option<Epoch>,
         ask: u64,
         age_ms: u64,
+        life: LifeSign,
         now: Timestamp,
     ) {
         let (Some(epoch), Some(asked_at)) = (epoch, self.questions.asked_at(ask)) else { return };
-        let heard_at = asked_at - Duration::from_millis(age_ms);
-        if epoch.leader == self.id || epoch.leader == *from || self.is_over(&epoch) {
+        let is_superseded = Some(&epoch) < self.epoch.as_ref();
+        if epoch.leader == self.id || epoch.leader == *from || self.is_over(&epoch) || is_superseded {
             return;
         }
+        let clock = match self.leader_clock.take().filter(|clock| clock.is_of(&epoch)) {
+            Some(clock) => self.leader_clock.insert(clock),
+            None => self.leader_clock.insert(LeaderClock::of_beat(epoch.clone(), life.clone(), now)),
+        };
+        // Whatever its sender says, the leader was alive when it sent its sign of life, and not known to be later.
+        let heard_at = (asked_at - Duration::from_millis(age_ms)).min(clock.observe(life, now));
         let believable = heard_at + self.config.response_timeout() > now;
         let doubtful = match &mut self.state {
             State::Following(following) if following.epoch == epoch => {
@@ -140,7 +171,7 @@ impl Election {
             State::Seeking(seeking) => Some(&epoch) != self.epoch.as_ref() || heard_at > seeking.known_until,
             State::Leading(_) => false,
         };
-        if believable && doubtful && Some(&epoch) >= self.epoch.as_ref() {
+        if believable && doubtful {
             self.adopt(epoch, heard_at, now);
         }
     }

@@ -1,7 +1,7 @@
 //! Effects of a node's leadership, and their order.
 
 use super::*;
-use crate::leadership::election::{Body, Candidacy, ElectionConfig, ElectionMessage};
+use crate::leadership::election::{Body, Candidacy, ElectionConfig, ElectionMessage, LifeSign};
 use crate::leadership::health::HealthSample;
 use crate::leadership::links::DataPlane;
 use crate::leadership::timers::HEALTH_PERIOD;
@@ -131,7 +131,7 @@ impl Scene {
 
     fn beat(&mut self) {
         let successors = vec![name("euclid")];
-        self.hear(Body::Beat { every_ms: 50, round: 40, followers: 1, after: None, successors });
+        self.hear(Body::Beat { every_ms: 50, round: 40, followers: 1, after: None, successors, life: LifeSign::default() });
     }
 
     fn notices(&self) -> Vec<&Notice> {
@@ -201,7 +201,9 @@ fn a_false_last_will_ends_a_leader_once_in_each_of_its_runs() {
         scene.members = vec![edge.clone()];
         scene.take(Input::MemberAlive { member: edge });
         scene.run_for(1000);
-        let beat = Body::Beat { every_ms: 50, round: 40, followers: 2, after: None, successors: vec![name("euclid")] };
+        let successors = vec![name("euclid")];
+        let beat =
+            Body::Beat { every_ms: 50, round: 40, followers: 2, after: None, successors, life: LifeSign::default() };
         scene.hear_in(Epoch::new(7 + 2 * attempt, name("edge")), beat);
         assert_eq!(scene.machine.leadership.leader(), Some(&name("edge")), "attempt {attempt}");
         for state in [NodeState::Aggregating, NodeState::Offline] {
@@ -411,7 +413,8 @@ fn is_followed(rights: Rights) -> bool {
     scene.take(Input::MemberAlive { member: member("edge", 2) });
     for _ in 0..10 {
         let successors = vec![name("euclid")];
-        let body = Body::Beat { every_ms: 50, round: 40, followers: 1, after: None, successors };
+        let body =
+            Body::Beat { every_ms: 50, round: 40, followers: 1, after: None, successors, life: LifeSign::default() };
         let message = scene.message(Epoch::new(7, name("edge")), body);
         scene.take(Input::Receive { from: name("edge"), rights, message });
         scene.run_for(50);

@@ -1,8 +1,8 @@
 //! The file to which accepted maps are appended.
 
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
-use std::path::PathBuf;
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use ecod::model::names::NodeName;
@@ -13,14 +13,19 @@ use tokio::sync::watch;
 use crate::messages::newest::ReceivedMap;
 
 /// Time after a failure until the file is opened again.
-const RETRY_PAUSE: Duration = Duration::from_secs(60);
+const RETRY_PAUSE: Duration = Duration::from_secs(10);
+
+/// Size from which a log is renamed to `….1`, in place of the one before, and a new one begun: a disk is filled by two of them
+/// at most.
+const MAX_BYTES: u64 = 512 * 1024 * 1024;
 
 /// A file of maps with their times of receipt, one JSON object a line. A disk that refuses it costs its lines only.
 pub(super) struct MapLog {
     path: PathBuf,
     cell: NodeName,
     present_cell: watch::Receiver<NodeName>,
-    file: Option<BufWriter<File>>,
+    /// The file and its size in bytes.
+    file: Option<(File, u64)>,
     retry_at: Timestamp,
 }
 
@@ -45,17 +50,44 @@ impl MapLog {
     }
 
     fn write(&mut self, map: &ReceivedMap) -> io::Result<()> {
-        let file = match &mut self.file {
+        let mut line = serde_json::to_vec(&LogLine { cell: &self.cell, map })?;
+        line.push(b'\n');
+        if self.file.as_ref().is_some_and(|(_, bytes)| *bytes >= MAX_BYTES) {
+            self.file = None;
+            fs::rename(&self.path, with_suffix(&self.path, ".1"))?;
+        }
+        let (file, bytes) = match &mut self.file {
             Some(file) => file,
             None => {
-                let file = File::options().create(true).append(true).open(&self.path)?;
-                self.file.insert(BufWriter::new(file))
+                let mut file = File::options().create(true).read(true).append(true).open(&self.path)?;
+                if ends_within_a_line(&mut file)? {
+                    file.write_all(b"\n")?;
+                }
+                let bytes = file.metadata()?.len();
+                self.file.insert((file, bytes))
             }
         };
-        serde_json::to_writer(&mut *file, &LogLine { cell: &self.cell, map })?;
-        file.write_all(b"\n")?;
-        file.flush()
+        *bytes += line.len() as u64;
+        file.write_all(&line)
     }
+}
+
+/// The path with a suffix after the whole name of the file.
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(suffix);
+    name.into()
+}
+
+/// True if the file ends in half a line, as a crash or a full disk leaves it.
+fn ends_within_a_line(file: &mut File) -> io::Result<bool> {
+    if file.seek(SeekFrom::End(0))? == 0 {
+        return Ok(false);
+    }
+    file.seek(SeekFrom::End(-1))?;
+    let mut last = [0];
+    file.read_exact(&mut last)?;
+    Ok(last != *b"\n")
 }
 
 /// A line of the log; readers take it for a [`ReceivedMap`].
@@ -81,6 +113,35 @@ mod tests {
         }))
         .unwrap();
         ReceivedMap { received_at, map: Arc::new(map) }
+    }
+
+    #[test]
+    fn a_new_line_begins_on_a_line_of_its_own_after_a_crash() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("maps.jsonl");
+        std::fs::write(&path, "{\"received_at_us\":17,\"sch").unwrap();
+        let cell = NodeName::from_static("lot-1");
+        let (_present, present_cell) = watch::channel(cell.clone());
+        let mut log = MapLog::new(path.clone(), cell, present_cell);
+        log.append(&map(Timestamp(1)));
+        log.append(&map(Timestamp(2)));
+        let lines = std::fs::read_to_string(&path).unwrap();
+        let whole = lines.lines().filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
+        assert_eq!(whole.collect::<Vec<_>>(), [map(Timestamp(1)), map(Timestamp(2))]);
+    }
+
+    #[test]
+    fn a_large_log_is_renamed_and_a_new_one_begun() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("maps.jsonl");
+        File::create(&path).unwrap().set_len(MAX_BYTES).unwrap();
+        let cell = NodeName::from_static("lot-1");
+        let (_present, present_cell) = watch::channel(cell.clone());
+        let mut log = MapLog::new(path.clone(), cell, present_cell);
+        log.append(&map(Timestamp(1)));
+        log.append(&map(Timestamp(2)));
+        let size = |name: &str| std::fs::metadata(directory.path().join(name)).unwrap().len();
+        assert!(size("maps.jsonl.1") > MAX_BYTES && size("maps.jsonl") < 1000);
     }
 
     #[test]

@@ -1,26 +1,40 @@
-//! Queue of reports before the fuser: the latest of each vehicle and kind.
+//! Queue of reports before the fuser: the latest of each vehicle and kind, and of each vehicle a bounded number of objects.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{ObjectReport, ReportKind};
 
+use crate::platform::throttle::KeyedThrottle;
 use crate::transport::mqtt::Delivery;
 
+/// Maximum number of objects a second of one vehicle, its parts together, and the burst: two thirds of the largest reports at
+/// 30 Hz. More would take the processor time of the others.
+const MAX_OBJECTS_HZ: u32 = 20_000;
+
 /// Queue filled on the links' tasks and emptied by the fuser. It holds at most one report of each vehicle and kind, so
-/// that a flood from one vehicle delays no other.
+/// that a flood from one vehicle delays no other, and takes at most [`MAX_OBJECTS_HZ`] objects a second of each.
 #[derive(Debug, Clone, Default)]
 pub struct LatestReportQueue(Arc<Mutex<Waiting>>);
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Waiting {
+    objects: KeyedThrottle<NodeName>,
     next: u64,
     /// In order of arrival.
     reports: BTreeMap<u64, Delivery<QueuedReport>>,
     /// Place and capture time of each vehicle's report.
     places: BTreeMap<(NodeName, ReportKind), (u64, Timestamp)>,
+}
+
+impl Default for Waiting {
+    fn default() -> Self {
+        let objects = KeyedThrottle::new(MAX_OBJECTS_HZ, Duration::from_secs(1) / MAX_OBJECTS_HZ);
+        Self { objects, next: 0, reports: BTreeMap::new(), places: BTreeMap::new() }
+    }
 }
 
 /// A report and the algorithm that it is for.
@@ -39,6 +53,8 @@ pub struct PushOutcome {
     pub is_first: bool,
     /// An older report of the vehicle was dropped for this one, or this one for a newer.
     pub has_replaced: bool,
+    /// The report was dropped: its vehicle has sent too many objects lately.
+    pub is_over_budget: bool,
 }
 
 impl LatestReportQueue {
@@ -49,14 +65,19 @@ impl LatestReportQueue {
         let is_first = waiting.reports.is_empty();
         let (key, captured_at) = ((report.node.clone(), *kind), report.captured_at_us);
         if waiting.places.get(&key).is_some_and(|(_, known)| *known > captured_at) {
-            return PushOutcome { is_first, has_replaced: true };
+            return PushOutcome { is_first, has_replaced: true, is_over_budget: false };
+        }
+        let count = u32::try_from(report.objects.len()).unwrap_or(u32::MAX);
+        let received_at = delivery.received_at;
+        if count > 0 && !waiting.objects.allow_many(&key.0.vehicle(), count, received_at) {
+            return PushOutcome { is_first: false, has_replaced: false, is_over_budget: true };
         }
         let place = waiting.next;
         waiting.next += 1;
         waiting.reports.insert(place, delivery);
         let older = waiting.places.insert(key, (place, captured_at));
         let has_replaced = older.is_some_and(|(older, _)| waiting.reports.remove(&older).is_some());
-        PushOutcome { is_first, has_replaced }
+        PushOutcome { is_first, has_replaced, is_over_budget: false }
     }
 
     /// Empties the queue, in order of arrival.
@@ -73,6 +94,8 @@ impl LatestReportQueue {
 
 #[cfg(test)]
 mod tests {
+    use ecod::wire::PerceivedObject;
+
     use super::*;
 
     #[test]
@@ -83,10 +106,10 @@ mod tests {
             queue.push(Delivery::local(QueuedReport { kind, report }, Timestamp(seq)))
         };
         use ReportKind::{Detections, VoteDetections};
-        assert_eq!(push("mallory", Detections, 0), PushOutcome { is_first: true, has_replaced: false });
+        assert_eq!(push("mallory", Detections, 0), PushOutcome { is_first: true, has_replaced: false, is_over_budget: false });
         assert_eq!(push("euclid", Detections, 1), PushOutcome { is_first: false, has_replaced: false });
         for seq in 2..1000 {
-            assert_eq!(push("mallory", Detections, seq), PushOutcome { is_first: false, has_replaced: true });
+            assert_eq!(push("mallory", Detections, seq), PushOutcome { is_first: false, has_replaced: true, is_over_budget: false });
         }
         push("mallory", VoteDetections, 1000);
         let taken: Vec<_> = queue.drain().iter().map(|delivery| delivery.received_at.micros()).collect();
@@ -94,5 +117,25 @@ mod tests {
         assert!(push("euclid", Detections, 1001).is_first);
         assert!(push("euclid", Detections, 1000).has_replaced, "the later capture stays, whichever came first");
         assert_eq!(queue.drain()[0].received_at.micros(), 1001);
+    }
+
+    #[test]
+    fn a_vehicle_and_its_parts_share_a_budget_of_objects_and_others_have_their_own() {
+        let queue = LatestReportQueue::default();
+        let push = |node: &str, at_us: u64, objects: usize| {
+            let object = PerceivedObject::new("car", 0.5, 0.0, 0.0);
+            let report = ObjectReport {
+                objects: vec![object; objects],
+                ..ObjectReport::new(NodeName::new(node).unwrap(), at_us, Timestamp(at_us))
+            };
+            let delivery = QueuedReport { kind: ReportKind::Detections, report: Arc::new(report) };
+            !queue.push(Delivery::local(delivery, Timestamp(at_us))).is_over_budget
+        };
+        let start = 1_000_000_000;
+        let of_parts = (0..100).filter(|part| push(&format!("mallory--{part}"), start + part, 1000)).count();
+        assert_eq!(of_parts, MAX_OBJECTS_HZ as usize / 1000);
+        assert!(push("mallory", start + 200, 0), "a report without objects costs nothing");
+        assert!(push("euclid", start + 200, 1000));
+        assert!(push("mallory", start + 100_000, 1000), "it earns new ones");
     }
 }

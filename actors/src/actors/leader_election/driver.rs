@@ -17,6 +17,7 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 use tracing::field::display;
 
+use super::life_signs::LifeSigns;
 use super::term_writer::{TermState, TermWriter, saved_term};
 use super::{LeaderElectionArguments, Parts, probe};
 use crate::messages::description_keeper::DescriptionKeeperMessage;
@@ -44,6 +45,7 @@ pub struct ElectionDriver {
     parts: Parts,
     leadership: watch::Sender<Leadership>,
     counters: Arc<Counters>,
+    life_signs: LifeSigns,
     /// Nodes that declared more than their certificate allows.
     overreached: BTreeSet<NodeName>,
     name: NodeName,
@@ -68,6 +70,8 @@ impl ElectionDriver {
             parts,
             leadership,
             clock,
+            cell,
+            credentials,
             counters,
         } = arguments;
         let saved_term = saved_term(term_file.as_ref());
@@ -86,6 +90,7 @@ impl ElectionDriver {
             parts,
             leadership,
             counters,
+            life_signs: LifeSigns::new(cell, credentials),
             overreached: BTreeSet::new(),
             name,
             complaint: None,
@@ -97,18 +102,26 @@ impl ElectionDriver {
     }
 
     pub(super) async fn take_event(&mut self, event: MembershipEvent) {
+        if let MembershipEvent::Alive { member } | MembershipEvent::Changed { member } = &event {
+            self.life_signs.meet(&member.name, member.certificate.as_ref());
+        }
         let input = match event {
             MembershipEvent::Alive { member } => Input::MemberAlive { member: as_seen(&member) },
             MembershipEvent::Changed { member } => Input::MemberChanged { member: as_seen(&member) },
             MembershipEvent::Suspected { name } => Input::MemberSuspected { name },
             MembershipEvent::Expelled { name } => {
                 self.cell_time.forget(&name);
+                self.life_signs.forget(&name);
                 self.parts.fuser.send(FuserMessage::ForgetMap { of: name });
                 return;
             }
             MembershipEvent::Down { name } => Input::MemberDown { name },
             MembershipEvent::Received { from, rights, payload, .. } => match ElectionMessage::decode(&payload) {
                 Ok(message) => {
+                    if !self.life_signs.is_proven(&message) {
+                        self.counters.reject(RejectReason::Unattested, from.as_str());
+                        return tracing::debug!(%from, "a sign of life without its leader's signature");
+                    }
                     if message.from == from {
                         if let Some(stamp) = message.description.as_deref().copied() {
                             let may_lead = rights.limit_role(message.candidacy.role) != Role::Cav;
@@ -183,6 +196,7 @@ impl ElectionDriver {
             Effect::PersistTerm { term } => self.terms.save(term),
             Effect::Send { to, mut message } => {
                 message.description = Some(Box::new(self.machine.description()));
+                self.life_signs.sign(&mut message);
                 message.clock = Some(Box::new(self.cell_time.stamps(&to, clock::now())));
                 let payload = message.encode(Encoding::Cbor).into();
                 self.parts.membership.send(MembershipMessage::Send { to, payload });

@@ -152,6 +152,10 @@ impl NodeBuilder {
                     if outcome.has_replaced {
                         counters.shed(ShedReason::ReportReplaced, node.as_str());
                     }
+                    if outcome.is_over_budget {
+                        counters.shed(ShedReason::ObjectsThrottled, node.vehicle().as_str());
+                        return;
+                    }
                     !outcome.is_first || fuser.send(FuserMessage::TakeReports)
                 }
                 Incoming::Map(map) => {
@@ -307,6 +311,8 @@ impl NodeBuilder {
                 shared: self.shared.subscribe(),
             },
             leadership: self.leadership.clone(),
+            cell: self.config.cell.clone(),
+            credentials: self.security.credentials.clone(),
             clock: self.clock.clone(),
             counters: self.counters(),
         }

@@ -20,6 +20,8 @@ pub enum ShedReason {
     LedgerThrottled,
     /// A node published its status more often than `mqtt.max_report_hz`; it was not decoded.
     StatusThrottled,
+    /// A vehicle and its parts reported more than 20,000 objects a second; the report was not fused.
+    ObjectsThrottled,
     /// A newer report of the same vehicle came before the fuser read this one.
     ReportReplaced,
     /// A neighbouring cell sent maps more often than 20 times a second; the map was not decoded.

@@ -135,7 +135,7 @@ const DROPS = {
   cell_reputation_dropped: "region not told of a vehicle: too many have left while its broker is away",
   overreached: "node declares more than its certificate allows",
   record_failed: "log cannot be written", record_dropped: "entry missing in the log",
-  vote_ignored: "vote ignored: no usable location", report_late: "report too late for tracking", object_refused: "new object not tracked: too many", reputations_not_saved: "reputations cannot be saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
+  vote_ignored: "vote ignored: no usable location", report_late: "report too late for tracking", object_refused: "new object not tracked: too many", entry_left_out: "object left out of the map: out of bounds, or too many of one vehicle", reputations_not_saved: "reputations cannot be saved", frame_failed: "camera frame unusable", frame_skipped: "camera frame skipped", source_failed: "camera failed",
   detection_unplaced: "detection without a position", pose_rejected: "pose rejected", frame_without_pose: "frame without a pose", browser_refused: "browser refused", browser_throttled: "browser refused: too many requests", dashboard_not_bound: "page address already in use",
 };
 

@@ -1,0 +1,89 @@
+//! The clock of the present leader, as its signs of life show it at another node.
+//!
+//! A leader states in each beat how long it has led. So a node can date a sign of life that others pass on: as long after one
+//! that it received itself as the leader says. A node that passes on an old sign of life as a new one convinces nobody, and with
+//! certificates nobody but the leader can make one.
+
+use std::time::Duration;
+
+use crate::leadership::election::message::LifeSign;
+use crate::model::epoch::Epoch;
+use crate::model::time::Timestamp;
+
+/// Clock of a leader.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(super) struct LeaderClock {
+    epoch: Epoch,
+    /// Beginning of the leadership on this node's clock.
+    began_at: Timestamp,
+    /// Time of the last sign of life that was dated.
+    observed_at: Timestamp,
+    /// The latest sign of life.
+    latest: LifeSign,
+}
+
+/// Two clocks drift apart by one part in so many at most.
+const MAX_DRIFT: u32 = 1000;
+
+impl LeaderClock {
+    /// Clock of a leader by a beat that it has just sent.
+    pub(super) fn of_beat(epoch: Epoch, life: LifeSign, now: Timestamp) -> Self {
+        let began_at = now - Duration::from_millis(life.led_ms);
+        Self { epoch, began_at, observed_at: now, latest: life }
+    }
+
+    /// True if it is the clock of this leadership.
+    pub(super) fn is_of(&self, epoch: &Epoch) -> bool {
+        self.epoch == *epoch
+    }
+
+    /// Time at which the leader sent its latest sign of life, at most.
+    pub(super) fn latest_at(&self) -> Timestamp {
+        self.began_at + Duration::from_millis(self.latest.led_ms)
+    }
+
+    /// The latest sign of life.
+    pub(super) fn latest(&self) -> &LifeSign {
+        &self.latest
+    }
+
+    /// Takes a sign of life that another node passed on; returns when the leader sent it, at most.
+    pub(super) fn observe(&mut self, life: LifeSign, now: Timestamp) -> Timestamp {
+        let led = Duration::from_millis(life.led_ms);
+        let drifted = self.began_at + now.since(self.observed_at) / MAX_DRIFT;
+        self.began_at = drifted.min(now - led);
+        self.observed_at = now;
+        if life.led_ms > self.latest.led_ms {
+            self.latest = life;
+        }
+        self.began_at + led
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::names::NodeName;
+
+    fn ms(ms: u64) -> Timestamp {
+        Timestamp(1_000_000_000 + ms * 1000)
+    }
+
+    fn led(led_ms: u64) -> LifeSign {
+        LifeSign { led_ms, signature: None }
+    }
+
+    #[test]
+    fn a_sign_of_life_is_as_old_as_the_leader_says_whoever_passes_it_on() {
+        let epoch = Epoch::new(3, NodeName::from_static("edge"));
+        let mut clock = LeaderClock::of_beat(epoch, led(5000), ms(100));
+        assert_eq!(clock.observe(led(5400), ms(510)), ms(500).shifted(410), "drift");
+        // The same one again and again, as new.
+        for at in [600, 2000, 10_000] {
+            assert!(clock.observe(led(5400), ms(at)) <= ms(511), "at {at} ms");
+        }
+        assert_eq!(clock.latest(), &led(5400));
+        // It cannot have been sent later than it came.
+        assert!(clock.observe(led(60_000), ms(10_001)) <= ms(10_001));
+    }
+}
