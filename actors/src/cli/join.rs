@@ -10,7 +10,6 @@ use anyhow::{Context, anyhow};
 use clap::Args;
 use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
-use ecod::wire::Role;
 use nix::ifaddrs::getifaddrs;
 use nix::net::if_::InterfaceFlags;
 use ring::rand::{SecureRandom, SystemRandom};

@@ -120,7 +120,7 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
             let authority = authority.map_err(failure)?;
             format!("made a CA for {cell}; copy its certificate to every node: {}\n", shown(&authority.ca()))
         }
-        PkiCommand::Issue { ca, node, role, priority, days } => {
+        PkiCommand::Issue { ca, node, role, priority, operator, days } => {
             let mut authority = open(&ca.dir, false)?;
             let rights = Rights { role: role_named(role), priority: *priority, may_describe: *operator };
             authority.issue(node, rights, validity(*days), now).map_err(failure)?;

@@ -18,18 +18,22 @@ pub(super) struct LeaderClock {
     began_at: Timestamp,
     /// Time of the last sign of life that was dated.
     observed_at: Timestamp,
-    /// The latest sign of life.
+    /// The latest sign of life, and when it was received.
     latest: LifeSign,
+    latest_received_at: Timestamp,
 }
 
 /// Two clocks drift apart by one part in so many at most.
 const MAX_DRIFT: u32 = 1000;
 
+/// Time between two signs of life from which their distance shows a live leader, whose clock stood still before.
+const LIVE_TIME: Duration = Duration::from_millis(150);
+
 impl LeaderClock {
     /// Clock of a leader by a beat that it has just sent.
     pub(super) fn of_beat(epoch: Epoch, life: LifeSign, now: Timestamp) -> Self {
         let began_at = now - Duration::from_millis(life.led_ms);
-        Self { epoch, began_at, observed_at: now, latest: life }
+        Self { epoch, began_at, observed_at: now, latest: life, latest_received_at: now }
     }
 
     /// True if it is the clock of this leadership.
@@ -50,11 +54,15 @@ impl LeaderClock {
     /// Takes a sign of life that another node passed on; returns when the leader sent it, at most.
     pub(super) fn observe(&mut self, life: LifeSign, now: Timestamp) -> Timestamp {
         let led = Duration::from_millis(life.led_ms);
+        let passed_here = now.since(self.latest_received_at);
+        let passed_there = Duration::from_millis(life.led_ms.saturating_sub(self.latest.led_ms));
+        let is_live = passed_here >= LIVE_TIME && passed_there >= passed_here * 9 / 10;
         let drifted = self.began_at + now.since(self.observed_at) / MAX_DRIFT;
-        self.began_at = drifted.min(now - led);
+        self.began_at = if is_live { now - led } else { drifted.min(now - led) };
         self.observed_at = now;
         if life.led_ms > self.latest.led_ms {
             self.latest = life;
+            self.latest_received_at = now;
         }
         self.began_at + led
     }
@@ -77,13 +85,24 @@ mod tests {
     fn a_sign_of_life_is_as_old_as_the_leader_says_whoever_passes_it_on() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut clock = LeaderClock::of_beat(epoch, led(5000), ms(100));
-        assert_eq!(clock.observe(led(5400), ms(510)), ms(500).shifted(410), "drift");
+        assert_eq!(clock.observe(led(5100), ms(210)), ms(200).shifted(110), "ten milliseconds on its way, and drift");
+        assert_eq!(clock.observe(led(5400), ms(520)), ms(520), "signs of life go on");
         // The same one again and again, as new.
         for at in [600, 2000, 10_000] {
-            assert!(clock.observe(led(5400), ms(at)) <= ms(511), "at {at} ms");
+            assert!(clock.observe(led(5400), ms(at)) <= ms(530), "at {at} ms");
         }
         assert_eq!(clock.latest(), &led(5400));
         // It cannot have been sent later than it came.
         assert!(clock.observe(led(60_000), ms(10_001)) <= ms(10_001));
+    }
+
+    #[test]
+    fn a_leader_that_stood_still_is_followed_again_once_its_signs_of_life_go_on() {
+        let epoch = Epoch::new(3, NodeName::from_static("edge"));
+        let mut clock = LeaderClock::of_beat(epoch, led(5000), ms(100));
+        // Its process was suspended for two seconds, which its clock does not count.
+        assert!(clock.observe(led(5050), ms(2160)) < ms(160));
+        assert!(clock.observe(led(5100), ms(2210)) < ms(210), "they may have waited");
+        assert_eq!(clock.observe(led(5300), ms(2410)), ms(2410));
     }
 }

@@ -403,7 +403,7 @@ mod tests {
         let life = LifeSign { led_ms: 900, signature: None };
         let compact = ElectionMessage { body: Body::LeaderEvidence { ask: 7, age_ms: 12, life }, ..beat(4, "edge") };
         let compact: String = compact.encode(Encoding::Compact).iter().map(|byte| format!("{byte:02x}")).collect();
-        assert_eq!(compact, "890164656467651b000627629fb54800098402186401f504f58302070c82046465646765");
+        assert_eq!(compact, "890164656467651b000627629fb54800098402186401f504f58402070c8119038482046465646765");
     }
 
     #[test]

@@ -6,15 +6,15 @@ use crate::admission::live_stream::LiveStream;
 use crate::admission::minimum_delay::MinimumDelay;
 use crate::leadership::timers::{LEADER_DELAY_MEMORY, LIVE_STREAM_TIME, MAX_ROUND_AGE, MAX_ROUND_WAIT};
 use crate::model::epoch::Epoch;
-use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 
 /// Filter that tells rounds that have just been made from those that waited.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct StalenessFilter {
-    /// The least delay of each leader whose rounds came in the last [`LEADER_DELAY_MEMORY`], to which the delay of its
-    /// rounds is compared. A leader that leads again has the same clock: leaders that alternate make no old round fresh.
-    delays: Vec<(NodeName, LeadersDelay)>,
+    /// The least delay of the present leader, to which the delay of its rounds is compared, and before it those of leaders
+    /// whose rounds came in the last [`LEADER_DELAY_MEMORY`]. A leader that leads again has the same clock: leaders that
+    /// alternate make no old round fresh.
+    delays: Vec<(Epoch, LeadersDelay)>,
     /// Arrival of the last round; before any, the time of the start.
     newest_at: Timestamp,
     /// Arrival of the first round after none had come for [`MAX_ROUND_AGE`].
@@ -51,6 +51,12 @@ impl LeadersDelay {
             last: (fused_at, received_at),
             last_waited: Duration::ZERO,
         }
+    }
+
+    /// Distance of a round's delay from the least one.
+    fn distance(&self, fused_at: Timestamp, received_at: Timestamp) -> Duration {
+        let delay_us = received_at.micros_from(fused_at);
+        Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs())
     }
 
     /// Takes a round; returns how long it waited, as far as is known.
@@ -106,11 +112,16 @@ impl StalenessFilter {
             self.resumed_at = Some(received_at);
         }
         // A delay that was not learnt before a silence is none after it: rounds that waited may have begun it.
-        self.delays.retain(|(_, delay)| {
-            (delay.is_learnt || !has_resumed) && received_at.since(delay.last.1) <= LEADER_DELAY_MEMORY
+        self.delays.retain(|(of, delay)| {
+            let is_recent = || received_at.since(delay.last.1) <= LEADER_DELAY_MEMORY;
+            (delay.is_learnt || !has_resumed) && (of == epoch || is_recent())
         });
-        let known = self.delays.iter().position(|(leader, _)| *leader == epoch.leader);
-        let known = known.map(|at| self.delays.remove(at).1);
+        let known = self.delays.iter().position(|(of, _)| of.leader == epoch.leader);
+        let known = known.map(|at| self.delays.remove(at)).filter(|(of, delay)| {
+            // A clock that was set while another node led says nothing about the delay.
+            of == epoch || delay.distance(fused_at, received_at) <= LEADER_DELAY_MEMORY
+        });
+        let known = known.map(|(_, delay)| delay);
         let has_waited = self.resumed_at.is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_ROUND_AGE);
         let mut delay = known.unwrap_or_else(|| LeadersDelay::new(!has_waited, fused_at, received_at));
         let waited = delay.observe(fused_at, received_at);
@@ -118,7 +129,7 @@ impl StalenessFilter {
         if self.delays.len() == MAX_LEADERS {
             self.delays.remove(0);
         }
-        self.delays.push((epoch.leader.clone(), delay));
+        self.delays.push((epoch.clone(), delay));
         is_fresh
     }
 }
@@ -165,6 +176,17 @@ mod tests {
         let late = |n: u64| 100 * (n - 30);
         let oldest = (30..70).filter(|n| filter.is_fresh(&epoch(*n), ms(100 * n), ms(100 * n + late(*n))));
         assert_eq!(oldest.map(late).max(), Some(900));
+    }
+
+    #[test]
+    fn a_leader_that_leads_again_with_another_clock_is_believed_at_once() {
+        let leaders = ["edge", "gauss"].map(NodeName::from_static);
+        let epoch = |term: u64| Epoch::new(term, leaders[(term % 2) as usize].clone());
+        let mut filter = StalenessFilter::new(ms(0));
+        assert!((0..10).all(|n| filter.is_fresh(&epoch(2), ms(100 * n), ms(100 * n + 2))));
+        assert!((10..20).all(|n| filter.is_fresh(&epoch(3), ms(100 * n), ms(100 * n + 2))));
+        let set_back = |n: u64| ms(100 * n).shifted(-3_600_000_000);
+        assert!((20..30).all(|n| filter.is_fresh(&epoch(4), set_back(n), ms(100 * n + 2))));
     }
 
     #[test]
