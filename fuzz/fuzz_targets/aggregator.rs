@@ -16,7 +16,8 @@ use ecod::perception::landmark::Landmark;
 use ecod::tracking::TracksMode;
 use ecod::vote::VoteMode;
 use ecod::wire::{
-    Encoding, FieldOfView, Limits, ObjectReport, Payload, PerceivedObject, ReportKind, WirePose, decode, encode,
+    Encoding, FieldOfView, Limits, ObjectReport, Payload, PerceivedObject, ReportKind, WirePose, decode_entries,
+    encode,
 };
 use libfuzzer_sys::arbitrary::{self, Arbitrary};
 use libfuzzer_sys::fuzz_target;
@@ -109,8 +110,9 @@ fn check(fused: &Fused) {
 /// Whether every node of the cell would take the payload, in every encoding.
 fn assert_valid<T: Payload + std::fmt::Debug>(payload: &T) {
     for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
-        if let Err(reason) = decode::<T>(&encode(payload, encoding), &Limits::default()) {
-            panic!("{reason}: {payload:?}");
+        match decode_entries::<T>(&encode(payload, encoding), &Limits::default()) {
+            Ok((_, left_out)) => assert!(left_out.is_empty(), "{left_out:?}: {payload:?}"),
+            Err(reason) => panic!("{reason}: {payload:?}"),
         }
     }
 }
@@ -126,8 +128,9 @@ fn landmark(index: u8) -> Landmark {
 }
 
 fn object(object: &Object) -> PerceivedObject {
-    let unit = 10f64.powi(i32::from(object.scale % 6) - 3);
-    let [x_m, y_m] = object.at.map(|length| f64::from(length) * unit);
+    let unit = 10f64.powi(i32::from(object.scale % 8) - 3);
+    // Up to the bounds of the wire format.
+    let [x_m, y_m] = object.at.map(|length| (f64::from(length) * unit).clamp(-1e8, 1e8));
     let spread = |(xx, yy, correlation): (u16, u16, i8)| {
         let (xx, yy) = (f64::from(xx) * unit * unit, f64::from(yy) * unit * unit);
         [xx, f64::from(correlation) / 128.0 * (xx * yy).sqrt(), yy]

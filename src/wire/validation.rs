@@ -60,9 +60,9 @@ const SPEED_BOUND_MPS: f64 = 1e4;
 /// encoding rounds no smaller size beyond it.
 const SIZE_BOUND_M: f64 = 102_400.0;
 
-/// Largest variance of a position in m²: far more than the square of [`WORLD_BOUND_M`], so that sums and products of
-/// covariances stay finite.
-const VARIANCE_BOUND_M2: f64 = 1e20;
+/// Largest variance of a position in m²: far more than the square of [`WORLD_BOUND_M`], and little enough for sums and products
+/// of covariances to stay finite. A power of two, 7.4e19, which no encoding rounds up.
+const VARIANCE_BOUND_M2: f64 = (1u128 << 66) as f64;
 
 /// Largest age in seconds and largest number of pairs of detections; a power of two, which no encoding rounds up.
 const COUNT_BOUND: f64 = (1u64 << 52) as f64;

@@ -351,3 +351,33 @@ fn a_map_for_others_is_taken_with_a_place_on_earth_alone() {
     assert_eq!(invalid, [InvalidEntry { reason: RejectReason::ConfidenceOutOfRange, contributors: vec![edge()] }]);
     assert_eq!(message.map, cell_map().map);
 }
+
+/// The compact encoding rounds numbers: none that is valid becomes one that is not.
+#[test]
+fn the_largest_valid_numbers_are_valid_after_the_rounding_of_every_encoding() {
+    let object = FusedObject {
+        size_m: Some([SIZE_BOUND_M, SIZE_BOUND_M * (1.0 - 1e-9)]),
+        velocity_mps: Some([SPEED_BOUND_MPS, -SPEED_BOUND_MPS]),
+        heading_rad: Some(ANGLE_BOUND_RAD),
+        age_s: Some(COUNT_BOUND),
+        x_m: WORLD_BOUND_M,
+        y_m: -WORLD_BOUND_M,
+        covariance_m2: [VARIANCE_BOUND_M2, VARIANCE_BOUND_M2, VARIANCE_BOUND_M2],
+        ..map().objects[0].clone()
+    };
+    let correction = PoseCorrection {
+        about_m: [WORLD_BOUND_M, -WORLD_BOUND_M],
+        dx_m: WORLD_BOUND_M,
+        dy_m: -WORLD_BOUND_M,
+        dheading_rad: -ANGLE_BOUND_RAD,
+        pairs: COUNT_BOUND,
+    };
+    let map = GlobalMap { objects: vec![object], pose_corrections: [(edge(), correction)].into(), ..map() };
+    let verdict = Verdict { score: SCORE_BOUND, margin: SCORE_BOUND, ..verdicts().verdicts[0].clone() };
+    let verdicts = Verdicts { verdicts: vec![verdict], ..verdicts() };
+    for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
+        let limits = Limits::default();
+        assert_eq!(decode_entries::<GlobalMap>(&encode(&map, encoding), &limits).unwrap().1, [], "{encoding:?}");
+        assert_eq!(decode_entries::<Verdicts>(&encode(&verdicts, encoding), &limits).unwrap().1, [], "{encoding:?}");
+    }
+}
