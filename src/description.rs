@@ -324,9 +324,8 @@ impl DescriptionExchange {
     ) -> Option<&'a NodeName> {
         let is_leader = |author: &NodeName| self.leader == Leader::Other(author.clone());
         let has_none = self.current().is_none();
-        let entitled = authors
-            .clone()
-            .find(|(author, statement)| statement.may_describe || has_none && is_leader(author));
+        let entitled =
+            authors.clone().find(|(author, statement)| statement.may_describe || has_none && is_leader(author));
         let many = || authors.clone().nth(MIN_WITNESSES - 1).and_then(|_| authors.clone().next());
         entitled.or_else(many).map(|(author, _)| author)
     }

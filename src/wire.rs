@@ -57,8 +57,8 @@ pub use reputation_topic::ReputationTopic;
 pub use topic::{ReportKind, Topic, Topics};
 pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
-    InvalidEntry, InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES, Payload,
-    check_fused_at,
+    InvalidEntry, InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES,
+    Payload, check_fused_at,
 };
 
 use crate::model::epoch::Epoch;

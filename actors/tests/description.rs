@@ -21,7 +21,7 @@ const PATIENCE: Duration = Duration::from_secs(20);
 fn config(name: &str, role: Role, seeds: &[&NodeHandle], (toml, state): (&str, Option<&Path>)) -> NodeConfig {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("node.toml");
-    std::fs::write(&file, toml).unwrap();
+    std::fs::write(&file, format!("# The node's own.\n{toml}")).unwrap();
     let mut config = NodeConfig::load(Some(&file), &serde_json::json!({ "name": name, "cell": "lot-1" })).unwrap();
     config.role = role;
     config.listen = Some("127.0.0.1:0".parse().unwrap());

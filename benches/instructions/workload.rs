@@ -3,7 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ecod::leadership::election::{Body, Candidacy, Election, ElectionConfig, ElectionInput, ElectionMessage, Health, LifeSign};
+use ecod::leadership::election::{
+    Body, Candidacy, Election, ElectionConfig, ElectionInput, ElectionMessage, Health, LifeSign,
+};
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::epoch::Epoch;
 use ecod::model::geometry::Pose;

@@ -16,8 +16,7 @@ use ecod::perception::landmark::Landmark;
 use ecod::tracking::TracksMode;
 use ecod::vote::VoteMode;
 use ecod::wire::{
-    Encoding, FieldOfView, Limits, ObjectReport, Payload, PerceivedObject, ReportKind, WirePose, decode_entries,
-    encode,
+    Encoding, FieldOfView, Limits, ObjectReport, Payload, PerceivedObject, ReportKind, WirePose, decode_entries, encode,
 };
 use libfuzzer_sys::arbitrary::{self, Arbitrary};
 use libfuzzer_sys::fuzz_target;

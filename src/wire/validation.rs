@@ -9,8 +9,8 @@ use serde::de::DeserializeOwned;
 
 use super::{
     CellDescription, CellMap, CellReputation, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare,
-    MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason, Reputation,
-    Reputations, SCHEMA_VERSION, Trouble, Verdict, Verdicts,
+    MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason,
+    Reputation, Reputations, SCHEMA_VERSION, Trouble, Verdict, Verdicts,
 };
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, NodeName, is_label, is_plain_text};

@@ -67,7 +67,8 @@ fn a_member_that_vouches_for_a_hung_leader_delays_no_takeover() {
             let Some(epoch) = world.nodes[leader].election().and_then(|election| election.epoch().cloned()) else {
                 return Ok(());
             };
-            let (began, _) = world.led.iter().rev().find(|(_, led)| *led == epoch).cloned().unwrap_or((world.now, epoch));
+            let (began, _) =
+                world.led.iter().rev().find(|(_, led)| *led == epoch).cloned().unwrap_or((world.now, epoch));
             let life = LifeSign { led_ms: (world.now - began) / MS, signature: None };
             world.plan(0, Fault::Pause { node: leader, micros: 20 * SECOND });
             let hung_at = world.now;
@@ -118,14 +119,23 @@ fn tell_lies(world: &mut World, liar: usize, leader: usize, seq: u64) {
     let other = world.random.index(world.nodes.len());
     let own = Epoch::new(present.term + 1, name.clone());
     let of_other = Epoch::new(present.term + 1, world.nodes[other].name.clone());
-    let beat = |followers, after| Body::Beat { every_ms: 50, round: 1, followers, after, successors: Vec::new(), life: LifeSign::default() };
+    let beat = |followers, after| Body::Beat {
+        every_ms: 50,
+        round: 1,
+        followers,
+        after,
+        successors: Vec::new(),
+        life: LifeSign::default(),
+    };
     let (epoch, hears_you, body) = match world.random.between(0, 8) {
         0 => (Some(own), true, beat(200, None)),
         1 => (Some(own), true, beat(200, Some(present))),
         // A leader that nobody follows makes way for one that does not hear it.
         2 if world.nodes.len() > 2 => (Some(own), false, beat(200, Some(present))),
         3 => (Some(of_other), true, Body::Status { over: None, no_login: Vec::new() }),
-        4 => (Some(of_other.clone()), true, Body::LeaderEvidence { ask: seq % 32, age_ms: 0, life: LifeSign::default() }),
+        4 => {
+            (Some(of_other.clone()), true, Body::LeaderEvidence { ask: seq % 32, age_ms: 0, life: LifeSign::default() })
+        }
         5 => (
             None,
             true,

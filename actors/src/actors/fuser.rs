@@ -415,7 +415,10 @@ impl FuserState {
             self.counters.count(Event::EntryLeftOut);
             for vehicle in contributors {
                 self.counters.troubles().note_about_with(vehicle.as_str(), TroubleKind::Misplaced, || {
-                    format!("the map leaves out an object of its reports, which would be out of bounds: {}", reason.in_words())
+                    format!(
+                        "the map leaves out an object of its reports, which would be out of bounds: {}",
+                        reason.in_words()
+                    )
                 });
             }
         }

@@ -172,7 +172,8 @@ fn check_whole(path: &std::path::Path) -> Result<(), LoadError> {
         let remedy = "write its keys, or start the node without `--config`";
         return Err(LoadError::Malformed(format!("the configuration {path} is empty: {remedy}")));
     }
-    let names_end = text.lines().any(|line| line.starts_with('#') && line.contains(&format!("`{END_OF_CONFIGURATION}`")));
+    let names_end =
+        text.lines().any(|line| line.starts_with('#') && line.contains(&format!("`{END_OF_CONFIGURATION}`")));
     if names_end && !text.lines().any(|line| line.trim_end() == END_OF_CONFIGURATION) {
         let remedy = "restore the file, or run `ecod-node join` again with a new token";
         return Err(LoadError::Malformed(format!(
@@ -457,6 +458,20 @@ mod tests {
         ] {
             let error = load(&format!("{source}{toml}")).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_configuration_that_is_cut_off_or_empty_stops_the_start() {
+        let written = format!("# Whole with `{END_OF_CONFIGURATION}`.\nname = \"n\"\n[tls]\nca = \"a\"\n");
+        let cut = load(&written).unwrap_err().to_string();
+        assert!(cut.contains("cut off") && cut.contains(END_OF_CONFIGURATION), "{cut}");
+        let whole =
+            load(&format!("# Whole with `{END_OF_CONFIGURATION}`.\ncell = \"lot-9\"\n{END_OF_CONFIGURATION}\n"));
+        assert_eq!(whole.unwrap().cell.as_str(), "lot-9");
+        for empty in ["", "\n \n"] {
+            let error = load(empty).unwrap_err().to_string();
+            assert!(error.contains("is empty"), "{error}");
         }
     }
 

@@ -44,14 +44,10 @@ type Place = (String, u64);
 
 impl LineThrottle {
     fn allows(&self, target: &str, line: u64, now: Timestamp) -> bool {
-        let (burst, interval) = if target.starts_with(OWN_TARGETS) {
-            (OWN_BURST, OWN_INTERVAL)
-        } else {
-            (LIBRARY_BURST, LIBRARY_INTERVAL)
-        };
+        let (burst, interval) =
+            if target.starts_with(OWN_TARGETS) { (OWN_BURST, OWN_INTERVAL) } else { (LIBRARY_BURST, LIBRARY_INTERVAL) };
         let mut places = self.places.lock().unwrap_or_else(PoisonError::into_inner);
-        let bucket =
-            places.entry((target.to_owned(), line)).or_insert_with(|| TokenBucket::new(burst, interval, now));
+        let bucket = places.entry((target.to_owned(), line)).or_insert_with(|| TokenBucket::new(burst, interval, now));
         let is_allowed = bucket.allow(now);
         if !is_allowed {
             LEFT_OUT.fetch_add(1, Ordering::Relaxed);

@@ -105,7 +105,14 @@ pub(crate) async fn join(target: &Target, role: Role) -> anyhow::Result<Insider>
 /// Claims a lead that its certificate does not allow.
 async fn beats(target: Target, round: u64) -> anyhow::Result<()> {
     let insider = join(&target, Role::Edge).await?;
-    let beat = Body::Beat { every_ms: 50, round, followers: 9, after: None, successors: Vec::new(), life: LifeSign::default() };
+    let beat = Body::Beat {
+        every_ms: 50,
+        round,
+        followers: 9,
+        after: None,
+        successors: Vec::new(),
+        life: LifeSign::default(),
+    };
     insider.repeat(9, Some(insider.epoch(9)), beat).await
 }
 

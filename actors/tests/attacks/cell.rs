@@ -17,7 +17,6 @@ use ecod_actors::platform::clock;
 use ecod_actors::transport::pki::{Authority, Credentials, TlsConfig};
 use rustls::ClientConfig;
 use serde::Deserialize;
-use serde::de::IgnoredAny;
 use tempfile::TempDir;
 
 use crate::key_holder;
@@ -313,7 +312,12 @@ struct Line {
 struct Map {
     aggregator: String,
     landmarks: Vec<Landmark>,
-    objects: Vec<IgnoredAny>,
+    objects: Vec<Object>,
+}
+
+#[derive(Deserialize)]
+struct Object {
+    contributors: BTreeSet<String>,
 }
 
 #[derive(Deserialize)]
@@ -323,18 +327,24 @@ struct Landmark {
 }
 
 impl Map {
-    /// True if the cell made it of the reports of honest vehicles: the object that is there, or none, and nothing else.
+    /// True if the cell made it of the reports of honest vehicles: the object that is there, or none. Beside the location there
+    /// may be what members report in their own names.
     fn is_true(&self) -> bool {
         let [landmark] = &self.landmarks[..] else { return false };
         NODES.iter().any(|(name, role)| *name == self.aggregator && *role != Role::Cav)
             && landmark.label.as_deref().is_none_or(|label| label == LABEL)
             && self.reporters().is_subset(&honest())
-            && self.objects.is_empty()
+            && self.objects.iter().flat_map(|object| &object.contributors).all(|name| is_member(name))
     }
 
     fn reporters(&self) -> BTreeSet<&str> {
         self.landmarks.iter().flat_map(|landmark| &landmark.contributors).map(String::as_str).collect()
     }
+}
+
+/// True if a vehicle of the cell may report under this name.
+fn is_member(name: &str) -> bool {
+    honest().contains(name) || VEHICLES.contains(&name)
 }
 
 /// Longest time without a map since `from`, up to now.
@@ -423,6 +433,7 @@ fn a_map_is_false_that_says_more_than_honest_vehicles_have_seen() {
     assert!(!map("gauss", r#""car""#, r#""v01""#, ""), "made by another");
     assert!(!map("edge", r#""bus""#, r#""v01""#, ""), "another object");
     assert!(!map("edge", r#""car""#, r#""gauss""#, ""), "seen by another");
-    assert!(!map("edge", r#""car""#, r#""v01""#, "{}"), "one object more");
+    assert!(map("edge", r#""car""#, r#""v01""#, r#"{"contributors":["gauss"]}"#), "a member may see something else");
+    assert!(!map("edge", r#""car""#, r#""v01""#, r#"{"contributors":["zeno"]}"#), "of nobody in the cell");
     assert!(!serde_json::from_str::<Map>(r#"{"aggregator":"edge","landmarks":[],"objects":[]}"#).unwrap().is_true());
 }

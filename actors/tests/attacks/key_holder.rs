@@ -53,7 +53,14 @@ async fn largest_term(target: Target) -> anyhow::Result<()> {
 
 async fn claims(target: Target) -> anyhow::Result<()> {
     let insider = Insider::join(&target, (NAME, Role::Edge), Some(Arc::clone(&target.foreign))).await?;
-    let beat = Body::Beat { every_ms: 50, round: 1, followers: 9, after: None, successors: Vec::new(), life: LifeSign::default() };
+    let beat = Body::Beat {
+        every_ms: 50,
+        round: 1,
+        followers: 9,
+        after: None,
+        successors: Vec::new(),
+        life: LifeSign::default(),
+    };
     tokio::try_join!(insider.repeat(1 << 20, Some(insider.epoch(1 << 20)), beat), insider.knock()).map(drop)
 }
 

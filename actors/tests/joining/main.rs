@@ -64,7 +64,8 @@ fn run(directory: &Path, gossip: &str) -> Running {
 
 /// Starts `invite`; gives it and the tokens in the order of the names.
 fn invite(directory: &str, seed: &str, names: &[&str]) -> (Running, Vec<String>) {
-    let mut command = ecod_node(&["invite", "--role", "auto", "--dir", directory, "--listen", "127.0.0.1:0", "--seed", seed]);
+    let mut command =
+        ecod_node(&["invite", "--role", "auto", "--dir", directory, "--listen", "127.0.0.1:0", "--seed", seed]);
     let mut host = Running(command.args(names).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap());
     let lines = BufReader::new(host.0.stdout.take().unwrap()).lines();
     let tokens = lines.filter_map(|line| Some(line.unwrap().trim().strip_prefix("sudo ecod-node join ")?.to_owned()));

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use crate::aggregator::round::FirstRound;
 use crate::leadership::election::interface::ElectionEffect;
-use crate::leadership::election::leading::Leading;
 use crate::leadership::election::leader_clock::LeaderClock;
+use crate::leadership::election::leading::Leading;
 use crate::leadership::election::message::{Body, Candidacy, LifeSign};
 use crate::leadership::election::{Election, State};
 use crate::leadership::timers::MAX_WAITING_QUESTIONS;
@@ -111,7 +111,8 @@ impl Election {
     /// that is old convinces nobody: then the leader is asked for another, which answers the question too.
     pub(super) fn answer(&mut self, from: &NodeName, ask: u64, now: Timestamp) {
         let patience = self.config.response_timeout();
-        let life = self.leader_clock.as_ref().filter(|clock| self.current_epoch().is_some_and(|epoch| clock.is_of(epoch)));
+        let life =
+            self.leader_clock.as_ref().filter(|clock| self.current_epoch().is_some_and(|epoch| clock.is_of(epoch)));
         match &self.state {
             State::Leading(_) => return self.send_beat(from, now),
             State::Following(following) if now.since(following.evidence_at()) <= patience => {

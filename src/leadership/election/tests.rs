@@ -41,7 +41,14 @@ fn received(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> Ele
 }
 
 fn beat_after(after: Option<&Epoch>) -> Body {
-    Body::Beat { every_ms: 50, round: 1, followers: 1, after: after.cloned(), successors: Vec::new(), life: LifeSign::default() }
+    Body::Beat {
+        every_ms: 50,
+        round: 1,
+        followers: 1,
+        after: after.cloned(),
+        successors: Vec::new(),
+        life: LifeSign::default(),
+    }
 }
 
 /// A message of edge, the leader of term 8, that knows `term`.
@@ -329,7 +336,8 @@ fn claim_of_gauss(seq: u64) -> ElectionInput {
     let gauss = NodeName::from_static("gauss");
     let epoch = Epoch::new(9, gauss.clone());
     let after = Some(epoch_of_edge());
-    let body = Body::Beat { every_ms: 50, round: 1, followers: 200, after, successors: Vec::new(), life: LifeSign::default() };
+    let body =
+        Body::Beat { every_ms: 50, round: 1, followers: 200, after, successors: Vec::new(), life: LifeSign::default() };
     received(&gauss, seq, Some(&epoch), body)
 }
 
@@ -414,7 +422,14 @@ fn a_node_that_heard_a_liar_first_follows_the_leader_of_the_others() {
 #[test]
 fn a_claim_waits_no_longer_for_being_repeated() {
     let (mut election, mut now) = (euclid(), NOW);
-    let idle = Body::Beat { every_ms: 2500, round: 1, followers: 1, after: None, successors: Vec::new(), life: LifeSign::default() };
+    let idle = Body::Beat {
+        every_ms: 2500,
+        round: 1,
+        followers: 1,
+        after: None,
+        successors: Vec::new(),
+        life: LifeSign::default(),
+    };
     election.handle(of_edge(1, 8, idle), now);
     for seq in 1..25 {
         now = NOW + Duration::from_millis(20 * seq);

@@ -131,7 +131,14 @@ impl Scene {
 
     fn beat(&mut self) {
         let successors = vec![name("euclid")];
-        self.hear(Body::Beat { every_ms: 50, round: 40, followers: 1, after: None, successors, life: LifeSign::default() });
+        self.hear(Body::Beat {
+            every_ms: 50,
+            round: 40,
+            followers: 1,
+            after: None,
+            successors,
+            life: LifeSign::default(),
+        });
     }
 
     fn notices(&self) -> Vec<&Notice> {

@@ -7,7 +7,9 @@ use uuid::Uuid;
 use super::*;
 use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
-use crate::wire::{Encoding, ForeignVotes, NeighbourObject, NodeState, Reputation, Role, decode, decode_entries, encode};
+use crate::wire::{
+    Encoding, ForeignVotes, NeighbourObject, NodeState, Reputation, Role, decode, decode_entries, encode,
+};
 
 fn edge() -> NodeName {
     NodeName::from_static("edge")

@@ -11,9 +11,12 @@ use ecod::wire::{ObjectReport, ReportKind};
 use crate::platform::throttle::KeyedThrottle;
 use crate::transport::mqtt::Delivery;
 
-/// Maximum number of objects a second of one vehicle, its parts together, and the burst: two thirds of the largest reports at
-/// 30 Hz. More would take the processor time of the others.
-const MAX_OBJECTS_HZ: u32 = 20_000;
+/// Maximum number of objects a second of one vehicle, its parts together: reports of 1000 objects at 15 Hz. More would take the
+/// processor time of the others.
+const MAX_OBJECTS_HZ: u32 = 15_000;
+
+/// Maximum number of them at once: more would delay the round.
+const OBJECT_BURST: u32 = 3_000;
 
 /// Queue filled on the links' tasks and emptied by the fuser. It holds at most one report of each vehicle and kind, so
 /// that a flood from one vehicle delays no other, and takes at most [`MAX_OBJECTS_HZ`] objects a second of each.
@@ -32,7 +35,7 @@ struct Waiting {
 
 impl Default for Waiting {
     fn default() -> Self {
-        let objects = KeyedThrottle::new(MAX_OBJECTS_HZ, Duration::from_secs(1) / MAX_OBJECTS_HZ);
+        let objects = KeyedThrottle::new(OBJECT_BURST, Duration::from_secs(1) / MAX_OBJECTS_HZ);
         Self { objects, next: 0, reports: BTreeMap::new(), places: BTreeMap::new() }
     }
 }
@@ -106,10 +109,19 @@ mod tests {
             queue.push(Delivery::local(QueuedReport { kind, report }, Timestamp(seq)))
         };
         use ReportKind::{Detections, VoteDetections};
-        assert_eq!(push("mallory", Detections, 0), PushOutcome { is_first: true, has_replaced: false, is_over_budget: false });
-        assert_eq!(push("euclid", Detections, 1), PushOutcome { is_first: false, has_replaced: false });
+        assert_eq!(
+            push("mallory", Detections, 0),
+            PushOutcome { is_first: true, has_replaced: false, is_over_budget: false }
+        );
+        assert_eq!(
+            push("euclid", Detections, 1),
+            PushOutcome { is_first: false, has_replaced: false, is_over_budget: false }
+        );
         for seq in 2..1000 {
-            assert_eq!(push("mallory", Detections, seq), PushOutcome { is_first: false, has_replaced: true, is_over_budget: false });
+            assert_eq!(
+                push("mallory", Detections, seq),
+                PushOutcome { is_first: false, has_replaced: true, is_over_budget: false }
+            );
         }
         push("mallory", VoteDetections, 1000);
         let taken: Vec<_> = queue.drain().iter().map(|delivery| delivery.received_at.micros()).collect();
@@ -133,7 +145,7 @@ mod tests {
         };
         let start = 1_000_000_000;
         let of_parts = (0..100).filter(|part| push(&format!("mallory--{part}"), start + part, 1000)).count();
-        assert_eq!(of_parts, MAX_OBJECTS_HZ as usize / 1000);
+        assert_eq!(of_parts, OBJECT_BURST as usize / 1000);
         assert!(push("mallory", start + 200, 0), "a report without objects costs nothing");
         assert!(push("euclid", start + 200, 1000));
         assert!(push("mallory", start + 100_000, 1000), "it earns new ones");

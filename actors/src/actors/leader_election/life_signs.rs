@@ -70,9 +70,7 @@ impl LifeSigns {
         let Some(epoch) = &message.epoch else { return false };
         let Some(certificate) = self.certificates.get(&epoch.leader) else { return false };
         let signature = life.signature.as_ref().and_then(|text| BASE64.decode(text).ok());
-        signature.is_some_and(|signature| {
-            is_signed_by(certificate, &life.signed_bytes(&self.cell, epoch), &signature)
-        })
+        signature.is_some_and(|signature| is_signed_by(certificate, &life.signed_bytes(&self.cell, epoch), &signature))
     }
 }
 
@@ -112,8 +110,7 @@ mod tests {
             let name = NodeName::from_static(name);
             authority.issue(&name, Role::Edge, Duration::from_secs(60), clock::now()).unwrap();
             let (certificate, key) = authority.files_of(&name);
-            let files =
-                TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
+            let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
             Arc::new(Credentials::load(&files, &name).unwrap())
         };
         let [edge, euclid] = ["edge", "euclid"].map(&mut credentials);

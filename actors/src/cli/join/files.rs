@@ -10,8 +10,8 @@ use anyhow::{Context, bail, ensure};
 use ecod::model::names::NodeName;
 use serde::Serialize;
 
-use crate::platform::bounded_file;
 use crate::node::config::END_OF_CONFIGURATION;
+use crate::platform::bounded_file;
 use crate::platform::state_file::replace_file;
 use crate::transport::invitation::Welcome;
 use crate::transport::pki::{CityTlsConfig, Credentials, TlsConfig};

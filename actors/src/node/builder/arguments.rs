@@ -401,7 +401,8 @@ impl NodeBuilder {
                     return Err("this node never leads and only follows: set the description at one that may".into());
                 }
                 if credentials.as_ref().is_some_and(|credentials| !credentials.may_describe()) {
-                    let remedy = "set it at an operator's node, such as that of the machine where `ecod-node init` was run";
+                    let remedy =
+                        "set it at an operator's node, such as that of the machine where `ecod-node init` was run";
                     return Err(format!(
                         "the certificate of this node does not let it describe the cell: {remedy}, or issue a certificate by \
                          `ecod-node pki issue --operator`"

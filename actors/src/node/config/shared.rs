@@ -169,7 +169,8 @@ impl SharedConfig {
         }
         let DescriptionCost { map_bytes, bytes_per_s } = self.cost();
         if map_bytes > MAX_DESCRIBED_MAP_BYTES || bytes_per_s > MAX_DESCRIBED_BYTES_PER_S {
-            let found = format!("{} entries, maps of {map_bytes} bytes, {bytes_per_s:.0} bytes/s", self.landmarks.len());
+            let found =
+                format!("{} entries, maps of {map_bytes} bytes, {bytes_per_s:.0} bytes/s", self.landmarks.len());
             let allowed =
                 format!("maps of {MAX_DESCRIBED_MAP_BYTES} bytes, and {MAX_DESCRIBED_BYTES_PER_S:.0} bytes/s at most");
             return Err(ConfigError::new("landmarks", found, allowed).into());
@@ -291,7 +292,7 @@ mod tests {
 
     fn own(toml: &str) -> NodeConfig {
         let mut file = tempfile::NamedTempFile::new().unwrap();
-        file.write_all(toml.as_bytes()).unwrap();
+        write!(file, "# The node's own.\n{toml}").unwrap();
         NodeConfig::load(Some(file.path()), &json!({ "name": "euclid" })).unwrap()
     }
 

@@ -176,8 +176,7 @@ impl LiveState {
             }
         }
         let of_members = living().filter(|(by, _)| leader != Some(*by));
-        let (of_itself, of_others): (Vec<_>, Vec<_>) =
-            of_members.partition(|(by, trouble)| is_of_itself(by, trouble));
+        let (of_itself, of_others): (Vec<_>, Vec<_>) = of_members.partition(|(by, trouble)| is_of_itself(by, trouble));
         let separating = of_others.into_iter().filter(|(_, trouble)| is_separating(trouble));
         let mut room_of: BTreeMap<NodeName, usize> = BTreeMap::new();
         for (by, trouble) in of_itself.into_iter().chain(separating) {
@@ -396,9 +395,9 @@ mod tests {
         let (name, edge) = (NodeName::from_static("self"), NodeName::from_static("edge"));
         let shown = live_state.troubles(&name, Some(&edge), Vec::new());
         let causes_by = |by: &str| -> Vec<&str> {
-            let of_node = shown.iter().filter(|(author, _)| {
-                author.as_ref().is_some_and(|author| author.vehicle().as_str() == by)
-            });
+            let of_node = shown
+                .iter()
+                .filter(|(author, _)| author.as_ref().is_some_and(|author| author.vehicle().as_str() == by));
             of_node.map(|(_, trouble)| &*trouble.cause).collect()
         };
         assert_eq!(causes_by("edge"), ["x_m is NaN"]);

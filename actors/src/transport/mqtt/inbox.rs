@@ -9,8 +9,8 @@ use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    Flaw, GlobalMap, InvalidEntry, Limits, NodeState, NodeStatus, Payload, RejectReason, ReportKind, Reputations, Topic,
-    Topics, Verdicts, check_fused_at, decode, decode_entries, decode_report, decode_share,
+    Flaw, GlobalMap, InvalidEntry, Limits, NodeState, NodeStatus, Payload, RejectReason, ReportKind, Reputations,
+    Topic, Topics, Verdicts, check_fused_at, decode, decode_entries, decode_report, decode_share,
 };
 use tokio::sync::Semaphore;
 use uuid::Uuid;
@@ -139,7 +139,8 @@ impl Inbox {
                 (Incoming::Map(Arc::new(map)), origin)
             }
             Topic::GlobalVerdicts => {
-                let verdicts: Verdicts = self.decode_entries(payload, |verdicts: &Verdicts| Some(&verdicts.aggregator))?;
+                let verdicts: Verdicts =
+                    self.decode_entries(payload, |verdicts: &Verdicts| Some(&verdicts.aggregator))?;
                 if verdicts.aggregator == self.node {
                     return Ok(self.echo());
                 }
