@@ -63,9 +63,9 @@ config_section! {
         pub false_alarm_probability: f64 = 0.01, in 1e-6 to *detection_probability;
         /// Maximum evidence of one vehicle for or against one label, in nats. Default 4 (odds of 55 to 1).
         pub evidence_limit: f64 = 4.0, in 0.1 to 100.0;
-        /// Maximum evidence of one vehicle against any object at a landmark, in nats. Default 1.4: misses repeat for the
-        /// same hidden cause, so one vehicle that reads a label outweighs two that find nothing, and not three.
-        pub absence_limit: f64 = 1.4, in 0.0 to 100.0;
+        /// Maximum evidence of one vehicle against any object at a landmark, in nats. Default 1.1: misses repeat for the
+        /// same hidden cause, so one vehicle that reads a label outweighs three that find nothing, and not four.
+        pub absence_limit: f64 = 1.1, in 0.0 to 100.0;
         /// Time in seconds between independent frames; faster frames count in proportion. Default 0.1.
         pub independent_after_s: f64 = 0.1, in 0.0 to 60.0;
         /// Evidence in nats against any object from which a landmark is known to be empty. Default 0.9: three misses of

@@ -271,7 +271,7 @@ fn a_sole_claim_against_several_that_look_is_not_published() {
         ObjectReport { seen, pose, view, ..report(node, Vec::new(), &[]) }
     };
     for (lookers, listed, expected) in
-        [(1, true, Some("car")), (3, true, None), (4, true, None), (3, false, None), (0, true, Some("car"))]
+        [(1, true, Some("car")), (3, true, Some("car")), (4, true, None), (4, false, None), (0, true, Some("car"))]
     {
         let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
         let mut published = Vec::new();

@@ -10,8 +10,8 @@ use std::collections::BTreeSet;
 use super::config::WeightedConfig;
 use super::confusion::{Confusion, LabelIndex};
 use super::parameters::{
-    CONVICTION, FLEET_PRIOR_SHARE, KEPT_AFTER_ALARM, MIN_SAVING, NEGLIGIBLE, SAVING_PRIOR_VOTES, SHORTFALL_ALARM,
-    SHORTFALL_SLACK,
+    CONVICTION, FLEET_PRIOR_SHARE, KEPT_AFTER_ALARM, MIN_PROVEN, MIN_SAVING, NEGLIGIBLE, SAVING_PRIOR_VOTES,
+    SHORTFALL_ALARM, SHORTFALL_SLACK,
 };
 use crate::wire::ForeignVotes;
 
@@ -229,19 +229,34 @@ impl HierarchicalModel {
         judgement(votes, &weights, candidates, stating, |label| self.log_shares[usize::from(label)])
     }
 
-    /// Judges votes by what each vehicle is worth as a witness: no more than a newcomer, however good its settled record,
-    /// and without class shares. Evidence that rests on one vehicle's record would be of its own making.
+    /// Judges votes by what each vehicle is worth as a witness, without class shares. Where fewer than [`MIN_PROVEN`] proven
+    /// vehicles vote, none is worth more than a newcomer, however good its settled record and what other cells say of it. Evidence that rests on one vehicle's record would be of its own making.
     pub(super) fn judge_as_witnesses(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> LandmarkJudgement {
         let assumed = self.config.assumed_accuracy;
         let prior = self.config.vehicle_prior_votes;
+        let proven = votes.iter().filter(|vote| !self.is_newcomer(vote.vehicle)).count();
+        let most = if proven >= MIN_PROVEN { 1.0 } else { assumed };
         let accuracy = |vehicle: usize| {
-            let VehicleEvidence { settled, inherited, .. } = &self.vehicles[vehicle];
-            let right = settled.correct() + inherited.correct() + prior * assumed;
-            (right / (settled.total() + inherited.total() + prior)).min(assumed)
+            let VehicleEvidence { settled, inherited, foreign, .. } = &self.vehicles[vehicle];
+            let right = settled.correct() + inherited.correct() + foreign.correct + prior * assumed;
+            let votes = settled.total() + inherited.total() + foreign.total() + prior;
+            bounded((right / votes).min(most))
         };
-        let stating = stating_coin(votes, candidates, |vehicle| (accuracy(vehicle), 1.0 - accuracy(vehicle)));
+        let wrong_labels = self.wrong_labels();
+        let stating = stating_coin(votes, candidates, |vehicle| {
+            let right = accuracy(vehicle);
+            (right, (1.0 - right) / wrong_labels)
+        });
         let weights: Vec<f64> = votes.iter().map(|vote| vote.weight.min(1.0) * vote.independence).collect();
         judgement(votes, &weights, candidates, stating, |_| 0.0)
+    }
+
+    /// Odds against a vote from which it settles as wrong: just more than those that one newcomer alone would give, where
+    /// so many labels are candidates. So two witnesses have to agree.
+    pub(super) fn conviction(&self, candidates: usize) -> f64 {
+        let right = self.config.assumed_accuracy;
+        let others = candidates.saturating_sub(1).max(1) as f64 * (1.0 - right) / self.wrong_labels();
+        CONVICTION * right / others
     }
 
     fn stating_per_class(&mut self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> Vec<f64> {
@@ -371,7 +386,7 @@ impl HierarchicalModel {
 
     /// Turns a vote, which must not be live at present, into fading evidence. Returns whether it was right, or `None` if
     /// that stays open: the vote is right if `others`, the witnesses' posterior without it, support its label most. It is
-    /// wrong only if they support another label by [`CONVICTION`].
+    /// wrong only if they support another label by the odds of [`Self::conviction`].
     pub(super) fn settle(
         &mut self,
         vote: &WeightedVote,
@@ -380,7 +395,7 @@ impl HierarchicalModel {
     ) -> Option<bool> {
         let right = probability(others, vote.label);
         let other = others.iter().filter(|(label, _)| *label != vote.label).map(|(_, p)| *p).fold(0.0, f64::max);
-        if right <= other && other < CONVICTION {
+        if right <= other && odds(other) < self.conviction(others.len()) {
             return None;
         }
         let fade = 1.0 - 1.0 / self.config.memory_votes;

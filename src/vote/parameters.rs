@@ -8,7 +8,8 @@
 //! | [`FLEET_PRIOR_SHARE`] | share | weight of one accuracy for all classes against the fleet's record of a class, as a share of all votes | M | a rare class learns from fewer votes; from more |
 //! | [`MIN_SAVING`] | nats a vote | log loss that accuracies by class must save over one accuracy | M | more sets use classes; fewer do |
 //! | [`SAVING_PRIOR_VOTES`] | votes | weight of a saving of 0 against the measured saving | M | small cells use classes sooner; later |
-//! | [`CONVICTION`] | probability | probability of another label, by newcomers' accuracy, from which a vote settles as wrong: just more than one newcomer alone (0.7) | T, two witnesses that agree | one witness is enough; steady cells stay open |
+//! | [`CONVICTION`] | ratio of odds | odds of another label from which a vote settles as wrong, against those that one newcomer alone gives it: just more | T, two witnesses that agree | one witness is enough; two are not |
+//! | [`MIN_PROVEN`] | vehicles | proven vehicles at a landmark from which their records count as witnesses': each has two others | T, two witnesses that agree | one proven vehicle judges another; newcomers count like proven vehicles for longer |
 //! | [`NEGLIGIBLE`] | probability | labels of less probability add no evidence | C | slower; coarser |
 //! | [`SHORTFALL_SLACK`] | share | drop in the rate of right votes that Page's test tolerates | T | more false alarms; smaller drops pass |
 //! | [`SHORTFALL_ALARM`] | votes | cumulative drop that is a change | T | alarm after 4 wrong votes; after 13 |
@@ -47,7 +48,8 @@ use std::time::Duration;
 pub(super) const FLEET_PRIOR_SHARE: f64 = 0.05;
 pub(super) const MIN_SAVING: f64 = 0.02;
 pub(super) const SAVING_PRIOR_VOTES: f64 = 500.0;
-pub(super) const CONVICTION: f64 = 0.705;
+pub(super) const CONVICTION: f64 = 1.025;
+pub(super) const MIN_PROVEN: usize = 3;
 pub(super) const NEGLIGIBLE: f64 = 1e-4;
 pub(super) const SHORTFALL_SLACK: f64 = 0.2;
 pub(super) const SHORTFALL_ALARM: f64 = 4.0;

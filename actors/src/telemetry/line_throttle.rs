@@ -36,11 +36,11 @@ pub(crate) fn lines_left_out() -> u64 {
 /// `info` pass: somebody has asked for all of them.
 #[derive(Debug, Default)]
 pub(crate) struct LineThrottle {
-    places: Mutex<HashMap<Place, TokenBucket>>,
+    places: Mutex<HashMap<CodePlace, TokenBucket>>,
 }
 
 /// A place in the code: target and line. The code of a program is finite, and so is the number of places.
-type Place = (String, u64);
+type CodePlace = (String, u64);
 
 impl LineThrottle {
     fn allows(&self, target: &str, line: u64, now: Timestamp) -> bool {

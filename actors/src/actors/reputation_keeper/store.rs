@@ -11,7 +11,7 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
 use ecod::wire::{
-    ForeignVotes, LedgerEntry, LedgerMark, LedgerShare, Limits, Payload, Reputation, Reputations, SCHEMA_VERSION,
+    ForeignVotes, InvalidEntry, LedgerEntry, LedgerMark, LedgerShare, Payload, Reputation, Reputations, SCHEMA_VERSION,
 };
 use serde::{Deserialize, Serialize};
 
@@ -51,12 +51,12 @@ impl ReputationStore {
         } else if reset_at_us > self.ledger.reset_at() {
             self.ledger = ReputationLedger::reset(reset_at_us);
         }
-        let standing =
+        let mut standing =
             Reputations { schema: SCHEMA_VERSION, aggregator: None, epoch: 0, round: 0, reputations: standing };
-        match standing.check(&Limits::default()) {
-            Ok(()) => self.standing = standing.reputations,
-            Err(reason) => tracing::warn!(%reason, "saved reputations not used"),
+        for InvalidEntry { reason, contributors } in standing.remove_invalid() {
+            tracing::warn!(%reason, vehicles = ?contributors, "a saved reputation is not used");
         }
+        self.standing = standing.reputations;
         let share = |entries, marks| LedgerShare {
             schema: SCHEMA_VERSION,
             node: node.clone(),
