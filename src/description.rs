@@ -298,7 +298,7 @@ impl DescriptionExchange {
             self.statements.iter().filter(move |(_, statement)| statement.may_lead && statement.stamp == stamp)
         };
         let newer = self.unproven.iter().filter(|body| body.stamp() > self.stamp());
-        let proven = newer.filter_map(|body| Some((Arc::clone(body), self.witness(authors(body.stamp()))?.clone())));
+        let proven = newer.filter_map(|body| Some((Arc::clone(body), self.witness(&authors(body.stamp()))?.clone())));
         let Some((description, node)) = proven.max_by_key(|(body, _)| body.stamp()) else { return };
         let certificates = authors(description.stamp()).filter_map(|(_, statement)| statement.certificate.clone());
         let mut authors: Vec<_> = certificates.take(MAX_AUTHORS + 1).collect();
@@ -320,7 +320,7 @@ impl DescriptionExchange {
     /// description is known yet, or any where there are [`MIN_WITNESSES`].
     fn witness<'a>(
         &self,
-        authors: impl Iterator<Item = (&'a NodeName, &'a DescriptionStatement)> + Clone,
+        authors: &(impl Iterator<Item = (&'a NodeName, &'a DescriptionStatement)> + Clone),
     ) -> Option<&'a NodeName> {
         let is_leader = |author: &NodeName| self.leader == Leader::Other(author.clone());
         let has_none = self.current().is_none();

@@ -30,7 +30,7 @@ pub(crate) const ROWS: &[Row] = &[
         on_brokers: true,
         deeds: (100_000, "objects"),
         bar: Bar { longest_gap_ms: Some(200), ..UNHARMED },
-        quick: true,
+        quick: false,
         run: |target| Box::pin(report_for_ever(target, 9, Duration::from_millis(40), crowd)),
     },
     Row {

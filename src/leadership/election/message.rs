@@ -106,7 +106,7 @@ pub struct LifeSign {
     /// adds and checks it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(1)]
-    pub signature: Option<String>,
+    pub signature: Option<Box<str>>,
 }
 
 /// The protocol. In the quiet, once the leader is known:
@@ -334,7 +334,7 @@ mod tests {
         let mut message = beat(4, "edge");
         let long = NodeName::new("x".repeat(64)).unwrap();
         if let Body::Beat { successors, after, life, .. } = &mut message.body {
-            *life = LifeSign { led_ms: wire::MAX_INTEGER, signature: Some("x".repeat(96)) };
+            *life = LifeSign { led_ms: wire::MAX_INTEGER, signature: Some("x".repeat(96).into()) };
             *successors = vec![long.clone(), long.clone(), long.clone()];
             *after = Some(Epoch::new(3, long));
         }

@@ -57,7 +57,7 @@ impl LifeSigns {
         }
         // Without random numbers the system gives no signature, and others do not pass this on.
         life.signature =
-            credentials.current().sign(&life.signed_bytes(&self.cell, epoch)).ok().map(|it| BASE64.encode(it));
+            credentials.current().sign(&life.signed_bytes(&self.cell, epoch)).ok().map(|it| BASE64.encode(it).into());
         self.signed = Some((epoch.clone(), life.clone()));
     }
 
@@ -69,7 +69,7 @@ impl LifeSigns {
         }
         let Some(epoch) = &message.epoch else { return false };
         let Some(certificate) = self.certificates.get(&epoch.leader) else { return false };
-        let signature = life.signature.as_ref().and_then(|text| BASE64.decode(text).ok());
+        let signature = life.signature.as_ref().and_then(|text| BASE64.decode(text.as_bytes()).ok());
         signature.is_some_and(|signature| is_signed_by(certificate, &life.signed_bytes(&self.cell, epoch), &signature))
     }
 }
