@@ -162,8 +162,13 @@ impl Election {
 
     fn refresh(&mut self, beat: Beat, now: Timestamp) {
         self.learn_round(&beat.epoch.leader, beat.round);
-        self.leader_clock = Some(LeaderClock::of_beat(beat.epoch.clone(), beat.life, now));
-        self.answer_waiting(now);
+        match &mut self.leader_clock {
+            Some(clock) if clock.is_of(&beat.epoch) => clock.beat(beat.life, now),
+            clock => *clock = Some(LeaderClock::of_beat(beat.epoch.clone(), beat.life, now)),
+        }
+        if !self.waiting_questions.is_empty() {
+            self.answer_waiting(now);
+        }
         let State::Following(following) = &mut self.state else { return };
         following.beat_interval = Duration::from_millis(beat.every_ms);
         following.hear(now);

@@ -36,6 +36,13 @@ impl LeaderClock {
         Self { epoch, began_at, observed_at: now, latest: life, latest_received_at: now }
     }
 
+    /// Takes a beat that the leader has just sent.
+    pub(super) fn beat(&mut self, life: LifeSign, now: Timestamp) {
+        self.began_at = now - Duration::from_millis(life.led_ms);
+        (self.observed_at, self.latest_received_at) = (now, now);
+        self.latest = life;
+    }
+
     /// True if it is the clock of this leadership.
     pub(super) fn is_of(&self, epoch: &Epoch) -> bool {
         self.epoch == *epoch
