@@ -314,14 +314,14 @@ impl Aggregator {
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    /// Ends a recording in a round of its own: VOTE's `paper` mode judges its incomplete packet, `weighted` mode all stored
-    /// votes once more. `None` if no verdict follows, or without leadership.
+    /// Judges the incomplete packet of VOTE's `paper` mode in a round of its own, at the end of a recording. `None` if no
+    /// packet was begun, or without leadership.
     pub fn end_packet(&mut self, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let by_packets = self.by_packets;
-        let vote = self.vote.as_mut().filter(|vote| !by_packets || vote.is_packet_begun())?;
-        let verdicts = if by_packets { vote.close(now).verdicts } else { vote.finish() };
-        if verdicts.is_empty() { None } else { Some(self.number_verdicts(&epoch, verdicts, now)) }
+        let vote = self.vote.as_mut().filter(|vote| by_packets && vote.is_packet_begun())?;
+        let verdicts = vote.close(now).verdicts;
+        Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
     fn number_verdicts(&mut self, epoch: &Epoch, verdicts: Vec<Verdict>, now: Timestamp) -> Verdicts {

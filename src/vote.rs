@@ -5,7 +5,7 @@
 //!
 //! [`Vote::ignored`] counts the objects that do not vote, which is no error:
 //! - those without a landmark, or at a landmark that a closed cell does not know;
-//! - objects of zero confidence or beyond the maximum range;
+//! - those of zero confidence or beyond the maximum range;
 //! - in `weighted` mode, all but the most confident object of a report at a landmark (the paper's sum takes them all);
 //! - votes for a label that made room for another.
 //!
@@ -16,13 +16,13 @@ mod calibration;
 mod config;
 mod configured_method;
 mod confusion;
+mod dawid_skene;
 mod dependence;
 mod label_table;
 mod landmark_votes;
+mod likelihood;
 mod method;
-mod model;
 mod paper;
-mod parameters;
 mod visibility;
 mod weighted;
 
@@ -47,7 +47,6 @@ use crate::wire::{
 };
 use configured_method::ConfiguredMethod;
 use method::NewVote;
-use parameters::{EVICTION_DIVISOR, MAX_OVERTAKEN, RETENTION};
 
 /// The result of one round.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -67,6 +66,14 @@ struct LastReport {
     /// Reports since the last verdict.
     frames: u32,
 }
+
+/// Largest step back in time of an overtaken report; a larger one means that the vehicle's clock was set back.
+/// [`crate::admission::report_window::ReportWindow`] admits reports for as long by default.
+const MAX_OVERTAKEN: Duration = Duration::from_secs(3);
+/// Silence after which a vehicle may be forgotten for another: unproven vehicles, proven vehicles.
+const RETENTION: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(600)];
+/// Inverse share of the vehicles that is forgotten at once, so that the cost per newcomer stays small.
+const EVICTION_DIVISOR: usize = 8;
 
 /// The last report of a part of a vehicle, or of the vehicle itself.
 #[derive(Debug, Clone, Copy)]
@@ -91,7 +98,7 @@ pub struct Vote {
     config: VoteConfig,
     /// Whether landmarks are taken from the reports.
     open: bool,
-    landmarks: BTreeMap<LandmarkId, Option<Box<Landmark>>>,
+    landmarks: BTreeMap<LandmarkId, Option<Landmark>>,
     /// Landmarks of an open cell, oldest first.
     arrivals: VecDeque<LandmarkId>,
     last_reports: BTreeMap<NodeName, LastReport>,
@@ -111,7 +118,7 @@ impl Vote {
         Self {
             config,
             open: landmarks.is_empty(),
-            landmarks: landmarks.into_iter().map(|l| (l.id.clone(), Some(Box::new(l)))).collect(),
+            landmarks: landmarks.into_iter().map(|l| (l.id.clone(), Some(l))).collect(),
             arrivals: VecDeque::new(),
             last_reports: BTreeMap::new(),
             method,
@@ -129,7 +136,7 @@ impl Vote {
         let method = self.method.get_mut();
         method.configure(&config);
         let is_open = landmarks.is_empty();
-        let mut known: BTreeMap<_, _> = landmarks.into_iter().map(|l| (l.id.clone(), Some(Box::new(l)))).collect();
+        let mut known: BTreeMap<_, _> = landmarks.into_iter().map(|l| (l.id.clone(), Some(l))).collect();
         if is_open {
             self.arrivals.extend(self.landmarks.keys().filter(|_| !self.open).cloned());
             known.extend(self.landmarks.into_keys().map(|id| (id, None)));
@@ -149,12 +156,12 @@ impl Vote {
     /// Counts the votes of a report that was received at `received_at`.
     ///
     /// # Errors
-    /// The reason why the report was not used; the state is unchanged then.
+    /// The reason why the report was not used; nothing has changed then.
     pub fn observe(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
         self.observe_part(report, &report.node, received_at)
     }
 
-    /// Counts the votes of a report that a part of its vehicle made.
+    /// The same for a report that a part of its vehicle made.
     ///
     /// # Errors
     /// As for [`Self::observe`].
@@ -191,7 +198,7 @@ impl Vote {
         Ok(())
     }
 
-    /// Makes room for a vehicle: evicts silent ones if the maximum is reached. Unproven vehicles and those that were
+    /// Makes room for a vehicle: forgets silent ones if the maximum is reached. Unproven vehicles and those that were
     /// mostly wrong go before proven ones, the longest silent first.
     fn evict_silent_vehicles(&mut self, now: Timestamp) -> Result<(), RejectReason> {
         if self.last_reports.len() < self.config.max_vehicles {
@@ -221,7 +228,7 @@ impl Vote {
             match best.entry(object.landmark.as_ref()) {
                 Entry::Vacant(free) => *free.insert(object),
                 Entry::Occupied(mut kept) => {
-                    let landmark = object.landmark.as_ref().and_then(|id| self.landmarks.get(id)?.as_deref());
+                    let landmark = object.landmark.as_ref().and_then(|id| self.landmarks.get(id)?.as_ref());
                     let rank = |object: &PerceivedObject| {
                         (!self.is_sign(landmark, self.voted_label(landmark, &object.label)), object.confidence)
                     };
@@ -243,7 +250,7 @@ impl Vote {
         if known.is_none() && !self.open {
             return false;
         }
-        let landmark = known.and_then(Option::as_deref);
+        let landmark = known.and_then(Option::as_ref);
         let position = landmark.map_or(Point2::new(object.x_m, object.y_m), |l| l.position);
         let label = self.voted_label(landmark, &object.label).clone();
         let is_sign = self.is_sign(landmark, &label);
@@ -304,7 +311,7 @@ impl Vote {
     pub fn readings(&self, landmark: &LandmarkId, now: Timestamp) -> Vec<LabelReading> {
         let mut readings = self.method.get().readings(landmark);
         let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
-        let known = self.landmarks.get(landmark).and_then(Option::as_deref);
+        let known = self.landmarks.get(landmark).and_then(Option::as_ref);
         if let (Some(sign), Some(signs)) = (known.and_then(|l| l.vacancy.as_ref()), self.signs.get(landmark)) {
             let votes: BTreeSet<NodeName> = readings.values().flatten().cloned().collect();
             let fresh = signs.iter().filter(|(node, at)| now.since(**at) < freshness && !votes.contains(*node));
@@ -364,21 +371,16 @@ impl Vote {
         self.landmarks.keys().filter_map(|landmark| self.method.get().verdict(landmark)).collect()
     }
 
-    /// Judges the stored votes at most `passes` times, starting from their majority; returns the verdict of every
-    /// landmark. The result does not depend on the order of arrival. Without effect in `paper` mode.
+    /// Judges the stored votes `passes` times, starting from equal trust; returns the verdict of every landmark.
+    ///
+    /// This is Dawid & Skene (1979) with the priors of the online machine. It does not depend on the order of arrival.
+    /// Without effect in `paper` mode.
     pub fn refine(&mut self, passes: u32) -> Vec<Verdict> {
         self.method.get_mut().refine(passes);
         self.verdicts()
     }
 
-    /// Judges all stored votes once more, at the end of a recording; returns the verdicts that changed. Without effect in
-    /// `paper` mode.
-    pub fn finish(&mut self) -> Vec<Verdict> {
-        let changed = self.method.get_mut().finish();
-        changed.iter().filter_map(|landmark| self.method.get().verdict(landmark)).collect()
-    }
-
-    /// The reputation of each vehicle.
+    /// The trust in each vehicle.
     pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
         self.method.get().reputations()
     }

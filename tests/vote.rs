@@ -198,11 +198,11 @@ fn vehicles_and_landmarks_beyond_their_limits_change_nothing_else() {
 }
 
 #[test]
-fn an_adopted_ledger_restores_trust() {
+fn an_adopted_ledger_restores_trust_by_class() {
     let mut ledger = ReputationLedger::default();
     for n in 0..200 {
         for (node, label, correct) in
-            [("a", "cup", true), ("a", "mouse", true), ("b", "cup", n % 5 == 0), ("b", "mouse", n % 5 == 0)]
+            [("a", "cup", true), ("a", "mouse", n % 5 == 0), ("b", "cup", n % 5 == 0), ("b", "mouse", true)]
         {
             ledger.record(1, &name("edge"), &Evidence { node: name(node), label: label.into(), correct });
         }
@@ -218,10 +218,18 @@ fn an_adopted_ledger_restores_trust() {
         assert!(vote.reputations().values().all(|r| (0.3..=1.0).contains(&r.score)));
         verdict.label.unwrap()
     };
-    assert_eq!(verdict([("a", "cup"), ("b", "mouse")]), "cup");
-    assert_eq!(verdict([("a", "mouse"), ("b", "cup")]), "mouse");
-    // Accuracies by class are used once votes show that they predict others better: a ledger alone does not.
-    assert_eq!(verdict([("a", "mouse"), ("c", "cup")]), "mouse");
+    // Each states one label that it is always right about and one that it mostly gets wrong.
+    assert_eq!(verdict([("a", "cup"), ("b", "cup")]), "cup");
+    let mut vote = Vote::new(VoteConfig::default(), Vec::new());
+    vote.adopt(&ledger);
+    for node in ["a", "c"] {
+        vote.observe(&report(node, 1, START, &[("x", if node == "a" { "cup" } else { "mouse" }, 0.8)]), START).unwrap();
+    }
+    let trusted = vote.close(START).verdicts.remove(0);
+    vote.observe(&report("a", 2, START, &[("y", "mouse", 0.8)]), START).unwrap();
+    vote.observe(&report("c", 2, START, &[("y", "cup", 0.8)]), START).unwrap();
+    let doubted = vote.close(START).verdicts.remove(0);
+    assert!(trusted.votes["cup"] > doubted.votes["mouse"]);
 }
 
 #[test]

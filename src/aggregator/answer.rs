@@ -19,12 +19,12 @@ pub(super) fn agree(
         Some(label) => Some(label) == sign,
         None => !state.observers.is_empty(),
     };
-    if let Some(Decision { label, share, voters }) = verdict.and_then(decision).filter(|_| !is_known_empty) {
+    if let Some(Decision { label, share, mass }) = verdict.and_then(decision).filter(|_| !is_known_empty) {
         match &state.label {
             Some(known) if known == label => state.confidence = state.confidence.min(share),
             known => {
                 // Without PACE, few voters make nothing sure: Laplace's rule of succession for votes that all agree.
-                let sure = if known.is_some() { state.confidence } else { voters / (voters + 1.0) };
+                let sure = if known.is_some() { state.confidence } else { mass / (mass + 1.0) };
                 state.confidence = share.min(sure);
                 let by = readings.iter().find(|reading| reading.label == *label);
                 state.contributors = by.map(|reading| reading.nodes.clone()).unwrap_or_default();
@@ -43,15 +43,15 @@ struct Decision<'a> {
     label: &'a Label,
     /// The label's share of all votes.
     share: f64,
-    /// Number of vehicles that voted.
-    voters: f64,
+    /// Weight of all votes.
+    mass: f64,
 }
 
 fn decision(verdict: &Verdict) -> Option<Decision<'_>> {
-    let all: f64 = verdict.votes.values().sum();
-    let label = verdict.label.as_ref().filter(|_| all > 0.0)?;
-    let share = (verdict.score / all).clamp(0.0, 1.0);
-    Some(Decision { label, share, voters: verdict.contributors.len() as f64 })
+    let mass: f64 = verdict.votes.values().sum();
+    let label = verdict.label.as_ref().filter(|_| mass > 0.0)?;
+    let share = (verdict.score / mass).clamp(0.0, 1.0);
+    Some(Decision { label, share, mass })
 }
 
 #[cfg(test)]
@@ -78,14 +78,13 @@ mod tests {
 
     fn verdict(votes: &[(&str, f64)]) -> Verdict {
         let (score, next) = (votes[0].1, votes.get(1).map_or(0.0, |(_, score)| *score));
-        let voters = votes.iter().map(|(_, score)| score).sum::<f64>().round() as usize;
         Verdict {
             landmark: "slot-0".into(),
             label: Some(votes[0].0.into()),
             score,
             margin: score - next,
             votes: votes.iter().map(|(label, score)| (Label::new(label), *score)).collect(),
-            contributors: vec![name("euclid"); voters],
+            contributors: Vec::new(),
         }
     }
 

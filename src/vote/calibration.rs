@@ -1,10 +1,24 @@
-//! Calibration: the weight of a stated confidence, estimated from agreement with the other vehicles.
+//! Calibration: the weight of a stated confidence, learned from agreement with the other vehicles.
 
 use std::collections::BTreeSet;
 
-use super::parameters::{BAND_PRIOR_VOTES, BANDS, BINS, CONFIDENCE_MEMORY, NOISE, RANK_PRIOR_VOTES, WEIGHT_RANGE};
+/// Bands of ranks of a confidence among its vehicle's.
+const BANDS: usize = 10;
+/// Bins of the histogram of a vehicle's confidences.
+const BINS: usize = 20;
+/// Weight, in votes, of the middle rank against a vehicle's own confidences.
+const RANK_PRIOR_VOTES: f64 = 5.0;
+/// Weight, in votes, of the overall rate of agreement against a band's own.
+const BAND_PRIOR_VOTES: f64 = 100.0;
+/// Spread of pooled bands, in variances of one vote, that is taken for noise: three times the chance spread of ten equal
+/// bands, 1/2 + … + 1/10 (Barlow et al. 1972).
+const NOISE: f64 = 6.0;
+/// Votes over which settled agreement fades to 1/e.
+const MEMORY_VOTES: f64 = 20_000.0;
+/// Least and greatest weight of a vote for its confidence.
+const WEIGHT_RANGE: (f64, f64) = (0.1, 3.0);
 
-/// Agreement of votes with the other vehicles' votes, by band.
+/// Agreement of votes with those of the other vehicles, by band.
 #[derive(Debug, Clone, Default, PartialEq)]
 struct BandCounts {
     agreed: [f64; BANDS],
@@ -32,7 +46,7 @@ struct ConfidenceHistogram {
 /// Weights of confidences.
 ///
 /// A detector's confidence orders its detections but is no probability: one vehicle's 0.6 may be another's 0.9. A
-/// vehicle's overall quality is its reputation; its confidence ranks its votes.
+/// vehicle's overall quality is its reputation; its confidence tells which of its votes are better than others.
 ///
 /// - A vote's band is the rank of its confidence among all of the vehicle's.
 /// - Its weight is the log-odds of being right in that band, divided by the log-odds over all bands.
@@ -48,8 +62,6 @@ pub(super) struct ConfidenceCalibration {
     histograms: Vec<ConfidenceHistogram>,
     /// Sum and number of all stated confidences.
     stated: (f64, f64),
-    /// Least and greatest of them.
-    range: Option<(f64, f64)>,
     prior_votes: f64,
 }
 
@@ -70,25 +82,18 @@ impl ConfidenceCalibration {
             self.histograms.resize(vehicle + 1, ConfidenceHistogram::default());
         }
         self.stated = (self.stated.0 + confidence, self.stated.1 + 1.0);
-        let (least, most) = self.range.unwrap_or((confidence, confidence));
-        self.range = Some((least.min(confidence), most.max(confidence)));
         let histogram = &mut self.histograms[vehicle];
         histogram.stated[bin(confidence)] += 1.0;
         histogram.total += 1.0;
     }
 
-    /// Removes the confidences of vehicles, whose indices may be reused.
+    /// Forgets the confidences of vehicles, whose indices may be reused.
     pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
         for &vehicle in vehicles {
             if let Some(histogram) = self.histograms.get_mut(vehicle) {
                 *histogram = ConfidenceHistogram::default();
             }
         }
-    }
-
-    /// False while all confidences are equal: they carry no information then.
-    pub(super) fn is_informed(&self) -> bool {
-        self.range.is_some_and(|(least, most)| least < most)
     }
 
     /// Band of a vote: the rank of its confidence among the vehicle's.
@@ -107,16 +112,16 @@ impl ConfidenceCalibration {
 
     /// Counts a settled vote.
     pub(super) fn settle(&mut self, band: usize, agreement: f64) {
-        self.settled.fade(1.0 - 1.0 / CONFIDENCE_MEMORY);
+        self.settled.fade(1.0 - 1.0 / MEMORY_VOTES);
         self.settled.add(band, agreement, 1.0);
     }
 
-    /// Replaces the live evidence by the live evidence of `other`.
+    /// Replaces the live evidence by that of `other`.
     pub(super) fn take_live(&mut self, other: Self) {
         self.live = other.live;
     }
 
-    /// Removes the live evidence.
+    /// Forgets the live evidence.
     pub(super) fn clear_live(&mut self) {
         self.live = BandCounts::default();
     }

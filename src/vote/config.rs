@@ -15,7 +15,7 @@ pub const MAX_LABELS: usize = 65_535;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VoteMode {
-    /// The hierarchical confusion model; the default.
+    /// Learned reputation × calibrated confidence × visibility; the default.
     #[default]
     Weighted,
     /// The paper's formulas to the letter.
@@ -32,13 +32,13 @@ pub struct VoteConfig {
     pub paper: PaperConfig,
     /// Settings of `weighted` mode.
     pub weighted: WeightedConfig,
-    /// Maximum number of landmarks; beyond it an open cell evicts the oldest. Default 1024. Bounds memory.
+    /// Maximum number of landmarks; beyond it an open cell forgets the oldest. Default 1024. Bounds memory.
     pub max_landmarks: usize,
-    /// Maximum number of vehicles. Beyond it long silent ones are evicted; without any, reports of new vehicles are
+    /// Maximum number of vehicles. Beyond it long silent ones are forgotten; without any, reports of new vehicles are
     /// rejected. Default 256. Bounds memory.
     pub max_vehicles: usize,
     /// Maximum number of distinct labels of the cell, in `paper` mode of a landmark. Default 256. Bounds memory. Beyond
-    /// it the least useful labels are evicted, first the labels of the vehicle that introduced most. In `paper` mode, whose
+    /// it the least useful labels are forgotten, first those of the vehicle that introduced most. In `paper` mode, whose
     /// sums never end, votes for new labels are ignored.
     pub max_labels: usize,
     /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's own synonyms go first.
@@ -102,15 +102,20 @@ config_section! {
         /// More suppresses more single frames with a wrong label, but notices a new object later. 0 takes the last statement
         /// alone, for inputs in which a new statement corrects the earlier one.
         pub smoothing_share: f64 = 0.5, in 0.0 to 10.0;
-        /// Weight, in votes, of the fleet's record against a vehicle's own, overall and by class; default 8. Less learns sooner
-        /// from noise.
+        /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion against its own record of one
+        /// class; default 5. Less learns classes faster from noise.
+        pub class_prior_votes: f64 = 5.0, in 1e-3 to 1e6;
+        /// Weight, in votes, of the fleet's reliability against the vehicle's own; default 8.
         pub vehicle_prior_votes: f64 = 8.0, in 1e-3 to 1e6;
         /// Assumed rate of right votes of a vehicle without evidence, 0.5 to 1; default 0.7.
         pub assumed_accuracy: f64 = 0.7, in 0.5 to 0.999;
+        /// Share of the fleet's confusion in the assumed distribution of errors; the rest is spread evenly over all wrong
+        /// labels. Default 0.5.
+        pub confusion_sharing: f64 = 0.5, in 0.0 to 1.0;
         /// Maximum weight of the shares of the classes, in verdicts; default 100. More favours frequent labels.
         pub class_share_verdicts: f64 = 100.0, in 2.0 to 1e9;
-        /// Votes over which the memory of a vehicle fades to 1/e; default 100. Shorter notices a change of mind sooner.
-        pub memory_votes: f64 = 100.0, in 1.0 to 1e9;
+        /// Votes over which the memory of a vehicle fades to 1/e; default 500. Shorter notices a change of mind sooner.
+        pub memory_votes: f64 = 500.0, in 1.0 to 1e9;
         /// Comparisons over which the memory of two vehicles' agreement fades to 1/e; default 100. Shorter notices sooner
         /// that vehicles begin to copy each other, longer finds fainter dependence.
         pub pair_memory_votes: f64 = 100.0, in 2.0 to 1e9;
@@ -128,7 +133,9 @@ config_section! {
         pub half_visibility_rad: f64 = 0.8, in 1e-3 to 10.0;
         /// Visibility at the maximum range, 0 to 1; default 0.3. In between it falls with the square of the distance.
         pub visibility_at_max_range: f64 = 0.3, in 1e-3 to 1.0;
-        /// Weight, in votes, of stated confidences against calibrated ones; default 10. More keeps stated confidences for
+        /// Votes on older landmarks that are judged again per fresh vote; default 8. More settles sooner, costs more.
+        pub revisit_votes: f64 = 8.0, in 0.0 to 1e6;
+        /// Weight, in votes, of stated confidences against calibrated ones; default 10. More trusts stated confidences for
         /// longer.
         pub calibration_votes: f64 = 10.0, in 1e-3 to 1e9;
     }

@@ -1,6 +1,6 @@
 //! Confusion counts: how often each label was stated where each was true.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Index of a label in the cell's [`LabelTable`](super::label_table::LabelTable).
 pub(super) type LabelIndex = u16;
@@ -8,21 +8,12 @@ pub(super) type LabelIndex = u16;
 /// Scale below which counts are written anew.
 const MIN_SCALE: f64 = 1e-60;
 
-/// Statements where one label is true.
-#[derive(Debug, Clone, PartialEq)]
-struct Row {
-    truth: LabelIndex,
-    sum: f64,
-    /// Counts by stated label, in order of the label.
-    cells: Vec<(LabelIndex, f64)>,
-}
-
-/// Sparse expected counts of (true label, stated label): only pairs that occurred take memory. All counts share one
+/// Sparse expected counts of (true label, stated label): pairs that never occurred take no memory. All counts share one
 /// scale, so that the cost of fading does not depend on their number.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Confusion {
-    /// In order of the true label.
-    rows: Vec<Row>,
+    cells: BTreeMap<(LabelIndex, LabelIndex), f64>,
+    rows: BTreeMap<LabelIndex, f64>,
     correct: f64,
     total: f64,
     scale: f64,
@@ -30,69 +21,62 @@ pub(super) struct Confusion {
 
 impl Default for Confusion {
     fn default() -> Self {
-        Self { rows: Vec::new(), correct: 0.0, total: 0.0, scale: 1.0 }
+        Self { cells: BTreeMap::new(), rows: BTreeMap::new(), correct: 0.0, total: 0.0, scale: 1.0 }
     }
 }
 
 impl Confusion {
     /// Adds `weight`; a negative one takes evidence back.
     pub(super) fn add(&mut self, truth: LabelIndex, stated: LabelIndex, weight: f64) {
-        let weight = weight / self.scale;
-        let row = match self.rows.binary_search_by_key(&truth, |row| row.truth) {
-            Ok(place) => &mut self.rows[place],
-            Err(place) => {
-                self.rows.insert(place, Row { truth, sum: 0.0, cells: Vec::new() });
-                &mut self.rows[place]
-            }
-        };
-        row.sum += weight;
-        match row.cells.binary_search_by_key(&stated, |(label, _)| *label) {
-            Ok(place) => row.cells[place].1 += weight,
-            Err(place) => row.cells.insert(place, (stated, weight)),
-        }
+        self.add_scaled(truth, stated, weight / self.scale);
+    }
+
+    fn add_scaled(&mut self, truth: LabelIndex, stated: LabelIndex, weight: f64) {
+        *self.cells.entry((truth, stated)).or_insert(0.0) += weight;
+        *self.rows.entry(truth).or_insert(0.0) += weight;
         self.total += weight;
         if truth == stated {
             self.correct += weight;
         }
     }
 
-    /// Removes all evidence about any of `labels`.
+    /// Forgets all evidence about any of `labels`.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
-        self.rows.retain(|row| !labels.contains(&row.truth));
-        (self.total, self.correct) = (0.0, 0.0);
-        for row in &mut self.rows {
-            row.cells.retain(|(stated, _)| !labels.contains(stated));
-            row.sum = row.cells.iter().map(|(_, count)| count).sum();
-            self.total += row.sum;
-            self.correct += row.cells.iter().filter(|(stated, _)| *stated == row.truth).map(|(_, n)| n).sum::<f64>();
+        let is_about =
+            |&(truth, stated): &(LabelIndex, LabelIndex)| labels.contains(&truth) || labels.contains(&stated);
+        let gone: Vec<_> = self.cells.iter().filter(|(cell, _)| is_about(cell)).map(|(cell, n)| (*cell, *n)).collect();
+        for ((truth, stated), count) in gone {
+            self.add_scaled(truth, stated, -count);
+            self.cells.remove(&(truth, stated));
         }
+        self.rows.retain(|truth, _| !labels.contains(truth));
     }
 
     /// Multiplies all evidence by `factor`.
     pub(super) fn fade(&mut self, factor: f64) {
         self.scale *= factor;
         if self.scale < MIN_SCALE {
-            for row in &mut self.rows {
-                row.sum *= self.scale;
-                row.cells.iter_mut().for_each(|(_, count)| *count *= self.scale);
-            }
+            self.cells.values_mut().for_each(|c| *c *= self.scale);
+            self.rows.values_mut().for_each(|r| *r *= self.scale);
             self.correct *= self.scale;
             self.total *= self.scale;
             self.scale = 1.0;
         }
     }
 
-    /// Numbers of votes for `stated` where `truth` was true, and of all votes there.
-    pub(super) fn cell_and_row(&self, truth: LabelIndex, stated: LabelIndex) -> (f64, f64) {
-        let Ok(place) = self.rows.binary_search_by_key(&truth, |row| row.truth) else { return (0.0, 0.0) };
-        let Row { sum, cells, .. } = &self.rows[place];
-        let cell = cells.binary_search_by_key(&stated, |(label, _)| *label).map_or(0.0, |place| cells[place].1);
-        (self.scale * cell.max(0.0), self.scale * sum.max(0.0))
+    /// Number of votes for `stated` where `truth` was true.
+    pub(super) fn cell(&self, truth: LabelIndex, stated: LabelIndex) -> f64 {
+        self.cells.get(&(truth, stated)).map_or(0.0, |c| self.scale * c.max(0.0))
+    }
+
+    /// Number of votes where `truth` was true.
+    pub(super) fn row(&self, truth: LabelIndex) -> f64 {
+        self.rows.get(&truth).map_or(0.0, |r| self.scale * r.max(0.0))
     }
 
     /// True labels with their numbers of votes.
     pub(super) fn rows(&self) -> impl Iterator<Item = (LabelIndex, f64)> {
-        self.rows.iter().map(|row| (row.truth, self.scale * row.sum.max(0.0)))
+        self.rows.iter().map(|(&truth, &count)| (truth, self.scale * count.max(0.0)))
     }
 
     /// Number of right votes.
@@ -132,8 +116,7 @@ mod tests {
             expected = expected * if step % 1000 == 0 { 0.1 } else { 0.998 } + 1.0;
         }
         assert!((confusion.total() / expected - 1.0).abs() < 1e-9, "{} {expected}", confusion.total());
-        let ((right, row), (wrong, _)) = (confusion.cell_and_row(0, 0), confusion.cell_and_row(0, 1));
-        assert!((right + wrong - row).abs() < 1e-9);
-        assert!((right - confusion.correct()).abs() < 1e-9);
+        assert!((confusion.cell(0, 0) + confusion.cell(0, 1) - confusion.row(0)).abs() < 1e-9);
+        assert!((confusion.cell(0, 0) - confusion.correct()).abs() < 1e-9);
     }
 }

@@ -7,15 +7,31 @@
 //! & Srivastava 2009). ρ = (κ − r_i r_j) / (1 − r_i r_j) is the part of a vote that is not its own.
 //!
 //! Of two groups that contradict each other, either could be the honest one. The group of more *vehicles* is taken for
-//! it, however closely the others agree. So fewer than half of the vehicles may be malicious.
+//! it, however closely the others agree. That bounds the number of liars that are withstood at fewer than half.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::confusion::LabelIndex;
-use super::parameters::{
-    DEVIATIONS, FACTOR_STEPS, MAX_COMPARED, MAX_COMPARED_STORED, PRIOR_COMPARISONS, SAME_GROUP, SHARES_MEMORY,
-    TENURE_VOTES,
-};
+
+/// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost of a vote.
+const MAX_COMPARED: usize = 8;
+/// The same over stored votes.
+const MAX_COMPARED_STORED: usize = 32;
+/// Standard deviations by which agreement must exceed the expected agreement.
+const SIGNIFICANCE: f64 = 4.0;
+/// The same over stored votes, where many pairs are tested at once: one in 3 million exceeds it by chance.
+const SIGNIFICANCE_STORED: f64 = 5.0;
+/// Agreement κ of two vehicles that surely belong to one group; closer agreement earns no more influence.
+const SAME_GROUP: f64 = 0.3;
+/// Weight, in comparisons, of the priors: no agreement between two vehicles, and a vehicle as reliable as others.
+const PRIOR_COMPARISONS: f64 = 10.0;
+/// Votes after which a vehicle has half of its final influence on the choice of the main group; bounds the gain of
+/// attackers who rejoin under new names.
+const TENURE_VOTES: f64 = 50.0;
+const GROUPING_STEPS: u32 = 30;
+const FACTOR_STEPS: u32 = 15;
+/// Comparisons after which the counts of stated labels are halved.
+const SHARES_MEMORY: f64 = 10_000.0;
 
 /// Fading counts of how often two vehicles voted on the same landmark and agreed.
 #[derive(Debug, Clone, Copy, Default)]
@@ -32,10 +48,10 @@ impl Pair {
     }
 
     /// The part ρ of a vote that is not its own, where κ = `explained` is expected of independent vehicles.
-    fn excess(&self, explained: f64) -> f64 {
+    fn excess(&self, explained: f64, significance: f64) -> f64 {
         let expected = self.chance + (self.compared - self.chance) * explained;
         let deviation = (expected * (1.0 - expected / self.compared).max(0.0) + 1.0).sqrt();
-        if self.agreed - expected > DEVIATIONS * deviation {
+        if self.agreed - expected > significance * deviation {
             ((self.kappa() - explained) / (1.0 - explained)).clamp(0.0, 1.0)
         } else {
             0.0
@@ -50,6 +66,8 @@ pub(super) struct AgreementGroups {
     pub(super) main: Vec<usize>,
     /// Vehicles outside it whose votes are at most half their own.
     pub(super) copies: Vec<usize>,
+    /// Number of vehicles whose votes are at most half their own.
+    pub(super) dependent: usize,
 }
 
 /// Pairwise agreement of vehicles and what follows from it.
@@ -58,7 +76,8 @@ pub(super) struct Dependence {
     /// Comparisons over which a pair's counts fade to 1/e.
     memory: f64,
     max_compared: usize,
-    pairs: BTreeMap<(u32, u32), Pair>,
+    significance: f64,
+    pairs: BTreeMap<(usize, usize), Pair>,
     /// Votes for each label, their sum and the sum of their squares.
     stated: Vec<f64>,
     total: f64,
@@ -74,7 +93,7 @@ pub(super) struct Dependence {
 impl Dependence {
     /// Without comparisons; the counts of a pair fade over `memory` comparisons to 1/e.
     pub(super) fn new(memory: f64) -> Self {
-        Self { memory, max_compared: MAX_COMPARED, ..Self::default() }
+        Self { memory, max_compared: MAX_COMPARED, significance: SIGNIFICANCE, ..Self::default() }
     }
 
     /// Goes on with another memory.
@@ -82,15 +101,15 @@ impl Dependence {
         self.memory = memory;
     }
 
-    /// As [`Self::new`], for all stored votes together, without fading.
+    /// As [`Self::new`], for all stored votes together: nothing fades.
     pub(super) fn of_stored() -> Self {
-        Self { memory: f64::INFINITY, max_compared: MAX_COMPARED_STORED, ..Self::default() }
+        let (max_compared, significance) = (MAX_COMPARED_STORED, SIGNIFICANCE_STORED);
+        Self { memory: f64::INFINITY, max_compared, significance, ..Self::default() }
     }
 
-    /// Removes vehicles, whose indices may be reused.
+    /// Forgets vehicles, whose indices may be reused.
     pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
-        self.pairs
-            .retain(|(one, other), _| !vehicles.contains(&(*one as usize)) && !vehicles.contains(&(*other as usize)));
+        self.pairs.retain(|(one, other), _| !vehicles.contains(one) && !vehicles.contains(other));
         self.partners.iter_mut().for_each(|partners| partners.retain(|(other, _)| !vehicles.contains(other)));
         for &vehicle in vehicles {
             self.tenure.get_mut(vehicle).into_iter().for_each(|tenure| *tenure = 0.0);
@@ -98,7 +117,7 @@ impl Dependence {
         }
     }
 
-    /// Removes how often labels were stated; their indices may be reused.
+    /// Forgets how often labels were stated; their indices may be reused.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         for &label in labels {
             let Some(stated) = self.stated.get_mut(usize::from(label)).map(std::mem::take) else { continue };
@@ -133,7 +152,7 @@ impl Dependence {
         self.count_label(other.1);
         let chance = self.squares / (self.total * self.total);
         let fade = 1.0 - 1.0 / self.memory;
-        let pair = self.pairs.entry((one.0.min(other.0) as u32, one.0.max(other.0) as u32)).or_default();
+        let pair = self.pairs.entry((one.0.min(other.0), one.0.max(other.0))).or_default();
         pair.compared = pair.compared * fade + 1.0;
         pair.agreed = pair.agreed * fade + f64::from(one.1 == other.1);
         pair.chance = pair.chance * fade + chance;
@@ -164,7 +183,7 @@ impl Dependence {
 
     /// Whether a fit is due: it then costs no more than the comparisons since the last one.
     pub(super) fn is_due(&self) -> bool {
-        self.compared >= (4 * self.pairs.len()).max(64)
+        self.compared >= self.pairs.len().max(64)
     }
 
     /// Finds the dependent pairs again; only vehicles that are `present` count for the main group.
@@ -176,15 +195,15 @@ impl Dependence {
             if present[vehicle] { tenure / (tenure + TENURE_VOTES) } else { 0.0 }
         };
         let influences: Vec<f64> = (0..vehicles).map(influence).collect();
-        let pairs: Vec<_> = self.pairs.iter().map(|(&(a, b), &pair)| (a as usize, b as usize, pair)).collect();
+        let pairs: Vec<_> = self.pairs.iter().map(|(&(one, other), &pair)| (one, other, pair)).collect();
         let belonging = main_group(&influences, &pairs);
         let typical = typical_agreement(&belonging, &pairs);
-        let mut rhos: Vec<f64> = pairs.iter().map(|(_, _, pair)| pair.excess(typical)).collect();
+        let mut rhos: Vec<f64> = pairs.iter().map(|(_, _, pair)| pair.excess(typical, self.significance)).collect();
         let mut factors = vec![0.5; vehicles];
         for _ in 0..FACTOR_STEPS {
             factors = next_factors(&factors, &belonging, &pairs, &rhos);
             for (rho, (one, other, pair)) in rhos.iter_mut().zip(&pairs) {
-                *rho = pair.excess(factors[*one] * factors[*other]);
+                *rho = pair.excess(factors[*one] * factors[*other], self.significance);
             }
         }
         self.partners = vec![Vec::new(); vehicles];
@@ -196,6 +215,7 @@ impl Dependence {
         let is_copy = |v: usize| belonging[v] < 0.1 && is_dependent(v);
         AgreementGroups {
             main: (0..vehicles).filter(|&v| belonging[v] >= 0.5).collect(),
+            dependent: (0..vehicles).filter(|&v| is_dependent(v)).count(),
             copies: (0..vehicles).filter(|&v| is_copy(v)).collect(),
         }
     }
@@ -205,7 +225,7 @@ impl Dependence {
 /// found by power iteration that drops negative parts.
 fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
     let mut belonging = influences.to_vec();
-    for _ in 0..FACTOR_STEPS {
+    for _ in 0..GROUPING_STEPS {
         let mut support = vec![0.0; influences.len()];
         for (one, other, pair) in pairs {
             let affinity =

@@ -1,16 +1,21 @@
-//! The labels of a cell by index, and the choice of labels to evict when room is short.
+//! The labels of a cell by index, and the choice of those that are evicted when room is short.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::confusion::LabelIndex;
-use super::parameters::{EVICTION_DIVISOR, SUPPORTED_VOTES};
 use crate::model::names::Label;
 use crate::model::time::Timestamp;
+
+/// Inverse share of the labels that is evicted at once, so that the cost per new label stays small.
+const EVICTION_DIVISOR: usize = 8;
+
+/// Correct votes from which a label is supported: unsupported labels are evicted first.
+const SUPPORTED_VOTES: f64 = 1.0;
 
 #[derive(Debug, Clone)]
 struct LabelEntry {
     name: Label,
-    /// The vehicle that stated it first, while that is recorded.
+    /// The vehicle that stated it first, while that is known.
     introduced_by: Option<usize>,
     stated_at: Option<Timestamp>,
 }
@@ -37,12 +42,12 @@ impl LabelTable {
         self.indices.get(label).copied()
     }
 
-    /// Whether a label is recorded or one more keeps to `max_labels`.
+    /// Whether a label is known or one more keeps to `max_labels`.
     pub(super) fn has_room_for(&self, label: &Label, max_labels: usize) -> bool {
         self.indices.len() < max_labels || self.indices.contains_key(label)
     }
 
-    /// The index of a label; a new label takes a new or free index; `stated` is the vehicle that stated it and when.
+    /// The index of a label, a new or free one if it has none; `stated` is the vehicle that stated it and when.
     pub(super) fn intern(&mut self, label: &Label, stated: Option<(usize, Timestamp)>) -> LabelIndex {
         let (introduced_by, stated_at) = stated.unzip();
         if let Some(index) = self.index(label) {
@@ -62,7 +67,7 @@ impl LabelTable {
         index
     }
 
-    /// Removes which labels these vehicles stated first: their indices may be reused.
+    /// Forgets which labels these vehicles stated first: their indices may be reused.
     pub(super) fn forget_vehicles(&mut self, vehicles: &BTreeSet<usize>) {
         for entry in &mut self.entries {
             entry.introduced_by = entry.introduced_by.filter(|by| !vehicles.contains(by));

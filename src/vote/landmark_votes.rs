@@ -1,31 +1,37 @@
 //! The votes on one landmark.
 
+use std::collections::BTreeSet;
+
 use super::calibration::{ConfidenceCalibration, Weights};
 use super::confusion::LabelIndex;
 use super::dependence::Dependence;
-use super::model::{HierarchicalModel, LandmarkJudgement, Posterior, WeightedVote, probability};
-use super::parameters::{INDEPENDENT_FRAMES, NORMAL_TO_LOGISTIC};
+use super::likelihood::{LandmarkPosterior, Posterior, WeightedVote, probability};
 use crate::model::time::Timestamp;
+
+/// Independent part of a vehicle's statements: one frame is much like the next.
+const INDEPENDENT_FRAMES: f64 = 1.0 / 3.0;
+/// tanh(0.8 z) is the two-sided normal probability of z, within 0.02.
+const NORMAL_TO_LOGISTIC: f64 = 0.8;
 
 /// A vote that counts at present.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StoredVote {
-    pub(super) vehicle: u32,
+    pub(super) vehicle: usize,
     pub(super) label: LabelIndex,
-    pub(super) confidence: f32,
-    pub(super) visibility: f32,
+    pub(super) confidence: f64,
+    pub(super) visibility: f64,
     /// The vehicle's latest statements.
     pub(super) recent: RecentStatements,
-    pub(super) weight: f32,
+    pub(super) weight: f64,
     /// Part of the weight that does not depend on other vehicles, 0 to 1.
-    pub(super) independence: f32,
+    pub(super) independence: f64,
     pub(super) at: Timestamp,
     /// When it began to count once more as evidence.
     pub(super) since: Timestamp,
     /// Rank of its confidence as of the last judgement.
-    pub(super) band: u8,
+    pub(super) band: usize,
     /// Probability that the others give its label, while the live evidence on confidences contains it.
-    pub(super) agreement: Option<f32>,
+    pub(super) agreement: Option<f64>,
     /// Whether the posterior rests on it.
     pub(super) judged: bool,
     /// Whether it has been compared with the other vehicles' votes since it began to count.
@@ -36,14 +42,14 @@ pub(super) struct StoredVote {
 /// that shows a wrong label does not change the vehicle's vote.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct RecentStatements {
-    labels: [(LabelIndex, f32); 3],
+    labels: [(LabelIndex, f64); 3],
     /// Fading number of statements.
-    statements: f32,
+    statements: f64,
 }
 
 impl RecentStatements {
     /// Adds a statement of `weight` after earlier ones faded by the factor `kept`; returns the label stated most.
-    pub(super) fn add(&mut self, label: LabelIndex, weight: f32, kept: f32) -> LabelIndex {
+    pub(super) fn add(&mut self, label: LabelIndex, weight: f64, kept: f64) -> LabelIndex {
         self.statements = self.statements * kept + 1.0;
         self.labels.iter_mut().for_each(|(_, sum)| *sum *= kept);
         let known = self.labels.iter().position(|(known, sum)| *known == label && *sum > 0.0);
@@ -55,7 +61,7 @@ impl RecentStatements {
         more.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
     }
 
-    /// Removes statements of labels whose indices may be reused.
+    /// Forgets statements of labels whose indices may be reused.
     pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
         self.labels.iter_mut().filter(|(label, _)| is_gone(*label)).for_each(|place| *place = (0, 0.0));
     }
@@ -64,25 +70,23 @@ impl RecentStatements {
     /// deviations of a multinomial draw, as a two-sided probability. A vehicle that wavers between two labels hardly
     /// votes.
     pub(super) fn certainty(&self) -> f64 {
-        let mut sums = self.labels.map(|(_, sum)| f64::from(sum));
+        let mut sums = self.labels.map(|(_, sum)| sum);
         sums.sort_by(f64::total_cmp);
         let [third, second, first] = sums;
         let total = (first + second + third).max(f64::MIN_POSITIVE);
         let lead = (first - second) / total;
-        let variance =
-            ((first + second) / total - lead * lead) / (INDEPENDENT_FRAMES * f64::from(self.statements)).max(1.0);
+        let variance = ((first + second) / total - lead * lead) / (INDEPENDENT_FRAMES * self.statements).max(1.0);
         (NORMAL_TO_LOGISTIC * lead / variance.max(1e-9).sqrt()).tanh()
     }
 }
 
 impl StoredVote {
     pub(super) fn weighted(&self) -> WeightedVote {
-        let (weight, independence) = (f64::from(self.weight), f64::from(self.independence));
-        WeightedVote { vehicle: self.vehicle as usize, label: self.label, weight, independence }
+        WeightedVote { vehicle: self.vehicle, label: self.label, weight: self.weight, independence: self.independence }
     }
 }
 
-/// The votes on one landmark, at most one vote for each vehicle, in order of vehicle.
+/// The votes on one landmark, at most one of each vehicle, in order of vehicle.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LandmarkVotes {
     pub(super) votes: Vec<StoredVote>,
@@ -102,10 +106,7 @@ impl LandmarkVotes {
     }
 
     pub(super) fn candidates(&self) -> Vec<LabelIndex> {
-        let mut labels: Vec<_> = self.votes.iter().map(|vote| vote.label).collect();
-        labels.sort_unstable();
-        labels.dedup();
-        labels
+        self.votes.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
     }
 
     /// Counts new votes as evidence on dependence and on confidences; where there are many voters, `order` decides which
@@ -117,11 +118,11 @@ impl LandmarkVotes {
         order: impl Fn(usize) -> usize,
     ) {
         if self.votes.iter().any(|c| !c.compared) {
-            let mut votes: Vec<_> = self.votes.iter().map(|c| (c.vehicle as usize, c.label, !c.compared)).collect();
+            let mut votes: Vec<_> = self.votes.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
             votes.sort_by_key(|(vehicle, ..)| order(*vehicle));
             dependence.compare(&votes);
             for vote in self.votes.iter_mut().filter(|c| !c.compared) {
-                calibration.record_confidence(vote.vehicle as usize, f64::from(vote.confidence));
+                calibration.record_confidence(vote.vehicle, vote.confidence);
                 vote.compared = true;
             }
         }
@@ -131,56 +132,26 @@ impl LandmarkVotes {
     pub(super) fn weigh(&mut self, dependence: &Dependence, calibration: &ConfidenceCalibration, weights: &Weights) {
         for place in 0..self.votes.len() {
             let StoredVote { vehicle, label, confidence, visibility, recent, .. } = self.votes[place];
-            let (vehicle, confidence) = (vehicle as usize, f64::from(confidence));
             let agrees = |other: usize| {
-                let found = self.votes.binary_search_by_key(&other, |c| c.vehicle as usize);
-                found.is_ok_and(|at| self.votes[at].label == label)
+                self.votes.binary_search_by_key(&other, |c| c.vehicle).is_ok_and(|at| self.votes[at].label == label)
             };
             let independence = dependence.independence(vehicle, agrees);
             let band = calibration.band(vehicle, confidence);
             let vote = &mut self.votes[place];
-            vote.independence = independence as f32;
-            vote.band = band as u8;
-            vote.weight = (weights.of(band, confidence) * f64::from(visibility) * recent.certainty()) as f32;
+            (vote.independence, vote.band, vote.weight) =
+                (independence, band, weights.of(band, confidence) * visibility * recent.certainty());
         }
     }
 
     /// Takes a judgement, and adds to the evidence on confidences how probable the others make the label of each vote.
-    /// The votes, which are also in `weighted`, become live evidence.
-    pub(super) fn take(
-        &mut self,
-        judged: LandmarkJudgement,
-        weighted: &[WeightedVote],
-        model: &mut HierarchicalModel,
-        calibration: &mut ConfidenceCalibration,
-    ) {
-        if self.has_several_voters() && calibration.is_informed() {
-            for (n, vote) in self.votes.iter_mut().enumerate() {
-                let agreement = probability(&judged.without(n, 1.0), vote.label) as f32;
-                calibration.count(usize::from(vote.band), f64::from(agreement), 1.0);
+    pub(super) fn take(&mut self, judged: LandmarkPosterior, calibration: &mut ConfidenceCalibration) {
+        if self.has_several_voters() {
+            for (vote, agreement) in self.votes.iter_mut().zip(judged.agreements) {
+                calibration.count(vote.band, agreement, 1.0);
                 vote.agreement = Some(agreement);
             }
         }
-        self.posterior = judged.posterior;
-        model.add_live(weighted, &self.posterior, 1.0);
-        self.counted = true;
-    }
-
-    /// Takes the votes out of the live evidence until they are judged again.
-    pub(super) fn remove_live(&mut self, model: &mut HierarchicalModel, calibration: &mut ConfidenceCalibration) {
-        if std::mem::take(&mut self.counted) {
-            model.add_live(&self.weighted_votes(), &self.posterior, -1.0);
-            for vote in &mut self.votes {
-                if let Some(agreement) = vote.agreement.take() {
-                    calibration.count(usize::from(vote.band), f64::from(agreement), -1.0);
-                }
-            }
-        }
-    }
-
-    /// Number of votes, each as far as it is independent and sure.
-    pub(super) fn effective_votes(&self) -> f64 {
-        self.votes.iter().map(|vote| f64::from(vote.independence * vote.weight.min(1.0))).sum()
+        self.posterior = judged.labels;
     }
 
     /// Publishes the most probable label, unless the published one is at most `hysteresis` behind.
@@ -199,16 +170,15 @@ impl LandmarkVotes {
 
     /// Share of each label in the weighted votes; equal shares where all voters waver, so that no vote has weight.
     pub(super) fn majority(&self) -> Posterior {
-        let weight = |vote: &StoredVote| f64::from(vote.weight * vote.independence);
-        let total: f64 = self.votes.iter().map(weight).sum();
+        let total: f64 = self.votes.iter().map(|c| c.weight * c.independence).sum();
         let candidates = self.candidates();
         let equal = 1.0 / candidates.len() as f64;
         let of_label = |label| self.votes.iter().filter(move |c| c.label == label);
-        let share = |label| of_label(label).map(weight).sum::<f64>() / total;
+        let share = |label| of_label(label).map(|c| c.weight * c.independence).sum::<f64>() / total;
         candidates.into_iter().map(|label| (label, if total > 0.0 { share(label) } else { equal })).collect()
     }
 
-    /// Removes labels with the votes for them; returns the number of votes. Not allowed while it is counted.
+    /// Forgets labels with the votes for them; returns the number of votes. Not allowed while it is counted.
     pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> usize {
         let votes = self.votes.len();
         self.votes.retain(|vote| !is_gone(vote.label));

@@ -15,32 +15,32 @@ pub(super) struct NewVote<'a> {
     pub(super) node: &'a NodeName,
     pub(super) label: &'a Label,
     pub(super) confidence: f64,
-    /// Distance in metres and bearing in radians of the landmark, where the vehicle's pose is recorded.
+    /// Distance in metres and bearing in radians of the landmark, where the vehicle's pose is known.
     pub(super) range_bearing: Option<(f64, f64)>,
     pub(super) at: Timestamp,
 }
 
-/// A voting method. Optional functions have an empty default.
+/// A voting method. What a method does without keeps the default, which does nothing.
 pub(super) trait VotingMethod {
     /// Goes on under other settings of the same mode.
     fn configure(&mut self, config: &VoteConfig);
 
-    /// Adds a landmark, so that a verdict exists even without votes.
+    /// Makes a landmark known, so that it has a verdict even without votes.
     fn add_landmark(&mut self, landmark: LandmarkId);
 
-    /// Removes a landmark.
+    /// Forgets a landmark.
     fn remove_landmark(&mut self, landmark: &LandmarkId);
 
-    /// Removes vehicles.
+    /// Forgets vehicles.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>);
 
-    /// Makes room for the label of a vote; returns how many votes were evicted for it, `None` if there is no room.
+    /// Makes room for the label of a vote; returns how many votes were forgotten for it, `None` if there is no room.
     fn make_room_for(&mut self, vote: &NewVote<'_>, max_labels: usize) -> Option<usize>;
 
     /// Counts a vote.
     fn add_vote(&mut self, vote: &NewVote<'_>);
 
-    /// Ends a round: returns the landmarks with news and the votes that have settled as right or wrong.
+    /// Ends a round: returns the landmarks with news and the votes that are now known to be right or wrong.
     fn close(&mut self, now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>);
 
     /// The verdict at a landmark.
@@ -51,7 +51,7 @@ pub(super) trait VotingMethod {
         BTreeMap::new()
     }
 
-    /// The reputation of each vehicle.
+    /// The trust in each vehicle.
     fn reputations(&self) -> BTreeMap<NodeName, Reputation>;
 
     /// Whether a vehicle has voted often enough to be judged, and was right more often than wrong.
@@ -69,11 +69,6 @@ pub(super) trait VotingMethod {
 
     /// See [`super::Vote::refine`].
     fn refine(&mut self, _passes: u32) {}
-
-    /// Judges all stored votes once more; returns the landmarks whose label changed.
-    fn finish(&mut self) -> BTreeSet<LandmarkId> {
-        BTreeSet::new()
-    }
 
     /// See [`super::Vote::adopt`].
     fn adopt(&mut self, _ledger: &ReputationLedger, _limits: &VoteConfig) {}

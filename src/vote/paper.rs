@@ -70,7 +70,7 @@ impl VotingMethod for PaperVoting {
         self.landmarks.remove(landmark);
     }
 
-    /// Removes reputations and names; the votes stay in the sums.
+    /// Forgets reputations and names; the votes stay in the sums.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.vehicles.retain(|node, _| !nodes.contains(node));
         self.landmarks.values_mut().for_each(|known| known.contributors.retain(|node| !nodes.contains(node)));

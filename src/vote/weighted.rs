@@ -1,43 +1,50 @@
-//! The default method: estimated reputation × calibrated confidence × visibility.
+//! The default voting: learned reputation × calibrated confidence × visibility.
 
+mod batch;
 mod eviction;
-mod fit;
 mod from_ledger;
 mod settlement;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Bound;
 use std::time::Duration;
 
 use super::calibration::{ConfidenceCalibration, Weights};
 use super::config::{VoteConfig, WeightedConfig};
 use super::confusion::LabelIndex;
+use super::dawid_skene::{DawidSkene, VehicleEvidence};
 use super::dependence::Dependence;
 use super::label_table::LabelTable;
 use super::landmark_votes::{LandmarkVotes, RecentStatements, StoredVote};
 use super::method::{self, NewVote, VotingMethod};
-use super::model::{HierarchicalModel, VehicleEvidence};
 use super::paper::REPUTATION_RANGE;
-use super::parameters::{CORRELATIONS, MIN_WEIGHT};
 use super::visibility;
 use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::reputation::{Counts, Evidence, ReputationLedger};
 use crate::wire::{ForeignVotes, Reputation, Verdict};
 
-/// Incremental expectation maximisation (Neal & Hinton 1998) over the fresh votes, and a fit of all whenever they have grown.
+/// Least weight of a statement among the vehicle's own.
+const MIN_WEIGHT: f64 = 0.01;
+/// Share of the present vehicles from which dependent ones can have decided verdicts.
+const MANY_DEPENDENT: f64 = 0.2;
+/// Times that all landmarks are judged in turn where learning starts again.
+const START_SWEEPS: u32 = 3;
+
+/// Incremental expectation maximisation (Neal & Hinton 1998) over the fresh votes.
 #[derive(Debug, Clone, Default)]
 pub(super) struct WeightedVoting {
     config: WeightedConfig,
-    model: HierarchicalModel,
+    model: DawidSkene,
     calibration: ConfidenceCalibration,
     dependence: Dependence,
     /// Index of each vehicle.
     vehicles: BTreeMap<NodeName, usize>,
     /// By index of the vehicle.
     names: Vec<NodeName>,
-    /// Indices of removed vehicles.
+    /// Indices of forgotten vehicles.
     free: Vec<usize>,
     /// Settled votes, by index of the vehicle.
     counts: Vec<Counts>,
@@ -49,21 +56,21 @@ pub(super) struct WeightedVoting {
     changed: BTreeSet<LandmarkId>,
     /// The next expiry of each landmark that has votes.
     expiries: BTreeSet<(Timestamp, LandmarkId)>,
-    /// Number of stored votes.
-    stored: usize,
-    /// Votes since the last fit that are new or settled and count anew.
-    since_fit: usize,
-    /// Log probability of the votes if those on one item are correlated by each of [`CORRELATIONS`].
-    predictions: [f64; CORRELATIONS.len()],
+    /// The landmark that was judged again last.
+    revisit_after: Option<LandmarkId>,
+    /// Votes since the last round.
+    fresh_votes: usize,
     evidence: Vec<Evidence>,
     /// Votes from then on become evidence.
     recorded_from: Timestamp,
+    /// Number of dependent vehicles when learning last started again because of them.
+    known_dependent: usize,
 }
 
 impl WeightedVoting {
     pub(super) fn new(config: WeightedConfig) -> Self {
         Self {
-            model: HierarchicalModel::new(config.clone()),
+            model: DawidSkene::new(config.clone()),
             calibration: ConfidenceCalibration::new(config.calibration_votes),
             dependence: Dependence::new(config.pair_memory_votes),
             config,
@@ -75,7 +82,7 @@ impl WeightedVoting {
         Duration::from_secs_f64(self.config.freshness_s)
     }
 
-    /// The index of a vehicle; a new vehicle takes a new or free index.
+    /// The index of a vehicle, a new or free one if it has none.
     fn vehicle(&mut self, node: &NodeName) -> usize {
         if let Some(&vehicle) = self.vehicles.get(node) {
             return vehicle;
@@ -96,31 +103,66 @@ impl WeightedVoting {
 
     /// Judges a landmark's votes from scratch.
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
+        self.remove_live(landmark);
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
-        landmark_votes.remove_live(&mut self.model, &mut self.calibration);
         landmark_votes.compare(&mut self.dependence, &mut self.calibration, |vehicle| vehicle);
         landmark_votes.weigh(&self.dependence, &self.calibration, weights);
+        let is_new = landmark_votes.votes.iter().any(|vote| !vote.judged);
         landmark_votes.votes.iter_mut().for_each(|vote| vote.judged = true);
         let votes = landmark_votes.weighted_votes();
-        let judged = self.model.judge(&votes, &landmark_votes.candidates());
-        landmark_votes.take(judged, &votes, &mut self.model, &mut self.calibration);
+        self.model.refresh(votes.iter().map(|vote| vote.vehicle));
+        let candidates = landmark_votes.candidates();
+        let judged =
+            if is_new { self.model.judge_new(&votes, &candidates) } else { self.model.judge(&votes, &candidates) };
+        landmark_votes.take(judged, &mut self.calibration);
+        self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
+        landmark_votes.counted = true;
         landmark_votes.publish(self.config.hysteresis);
     }
 
     /// Finds the vehicles that depend on each other.
     ///
     /// If the main group is thought wrong more often than right and its copies right, then verdicts that the copies
-    /// made themselves taught that. Such evidence is void, and all votes are judged again.
+    /// made themselves taught that. Such evidence is void: learning starts again. It also does where many vehicles turn out
+    /// to be dependent, whose agreement has passed for reliability.
     fn fit_dependence(&mut self) {
         let mut present = vec![false; self.names.len()];
-        self.landmarks.values().flat_map(|l| &l.votes).for_each(|vote| present[vote.vehicle as usize] = true);
+        self.landmarks.values().flat_map(|l| &l.votes).for_each(|vote| present[vote.vehicle] = true);
         let groups = self.dependence.fit(&present);
         let trust = |vehicles: &[usize]| {
             vehicles.iter().map(|&v| self.model.reliability(v)).sum::<f64>() / vehicles.len().max(1) as f64
         };
         if trust(&groups.copies) > 0.5 && trust(&groups.main) < 0.5 && !groups.main.is_empty() {
             self.model.clear_settled();
-            self.since_fit = usize::MAX;
+            self.start_from_majorities();
+        } else if groups.dependent as f64 >= MANY_DEPENDENT * present.iter().filter(|present| **present).count() as f64
+            && groups.dependent > 2 * self.known_dependent
+        {
+            self.known_dependent = groups.dependent;
+            self.start_again(START_SWEEPS);
+        }
+    }
+
+    /// Judges older landmarks in turn, as far as the budget for this round's fresh votes goes; adds those whose
+    /// published label changed to `changed`.
+    fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<LandmarkId>) {
+        let mut budget = (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
+        let mut visits = self.landmarks.len();
+        while budget > 0 && visits > 0 {
+            visits -= 1;
+            let after = self.revisit_after.as_ref().map_or(Bound::Unbounded, Bound::Excluded);
+            let next = self.landmarks.range::<LandmarkId, _>((after, Bound::Unbounded)).next();
+            let Some((landmark, landmark_votes)) = next.map(|(l, v)| (l.clone(), v)) else {
+                self.revisit_after = None;
+                continue;
+            };
+            budget = budget.saturating_sub(landmark_votes.votes.len().max(1));
+            let before = landmark_votes.published;
+            self.judge(&landmark, weights);
+            if self.landmarks.get(&landmark).is_some_and(|l| l.published != before) {
+                changed.insert(landmark.clone());
+            }
+            self.revisit_after = Some(landmark);
         }
     }
 
@@ -141,19 +183,16 @@ impl VotingMethod for WeightedVoting {
         self.landmarks.entry(landmark).or_default();
     }
 
-    /// Its fresh votes are dropped unsettled. Otherwise a vehicle that invents landmarks would make other votes settle early.
+    /// Keeps what its votes taught.
     fn remove_landmark(&mut self, landmark: &LandmarkId) {
-        if let Some(mut landmark_votes) = self.landmarks.remove(landmark) {
-            landmark_votes.remove_live(&mut self.model, &mut self.calibration);
-            self.stored -= landmark_votes.votes.len();
-            if let Some(due) = landmark_votes.due {
-                self.expiries.remove(&(due, landmark.clone()));
-            }
+        self.remove_votes(landmark, |_| true);
+        if let Some(due) = self.landmarks.remove(landmark).and_then(|landmark_votes| landmark_votes.due) {
+            self.expiries.remove(&(due, landmark.clone()));
         }
         self.changed.remove(landmark);
     }
 
-    /// Removes their votes and all evidence about them; other vehicles take their indices.
+    /// Forgets their votes and all evidence about them; other vehicles take their indices.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.evict_vehicles(nodes);
     }
@@ -165,18 +204,16 @@ impl VotingMethod for WeightedVoting {
     /// Takes a vote in the place of the vehicle's earlier one on the landmark.
     fn add_vote(&mut self, vote: &NewVote<'_>) {
         let &NewVote { landmark, confidence, at, .. } = vote;
-        let visibility = vote.range_bearing.map_or(1.0, |(d, a)| visibility::weighted(&self.config, d, a)) as f32;
-        let confidence = confidence as f32;
+        let visibility = vote.range_bearing.map_or(1.0, |(d, a)| visibility::weighted(&self.config, d, a));
         self.expire(at);
-        let index = self.vehicle(vote.node);
-        let label = self.label(vote.label, Some((index, at)));
-        let vehicle = index as u32;
+        let vehicle = self.vehicle(vote.node);
+        let label = self.label(vote.label, Some((vehicle, at)));
         let freshness = self.freshness();
         let earlier = self.landmarks.get(landmark).and_then(|l| l.votes.iter().find(|v| v.vehicle == vehicle).copied());
         let mut recent = earlier.map_or_else(RecentStatements::default, |earlier| earlier.recent);
         let age_s = earlier.map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
         let fading_s = self.config.freshness_s * self.config.smoothing_share;
-        let kept = if fading_s > 0.0 { (-age_s / fading_s).exp() as f32 } else { 0.0 };
+        let kept = if fading_s > 0.0 { (-age_s / fading_s).exp() } else { 0.0 };
         let stated_most = recent.add(label, (confidence * visibility).max(MIN_WEIGHT), kept);
         let (label, confidence, visibility) = match earlier {
             Some(earlier) if stated_most != label => (earlier.label, earlier.confidence, earlier.visibility),
@@ -218,19 +255,16 @@ impl VotingMethod for WeightedVoting {
         let landmark_votes = self.landmarks.entry(landmark.clone()).or_default();
         match landmark_votes.votes.binary_search_by_key(&vehicle, |vote| vote.vehicle) {
             Ok(place) => landmark_votes.votes[place] = stored,
-            Err(place) => {
-                landmark_votes.votes.insert(place, stored);
-                self.stored += 1;
-                self.since_fit = self.since_fit.saturating_add(1);
-            }
+            Err(place) => landmark_votes.votes.insert(place, stored),
         }
         if landmark_votes.due.is_none_or(|due| due > at + freshness) {
             self.schedule_expiry(landmark);
         }
         self.changed.insert(landmark.clone());
+        self.fresh_votes += 1;
     }
 
-    /// Judges the landmarks that changed, and all of them if a fit is due.
+    /// Judges the landmarks that changed, then some older ones in turn.
     fn close(&mut self, now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>) {
         self.expire(now);
         if self.dependence.is_due() {
@@ -241,27 +275,25 @@ impl VotingMethod for WeightedVoting {
         for landmark in &changed {
             self.judge(landmark, &weights);
         }
-        if self.is_fit_due() {
-            changed.append(&mut self.fit_online());
-        }
+        self.revisit(&weights, &mut changed);
         (changed, std::mem::take(&mut self.evidence))
     }
 
     fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
-        let landmark_votes = self.landmarks.get(landmark)?;
+        let LandmarkVotes { votes, posterior, published, .. } = self.landmarks.get(landmark)?;
+        let mass: f64 = votes.iter().map(|v| self.score(v.vehicle) * v.weight * v.independence).sum();
         let name = |label: LabelIndex| self.labels.name(label).clone();
-        let scores = self.published(landmark_votes).map(|(label, p)| (name(label), p)).collect();
-        let voters = landmark_votes.votes.iter().map(|vote| self.names[vote.vehicle as usize].clone());
-        let mut contributors: Vec<_> = voters.collect();
+        let scores = posterior.iter().map(|&(label, p)| (name(label), p * mass)).collect();
+        let mut contributors: Vec<_> = votes.iter().map(|vote| self.names[vote.vehicle].clone()).collect();
         contributors.sort();
-        Some(method::verdict(landmark.clone(), scores, landmark_votes.published.map(name), contributors))
+        Some(method::verdict(landmark.clone(), scores, published.map(name), contributors))
     }
 
     fn readings(&self, landmark: &LandmarkId) -> BTreeMap<Label, Vec<NodeName>> {
         let mut readings: BTreeMap<Label, Vec<NodeName>> = BTreeMap::new();
         for vote in self.landmarks.get(landmark).into_iter().flat_map(|known| &known.votes) {
             let label = self.labels.name(vote.label).clone();
-            readings.entry(label).or_default().push(self.names[vote.vehicle as usize].clone());
+            readings.entry(label).or_default().push(self.names[vote.vehicle].clone());
         }
         readings
     }
@@ -297,11 +329,7 @@ impl VotingMethod for WeightedVoting {
     }
 
     fn refine(&mut self, passes: u32) {
-        self.fit_stored(passes);
-    }
-
-    fn finish(&mut self) -> BTreeSet<LandmarkId> {
-        if self.since_fit > 0 { self.fit_online() } else { BTreeSet::new() }
+        self.judge_all(passes);
     }
 
     fn adopt(&mut self, ledger: &ReputationLedger, limits: &VoteConfig) {

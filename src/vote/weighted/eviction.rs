@@ -7,13 +7,13 @@ use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use crate::reputation::Counts;
 use crate::vote::confusion::LabelIndex;
-use crate::vote::model::VehicleEvidence;
+use crate::vote::dawid_skene::VehicleEvidence;
 
 impl WeightedVoting {
-    /// Removes vehicles with their votes and the evidence about them; other vehicles take their indices.
+    /// Forgets vehicles with their votes and the evidence about them; other vehicles take their indices.
     pub(super) fn evict_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         let gone: BTreeSet<usize> = nodes.iter().filter_map(|node| self.vehicles.remove(node)).collect();
-        let is_theirs = |vote: &StoredVote| gone.contains(&(vote.vehicle as usize));
+        let is_theirs = |vote: &StoredVote| gone.contains(&vote.vehicle);
         for landmark in self.landmarks_where(|l| l.votes.iter().any(is_theirs)) {
             self.remove_votes(&landmark, is_theirs);
         }
@@ -40,7 +40,7 @@ impl WeightedVoting {
         index
     }
 
-    /// Removes labels with the votes for them, if `label` would be one more than `max_labels`; returns how many votes.
+    /// Forgets labels with the votes for them, if `label` would be one more than `max_labels`; returns how many votes.
     pub(super) fn evict_labels_for(&mut self, label: &Label, max_labels: usize) -> usize {
         if self.labels.has_room_for(label, max_labels) {
             return 0;
@@ -60,7 +60,6 @@ impl WeightedVoting {
         for vote in self.landmarks.values_mut().flat_map(|l| &mut l.votes) {
             vote.recent.forget_labels(is_gone);
         }
-        self.stored -= forgotten;
         self.model.forget_labels(&gone);
         self.dependence.forget_labels(&gone);
         forgotten

@@ -10,8 +10,8 @@ use crate::vote::config::VoteConfig;
 use crate::vote::confusion::{Confusion, LabelIndex};
 
 impl WeightedVoting {
-    /// Takes over the ledger's votes in excess of the votes counted here: a standby has counted the latest
-    /// ones itself. Evidence of an earlier ledger is replaced.
+    /// Takes over the ledger's remembered votes beyond those that were counted here: a standby has counted the latest
+    /// ones itself. They replace those of an earlier ledger.
     ///
     /// Where room is short, the labels with most evidence are taken, and the vehicles that were right most often, on a
     /// tie those in the latest lanes. A ledger counts by stated label only: the truth behind a wrong vote is taken to
@@ -30,8 +30,9 @@ impl WeightedVoting {
         others.truncate(limits.max_vehicles.saturating_sub(self.vehicles.len()));
         let known = [heard, others].concat();
         self.take_over_labels(&known, limits.max_labels);
-        // Evidence that has left the ledger has no effect.
+        // Evidence that is no longer in the ledger does not count any more.
         self.model.vehicles.iter_mut().for_each(|vehicle| vehicle.inherited = Confusion::default());
+        self.model.inherit_coupling(known.iter().map(|(_, labels)| labels));
         for (node, labels) in known {
             let mut inherited = Confusion::default();
             for (label, (correct, incorrect)) in labels {

@@ -4,7 +4,7 @@ use super::{StoredVote, WeightedVoting};
 use crate::model::names::LandmarkId;
 use crate::model::time::Timestamp;
 use crate::reputation::Evidence;
-use crate::vote::model::probability;
+use crate::vote::likelihood::probability;
 
 impl WeightedVoting {
     /// Sets the next expiry of a landmark: when its oldest vote goes stale.
@@ -36,9 +36,7 @@ impl WeightedVoting {
         }
         self.settle_votes(landmark);
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
-        let before = landmark_votes.votes.len();
         landmark_votes.votes.retain(|vote| !is_past(vote));
-        self.stored -= before - landmark_votes.votes.len();
         if landmark_votes.votes.is_empty() {
             landmark_votes.published = None;
             landmark_votes.posterior.clear();
@@ -47,8 +45,15 @@ impl WeightedVoting {
 
     /// Takes a landmark's votes out of the live evidence until it is judged again.
     pub(super) fn remove_live(&mut self, landmark: &LandmarkId) {
-        if let Some(landmark_votes) = self.landmarks.get_mut(landmark) {
-            landmark_votes.remove_live(&mut self.model, &mut self.calibration);
+        if let Some(landmark_votes) = self.landmarks.get_mut(landmark)
+            && std::mem::take(&mut landmark_votes.counted)
+        {
+            self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, -1.0);
+            for vote in &mut landmark_votes.votes {
+                if let Some(agreement) = vote.agreement.take() {
+                    self.calibration.count(vote.band, agreement, -1.0);
+                }
+            }
         }
     }
 
@@ -60,22 +65,22 @@ impl WeightedVoting {
         self.remove_live(landmark);
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
         if landmark_votes.has_several_voters() {
-            let votes = landmark_votes.weighted_votes();
-            let witnesses = self.model.judge_as_witnesses(&votes, &landmark_votes.candidates());
-            for (n, vote) in landmark_votes.votes.iter().enumerate().filter(|(_, vote)| vote.judged) {
-                let others = witnesses.without(n, 1.0);
-                self.calibration.settle(usize::from(vote.band), probability(&others, vote.label));
-                let settled = self.model.settle(&votes[n], &others, &landmark_votes.posterior);
-                let Some(correct) = settled else { continue };
-                let vehicle = vote.vehicle as usize;
-                self.counts[vehicle].add(correct);
+            // The model judges a vote by the others: a vehicle that decides alone must not prove itself right to it.
+            let judged = landmark_votes.votes.iter().filter(|vote| vote.judged);
+            let settled: Vec<_> = judged
+                .map(|vote| (*vote, self.model.leave_one_out(&landmark_votes.posterior, &vote.weighted())))
+                .collect();
+            for (vote, others) in settled {
+                self.model.settle(&vote.weighted(), &others, &landmark_votes.posterior);
+                self.calibration.settle(vote.band, probability(&others, vote.label));
+                let correct = landmark_votes.published == Some(vote.label);
+                self.counts[vote.vehicle].add(correct);
                 if vote.at >= self.recorded_from {
-                    let (node, label) = (&self.names[vehicle], self.labels.name(vote.label));
+                    let (node, label) = (&self.names[vote.vehicle], self.labels.name(vote.label));
                     self.evidence.push(Evidence { node: node.clone(), label: label.clone(), correct });
                 }
             }
         }
-        self.since_fit = self.since_fit.saturating_add(landmark_votes.votes.len());
         for vote in &mut landmark_votes.votes {
             (vote.since, vote.judged, vote.compared) = (vote.at, false, false);
         }

@@ -1,0 +1,71 @@
+//! Likelihood of votes and the posterior that follows from it.
+
+use super::confusion::LabelIndex;
+
+/// A vote as the model takes it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct WeightedVote {
+    /// Index of the vehicle.
+    pub(super) vehicle: usize,
+    /// The stated label.
+    pub(super) label: LabelIndex,
+    /// Calibrated confidence × visibility, 1 for a plain vote.
+    pub(super) weight: f64,
+    /// Part of the vote that does not depend on other vehicles, 0 to 1.
+    pub(super) independence: f64,
+}
+
+/// Probabilities of labels.
+pub(super) type Posterior = Vec<(LabelIndex, f64)>;
+
+/// Judgement of a landmark by all its votes.
+pub(super) struct LandmarkPosterior {
+    pub(super) labels: Posterior,
+    /// Probability of each vote's label given the other votes.
+    pub(super) agreements: Vec<f64>,
+    /// Log of the probability of the votes, each predicted from the others, in nats.
+    pub(super) log_probability: f64,
+}
+
+/// Likelihood of one vote, by candidate for the true label.
+pub(super) struct Likelihood {
+    /// Probability that the vehicle states the vote's label.
+    pub(super) stating: Vec<f64>,
+    /// Its logarithm, but at most as much as where the stated label is true: no vote counts against its own label.
+    /// Otherwise the model has a mirrored solution, in which the honest majority consists of consistent liars.
+    pub(super) logs: Vec<f64>,
+    /// The logarithm where the stated label is true.
+    own_log: f64,
+}
+
+impl Likelihood {
+    /// From the probabilities by candidate; the vote's label is one of the candidates.
+    pub(super) fn new(vote: &WeightedVote, candidates: &[LabelIndex], stating: Vec<f64>) -> Self {
+        let own = candidates.iter().zip(&stating).find(|(label, _)| **label == vote.label).map_or(1.0, |(_, own)| *own);
+        Self { logs: stating.iter().map(|p| p.min(own).ln()).collect(), own_log: own.ln(), stating }
+    }
+
+    /// The posterior of the same candidates without `vote`.
+    pub(super) fn leave_out(&self, vote: &WeightedVote, posterior: &[(LabelIndex, f64)]) -> Posterior {
+        let weight = vote.weight * vote.independence;
+        let without = |((label, p), log): (&(LabelIndex, f64), &f64)| {
+            (*label, p * (weight * (self.own_log - log)).min(500.0).exp())
+        };
+        let mut others: Posterior = posterior.iter().zip(&self.logs).map(without).collect();
+        if normalise(&mut others) { others } else { posterior.to_vec() }
+    }
+}
+
+/// Makes the sum 1; returns false, with nothing changed, where it is 0.
+pub(super) fn normalise(posterior: &mut [(LabelIndex, f64)]) -> bool {
+    let total: f64 = posterior.iter().map(|(_, p)| p).sum();
+    if total > 0.0 {
+        posterior.iter_mut().for_each(|(_, p)| *p /= total);
+    }
+    total > 0.0
+}
+
+/// Probability of a label; 0 for one that is not listed.
+pub(super) fn probability(posterior: &[(LabelIndex, f64)], label: LabelIndex) -> f64 {
+    posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
+}
