@@ -19,7 +19,7 @@ const MAX_OBJECTS_HZ: u32 = 15_000;
 const OBJECT_BURST: u32 = 3_000;
 
 /// Queue filled on the links' tasks and emptied by the fuser. It holds at most one report of each vehicle and kind, so
-/// that a flood from one vehicle delays no other, and takes at most [`MAX_OBJECTS_HZ`] objects a second of each.
+/// that a flood from one vehicle delays no other, and takes at most `MAX_OBJECTS_HZ` objects a second of each.
 #[derive(Debug, Clone, Default)]
 pub struct LatestReportQueue(Arc<Mutex<Waiting>>);
 
