@@ -12,8 +12,12 @@ use ecod::model::time::Timestamp;
 use ecod::pace::{Pace, PaceConfig, PaceMode};
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::landmark::{Landmark, LandmarkIndex};
-use ecod::perception::projection::{Cut, ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
-use ecod::wire::{Encoding, Limits, ObjectReport, PerceivedObject, WirePose, decode_report, encode};
+use ecod::perception::projection::{
+    Cut, ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging,
+};
+use ecod::wire::{
+    Encoding, Limits, ObjectReport, PerceivedObject, WirePose, decode_report, encode,
+};
 use nalgebra::Point2;
 
 use figures::Figures;
@@ -32,25 +36,55 @@ fn main() {
 
 /// Rounds of 10² to 10⁶ detections, 32 a vehicle, on as many landmarks as an eighth of the detections.
 fn pace_rounds(figures: &mut Figures) {
-    println!("{:<6} {:>10} {:>10} {:>10} {:>14}", "mode", "detections", "landmarks", "round ms", "ns/detection");
+    println!(
+        "{:<6} {:>10} {:>10} {:>10} {:>14}",
+        "mode", "detections", "landmarks", "round ms", "ns/detection"
+    );
     for (name, mode) in [("bayes", PaceMode::Bayes), ("paper", PaceMode::Paper)] {
         let costs = [100, 1_000, 10_000, 100_000, 1_000_000].map(|detections| {
-            let (vehicles, objects) = if detections < 1_000 { (10, 10) } else { (detections / 32, 32) };
+            let (vehicles, objects) = if detections < 1_000 {
+                (10, 10)
+            } else {
+                (detections / 32, 32)
+            };
             let round_ms = round(figures, name, mode, vehicles, objects, detections / 8);
             round_ms / (vehicles * objects) as f64
         });
         figures.flat(&format!("pace_{name}_cost_per_detection"), &costs);
         let large = round(figures, name, mode, 1_000, 32, 4_096);
-        figures.goal(&format!("pace_{name}_round_of_1000_vehicles_32_objects_4096_landmarks"), large, 5.0, " ms");
+        figures.goal(
+            &format!("pace_{name}_round_of_1000_vehicles_32_objects_4096_landmarks"),
+            large,
+            5.0,
+            " ms",
+        );
     }
 }
 
 /// Prints, takes and returns the least time of a round in milliseconds: what the machine allows when nothing disturbs.
-fn round(figures: &mut Figures, name: &str, mode: PaceMode, vehicles: usize, objects: usize, landmarks: usize) -> f64 {
+fn round(
+    figures: &mut Figures,
+    name: &str,
+    mode: PaceMode,
+    vehicles: usize,
+    objects: usize,
+    landmarks: usize,
+) -> f64 {
     let side = (landmarks as f64).sqrt().ceil() as usize;
-    let index = Arc::new(LandmarkIndex::new(grid(landmarks, side), PaceConfig::default().gate_m));
-    let reports: Vec<_> = (0..vehicles).map(|v| report(v, objects, landmarks, side)).collect();
-    let mut pace = Pace::new(PaceConfig { mode, ..PaceConfig::default() }, index);
+    let index = Arc::new(LandmarkIndex::new(
+        grid(landmarks, side),
+        PaceConfig::default().gate_m,
+    ));
+    let reports: Vec<_> = (0..vehicles)
+        .map(|v| report(v, objects, landmarks, side))
+        .collect();
+    let mut pace = Pace::new(
+        PaceConfig {
+            mode,
+            ..PaceConfig::default()
+        },
+        index,
+    );
     let mut now = NOON;
     let times = times(if vehicles * objects > 200_000 { 7 } else { 51 }, || {
         now = now + Duration::from_millis(100);
@@ -60,9 +94,14 @@ fn round(figures: &mut Figures, name: &str, mode: PaceMode, vehicles: usize, obj
         std::hint::black_box(pace.close(now));
     });
     let detections = vehicles * objects;
-    let (least_ms, median_ms) = (times[0].as_secs_f64() * 1e3, median(&times).as_secs_f64() * 1e3);
+    let (least_ms, median_ms) = (
+        times[0].as_secs_f64() * 1e3,
+        median(&times).as_secs_f64() * 1e3,
+    );
     let per_detection_ns = least_ms * 1e6 / detections as f64;
-    println!("{name:<6} {detections:>10} {landmarks:>10} {least_ms:>10.3} {per_detection_ns:>14.1}");
+    println!(
+        "{name:<6} {detections:>10} {landmarks:>10} {least_ms:>10.3} {per_detection_ns:>14.1}"
+    );
     figures.insert(
         format!("pace_{name}_{detections}_detections_{landmarks}_landmarks"),
         serde_json::json!({
@@ -76,16 +115,34 @@ fn round(figures: &mut Figures, name: &str, mode: PaceMode, vehicles: usize, obj
 
 /// From boxes to positions and their covariances, 10² to 10⁶ of them.
 fn projections(figures: &mut Figures) {
-    let intrinsics = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
+    let intrinsics =
+        Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
     let camera = Pose::new(0.6096, 0.4572, 2.8798);
-    println!("\n{:<10} {:>10} {:>14}", "ranging", "detections", "ns/detection");
-    for (name, ranging) in
-        [("box_height", Ranging::BoxHeight), ("box_width", Ranging::BoxWidth), ("paper", Ranging::Paper)]
-    {
-        let size = ObjectSize { width_m: 1.8, height_m: 1.5, length_m: None, relative_sigma: 0.05 };
-        let sizes = ObjectSizes { labels: [("car".into(), size)].into(), default: Some(size) };
+    println!(
+        "\n{:<10} {:>10} {:>14}",
+        "ranging", "detections", "ns/detection"
+    );
+    for (name, ranging) in [
+        ("box_height", Ranging::BoxHeight),
+        ("box_width", Ranging::BoxWidth),
+        ("paper", Ranging::Paper),
+    ] {
+        let size = ObjectSize {
+            width_m: 1.8,
+            height_m: 1.5,
+            length_m: None,
+            relative_sigma: 0.05,
+        };
+        let sizes = ObjectSizes {
+            labels: [("car".into(), size)].into(),
+            default: Some(size),
+        };
         let projection = Projection::new(
-            ProjectionConfig { ranging, sizes, ..ProjectionConfig::default() },
+            ProjectionConfig {
+                ranging,
+                sizes,
+                ..ProjectionConfig::default()
+            },
             intrinsics,
             Mount::default(),
         );
@@ -94,7 +151,11 @@ fn projections(figures: &mut Figures) {
             let times = times(if count > 100_000 { 7 } else { 51 }, || {
                 for detection in &detections {
                     // A clipped box is left out, as by a projector.
-                    std::hint::black_box(projection.place(detection, Cut::default(), None, &camera).ok());
+                    std::hint::black_box(
+                        projection
+                            .place(detection, Cut::default(), None, &camera)
+                            .ok(),
+                    );
                 }
             });
             let per_detection_ns = times[0].as_secs_f64() * 1e9 / count as f64;
@@ -112,28 +173,59 @@ fn detection(index: usize) -> Detection {
     let (x_min, y_min) = (10.0 + (index % 500) as f64, 100.0 + (index % 97) as f64);
     let (width, height) = (20.0 + (index % 80) as f64, 30.0 + (index % 60) as f64);
     Detection {
-        label: if index.is_multiple_of(10) { "truck".into() } else { "car".into() },
+        label: if index.is_multiple_of(10) {
+            "truck".into()
+        } else {
+            "car".into()
+        },
         confidence: 0.5 + (index % 50) as f64 / 100.0,
-        bounding_box: BoundingBox { x_min, y_min, x_max: x_min + width, y_max: y_min + height },
+        bounding_box: BoundingBox {
+            x_min,
+            y_min,
+            x_max: x_min + width,
+            y_max: y_min + height,
+        },
         corners: None,
     }
 }
 
 /// Every encoding, written and read, per 1000 objects, as reports and as votes; the compact one has goals.
 fn encodings(figures: &mut Figures) {
-    println!("\n{:<14} {:>16} {:>16} {:>14}", "format", "encode µs/1000", "decode µs/1000", "bytes/object");
-    let formats = [("json", Encoding::Json), ("cbor", Encoding::Cbor), ("compact", Encoding::Compact)];
+    println!(
+        "\n{:<14} {:>16} {:>16} {:>14}",
+        "format", "encode µs/1000", "decode µs/1000", "bytes/object"
+    );
+    let formats = [
+        ("json", Encoding::Json),
+        ("cbor", Encoding::Cbor),
+        ("compact", Encoding::Compact),
+    ];
     for (name, encoding) in formats {
         encoding_of(figures, name, encoding, &report(7, 100, 10_000, 100));
-        encoding_of(figures, &format!("{name}_votes"), encoding, &votes(7, 100, 10_000, 100));
+        encoding_of(
+            figures,
+            &format!("{name}_votes"),
+            encoding,
+            &votes(7, 100, 10_000, 100),
+        );
     }
 }
 
 fn encoding_of(figures: &mut Figures, name: &str, encoding: Encoding, report: &ObjectReport) {
     let limits = Limits::default();
     let bytes = encode(report, encoding);
-    let encode_us = median(&times(301, || drop(std::hint::black_box(encode(report, encoding))))).as_secs_f64() * 1e7;
-    let decodings = times(301, || drop(std::hint::black_box(decode_report(&bytes, &report.node, &limits))));
+    let encode_us = median(&times(301, || {
+        drop(std::hint::black_box(encode(report, encoding)))
+    }))
+    .as_secs_f64()
+        * 1e7;
+    let decodings = times(301, || {
+        drop(std::hint::black_box(decode_report(
+            &bytes,
+            &report.node,
+            &limits,
+        )))
+    });
     let decode_us = median(&decodings).as_secs_f64() * 1e7;
     let size = bytes.len() as f64 / 100.0;
     println!("{name:<14} {encode_us:>16.1} {decode_us:>16.1} {size:>14.1}");
@@ -147,14 +239,23 @@ fn encoding_of(figures: &mut Figures, name: &str, encoding: Encoding, report: &O
     );
     if encoding == Encoding::Compact {
         figures.goal(&format!("codec_{name}_bytes_per_object"), size, 40.0, "");
-        figures.goal(&format!("codec_{name}_decode_per_object"), decodings[0].as_secs_f64() * 1e7, 150.0, " ns");
+        figures.goal(
+            &format!("codec_{name}_decode_per_object"),
+            decodings[0].as_secs_f64() * 1e7,
+            150.0,
+            " ns",
+        );
     }
 }
 
 /// The same objects as a vehicle votes on them: placards, each with its landmark.
 fn votes(vehicle: usize, objects: usize, landmarks: usize, side: usize) -> ObjectReport {
     let mut report = report(vehicle, objects, landmarks, side);
-    for (object, landmark) in report.objects.iter_mut().zip(report.seen.take().into_iter().flatten()) {
+    for (object, landmark) in report
+        .objects
+        .iter_mut()
+        .zip(report.seen.take().into_iter().flatten())
+    {
         (object.label, object.landmark) = ("ABCD123".into(), Some(landmark));
     }
     report
@@ -172,7 +273,10 @@ fn grid(landmarks: usize, side: usize) -> Vec<Landmark> {
 }
 
 fn place(index: usize, side: usize) -> Point2<f64> {
-    Point2::new((index % side) as f64 * SPACING_M, (index / side) as f64 * SPACING_M)
+    Point2::new(
+        (index % side) as f64 * SPACING_M,
+        (index / side) as f64 * SPACING_M,
+    )
 }
 
 /// A vehicle that sees `objects` neighbouring landmarks, each a little off its place.
@@ -185,7 +289,11 @@ fn report(vehicle: usize, objects: usize, landmarks: usize, side: usize) -> Obje
         PerceivedObject {
             covariance_m2: Some([0.01, 0.001, 0.02]),
             ..PerceivedObject::new(
-                if (vehicle + n).is_multiple_of(10) { "truck" } else { "car" },
+                if (vehicle + n).is_multiple_of(10) {
+                    "truck"
+                } else {
+                    "car"
+                },
                 0.5 + ((vehicle + n) % 50) as f64 / 100.0,
                 position.x + 0.2 * jitter,
                 position.y - 0.2 * jitter,
@@ -195,8 +303,16 @@ fn report(vehicle: usize, objects: usize, landmarks: usize, side: usize) -> Obje
     ObjectReport {
         pose: Some(WirePose::new(0.6096, 0.4572, 2.8798)),
         objects: (0..objects).map(object).collect(),
-        seen: Some((0..objects).map(|n| format!("l{}", (first + n) % landmarks).into()).collect()),
-        ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).expect("a valid name"), 1, NOON)
+        seen: Some(
+            (0..objects)
+                .map(|n| format!("l{}", (first + n) % landmarks).into())
+                .collect(),
+        ),
+        ..ObjectReport::new(
+            NodeName::new(format!("v{vehicle}")).expect("a valid name"),
+            1,
+            NOON,
+        )
     }
 }
 

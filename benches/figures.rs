@@ -13,7 +13,10 @@ pub(crate) struct Figures {
 impl Figures {
     /// An empty section.
     pub(crate) fn new(section: &'static str) -> Self {
-        Self { section, values: Map::new() }
+        Self {
+            section,
+            values: Map::new(),
+        }
     }
 
     /// Takes a figure, or an object of figures.
@@ -25,8 +28,14 @@ impl Figures {
     #[allow(dead_code, reason = "not every benchmark has a goal")]
     pub(crate) fn goal(&mut self, name: &str, figure: f64, goal: f64, unit: &str) {
         let met = figure <= goal;
-        println!("{name}: {figure:.2}{unit}, goal {goal}{unit}: {}", if met { "met" } else { "MISSED" });
-        self.insert(name, serde_json::json!({ "figure": figure, "goal": goal, "met": met }));
+        println!(
+            "{name}: {figure:.2}{unit}, goal {goal}{unit}: {}",
+            if met { "met" } else { "MISSED" }
+        );
+        self.insert(
+            name,
+            serde_json::json!({ "figure": figure, "goal": goal, "met": met }),
+        );
     }
 
     /// Takes how far the costs of small and large loads are from the middle between the least and the most: within
@@ -35,7 +44,12 @@ impl Figures {
     pub(crate) fn flat(&mut self, name: &str, costs: &[f64]) {
         let least = costs.iter().copied().fold(f64::INFINITY, f64::min);
         let most = costs.iter().copied().fold(0.0, f64::max);
-        self.goal(&format!("{name}_from_the_middle"), 100.0 * (most - least) / (most + least), 50.0, " %");
+        self.goal(
+            &format!("{name}_from_the_middle"),
+            100.0 * (most - least) / (most + least),
+            50.0,
+            " %",
+        );
     }
 
     /// Replaces the section in the file and keeps the others.
@@ -44,16 +58,21 @@ impl Figures {
     /// When the file cannot be written.
     pub(crate) fn save(self) {
         let path = std::env::var_os("BENCH_JSON").map_or_else(default_path, PathBuf::from);
-        let read = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        let read = std::fs::read(&path)
+            .ok()
+            .and_then(|bytes| serde_json::from_slice(&bytes).ok());
         let mut sections: Map<String, Value> = read.unwrap_or_default();
         sections.insert(self.section.into(), Value::Object(self.values));
         let text = serde_json::to_string_pretty(&sections).expect("figures are plain numbers");
-        std::fs::write(&path, text + "\n").unwrap_or_else(|error| panic!("cannot write {}: {error}", path.display()));
+        std::fs::write(&path, text + "\n")
+            .unwrap_or_else(|error| panic!("cannot write {}: {error}", path.display()));
     }
 }
 
 /// Cargo runs a benchmark in the directory of its package.
 fn default_path() -> PathBuf {
-    let workspace = [".", ".."].into_iter().find(|place| Path::new(place).join("Cargo.lock").exists());
+    let workspace = [".", ".."]
+        .into_iter()
+        .find(|place| Path::new(place).join("Cargo.lock").exists());
     Path::new(workspace.unwrap_or(".")).join("target/bench.json")
 }

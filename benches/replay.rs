@@ -20,14 +20,23 @@ const LANDMARKS: u64 = 64;
 
 fn main() {
     let mut figures = Figures::new("replay");
-    println!("{:<16} {:>10} {:>12} {:>14} {:>12}", "topic", "reports", "reports/s", "lines written", "MB/s read");
+    println!(
+        "{:<16} {:>10} {:>12} {:>14} {:>12}",
+        "topic", "reports", "reports/s", "lines written", "MB/s read"
+    );
     for topic in ["detections", "vote_detections"] {
         let lines = recording(topic);
         let read: usize = lines.iter().map(String::len).sum();
         let runs: Vec<(f64, u64)> = (0..5).map(|_| run(&lines)).collect();
-        let (seconds, written) = runs.into_iter().min_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
+        let (seconds, written) = runs
+            .into_iter()
+            .min_by(|a, b| a.0.total_cmp(&b.0))
+            .unwrap_or_default();
         let (rate, megabytes) = (lines.len() as f64 / seconds, read as f64 / seconds / 1e6);
-        println!("{topic:<16} {:>10} {rate:>12.0} {written:>14} {megabytes:>12.1}", lines.len());
+        println!(
+            "{topic:<16} {:>10} {rate:>12.0} {written:>14} {megabytes:>12.1}",
+            lines.len()
+        );
         figures.insert(
             topic,
             json!({"reports": lines.len(), "objects_per_report": OBJECTS, "reports_per_second": rate,
@@ -70,7 +79,11 @@ fn recording(topic: &str) -> Vec<String> {
                     covariance_m2: Some([0.01, 0.001, 0.02]),
                     landmark: Some(format!("slot-{place}").into()),
                     ..PerceivedObject::new(
-                        if (frame + vehicle + n).is_multiple_of(10) { "truck" } else { "car" },
+                        if (frame + vehicle + n).is_multiple_of(10) {
+                            "truck"
+                        } else {
+                            "car"
+                        },
                         0.5 + ((vehicle + n) % 50) as f64 / 100.0,
                         3.0 * place as f64 + 0.01 * (vehicle % 7) as f64,
                         0.02 * (frame % 5) as f64,

@@ -22,11 +22,20 @@ const PER_OBSERVER: f64 = 3.0;
 
 fn main() {
     let mut figures = Figures::new("tracks");
-    println!("{:>10} {:>10} {:>10} {:>12}", "observers", "objects", "round ms", "µs/report");
-    let costs = [10, 100, 1_000].map(|observers| round(&mut figures, observers) / f64::from(observers));
+    println!(
+        "{:>10} {:>10} {:>10} {:>12}",
+        "observers", "objects", "round ms", "µs/report"
+    );
+    let costs =
+        [10, 100, 1_000].map(|observers| round(&mut figures, observers) / f64::from(observers));
     figures.flat("tracks_cost_per_report", &costs);
     let round_ms = round(&mut figures, 200);
-    figures.goal("tracks_round_of_200_observers_50_objects", round_ms, 20.0, " ms");
+    figures.goal(
+        "tracks_round_of_200_observers_50_objects",
+        round_ms,
+        20.0,
+        " ms",
+    );
     figures.save();
 }
 
@@ -38,7 +47,9 @@ fn round(figures: &mut Figures, observers: u32) -> f64 {
         .map(|_| {
             frame += 1;
             let now = NOON + Duration::from_millis(100 * frame);
-            let reports: Vec<_> = (0..observers).map(|observer| report(observer, observers, frame, now)).collect();
+            let reports: Vec<_> = (0..observers)
+                .map(|observer| report(observer, observers, frame, now))
+                .collect();
             elapsed(|| {
                 for report in reports {
                     tracker.observe(report, now);
@@ -49,9 +60,15 @@ fn round(figures: &mut Figures, observers: u32) -> f64 {
         .skip(15)
         .collect();
     times.sort();
-    let (least_ms, median_ms) = (times[0].as_secs_f64() * 1e3, times[times.len() / 2].as_secs_f64() * 1e3);
+    let (least_ms, median_ms) = (
+        times[0].as_secs_f64() * 1e3,
+        times[times.len() / 2].as_secs_f64() * 1e3,
+    );
     let report_us = median_ms * 1e3 / f64::from(observers);
-    println!("{observers:>10} {:>10} {median_ms:>10.2} {report_us:>12.1}", observers as usize * OBJECTS);
+    println!(
+        "{observers:>10} {:>10} {median_ms:>10.2} {report_us:>12.1}",
+        observers as usize * OBJECTS
+    );
     figures.insert(
         format!("tracks_{observers}_observers"),
         serde_json::json!({ "round_ms": median_ms, "round_least_ms": least_ms, "us_per_report": report_us }),
@@ -64,16 +81,24 @@ fn report(observer: u32, observers: u32, frame: u64, now: Timestamp) -> ObjectRe
     let side = (f64::from(observers).sqrt() * PER_OBSERVER).ceil();
     let columns = (f64::from(observers)).sqrt().ceil() as u32;
     let step = side / f64::from(columns);
-    let (column, row) = (f64::from(observer % columns) * step, f64::from(observer / columns) * step);
+    let (column, row) = (
+        f64::from(observer % columns) * step,
+        f64::from(observer / columns) * step,
+    );
     let across = (OBJECTS as f64).sqrt().ceil() as usize;
     let object = |n: usize| {
-        let jitter = ((observer as usize * 31 + n * 17 + frame as usize * 7) % 100) as f64 / 100.0 - 0.5;
+        let jitter =
+            ((observer as usize * 31 + n * 17 + frame as usize * 7) % 100) as f64 / 100.0 - 0.5;
         let x_m = (column.floor() + (n % across) as f64) * SPACING_M + 0.4 * jitter;
         let y_m = (row.floor() + (n / across) as f64) * SPACING_M - 0.4 * jitter;
         PerceivedObject::new("car", 0.5 + (n % 50) as f64 / 100.0, x_m, y_m)
     };
     let middle = across as f64 / 2.0 + 0.5;
-    let pose = WirePose::new((column + middle) * SPACING_M, (row + middle) * SPACING_M, 0.0);
+    let pose = WirePose::new(
+        (column + middle) * SPACING_M,
+        (row + middle) * SPACING_M,
+        0.0,
+    );
     let node = NodeName::new(format!("v{observer}")).expect("a valid name");
     ObjectReport {
         pose: Some(pose),

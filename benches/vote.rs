@@ -30,7 +30,10 @@ fn main() {
 
 /// Rounds of 10² to 10⁵ votes, eight vehicles a landmark; one in five votes is wrong.
 fn rounds(figures: &mut Figures) {
-    println!("{:<10} {:>8} {:>10} {:>10}", "mode", "votes", "round ms", "ns/vote");
+    println!(
+        "{:<10} {:>8} {:>10} {:>10}",
+        "mode", "votes", "round ms", "ns/vote"
+    );
     for (name, mode) in [("weighted", VoteMode::Weighted), ("paper", VoteMode::Paper)] {
         let costs = [100, 1_000, 10_000, 100_000].map(|votes| {
             let mut vote = Vote::new(config(mode), Vec::new());
@@ -58,10 +61,22 @@ fn many_labels(figures: &mut Figures) {
             round_time(&mut vote, &reports(10_000, round, now, labels), now)
         });
         let least = rounds.skip(5).min().expect("there are rounds");
-        record(figures, &format!("weighted_round_{labels}_labels"), 10_000, least)
+        record(
+            figures,
+            &format!("weighted_round_{labels}_labels"),
+            10_000,
+            least,
+        )
     });
-    figures.insert("vote_weighted_cost_of_256_labels_against_5", (costs[1] / costs[0]).into());
-    println!("256 labels cost {:.1} times as much as {}", costs[1] / costs[0], LABELS.len());
+    figures.insert(
+        "vote_weighted_cost_of_256_labels_against_5",
+        (costs[1] / costs[0]).into(),
+    );
+    println!(
+        "256 labels cost {:.1} times as much as {}",
+        costs[1] / costs[0],
+        LABELS.len()
+    );
 }
 
 fn round_time(vote: &mut Vote, reports: &[ObjectReport], now: Timestamp) -> Duration {
@@ -86,7 +101,13 @@ fn ledgers(figures: &mut Figures) {
             .collect();
         let mut ledger = ReputationLedger::default();
         let least = (0..21)
-            .map(|epoch| time(|| evidence.iter().for_each(|e| ledger.record(epoch / 10, &aggregator, e))))
+            .map(|epoch| {
+                time(|| {
+                    evidence
+                        .iter()
+                        .for_each(|e| ledger.record(epoch / 10, &aggregator, e))
+                })
+            })
             .min()
             .expect("there are rounds");
         let publishing = (0..21)
@@ -97,7 +118,12 @@ fn ledgers(figures: &mut Figures) {
             })
             .min()
             .expect("there are rounds");
-        record(figures, "reputations_of_64_vehicles_after", votes, publishing);
+        record(
+            figures,
+            "reputations_of_64_vehicles_after",
+            votes,
+            publishing,
+        );
         record(figures, "ledger_update", votes, least)
     });
     figures.flat("ledger_update_cost_per_vote", &costs);
@@ -112,8 +138,12 @@ fn time(run: impl FnOnce()) -> Duration {
 
 fn record(figures: &mut Figures, name: &str, votes: usize, time: Duration) -> f64 {
     let per_vote = time.as_secs_f64() * 1e9 / votes as f64;
-    println!("{name:<10} {votes:>8} {:>10.3} {per_vote:>10.1}", time.as_secs_f64() * 1e3);
-    let value = serde_json::json!({ "round_ms": time.as_secs_f64() * 1e3, "ns_per_vote": per_vote });
+    println!(
+        "{name:<10} {votes:>8} {:>10.3} {per_vote:>10.1}",
+        time.as_secs_f64() * 1e3
+    );
+    let value =
+        serde_json::json!({ "round_ms": time.as_secs_f64() * 1e3, "ns_per_vote": per_vote });
     figures.insert(format!("{name}_{votes}_votes"), value);
     per_vote
 }
@@ -123,7 +153,11 @@ fn memory(figures: &mut Figures) {
     let resident = || -> Option<f64> {
         let status = std::fs::read_to_string("/proc/self/status").ok()?;
         let line = status.lines().find(|line| line.starts_with("VmRSS:"))?;
-        line.split_whitespace().nth(1)?.parse::<f64>().ok().map(|kib| kib * 1024.0)
+        line.split_whitespace()
+            .nth(1)?
+            .parse::<f64>()
+            .ok()
+            .map(|kib| kib * 1024.0)
     };
     let landmarks = 50_000;
     let reports = reports(landmarks * WITNESSES, 0, NOON, LABELS.len());
@@ -141,11 +175,18 @@ fn memory(figures: &mut Figures) {
 }
 
 fn config(mode: VoteMode) -> VoteConfig {
-    VoteConfig { mode, max_landmarks: 1_000_000, max_vehicles: 100_000, ..VoteConfig::default() }
+    VoteConfig {
+        mode,
+        max_landmarks: 1_000_000,
+        max_vehicles: 100_000,
+        ..VoteConfig::default()
+    }
 }
 
 fn label(n: usize) -> Label {
-    LABELS.get(n).map_or_else(|| format!("label-{n}").into(), |name| (*name).into())
+    LABELS
+        .get(n)
+        .map_or_else(|| format!("label-{n}").into(), |name| (*name).into())
 }
 
 fn node(n: usize) -> NodeName {
@@ -172,7 +213,9 @@ fn reports(votes: usize, round: u64, at: Timestamp, labels: usize) -> Vec<Object
                 }
             };
             reports.push(ObjectReport {
-                objects: (group * OBJECTS..landmarks.min((group + 1) * OBJECTS)).map(object).collect(),
+                objects: (group * OBJECTS..landmarks.min((group + 1) * OBJECTS))
+                    .map(object)
+                    .collect(),
                 ..ObjectReport::new(
                     node(vehicle),
                     round * 1_000_000 + group as u64,

@@ -28,7 +28,10 @@ struct RedBalls;
 
 impl Detect for RedBalls {
     fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
-        find(&frame.image).map_err(|source| DetectError::OpenCv { step: "red balls", source })
+        find(&frame.image).map_err(|source| DetectError::OpenCv {
+            step: "red balls",
+            source,
+        })
     }
 }
 
@@ -36,9 +39,19 @@ fn find(image: &Mat) -> opencv::Result<Vec<Detection>> {
     let (mut hsv, mut mask) = (Mat::default(), Mat::default());
     imgproc::cvt_color_def(image, &mut hsv, imgproc::COLOR_BGR2HSV)?;
     // OpenCV's hue of red is around 0.
-    core::in_range(&hsv, &Scalar::new(0.0, 150.0, 80.0, 0.0), &Scalar::new(8.0, 255.0, 255.0, 0.0), &mut mask)?;
+    core::in_range(
+        &hsv,
+        &Scalar::new(0.0, 150.0, 80.0, 0.0),
+        &Scalar::new(8.0, 255.0, 255.0, 0.0),
+        &mut mask,
+    )?;
     let mut outlines = Vector::<Vector<Point>>::new();
-    imgproc::find_contours_def(&mask, &mut outlines, imgproc::RETR_EXTERNAL, imgproc::CHAIN_APPROX_NONE)?;
+    imgproc::find_contours_def(
+        &mask,
+        &mut outlines,
+        imgproc::RETR_EXTERNAL,
+        imgproc::CHAIN_APPROX_NONE,
+    )?;
     let mut balls = Vec::new();
     for outline in outlines {
         let bounds = imgproc::bounding_rect(&outline)?;
@@ -51,7 +64,12 @@ fn find(image: &Mat) -> opencv::Result<Vec<Detection>> {
             balls.push(Detection {
                 label: "red ball".into(),
                 confidence: confidence.clamp(0.0, 1.0),
-                bounding_box: BoundingBox { x_min, y_min, x_max: x_min + width, y_max: y_min + height },
+                bounding_box: BoundingBox {
+                    x_min,
+                    y_min,
+                    x_max: x_min + width,
+                    y_max: y_min + height,
+                },
                 corners: None,
             });
         }
@@ -66,7 +84,10 @@ async fn main() -> anyhow::Result<()> {
         Some(directory) => PathBuf::from(directory),
         None => draw(drawn.path())?,
     };
-    let cell = NodeConfig { landmarks: vec![LandmarkConfig::at("spot", 1.0, 0.0)], ..NodeConfig::default() };
+    let cell = NodeConfig {
+        landmarks: vec![LandmarkConfig::at("spot", 1.0, 0.0)],
+        ..NodeConfig::default()
+    };
     let edge = node::start(NodeConfig {
         name: Some(NodeName::new("edge")?),
         role: Role::Edge,
@@ -77,26 +98,43 @@ async fn main() -> anyhow::Result<()> {
 
     let camera = CameraConfig {
         name: None,
-        source: SourceConfig::Images { path: frames, fps: 10.0, looping: true },
+        source: SourceConfig::Images {
+            path: frames,
+            fps: 10.0,
+            looping: true,
+        },
         capture: Default::default(),
         optics: OpticsConfig::default(),
         mount: Default::default(),
         detector: DetectorConfig::Custom(CustomDetector::new(|| Ok(Box::new(RedBalls)))),
         projection: ProjectionConfig {
             ranging: Ranging::BoxHeight,
-            sizes: ObjectSizes { default: Some(ObjectSize::square(BALL_M)), ..Default::default() },
+            sizes: ObjectSizes {
+                default: Some(ObjectSize::square(BALL_M)),
+                ..Default::default()
+            },
             ..Default::default()
         },
         view: Default::default(),
         votes: true,
     };
-    let mut config = NodeConfig { name: Some(NodeName::new("euclid")?), role: Role::Cav, camera: Some(camera), ..cell };
+    let mut config = NodeConfig {
+        name: Some(NodeName::new("euclid")?),
+        role: Role::Cav,
+        camera: Some(camera),
+        ..cell
+    };
     config.mqtt.broker = edge.broker_address().map(Into::into);
     config.validate()?;
     let cav = node::start(config).await?;
 
     let mut maps = cav.newest_map();
-    let seen = maps.wait_for(|map| map.as_ref().is_some_and(|map| map.map.landmarks[0].label.is_some())).await?;
+    let seen = maps
+        .wait_for(|map| {
+            map.as_ref()
+                .is_some_and(|map| map.map.landmarks[0].label.is_some())
+        })
+        .await?;
     if let Some(received) = &*seen {
         println!("{:#?}", received.map.landmarks[0]);
     }
@@ -110,11 +148,20 @@ async fn main() -> anyhow::Result<()> {
 fn draw(directory: &Path) -> anyhow::Result<PathBuf> {
     let camera = OpticsConfig::default().lens()?.intrinsics;
     let grey = Scalar::new(120.0, 120.0, 120.0, 0.0);
-    let mut image = Mat::new_rows_cols_with_default(camera.height as i32, camera.width as i32, CV_8UC3, grey)?;
+    let mut image =
+        Mat::new_rows_cols_with_default(camera.height as i32, camera.width as i32, CV_8UC3, grey)?;
     let centre = Point::new(camera.cx as i32, camera.cy as i32);
     // A disc of radius r covers 2r + 1 pixels.
     let radius_px = (camera.fx * BALL_M / 2.0 - 0.5).round() as i32;
-    imgproc::circle(&mut image, centre, radius_px, Scalar::new(30.0, 30.0, 200.0, 0.0), imgproc::FILLED, 8, 0)?;
+    imgproc::circle(
+        &mut image,
+        centre,
+        radius_px,
+        Scalar::new(30.0, 30.0, 200.0, 0.0),
+        imgproc::FILLED,
+        8,
+        0,
+    )?;
     imgcodecs::imwrite_def(directory.join("0.png"), &image)?;
     Ok(directory.to_owned())
 }

@@ -24,10 +24,17 @@ struct Options {
 }
 
 fn options() -> anyhow::Result<Options> {
-    let mut options = Options { seeds: 4, seconds: 60.0, roads: 2, table: None };
+    let mut options = Options {
+        seeds: 4,
+        seconds: 60.0,
+        roads: 2,
+        table: None,
+    };
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
-        let value = args.next().with_context(|| format!("{key} needs a value"))?;
+        let value = args
+            .next()
+            .with_context(|| format!("{key} needs a value"))?;
         match key.as_str() {
             "--seeds" => options.seeds = number(&key, &value)?,
             "--seconds" => options.seconds = number(&key, &value)?,
@@ -40,27 +47,54 @@ fn options() -> anyhow::Result<Options> {
 }
 
 fn number<T: FromStr<Err: Into<anyhow::Error>>>(key: &str, value: &str) -> anyhow::Result<T> {
-    value.parse().map_err(|error: T::Err| error.into().context(format!("{key} {value}")))
+    value
+        .parse()
+        .map_err(|error: T::Err| error.into().context(format!("{key} {value}")))
 }
 
 fn main() -> anyhow::Result<()> {
     let options = options()?;
     let traffic = town_traffic(options.roads, options.seconds);
     traffic.validate()?;
-    eprintln!("{} roads each way, {} vehicles, {} observers", traffic.roads, traffic.vehicles, traffic.observers);
+    eprintln!(
+        "{} roads each way, {} vehicles, {} observers",
+        traffic.roads, traffic.vehicles, traffic.observers
+    );
     let links = [
-        ("no links", LinkConfig { is_up: false, ..LinkConfig::default() }),
-        ("2 Hz", LinkConfig { map_hz: 2.0, ..LinkConfig::default() }),
+        (
+            "no links",
+            LinkConfig {
+                is_up: false,
+                ..LinkConfig::default()
+            },
+        ),
+        (
+            "2 Hz",
+            LinkConfig {
+                map_hz: 2.0,
+                ..LinkConfig::default()
+            },
+        ),
         ("10 Hz", LinkConfig::default()),
     ];
     let mut rows: Vec<(String, Vec<Figures>)> = vec![("one aggregator".into(), Vec::new())];
-    rows.extend(links.iter().map(|(name, _)| (format!("nine cells, {name}"), Vec::new())));
+    rows.extend(
+        links
+            .iter()
+            .map(|(name, _)| (format!("nine cells, {name}"), Vec::new())),
+    );
     for seed in FIRST_SEED..FIRST_SEED + options.seeds {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let recording = generate(&traffic, &mut || rng.random());
         for (row, (name, link)) in links.iter().enumerate() {
             let result = run(&traffic, &recording, *link, &mut || rng.random())?;
-            let TownResult { identities, hand_overs, received, refused, .. } = &result;
+            let TownResult {
+                identities,
+                hand_overs,
+                received,
+                refused,
+                ..
+            } = &result;
             eprintln!(
                 "seed {seed}, {name}: {identities} identities, {hand_overs:?}, {received} maps received, \
                  {refused} refused"
@@ -81,10 +115,17 @@ fn main() -> anyhow::Result<()> {
 
 /// Writes the table between its marks in a document.
 fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
-    const MARKS: [&str; 2] = ["<!-- make eval-city -->\n", "<!-- end of make eval-city -->"];
+    const MARKS: [&str; 2] = [
+        "<!-- make eval-city -->\n",
+        "<!-- end of make eval-city -->",
+    ];
     let text = fs::read_to_string(path)?;
-    let (head, rest) = text.split_once(MARKS[0]).context("has no mark for the table")?;
-    let (_, tail) = rest.split_once(MARKS[1]).context("has no mark for the table's end")?;
+    let (head, rest) = text
+        .split_once(MARKS[0])
+        .context("has no mark for the table")?;
+    let (_, tail) = rest
+        .split_once(MARKS[1])
+        .context("has no mark for the table's end")?;
     fs::write(path, format!("{head}{}{table}{}{tail}", MARKS[0], MARKS[1]))?;
     Ok(())
 }
@@ -110,8 +151,12 @@ fn table(rows: &[(String, Vec<Figures>)]) -> String {
         "| | IDF1 | HOTA | MODA | IDF1, border | HOTA, border | IDF1, middle | HOTA, middle |\n|---|--:|--:|--:|--:|--:|--:|--:|\n",
     );
     for (name, of_seeds) in rows {
-        let mean = |figure: usize| of_seeds.iter().map(|figures| figures[figure]).sum::<f64>() / of_seeds.len() as f64;
-        let cells: Vec<String> = (0..7).map(|figure| format!("{:.1}", mean(figure))).collect();
+        let mean = |figure: usize| {
+            of_seeds.iter().map(|figures| figures[figure]).sum::<f64>() / of_seeds.len() as f64
+        };
+        let cells: Vec<String> = (0..7)
+            .map(|figure| format!("{:.1}", mean(figure)))
+            .collect();
         let _ = writeln!(text, "| {name} | {} |", cells.join(" | "));
     }
     text

@@ -43,8 +43,7 @@ const SETS: [(&str, f64); 8] = [
     ("face", 64.0),
 ];
 
-const HEADER: &str =
-    "| set | majority | best known | `paper` | online, one pass | with passes |\n|---|---|---|---|---|---|\n";
+const HEADER: &str = "| set | majority | best known | `paper` | online, one pass | with passes |\n|---|---|---|---|---|---|\n";
 const START_US: u64 = 1_700_000_000_000_000;
 const ROUND_US: u64 = 100_000;
 
@@ -82,7 +81,9 @@ fn options() -> anyhow::Result<Options> {
     };
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
-        let value = args.next().with_context(|| format!("{key} needs a value"))?;
+        let value = args
+            .next()
+            .with_context(|| format!("{key} needs a value"))?;
         match key.as_str() {
             "--program" => options.program = value.into(),
             "--sets" => options.sets = value.into(),
@@ -107,13 +108,26 @@ struct Names {
 
 impl Names {
     fn new(kind: &'static str, is_allowed: fn(&str) -> bool) -> Self {
-        Self { kind, is_allowed, known: HashMap::new() }
+        Self {
+            kind,
+            is_allowed,
+            known: HashMap::new(),
+        }
     }
 
     fn of(&mut self, name: &str) -> String {
         let (kind, number, is_allowed) = (self.kind, self.known.len(), self.is_allowed);
-        let given = || if is_allowed(name) { name.to_owned() } else { format!("{kind}~{number}") };
-        self.known.entry(name.to_owned()).or_insert_with(given).clone()
+        let given = || {
+            if is_allowed(name) {
+                name.to_owned()
+            } else {
+                format!("{kind}~{number}")
+            }
+        };
+        self.known
+            .entry(name.to_owned())
+            .or_insert_with(given)
+            .clone()
     }
 }
 
@@ -123,15 +137,29 @@ fn is_label(text: &str) -> bool {
 
 /// The rows of a table, each with the values of the named columns; those after `required` may be absent.
 fn rows(path: &Path, columns: &[&str], required: usize) -> anyhow::Result<Vec<Vec<String>>> {
-    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_path(path)?;
+    let mut reader = csv::ReaderBuilder::new()
+        .trim(csv::Trim::All)
+        .from_path(path)?;
     let header = reader.headers()?.clone();
-    let place = |column: &&str| header.iter().position(|name| name.trim_start_matches('\u{feff}') == *column);
+    let place = |column: &&str| {
+        header
+            .iter()
+            .position(|name| name.trim_start_matches('\u{feff}') == *column)
+    };
     let places: Vec<Option<usize>> = columns.iter().map(place).collect();
     if let Some(missing) = places[..required].iter().position(Option::is_none) {
         bail!("there is no column {}", columns[missing]);
     }
     let read = |row: csv::StringRecord| {
-        places.iter().map(|place| place.and_then(|p| row.get(p)).unwrap_or_default().to_owned()).collect()
+        places
+            .iter()
+            .map(|place| {
+                place
+                    .and_then(|p| row.get(p))
+                    .unwrap_or_default()
+                    .to_owned()
+            })
+            .collect()
     };
     reader.records().map(|row| Ok(read(row?))).collect()
 }
@@ -144,22 +172,39 @@ fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
     let mut items: BTreeMap<String, Vec<(String, String, f64)>> = BTreeMap::new();
     let path = set.join("label.csv");
     let of_path = || path.display().to_string();
-    for (number, row) in
-        rows(&path, &["item", "worker", "label", "confidence"], 3).with_context(of_path)?.into_iter().enumerate()
+    for (number, row) in rows(&path, &["item", "worker", "label", "confidence"], 3)
+        .with_context(of_path)?
+        .into_iter()
+        .enumerate()
     {
         if rng.random_bool(options.keep) {
-            let confidence = if row[3].is_empty() { 1.0 } else { row[3].parse().unwrap_or(f64::NAN) };
+            let confidence = if row[3].is_empty() {
+                1.0
+            } else {
+                row[3].parse().unwrap_or(f64::NAN)
+            };
             if !(0.0..=1.0).contains(&confidence) {
-                bail!("{}, row {}: confidence {:?} is not 0 to 1", of_path(), number + 1, row[3]);
+                bail!(
+                    "{}, row {}: confidence {:?} is not 0 to 1",
+                    of_path(),
+                    number + 1,
+                    row[3]
+                );
             }
             let worker = format!("w{}", workers.of(&row[1]).replace('~', "-"));
-            items.entry(names.of(&row[0])).or_default().push((worker, labels.of(&row[2]), confidence));
+            items.entry(names.of(&row[0])).or_default().push((
+                worker,
+                labels.of(&row[2]),
+                confidence,
+            ));
         }
     }
     let path = set.join("truth.csv");
     let truth = rows(&path, &["item", "truth"], 2).with_context(|| path.display().to_string())?;
-    let truth: BTreeMap<String, String> =
-        truth.into_iter().map(|row| (names.of(&row[0]), labels.of(&row[1]))).collect();
+    let truth: BTreeMap<String, String> = truth
+        .into_iter()
+        .map(|row| (names.of(&row[0]), labels.of(&row[1])))
+        .collect();
     let mut order: Vec<_> = items.into_iter().collect();
     order.shuffle(&mut rng);
     let mut sequence: HashMap<String, u64> = HashMap::new();
@@ -176,19 +221,40 @@ fn convert(set: &Path, work: &Path, options: &Options) -> anyhow::Result<()> {
         }
     }
     let mut recording = BufWriter::new(File::create(work.join("reports.jsonl"))?);
-    reports.iter().try_for_each(|report| writeln!(recording, "{report}"))?;
+    reports
+        .iter()
+        .try_for_each(|report| writeln!(recording, "{report}"))?;
     recording.flush()?;
-    fs::write(work.join("truth.json"), json!({ "landmarks": truth }).to_string())?;
-    ORDERS.iter().try_for_each(|order| place(&reports, &truth, work, order))
+    fs::write(
+        work.join("truth.json"),
+        json!({ "landmarks": truth }).to_string(),
+    )?;
+    ORDERS
+        .iter()
+        .try_for_each(|order| place(&reports, &truth, work, order))
 }
 
 /// Writes a set for the comparison: its items at known locations, for both algorithms, labels named by their order.
-fn place(reports: &[Value], truth: &BTreeMap<String, String>, work: &Path, order: &str) -> anyhow::Result<()> {
-    let reported = reports.iter().filter_map(|report| report["objects"][0]["label"].as_str());
+fn place(
+    reports: &[Value],
+    truth: &BTreeMap<String, String>,
+    work: &Path,
+    order: &str,
+) -> anyhow::Result<()> {
+    let reported = reports
+        .iter()
+        .filter_map(|report| report["objects"][0]["label"].as_str());
     let labels: BTreeSet<&str> = reported.chain(truth.values().map(String::as_str)).collect();
     let named = |label: &str| {
         let rank = labels.range(..label).count();
-        format!("{:04}", if order == ORDERS[0] { rank } else { labels.len() - rank })
+        format!(
+            "{:04}",
+            if order == ORDERS[0] {
+                rank
+            } else {
+                labels.len() - rank
+            }
+        )
     };
     let mut placed = BufWriter::new(File::create(work.join(format!("placed-{order}.jsonl")))?);
     let mut spans: BTreeMap<String, Vec<Value>> = BTreeMap::new();
@@ -196,12 +262,19 @@ fn place(reports: &[Value], truth: &BTreeMap<String, String>, work: &Path, order
     for report in reports {
         let (mut report, object) = (report.clone(), &report["objects"][0]);
         // An item without a known truth would be judged by that of the item before it.
-        let Some(true_label) = object["landmark"].as_str().and_then(|item| truth.get(item)) else { continue };
-        let at = report["captured_at_us"].as_u64().context("a report without time")?;
+        let Some(true_label) = object["landmark"].as_str().and_then(|item| truth.get(item)) else {
+            continue;
+        };
+        let at = report["captured_at_us"]
+            .as_u64()
+            .context("a report without time")?;
         let place = (at - START_US) / ROUND_US % PLACES;
         if item_before.replace(at) != Some(at) {
             let span = json!({"from_us": at, "label": named(true_label)});
-            spans.entry(format!("place-{place}")).or_default().push(span);
+            spans
+                .entry(format!("place-{place}"))
+                .or_default()
+                .push(span);
         }
         let label = named(object["label"].as_str().context("a report without label")?);
         report["objects"][0]["label"] = label.into();
@@ -213,26 +286,52 @@ fn place(reports: &[Value], truth: &BTreeMap<String, String>, work: &Path, order
         }
     }
     placed.flush()?;
-    fs::write(work.join(format!("placed-{order}-truth.json")), json!({ "landmarks": spans }).to_string())?;
+    fs::write(
+        work.join(format!("placed-{order}-truth.json")),
+        json!({ "landmarks": spans }).to_string(),
+    )?;
     Ok(())
 }
 
 /// Runs the program; of what it says, only rejections are shown.
 fn run(command: &mut Command) -> anyhow::Result<()> {
-    let output = command.stdin(Stdio::null()).output().with_context(|| format!("cannot run {command:?}"))?;
+    let output = command
+        .stdin(Stdio::null())
+        .output()
+        .with_context(|| format!("cannot run {command:?}"))?;
     let said = String::from_utf8_lossy(&output.stderr);
     if !output.status.success() {
         bail!("{command:?}: {said}");
     }
-    let is_news = |line: &&str| line.starts_with("rejected") && !line.starts_with("rejected not_fused");
-    said.lines().filter(is_news).for_each(|line| eprintln!("{line}"));
+    let is_news =
+        |line: &&str| line.starts_with("rejected") && !line.starts_with("rejected not_fused");
+    said.lines()
+        .filter(is_news)
+        .for_each(|line| eprintln!("{line}"));
     Ok(())
 }
 
 /// Accuracy in percent of one run and of the majority.
-fn measure(options: &Options, work: &Path, name: &str, config: &Path, passes: u32) -> anyhow::Result<(f64, f64)> {
-    let result = judge(options, work, name, config, passes, ["reports.jsonl", "truth.json"])?;
-    let figure = |key: &str| result["vote"][key].as_f64().with_context(|| format!("{name}: eval gave no {key}"));
+fn measure(
+    options: &Options,
+    work: &Path,
+    name: &str,
+    config: &Path,
+    passes: u32,
+) -> anyhow::Result<(f64, f64)> {
+    let result = judge(
+        options,
+        work,
+        name,
+        config,
+        passes,
+        ["reports.jsonl", "truth.json"],
+    )?;
+    let figure = |key: &str| {
+        result["vote"][key]
+            .as_f64()
+            .with_context(|| format!("{name}: eval gave no {key}"))
+    };
     Ok((figure("accuracy_pct")?, figure("majority_accuracy_pct")?))
 }
 
@@ -241,7 +340,10 @@ fn compare(options: &Options, work: &Path) -> anyhow::Result<[f64; 3]> {
     let accuracy = |algorithms: &str, judged: &str| -> anyhow::Result<f64> {
         let config = placed_config(options, algorithms)?;
         let in_order = |order: &str| {
-            let files = [format!("placed-{order}.jsonl"), format!("placed-{order}-truth.json")];
+            let files = [
+                format!("placed-{order}.jsonl"),
+                format!("placed-{order}-truth.json"),
+            ];
             let result = judge(
                 options,
                 work,
@@ -250,11 +352,17 @@ fn compare(options: &Options, work: &Path) -> anyhow::Result<[f64; 3]> {
                 0,
                 files.each_ref().map(|f| &**f),
             )?;
-            result[judged]["accuracy_pct"].as_f64().with_context(|| format!("{algorithms}: eval gave no accuracy"))
+            result[judged]["accuracy_pct"]
+                .as_f64()
+                .with_context(|| format!("{algorithms}: eval gave no accuracy"))
         };
         Ok((in_order(ORDERS[0])? + in_order(ORDERS[1])?) / ORDERS.len() as f64)
     };
-    Ok([accuracy("pace", "pace")?, accuracy("vote", "vote")?, accuracy("both", "pace")?])
+    Ok([
+        accuracy("pace", "pace")?,
+        accuracy("vote", "vote")?,
+        accuracy("both", "pace")?,
+    ])
 }
 
 /// The configuration of the comparison.
@@ -287,21 +395,37 @@ fn judge(
 ) -> anyhow::Result<Value> {
     let (reports, output) = (work.join(reports), work.join(format!("{name}.jsonl")));
     let mut replay = Command::new(&options.program);
-    replay.arg("replay").arg("--config").arg(config).arg("--input").arg(&reports).arg("--output").arg(&output);
+    replay
+        .arg("replay")
+        .arg("--config")
+        .arg(config)
+        .arg("--input")
+        .arg(&reports)
+        .arg("--output")
+        .arg(&output);
     if passes > 0 {
         replay.arg("--passes").arg(passes.to_string());
     }
     run(&mut replay)?;
     let result = work.join(format!("{name}.json"));
     let mut eval = Command::new(options.program.with_file_name("ecod-lab"));
-    eval.arg("eval").arg("--truth").arg(work.join(truth)).arg("--input").arg(&output);
-    run(eval.arg("--reports").arg(&reports).arg("--out").arg(&result))?;
+    eval.arg("eval")
+        .arg("--truth")
+        .arg(work.join(truth))
+        .arg("--input")
+        .arg(&output);
+    run(eval
+        .arg("--reports")
+        .arg(&reports)
+        .arg("--out")
+        .arg(&result))?;
     Ok(serde_json::from_slice(&fs::read(&result)?)?)
 }
 
 /// The configuration with the paper's formulas and a verdict after every item.
 fn paper_config(options: &Options) -> anyhow::Result<PathBuf> {
-    let text = fs::read_to_string(&options.config).with_context(|| options.config.display().to_string())?;
+    let text = fs::read_to_string(&options.config)
+        .with_context(|| options.config.display().to_string())?;
     let mut config: toml::Table = toml::from_str(&text)?;
     let table = |parent: &mut toml::Table, key: &str| -> anyhow::Result<toml::Table> {
         match parent.remove(key) {
@@ -329,19 +453,38 @@ fn sets(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     if is_set(&folder.to_owned()) {
         return Ok(vec![folder.to_owned()]);
     }
-    let entries = fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
-    let mut sets: Vec<PathBuf> = entries.filter_map(Result::ok).map(|entry| entry.path()).filter(is_set).collect();
-    let rank = |path: &Path| SETS.iter().position(|(set, _)| path.ends_with(set)).unwrap_or(SETS.len());
+    let entries =
+        fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
+    let mut sets: Vec<PathBuf> = entries
+        .filter_map(Result::ok)
+        .map(|entry| entry.path())
+        .filter(is_set)
+        .collect();
+    let rank = |path: &Path| {
+        SETS.iter()
+            .position(|(set, _)| path.ends_with(set))
+            .unwrap_or(SETS.len())
+    };
     sets.sort_by_key(|path| (rank(path), path.clone()));
-    if sets.is_empty() { bail!("there is no set in {}", folder.display()) } else { Ok(sets) }
+    if sets.is_empty() {
+        bail!("there is no set in {}", folder.display())
+    } else {
+        Ok(sets)
+    }
 }
 
 fn write_table(path: &Path, kind: &str, table: &str) -> anyhow::Result<()> {
-    let (begin, end) = (format!("<!-- {kind} table begin -->\n"), format!("<!-- {kind} table end -->"));
+    let (begin, end) = (
+        format!("<!-- {kind} table begin -->\n"),
+        format!("<!-- {kind} table end -->"),
+    );
     let text = fs::read_to_string(path)?;
     let (before, rest) = text.split_once(&begin).context("no begin marker")?;
     let (_, after) = rest.split_once(&end).context("no end marker")?;
-    Ok(fs::write(path, format!("{before}{begin}{table}{end}{after}"))?)
+    Ok(fs::write(
+        path,
+        format!("{before}{begin}{table}{end}{after}"),
+    )?)
 }
 
 fn main() -> anyhow::Result<()> {
@@ -351,16 +494,26 @@ fn main() -> anyhow::Result<()> {
     let (mut table, mut answers) = (HEADER.to_owned(), ANSWER_HEADER.to_owned());
     print!("{table}");
     for set in sets(&options.sets)? {
-        let name = fs::canonicalize(&set)?.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let name = fs::canonicalize(&set)?
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
         let work = options.work.join(&name);
         fs::create_dir_all(&work)?;
         convert(&set, &work, &options)?;
         let (paper, majority) = measure(&options, &work, "paper", &paper_config, 0)?;
         let (online, _) = measure(&options, &work, "online", &options.config, 0)?;
         let (refined, _) = measure(&options, &work, "passes", &options.config, options.passes)?;
-        let best = SETS.iter().find(|(set, _)| *set == name).map_or(String::new(), |(_, best)| format!("{best:.1}"));
+        let best = SETS
+            .iter()
+            .find(|(set, _)| *set == name)
+            .map_or(String::new(), |(_, best)| format!("{best:.1}"));
         let mut row = String::new();
-        writeln!(row, "| {name} | {majority:.2} | {best} | {paper:.2} | {online:.2} | {refined:.2} |")?;
+        writeln!(
+            row,
+            "| {name} | {majority:.2} | {best} | {paper:.2} | {online:.2} | {refined:.2} |"
+        )?;
         print!("{row}");
         table.push_str(&row);
         let [pace, vote, both] = compare(&options, &work)?;

@@ -22,7 +22,9 @@ use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::reputation::{Evidence, ReputationLedger};
 use ecod::vote::{Vote, VoteConfig};
-use ecod::wire::{LedgerEntry, LedgerShare, LedgerSignature, ObjectReport, PerceivedObject, SCHEMA_VERSION};
+use ecod::wire::{
+    LedgerEntry, LedgerShare, LedgerSignature, ObjectReport, PerceivedObject, SCHEMA_VERSION,
+};
 use plotters::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -38,7 +40,14 @@ const SERIES: [(&str, RGBColor); 4] = [
 const LANDMARKS: usize = 6;
 const ROUNDS: u64 = 600;
 const SETTLED: u64 = 300;
-const LIES: [Lie; 6] = [Lie::Random, Lie::Constant, Lie::Copying, Lie::Turning, Lie::Rejoining, Lie::Forging];
+const LIES: [Lie; 6] = [
+    Lie::Random,
+    Lie::Constant,
+    Lie::Copying,
+    Lie::Turning,
+    Lie::Rejoining,
+    Lie::Forging,
+];
 /// Round before which the aggregator restarts, where evidence is forged.
 const RESTART: u64 = 150;
 /// Rounds of 12 s in which another candidate follows the forger. A leader renews its term after 10 s at most.
@@ -75,21 +84,40 @@ struct Candidate {
 
 impl Candidate {
     fn new(name: &str) -> Result<Self, Box<dyn Error>> {
-        let (resync, ledger) = (LedgerResync::signed(NodeName::new(name)?, 10), ReputationLedger::default());
-        Ok(Self { resync, ledger, leadership: Leadership::default() })
+        let (resync, ledger) = (
+            LedgerResync::signed(NodeName::new(name)?, 10),
+            ReputationLedger::default(),
+        );
+        Ok(Self {
+            resync,
+            ledger,
+            leadership: Leadership::default(),
+        })
     }
 
     /// Leads, or follows a leader.
     fn go_by(&mut self, term: u64, leader: &str, position: Position) -> Result<(), Box<dyn Error>> {
         let epoch = Some(Epoch::new(term, NodeName::new(leader)?));
-        self.leadership = Leadership { position, epoch, term, ..Leadership::default() };
+        self.leadership = Leadership {
+            position,
+            epoch,
+            term,
+            ..Leadership::default()
+        };
         Ok(())
     }
 
     /// Takes what another candidate says.
     fn take(&mut self, share: &LedgerShare, now: Timestamp) -> Result<Merged, Box<dyn Error>> {
         let candidates = std::slice::from_ref(&share.node);
-        Ok(self.resync.merge(share, &mut self.ledger, candidates, &self.leadership, now, now)?)
+        Ok(self.resync.merge(
+            share,
+            &mut self.ledger,
+            candidates,
+            &self.leadership,
+            now,
+            now,
+        )?)
     }
 }
 
@@ -108,21 +136,38 @@ impl Cell {
         euclid.resync.lead(Epoch::new(1, NodeName::new("euclid")?));
         euclid.resync.step_down();
         euclid.go_by(2, "edge", Position::Following)?;
-        Ok(Self { edge, euclid, passed_on: Vec::new() })
+        Ok(Self {
+            edge,
+            euclid,
+            passed_on: Vec::new(),
+        })
     }
 
     /// Counts what a round settled, and tells the other candidate.
     fn record(&mut self, evidence: &[Evidence], now: Timestamp) -> Result<(), Box<dyn Error>> {
-        let Some(epoch) = &self.edge.leadership.epoch else { return Ok(()) };
-        for share in self.edge.resync.record(epoch, evidence, &mut self.edge.ledger) {
-            self.passed_on.extend(self.euclid.take(&signed(share), now)?.shares);
+        let Some(epoch) = &self.edge.leadership.epoch else {
+            return Ok(());
+        };
+        for share in self
+            .edge
+            .resync
+            .record(epoch, evidence, &mut self.edge.ledger)
+        {
+            self.passed_on
+                .extend(self.euclid.take(&signed(share), now)?.shares);
         }
         Ok(())
     }
 
     /// The first liar tells both candidates of leaderships of its own. One starts, and follows it until the aggregator
     /// renews its term. Fails if the aggregator takes anything.
-    fn forge(&mut self, round: u64, vehicles: usize, liars: usize, now: Timestamp) -> Result<(), Box<dyn Error>> {
+    fn forge(
+        &mut self,
+        round: u64,
+        vehicles: usize,
+        liars: usize,
+        now: Timestamp,
+    ) -> Result<(), Box<dyn Error>> {
         if round == MISLED.start {
             self.euclid.go_by(3, "liar-0", Position::Following)?;
         } else if round == MISLED.end {
@@ -133,12 +178,22 @@ impl Cell {
             let share = forged(term, vehicles, liars)?;
             let merged = self.edge.take(&share, now)?;
             let is_taken = self.euclid.take(&share, now)?.is_news;
-            if merged.is_news || merged.refused.is_empty() || (is_taken && !MISLED_WITH_LAST_WORD.contains(&round)) {
-                return Err(format!("round {round}: forged evidence of term {term} was taken").into());
+            if merged.is_news
+                || merged.refused.is_empty()
+                || (is_taken && !MISLED_WITH_LAST_WORD.contains(&round))
+            {
+                return Err(
+                    format!("round {round}: forged evidence of term {term} was taken").into(),
+                );
             }
         }
-        let Candidate { resync, ledger, leadership } = &mut self.euclid;
-        self.passed_on.extend(resync.tick(ledger, leadership, now).shares);
+        let Candidate {
+            resync,
+            ledger,
+            leadership,
+        } = &mut self.euclid;
+        self.passed_on
+            .extend(resync.tick(ledger, leadership, now).shares);
         for share in self.passed_on.drain(..).map(signed) {
             if self.edge.take(&share, now)?.is_news {
                 return Err(format!("round {round}: forged evidence was passed on").into());
@@ -150,8 +205,14 @@ impl Cell {
 
 /// The share as its aggregator signs it.
 fn signed(share: LedgerShare) -> LedgerShare {
-    let signature = LedgerSignature { certificate: String::new(), signature: "valid".into() };
-    LedgerShare { signed: Some(signature).filter(|_| !share.is_empty()), ..share }
+    let signature = LedgerSignature {
+        certificate: String::new(),
+        signature: "valid".into(),
+    };
+    LedgerShare {
+        signed: Some(signature).filter(|_| !share.is_empty()),
+        ..share
+    }
 }
 
 /// Evidence of a leadership of the first liar: all liars are right and all others wrong.
@@ -159,15 +220,39 @@ fn forged(term: u64, vehicles: usize, liars: usize) -> Result<LedgerShare, Box<d
     let forger = NodeName::new("liar-0")?;
     let entry = |vehicle: usize, label: &str| {
         let is_liar = vehicle < liars;
-        let node = NodeName::new(format!("{}-{vehicle}", if is_liar { "liar" } else { "honest" }))?;
-        let (correct, incorrect) = if is_liar { (1_000_000, 0) } else { (0, 1_000_000) };
-        Ok(LedgerEntry { epoch: term, aggregator: forger.clone(), node, label: label.into(), correct, incorrect })
+        let node = NodeName::new(format!(
+            "{}-{vehicle}",
+            if is_liar { "liar" } else { "honest" }
+        ))?;
+        let (correct, incorrect) = if is_liar {
+            (1_000_000, 0)
+        } else {
+            (0, 1_000_000)
+        };
+        Ok(LedgerEntry {
+            epoch: term,
+            aggregator: forger.clone(),
+            node,
+            label: label.into(),
+            correct,
+            incorrect,
+        })
     };
     let pairs = (0..vehicles).flat_map(|vehicle| LABELS.map(|label| (vehicle, label)));
-    let entries = pairs.map(|(vehicle, label)| entry(vehicle, label)).collect::<Result<_, Box<dyn Error>>>()?;
+    let entries = pairs
+        .map(|(vehicle, label)| entry(vehicle, label))
+        .collect::<Result<_, Box<dyn Error>>>()?;
     let epoch = (term == 3).then_some(term);
     let (schema, marks) = (SCHEMA_VERSION, Vec::new());
-    Ok(signed(LedgerShare { schema, node: forger, epoch, entries, marks, signed: None, reset_at_us: None }))
+    Ok(signed(LedgerShare {
+        schema,
+        node: forger,
+        epoch,
+        entries,
+        marks,
+        signed: None,
+        reset_at_us: None,
+    }))
 }
 
 struct Course {
@@ -206,19 +291,36 @@ impl Trial {
 
     /// Title of its panel.
     fn name(&self) -> String {
-        format!("{}, {} of {} lie", self.lie_name(), self.liars(), self.vehicles)
+        format!(
+            "{}, {} of {} lie",
+            self.lie_name(),
+            self.liars(),
+            self.vehicles
+        )
     }
 
     fn worst(&self) -> f64 {
-        self.courses.iter().map(|c| c.settled).fold(f64::INFINITY, f64::min)
+        self.courses
+            .iter()
+            .map(|c| c.settled)
+            .fold(f64::INFINITY, f64::min)
     }
 
     /// The flaw, if liars achieve more than the bound allows.
     fn flaw(&self) -> Option<String> {
-        let (worst, verdicts, honest) = (self.worst(), self.mean(|c| c.settled), self.mean(|c| c.honest));
+        let (worst, verdicts, honest) = (
+            self.worst(),
+            self.mean(|c| c.settled),
+            self.mean(|c| c.honest),
+        );
         let is_good = worst >= MIN_WORST && verdicts >= honest;
         let bound = format!("at least {MIN_WORST} and {honest:.1}, the honest majority's");
-        (!is_good).then(|| format!("{}: worst {worst:.1} %, mean {verdicts:.1} %, to be {bound}", self.name()))
+        (!is_good).then(|| {
+            format!(
+                "{}: worst {worst:.1} %, mean {verdicts:.1} %, to be {bound}",
+                self.name()
+            )
+        })
     }
 
     fn row(&self) -> String {
@@ -246,14 +348,24 @@ fn other(rng: &mut ChaCha8Rng, truth: usize) -> usize {
 fn chance_of_most(votes: &[usize], truth: usize) -> f64 {
     let most = votes.iter().max().copied().unwrap_or(0);
     let first = votes.iter().filter(|n| **n == most).count();
-    if votes[truth] == most { 1.0 / first as f64 } else { 0.0 }
+    if votes[truth] == most {
+        1.0 / first as f64
+    } else {
+        0.0
+    }
 }
 
 fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let liars = (vehicles - 1) / 2;
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
-    let mut course = Course { accuracy: Vec::new(), reputation: Vec::new(), settled: 0.0, majority: 0.0, honest: 0.0 };
+    let mut course = Course {
+        accuracy: Vec::new(),
+        reputation: Vec::new(),
+        settled: 0.0,
+        majority: 0.0,
+        honest: 0.0,
+    };
     let (mut right, mut right_most, mut settled, mut majority, mut honest) = (0, 0.0, 0, 0.0, 0.0);
     let mut now = Timestamp(1_700_000_000_000_000);
     let mut truths = [0; LANDMARKS];
@@ -272,7 +384,9 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
         // The objects are exchanged when the votes of the last ones are no longer fresh.
         if round % 6 == 0 {
             now = now + Duration::from_secs(3);
-            truths.iter_mut().for_each(|t| *t = rng.random_range(0..LABELS.len()));
+            truths
+                .iter_mut()
+                .for_each(|t| *t = rng.random_range(0..LABELS.len()));
         }
         let common: Vec<usize> = truths.iter().map(|&t| other(&mut rng, t)).collect();
         let mut said = vec![[0usize; LABELS.len()]; LANDMARKS];
@@ -281,7 +395,10 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
             let lies = vehicle < liars && !(lie == Lie::Turning && round < ROUNDS / 3);
             let name = match lie {
                 Lie::Rejoining if lies => format!("liar-{vehicle}-{}", round / 10),
-                _ => format!("{}-{vehicle}", if vehicle < liars { "liar" } else { "honest" }),
+                _ => format!(
+                    "{}-{vehicle}",
+                    if vehicle < liars { "liar" } else { "honest" }
+                ),
             };
             let mut objects = Vec::new();
             for (place, &truth) in truths.iter().enumerate() {
@@ -305,14 +422,24 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
                 });
             }
             let node = NodeName::new(name)?;
-            let report = ObjectReport { objects, ..ObjectReport::new(node, round, now) };
+            let report = ObjectReport {
+                objects,
+                ..ObjectReport::new(node, round, now)
+            };
             vote.observe(&report, now)?;
         }
         let closed = vote.close(now);
         cell.record(&closed.evidence, now)?;
-        let verdicts: BTreeMap<_, Option<Label>> = closed.verdicts.into_iter().map(|v| (v.landmark, v.label)).collect();
+        let verdicts: BTreeMap<_, Option<Label>> = closed
+            .verdicts
+            .into_iter()
+            .map(|v| (v.landmark, v.label))
+            .collect();
         for (place, &truth) in truths.iter().enumerate() {
-            let label = verdicts.get(format!("place-{place}").as_str()).cloned().flatten();
+            let label = verdicts
+                .get(format!("place-{place}").as_str())
+                .cloned()
+                .flatten();
             let good = usize::from(label.as_deref() == Some(LABELS[truth]));
             let most = chance_of_most(&said[place], truth);
             right += good;
@@ -325,12 +452,17 @@ fn run(vehicles: usize, lie: Lie, seed: u64) -> Result<Course, Box<dyn Error>> {
         }
         if round % 10 == 9 {
             let judged = (10 * LANDMARKS) as f64;
-            course.accuracy.push((right as f64 / judged, right_most / judged));
+            course
+                .accuracy
+                .push((right as f64 / judged, right_most / judged));
             (right, right_most) = (0, 0.0);
             let reputations = vote.reputations();
             let mean = |prefix: &str| {
-                let scores: Vec<f64> =
-                    reputations.iter().filter(|(n, _)| n.as_str().starts_with(prefix)).map(|(_, r)| r.score).collect();
+                let scores: Vec<f64> = reputations
+                    .iter()
+                    .filter(|(n, _)| n.as_str().starts_with(prefix))
+                    .map(|(_, r)| r.score)
+                    .collect();
                 scores.iter().sum::<f64>() / scores.len().max(1) as f64
             };
             course.reputation.push((mean("honest"), mean("liar")));
@@ -351,12 +483,21 @@ fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
     let (legend, panels) = area.split_vertically(32);
     let mut x = 12;
     for (name, color) in SERIES {
-        legend.draw(&PathElement::new([(x, 16), (x + 28, 16)], color.stroke_width(3)))?;
+        legend.draw(&PathElement::new(
+            [(x, 16), (x + 28, 16)],
+            color.stroke_width(3),
+        ))?;
         legend.draw(&Text::new(name, (x + 34, 8), ("sans-serif", 17)))?;
         x += 270;
     }
-    for (place, area) in panels.split_evenly((LIES.len(), columns)).iter().enumerate() {
-        let Some(trial) = trials.get(place % columns * LIES.len() + place / columns) else { continue };
+    for (place, area) in panels
+        .split_evenly((LIES.len(), columns))
+        .iter()
+        .enumerate()
+    {
+        let Some(trial) = trials.get(place % columns * LIES.len() + place / columns) else {
+            continue;
+        };
         let mut chart = ChartBuilder::on(area)
             .margin(8)
             .margin_right(24)
@@ -375,10 +516,15 @@ fn draw(path: &str, trials: &[Trial]) -> Result<(), Box<dyn Error>> {
             .light_line_style(WHITE)
             .draw()?;
         let course = |of: fn(&Course, usize) -> f64| {
-            (0..(ROUNDS / 10) as usize).map(move |n| (n as f64 * 10.0 + 10.0, trial.mean(|c| of(c, n))))
+            (0..(ROUNDS / 10) as usize)
+                .map(move |n| (n as f64 * 10.0 + 10.0, trial.mean(|c| of(c, n))))
         };
-        let courses: [fn(&Course, usize) -> f64; SERIES.len()] =
-            [|c, n| c.accuracy[n].1, |c, n| c.accuracy[n].0, |c, n| c.reputation[n].0, |c, n| c.reputation[n].1];
+        let courses: [fn(&Course, usize) -> f64; SERIES.len()] = [
+            |c, n| c.accuracy[n].1,
+            |c, n| c.accuracy[n].0,
+            |c, n| c.reputation[n].0,
+            |c, n| c.reputation[n].1,
+        ];
         for ((_, color), of) in SERIES.iter().zip(courses) {
             chart.draw_series(LineSeries::new(course(of), color.stroke_width(2)))?;
         }
@@ -393,7 +539,10 @@ fn write_table(path: &str, table: &str) -> Result<(), Box<dyn Error>> {
     let text = std::fs::read_to_string(path)?;
     let (before, rest) = text.split_once(BEGIN).ok_or("no begin marker")?;
     let (_, after) = rest.split_once(END).ok_or("no end marker")?;
-    Ok(std::fs::write(path, format!("{before}{BEGIN}{table}{END}{after}"))?)
+    Ok(std::fs::write(
+        path,
+        format!("{before}{BEGIN}{table}{END}{after}"),
+    )?)
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -416,8 +565,14 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut trials = Vec::new();
     for vehicles in SIZES {
         for lie in LIES {
-            let courses = (1..=seeds).map(|seed| run(vehicles, lie, seed)).collect::<Result<_, _>>()?;
-            let trial = Trial { vehicles, lie, courses };
+            let courses = (1..=seeds)
+                .map(|seed| run(vehicles, lie, seed))
+                .collect::<Result<_, _>>()?;
+            let trial = Trial {
+                vehicles,
+                lie,
+                courses,
+            };
             table.push_str(&trial.row());
             trials.push(trial);
         }
@@ -433,5 +588,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         draw(&path, &trials)?;
     }
     let flaws: Vec<_> = trials.iter().filter_map(Trial::flaw).collect();
-    if flaws.is_empty() { Ok(()) } else { Err(flaws.join("\n").into()) }
+    if flaws.is_empty() {
+        Ok(())
+    } else {
+        Err(flaws.join("\n").into())
+    }
 }

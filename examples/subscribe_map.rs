@@ -13,10 +13,16 @@ async fn main() -> anyhow::Result<()> {
     let (Some(broker), Some(cell)) = (arguments.next(), arguments.next()) else {
         anyhow::bail!("usage: subscribe_map HOST:PORT CELL");
     };
-    let (host, port) = broker.rsplit_once(':').context("the broker must be HOST:PORT")?;
+    let (host, port) = broker
+        .rsplit_once(':')
+        .context("the broker must be HOST:PORT")?;
     let topic = Topics::new(&NodeName::new(&cell)?).path(&Topic::GlobalDetections);
 
-    let options = MqttOptions::new(format!("subscribe-map-{}", std::process::id()), host, port.parse()?);
+    let options = MqttOptions::new(
+        format!("subscribe-map-{}", std::process::id()),
+        host,
+        port.parse()?,
+    );
     let (client, mut events) = AsyncClient::new(options, 10);
     loop {
         match events.poll().await? {
@@ -39,5 +45,11 @@ fn print(map: &GlobalMap) {
         None if place.observers.is_empty() => format!("{}=?", place.id),
         None => format!("{}=-", place.id),
     });
-    println!("{} {}/{}: {}", map.aggregator, map.epoch, map.round, places.collect::<Vec<_>>().join(" "));
+    println!(
+        "{} {}/{}: {}",
+        map.aggregator,
+        map.epoch,
+        map.round,
+        places.collect::<Vec<_>>().join(" ")
+    );
 }

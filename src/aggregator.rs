@@ -49,8 +49,8 @@ use crate::reputation::{Evidence, ReputationLedger};
 use crate::tracking::{HandOvers, Tracker, TracksLosses, TracksMode, TracksRound};
 use crate::vote::{Vote, VoteMode};
 use crate::wire::{
-    FusedObject, GlobalMap, InvalidEntry, LandmarkState, NeighbourObject, ObjectReport, Payload, PerceivedObject,
-    RejectReason, ReportKind, Reputation, Verdict, Verdicts,
+    FusedObject, GlobalMap, InvalidEntry, LandmarkState, NeighbourObject, ObjectReport, Payload,
+    PerceivedObject, RejectReason, ReportKind, Reputation, Verdict, Verdicts,
 };
 
 /// A closed round.
@@ -112,13 +112,25 @@ impl Aggregator {
     /// An aggregator without evidence that does not lead; `config` is taken as valid.
     pub fn new_standby(config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
         let is_tracking = config.tracks_objects(!landmarks.is_empty());
-        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
+        let FusionConfig {
+            algorithms,
+            window,
+            round,
+            pace,
+            tracks,
+            vote,
+            reputation,
+        } = config;
         let (by_packets, initial_votes) = (vote.mode == VoteMode::Paper, reputation.initial_votes);
-        let vote = algorithms.vote().then(|| Vote::new(vote, landmarks.clone()));
+        let vote = algorithms
+            .vote()
+            .then(|| Vote::new(vote, landmarks.clone()));
         let tracks_open_cell = tracks.mode == TracksMode::Auto;
         let tracks = is_tracking.then(|| Tracker::new(tracks, reputation));
         let gate_m = pace.gate_m;
-        let pace = algorithms.pace().then(|| Pace::new(pace, Arc::new(LandmarkIndex::new(landmarks, gate_m))));
+        let pace = algorithms
+            .pace()
+            .then(|| Pace::new(pace, Arc::new(LandmarkIndex::new(landmarks, gate_m))));
         Self {
             leads: None,
             next_round: 1,
@@ -140,7 +152,13 @@ impl Aggregator {
     }
 
     /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as valid.
-    pub fn new(name: NodeName, epoch: u64, config: FusionConfig, landmarks: Vec<Landmark>, now: Timestamp) -> Self {
+    pub fn new(
+        name: NodeName,
+        epoch: u64,
+        config: FusionConfig,
+        landmarks: Vec<Landmark>,
+        now: Timestamp,
+    ) -> Self {
         let mut aggregator = Self::new_standby(config, landmarks, now);
         aggregator.lead(Epoch::new(epoch, name), 1, FirstRound::OnTime, now);
         aggregator
@@ -150,10 +168,21 @@ impl Aggregator {
     /// locations are told apart by their ids. An algorithm, or a mode of one, that was not used before starts anew.
     pub fn configure(&mut self, config: FusionConfig, landmarks: Vec<Landmark>) {
         let is_tracking = config.tracks_objects(!landmarks.is_empty());
-        let FusionConfig { algorithms, window, round, pace, tracks, vote, reputation } = config;
-        self.windows.iter_mut().for_each(|known| known.configure(window.clone()));
+        let FusionConfig {
+            algorithms,
+            window,
+            round,
+            pace,
+            tracks,
+            vote,
+            reputation,
+        } = config;
+        self.windows
+            .iter_mut()
+            .for_each(|known| known.configure(window.clone()));
         self.rounds.configure(round);
-        (self.by_packets, self.initial_votes) = (vote.mode == VoteMode::Paper, reputation.initial_votes);
+        (self.by_packets, self.initial_votes) =
+            (vote.mode == VoteMode::Paper, reputation.initial_votes);
         self.foreign.repeat();
         self.vote = algorithms.vote().then(|| match self.vote.take() {
             Some(known) => known.configured(vote, landmarks.clone()),
@@ -176,10 +205,16 @@ impl Aggregator {
     pub fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound, now: Timestamp) {
         if self.leads.replace(epoch).is_none() {
             self.vote.iter_mut().for_each(|vote| vote.begin_record(now));
-            self.tracks.iter_mut().for_each(|tracks| tracks.begin_record(now));
+            self.tracks
+                .iter_mut()
+                .for_each(|tracks| tracks.begin_record(now));
         }
         // Rounds that were closed meanwhile count.
-        let min_round = if first == FirstRound::InStep { self.next_round } else { 0 };
+        let min_round = if first == FirstRound::InStep {
+            self.next_round
+        } else {
+            0
+        };
         self.next_round = first_round.max(min_round);
         self.rounds.start(first, now);
     }
@@ -218,9 +253,11 @@ impl Aggregator {
                 if !pace.landmarks().landmarks().is_empty() && !report.objects.is_empty() {
                     let is_tracking = self.tracks.is_some();
                     let is_near = |object: &PerceivedObject| {
-                        pace.landmarks().is_around(&Point2::new(object.x_m, object.y_m), MAX_AWAY_M)
+                        pace.landmarks()
+                            .is_around(&Point2::new(object.x_m, object.y_m), MAX_AWAY_M)
                     };
-                    let is_placed = |object| pace.is_at_landmark(object) || is_tracking && is_near(object);
+                    let is_placed =
+                        |object| pace.is_at_landmark(object) || is_tracking && is_near(object);
                     let is_placed = report.objects.iter().any(is_placed);
                     window.note_place(&report.node, is_placed, now);
                     let Placements { placed, misplaced } = &mut self.placements;
@@ -230,7 +267,9 @@ impl Aggregator {
                 let (Admitted::InOrder(captured_at) | Admitted::OutOfOrder(captured_at)) = admitted;
                 let tracks = self.tracks.as_mut();
                 let is_tracked = tracks.is_some_and(|tracks| {
-                    tracks.observe_only(Arc::clone(report), captured_at, |object| !pace.is_at_landmark(object))
+                    tracks.observe_only(Arc::clone(report), captured_at, |object| {
+                        !pace.is_at_landmark(object)
+                    })
                 });
                 match admitted {
                     Admitted::InOrder(_) => pace.observe(report, captured_at),
@@ -250,12 +289,20 @@ impl Aggregator {
                 self.voted = true;
             }
         }
-        Ok(if self.rounds.report(kind, &report.node, now) { self.close(now) } else { None })
+        Ok(if self.rounds.report(kind, &report.node, now) {
+            self.close(now)
+        } else {
+            None
+        })
     }
 
     /// Closes the round if it is due at `now`.
     pub fn tick(&mut self, now: Timestamp) -> Option<Fused> {
-        if self.rounds.tick(now) { self.close(now) } else { None }
+        if self.rounds.tick(now) {
+            self.close(now)
+        } else {
+            None
+        }
     }
 
     /// Closes the round, whether or not it is due.
@@ -275,12 +322,20 @@ impl Aggregator {
     }
 
     /// Doubts about a report that was used, the range of its objects before their place.
-    pub fn doubts(&self, kind: ReportKind, report: &ObjectReport, now: Timestamp) -> impl Iterator<Item = ReportDoubt> {
+    pub fn doubts(
+        &self,
+        kind: ReportKind,
+        report: &ObjectReport,
+        now: Timestamp,
+    ) -> impl Iterator<Item = ReportDoubt> {
         let sender = self.windows[kind as usize].sender(&report.node, now);
         let is_nowhere = sender.misplaced >= MIN_MISPLACED;
-        let place = ReportDoubt::of_ranges(report).or(is_nowhere.then_some(ReportDoubt::NoObjectAtLocation));
+        let place = ReportDoubt::of_ranges(report)
+            .or(is_nowhere.then_some(ReportDoubt::NoObjectAtLocation));
         let place = place.or(sender.has_moved.then_some(ReportDoubt::Moves));
-        place.into_iter().chain(sender.is_shared.then_some(ReportDoubt::SharedName))
+        place
+            .into_iter()
+            .chain(sender.is_shared.then_some(ReportDoubt::SharedName))
     }
 
     /// Numbers of reports of detections so far by the places of their objects.
@@ -290,7 +345,9 @@ impl Aggregator {
 
     /// True if a location of this id is known; `None` if none is known at all.
     pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
-        let Some(pace) = &self.pace else { return self.vote.as_ref()?.knows_location(id) };
+        let Some(pace) = &self.pace else {
+            return self.vote.as_ref()?.knows_location(id);
+        };
         let landmarks = pace.landmarks();
         (!landmarks.landmarks().is_empty()).then(|| landmarks.position_of(id).is_some())
     }
@@ -319,12 +376,20 @@ impl Aggregator {
     pub fn end_packet(&mut self, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let by_packets = self.by_packets;
-        let vote = self.vote.as_mut().filter(|vote| by_packets && vote.is_packet_begun())?;
+        let vote = self
+            .vote
+            .as_mut()
+            .filter(|vote| by_packets && vote.is_packet_begun())?;
         let verdicts = vote.close(now).verdicts;
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    fn number_verdicts(&mut self, epoch: &Epoch, verdicts: Vec<Verdict>, now: Timestamp) -> Verdicts {
+    fn number_verdicts(
+        &mut self,
+        epoch: &Epoch,
+        verdicts: Vec<Verdict>,
+        now: Timestamp,
+    ) -> Verdicts {
         let round = self.take_round_number();
         Verdicts::new(epoch, round, self.in_cell_time(now), verdicts)
     }
@@ -339,12 +404,18 @@ impl Aggregator {
     /// kinds counts once.
     pub fn timeliness(&self, now: Timestamp) -> Timeliness {
         let [detections, votes] = self.windows.each_ref().map(|window| window.timeliness(now));
-        Timeliness { timely: detections.timely.max(votes.timely), untimely: detections.untimely.max(votes.untimely) }
+        Timeliness {
+            timely: detections.timely.max(votes.timely),
+            untimely: detections.untimely.max(votes.untimely),
+        }
     }
 
     /// VOTE's trust in each vehicle, from the evidence of this aggregator.
     pub fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
-        self.vote.as_ref().map(Vote::reputations).unwrap_or_default()
+        self.vote
+            .as_ref()
+            .map(Vote::reputations)
+            .unwrap_or_default()
     }
 
     /// Starts from the evidence of a ledger, after a restart or a change of aggregator.
@@ -380,17 +451,25 @@ impl Aggregator {
     /// cell's time, which may jump; everything else goes by `now`, which does not.
     pub fn set_cell_offset(&mut self, offset_us: i64) {
         self.cell_offset_us = offset_us;
-        self.windows.iter_mut().for_each(|window| window.set_cell_offset(offset_us));
+        self.windows
+            .iter_mut()
+            .for_each(|window| window.set_cell_offset(offset_us));
     }
 
     /// Numbers of reports and objects so far that tracking could not use.
     pub fn tracks_losses(&self) -> TracksLosses {
-        self.tracks.as_ref().map(Tracker::losses).unwrap_or_default()
+        self.tracks
+            .as_ref()
+            .map(Tracker::losses)
+            .unwrap_or_default()
     }
 
     /// Numbers of identities so far that tracking took over from neighbouring cells.
     pub fn hand_overs(&self) -> HandOvers {
-        self.tracks.as_ref().map(Tracker::hand_overs).unwrap_or_default()
+        self.tracks
+            .as_ref()
+            .map(Tracker::hand_overs)
+            .unwrap_or_default()
     }
 
     /// Number of reports so far that only tracking used, because a later one of their vehicle came before.
@@ -415,17 +494,26 @@ impl Aggregator {
     }
 
     /// The state of each place, as PACE and VOTE agree on it. Their `paper` modes stay as published.
-    fn agree(&self, places: Vec<LandmarkState>, verdicts: Option<&[Verdict]>, now: Timestamp) -> Vec<LandmarkState> {
+    fn agree(
+        &self,
+        places: Vec<LandmarkState>,
+        verdicts: Option<&[Verdict]>,
+        now: Timestamp,
+    ) -> Vec<LandmarkState> {
         let (Some(vote), Some(pace @ Pace::Bayes(_)), Some(verdicts), false) =
             (&self.vote, &self.pace, verdicts, self.by_packets)
         else {
             return places;
         };
-        let known: BTreeMap<_, _> = verdicts.iter().map(|verdict| (&verdict.landmark, verdict)).collect();
+        let known: BTreeMap<_, _> = verdicts
+            .iter()
+            .map(|verdict| (&verdict.landmark, verdict))
+            .collect();
         let landmarks = pace.landmarks().landmarks();
         let sign = |place: usize| Some(&landmarks.get(place)?.vacancy.as_ref()?.label);
         let agreed = places.into_iter().enumerate().map(|(place, state)| {
-            let (verdict, readings) = (known.get(&state.id).copied(), vote.readings(&state.id, now));
+            let (verdict, readings) =
+                (known.get(&state.id).copied(), vote.readings(&state.id, now));
             answer::agree(state, verdict, readings, sign(place))
         });
         agreed.collect()
@@ -434,11 +522,25 @@ impl Aggregator {
     fn close(&mut self, now: Timestamp) -> Option<Fused> {
         self.foreign.weigh(self.vote.as_mut(), self.tracks.as_mut());
         let pace = self.pace.as_mut().map(|pace| pace.close(now));
-        let tracks = self.tracks.as_mut().map(|tracks| tracks.close(now)).unwrap_or_default();
+        let tracks = self
+            .tracks
+            .as_mut()
+            .map(|tracks| tracks.close(now))
+            .unwrap_or_default();
         let by_packets = self.by_packets;
         let wanted = self.voted || pace.is_none();
-        let is_due = |vote: &&mut Vote| if by_packets { vote.is_packet_complete() } else { wanted };
-        let vote = self.vote.as_mut().filter(is_due).map(|vote| vote.close(now));
+        let is_due = |vote: &&mut Vote| {
+            if by_packets {
+                vote.is_packet_complete()
+            } else {
+                wanted
+            }
+        };
+        let vote = self
+            .vote
+            .as_mut()
+            .filter(is_due)
+            .map(|vote| vote.close(now));
         if let (Some(tracks), Some(vote)) = (&mut self.tracks, &vote) {
             tracks.learn(&vote.evidence);
         }
@@ -448,27 +550,67 @@ impl Aggregator {
         }
         let round = self.take_round_number();
         let fused_at = self.in_cell_time(now);
-        let TracksRound { mut objects, pose_corrections, oldest_capture, evidence: seen } = tracks;
+        let TracksRound {
+            mut objects,
+            pose_corrections,
+            oldest_capture,
+            evidence: seen,
+        } = tracks;
         let mut left_out = limit_shares(&mut objects);
         date_objects(&mut objects, self.cell_offset_us);
-        let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| (Some(vote.verdicts), vote.evidence));
+        let (verdicts, mut evidence) = vote.map_or((None, Vec::new()), |vote| {
+            (Some(vote.verdicts), vote.evidence)
+        });
         evidence.extend(seen);
-        let oldest = [pace.as_ref().and_then(|pace| pace.oldest_capture), oldest_capture].into_iter().flatten().min();
-        let pace = pace.map(|PaceRound { landmarks, .. }| self.agree(landmarks, verdicts.as_deref(), now));
+        let oldest = [
+            pace.as_ref().and_then(|pace| pace.oldest_capture),
+            oldest_capture,
+        ]
+        .into_iter()
+        .flatten()
+        .min();
+        let pace =
+            pace.map(|PaceRound { landmarks, .. }| self.agree(landmarks, verdicts.as_deref(), now));
         let mut map = pace.map(|landmarks| GlobalMap {
             oldest_capture_us: oldest.map(|oldest| self.in_cell_time(oldest)),
             landmarks,
-            neighbour_objects: self.neighbours.shown(&objects, self.tracks.as_ref(), now, self.cell_offset_us),
+            neighbour_objects: self.neighbours.shown(
+                &objects,
+                self.tracks.as_ref(),
+                now,
+                self.cell_offset_us,
+            ),
             objects,
             pose_corrections,
             ..GlobalMap::new(&epoch, round, fused_at)
         });
-        let mut verdicts = verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
+        let mut verdicts =
+            verdicts.map(|verdicts| Verdicts::new(&epoch, round, fused_at, verdicts));
         // What this aggregator publishes passes the check of those who receive it.
-        left_out.extend(map.as_mut().map(Payload::remove_invalid).unwrap_or_default());
-        left_out.extend(verdicts.as_mut().map(Payload::remove_invalid).unwrap_or_default());
-        let reputations = verdicts.as_ref().filter(|_| by_packets).map(|_| self.reputations());
-        Some(Fused { epoch, round, map, verdicts, evidence, reputations, left_out })
+        left_out.extend(
+            map.as_mut()
+                .map(Payload::remove_invalid)
+                .unwrap_or_default(),
+        );
+        left_out.extend(
+            verdicts
+                .as_mut()
+                .map(Payload::remove_invalid)
+                .unwrap_or_default(),
+        );
+        let reputations = verdicts
+            .as_ref()
+            .filter(|_| by_packets)
+            .map(|_| self.reputations());
+        Some(Fused {
+            epoch,
+            round,
+            map,
+            verdicts,
+            evidence,
+            reputations,
+            left_out,
+        })
     }
 }
 
@@ -479,12 +621,17 @@ fn of_vehicle(report: &Arc<ObjectReport>) -> Arc<ObjectReport> {
     if vehicle == report.node {
         return Arc::clone(report);
     }
-    Arc::new(ObjectReport { node: vehicle, ..ObjectReport::clone(report) })
+    Arc::new(ObjectReport {
+        node: vehicle,
+        ..ObjectReport::clone(report)
+    })
 }
 
 /// Moves the dates of objects to another clock.
 fn date_objects(objects: &mut [FusedObject], offset_us: i64) {
     for object in objects.iter_mut().filter(|_| offset_us != 0) {
-        object.first_seen_us = object.first_seen_us.map(|first_seen| first_seen.shifted(offset_us));
+        object.first_seen_us = object
+            .first_seen_us
+            .map(|first_seen| first_seen.shifted(offset_us));
     }
 }

@@ -36,7 +36,10 @@ pub struct ClusterSize {
 /// nothing.
 ///
 /// `limit` may assign a cluster in its own way: the time to solve one grows with the cube of its size.
-pub fn assign<C: Candidate>(candidates: Vec<C>, limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>) -> Vec<C> {
+pub fn assign<C: Candidate>(
+    candidates: Vec<C>,
+    limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>,
+) -> Vec<C> {
     let mut by_cluster = by_cluster(candidates);
     by_cluster.sort_by_key(|(cluster, _)| *cluster);
     let mut assigned = Vec::with_capacity(by_cluster.len());
@@ -55,7 +58,11 @@ pub fn assign<C: Candidate>(candidates: Vec<C>, limit: impl Fn(ClusterSize, &[C]
 /// The candidates, each with the number of its cluster: disjoint sets (Tarjan 1975).
 fn by_cluster<C: Candidate>(candidates: Vec<C>) -> Vec<(u32, C)> {
     let mut parents: Vec<u32> = (0..candidates.len() as u32).collect();
-    let rows = candidates.iter().map(|candidate| candidate.row() as usize + 1).max().unwrap_or(0);
+    let rows = candidates
+        .iter()
+        .map(|candidate| candidate.row() as usize + 1)
+        .max()
+        .unwrap_or(0);
     let mut of_row: Vec<u32> = vec![u32::MAX; rows];
     let mut of_column: HashMap<u32, u32> = HashMap::with_capacity(candidates.len());
     for (number, candidate) in candidates.iter().enumerate() {
@@ -67,7 +74,9 @@ fn by_cluster<C: Candidate>(candidates: Vec<C>) -> Vec<(u32, C)> {
         parents[cluster as usize] = root(&mut parents, of_column);
     }
     let numbered = (0..).zip(candidates);
-    numbered.map(|(number, candidate)| (root(&mut parents, number), candidate)).collect()
+    numbered
+        .map(|(number, candidate)| (root(&mut parents, number), candidate))
+        .collect()
 }
 
 /// The set that a member belongs to, by path halving.
@@ -80,20 +89,31 @@ fn root(parents: &mut [u32], mut member: u32) -> u32 {
     member
 }
 
-fn solve<C: Candidate>(cluster: &[C], limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>, assigned: &mut Vec<C>) {
+fn solve<C: Candidate>(
+    cluster: &[C],
+    limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>,
+    assigned: &mut Vec<C>,
+) {
     let (mut row_of, mut column_of) = (HashMap::new(), HashMap::new());
     let mut cells: Vec<(usize, usize)> = Vec::with_capacity(cluster.len());
     for candidate in cluster {
         let (next_row, next_column) = (row_of.len(), column_of.len());
         let row = *row_of.entry(candidate.row()).or_insert(next_row);
-        cells.push((row, *column_of.entry(candidate.column()).or_insert(next_column)));
+        cells.push((
+            row,
+            *column_of.entry(candidate.column()).or_insert(next_column),
+        ));
     }
     let (rows, columns) = (row_of.len(), column_of.len());
     if let Some(settled) = limit(ClusterSize { rows, columns }, cluster) {
         assigned.extend(settled);
         return;
     }
-    let columns = if C::SPARE_COLUMNS { columns + rows } else { columns };
+    let columns = if C::SPARE_COLUMNS {
+        columns + rows
+    } else {
+        columns
+    };
     // The algorithm requires at least as many columns as rows.
     if rows > columns {
         cells.iter_mut().for_each(|cell| *cell = (cell.1, cell.0));
@@ -103,6 +123,9 @@ fn solve<C: Candidate>(cluster: &[C], limit: impl Fn(ClusterSize, &[C]) -> Optio
         benefits[*cell] = candidate.benefit();
     }
     let (_, best) = kuhn_munkres(&benefits);
-    let chosen = cells.iter().zip(cluster).filter(|((row, column), _)| best[*row] == *column);
+    let chosen = cells
+        .iter()
+        .zip(cluster)
+        .filter(|((row, column), _)| best[*row] == *column);
     assigned.extend(chosen.map(|(_, candidate)| *candidate));
 }

@@ -17,13 +17,21 @@ pub struct ConfigError {
 impl ConfigError {
     /// An error about one key.
     pub fn new(key: impl Into<String>, value: impl Display, allowed: impl Into<String>) -> Self {
-        Self { key: key.into(), value: value.to_string(), allowed: allowed.into() }
+        Self {
+            key: key.into(),
+            value: value.to_string(),
+            allowed: allowed.into(),
+        }
     }
 
     /// The same error with the key below `section`; an error without a key gets that of the section.
     #[must_use]
     pub fn within(mut self, section: &str) -> Self {
-        self.key = if self.key.is_empty() { section.into() } else { format!("{section}.{}", self.key) };
+        self.key = if self.key.is_empty() {
+            section.into()
+        } else {
+            format!("{section}.{}", self.key)
+        };
         self
     }
 }
@@ -75,12 +83,23 @@ pub fn check_range(key: &str, value: f64, low: f64, high: f64) -> Result<(), Con
     if (low..=high).contains(&value) {
         Ok(())
     } else {
-        let shown = if value.abs() < 1e9 { value.to_string() } else { format!("{value:e}") };
-        Err(ConfigError::new(key, shown, format!("a number from {low} to {high}")))
+        let shown = if value.abs() < 1e9 {
+            value.to_string()
+        } else {
+            format!("{value:e}")
+        };
+        Err(ConfigError::new(
+            key,
+            shown,
+            format!("a number from {low} to {high}"),
+        ))
     }
 }
 
 /// A check that a value, if there is one, is a number from `low` to `high`.
-pub(crate) fn check_optional(low: f64, high: f64) -> impl Fn(&Option<f64>) -> Result<(), ConfigError> {
+pub(crate) fn check_optional(
+    low: f64,
+    high: f64,
+) -> impl Fn(&Option<f64>) -> Result<(), ConfigError> {
     move |value| value.map_or(Ok(()), |value| check_range("", value, low, high))
 }

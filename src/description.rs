@@ -148,7 +148,10 @@ impl DescriptionExchange {
 
     /// The description that counts here.
     pub fn current(&self) -> Option<&Arc<CellDescription>> {
-        self.history.current.as_ref().map(|current| &current.description)
+        self.history
+            .current
+            .as_ref()
+            .map(|current| &current.description)
     }
 
     /// The same with those before, as it is to be saved.
@@ -158,12 +161,21 @@ impl DescriptionExchange {
 
     /// Its stamp; version 0 without one.
     pub fn stamp(&self) -> DescriptionStamp {
-        self.current().map(|current| current.stamp()).unwrap_or_default()
+        self.current()
+            .map(|current| current.stamp())
+            .unwrap_or_default()
     }
 
     /// Takes the authenticated word of a node about its description.
-    pub fn hear(&mut self, from: &NodeName, statement: DescriptionStatement, now: Timestamp) -> Vec<DescriptionEffect> {
-        let DescriptionStatement { stamp, may_lead, .. } = statement;
+    pub fn hear(
+        &mut self,
+        from: &NodeName,
+        statement: DescriptionStatement,
+        now: Timestamp,
+    ) -> Vec<DescriptionEffect> {
+        let DescriptionStatement {
+            stamp, may_lead, ..
+        } = statement;
         let is_leader = self.leader == Leader::Other(from.clone());
         if stamp.version > self.highest_plausible() && !is_leader {
             return vec![DescriptionEffect::CountImplausible { from: from.clone() }];
@@ -178,7 +190,11 @@ impl DescriptionExchange {
     }
 
     /// Takes a body from a broker; `description.hash` must be that of its content.
-    pub fn take(&mut self, description: Arc<CellDescription>, now: Timestamp) -> Vec<DescriptionEffect> {
+    pub fn take(
+        &mut self,
+        description: Arc<CellDescription>,
+        now: Timestamp,
+    ) -> Vec<DescriptionEffect> {
         let stamp = description.stamp();
         if stamp < self.stamp() {
             // It may have taken the place of the right one at the broker.
@@ -197,13 +213,21 @@ impl DescriptionExchange {
 
     /// Sets the cell's description at this node, which may lead. Nothing happens if the content is that of the present
     /// one.
-    pub fn set(&mut self, text: String, hash: ContentHash, now: Timestamp) -> Vec<DescriptionEffect> {
+    pub fn set(
+        &mut self,
+        text: String,
+        hash: ContentHash,
+        now: Timestamp,
+    ) -> Vec<DescriptionEffect> {
         if !self.may_lead || self.current().is_some_and(|current| current.text == text) {
             return Vec::new();
         }
         let description = self.described(self.next_version(), hash, text);
         self.adopt(
-            AttributedDescription { description: Arc::clone(&description), authors: Vec::new() },
+            AttributedDescription {
+                description: Arc::clone(&description),
+                authors: Vec::new(),
+            },
             self.name.clone(),
         );
         self.publish(description, now);
@@ -220,7 +244,8 @@ impl DescriptionExchange {
         now: Timestamp,
     ) -> Vec<DescriptionEffect> {
         let version = self.next_version();
-        self.statements.retain(|_, statement| !statement.certificate.as_deref().is_some_and(&is_revoked));
+        self.statements
+            .retain(|_, statement| !statement.certificate.as_deref().is_some_and(&is_revoked));
         // Descriptions of the revoked do not delay the right one.
         self.adopted.clear();
         if self.may_lead && self.history.drop_revoked(is_revoked) {
@@ -229,9 +254,19 @@ impl DescriptionExchange {
                     description: self.described(version, empty, String::new()),
                     authors: Vec::new(),
                 },
-                |AttributedDescription { description, authors }| {
-                    let description = CellDescription { version, ..CellDescription::clone(&description) }.into();
-                    AttributedDescription { description, authors }
+                |AttributedDescription {
+                     description,
+                     authors,
+                 }| {
+                    let description = CellDescription {
+                        version,
+                        ..CellDescription::clone(&description)
+                    }
+                    .into();
+                    AttributedDescription {
+                        description,
+                        authors,
+                    }
                 },
             );
             self.is_due = true;
@@ -241,15 +276,31 @@ impl DescriptionExchange {
     }
 
     fn described(&self, version: u64, hash: ContentHash, text: String) -> Arc<CellDescription> {
-        CellDescription { schema: SCHEMA_VERSION, version, hash, set_by: self.name.clone(), text }.into()
+        CellDescription {
+            schema: SCHEMA_VERSION,
+            version,
+            hash,
+            set_by: self.name.clone(),
+            text,
+        }
+        .into()
     }
 
     /// The version of a change here. Those that have what this node has must be able to take it, whatever somebody else has
     /// stated.
     fn next_version(&self) -> u64 {
-        let of_candidates = self.statements.values().filter(|statement| statement.may_lead);
-        let known = of_candidates.map(|statement| statement.stamp.version).max().unwrap_or(0);
-        known.max(self.stamp().version).saturating_add(1).min(self.highest_plausible())
+        let of_candidates = self
+            .statements
+            .values()
+            .filter(|statement| statement.may_lead);
+        let known = of_candidates
+            .map(|statement| statement.stamp.version)
+            .max()
+            .unwrap_or(0);
+        known
+            .max(self.stamp().version)
+            .saturating_add(1)
+            .min(self.highest_plausible())
     }
 
     /// Notes who leads.
@@ -288,24 +339,42 @@ impl DescriptionExchange {
     /// comes late or was away gets the cell's.
     fn highest_plausible(&self) -> u64 {
         let known = self.stamp().version;
-        let highest = if known == 0 { MAX_FIRST_VERSION } else { known.saturating_add(MAX_VERSION_STEP) };
+        let highest = if known == 0 {
+            MAX_FIRST_VERSION
+        } else {
+            known.saturating_add(MAX_VERSION_STEP)
+        };
         highest.min(MAX_INTEGER)
     }
 
     /// Adopts the greatest body that enough candidates state, unless too many were adopted lately.
     fn adopt_proven(&mut self, now: Timestamp) {
         let authors = |stamp: DescriptionStamp| {
-            self.statements.iter().filter(move |(_, statement)| statement.may_lead && statement.stamp == stamp)
+            self.statements
+                .iter()
+                .filter(move |(_, statement)| statement.may_lead && statement.stamp == stamp)
         };
-        let newer = self.unproven.iter().filter(|body| body.stamp() > self.stamp());
-        let proven = newer.filter_map(|body| Some((Arc::clone(body), self.witness(&authors(body.stamp()))?.clone())));
-        let Some((description, node)) = proven.max_by_key(|(body, _)| body.stamp()) else { return };
-        let certificates = authors(description.stamp()).filter_map(|(_, statement)| statement.certificate.clone());
+        let newer = self
+            .unproven
+            .iter()
+            .filter(|body| body.stamp() > self.stamp());
+        let proven = newer.filter_map(|body| {
+            Some((
+                Arc::clone(body),
+                self.witness(&authors(body.stamp()))?.clone(),
+            ))
+        });
+        let Some((description, node)) = proven.max_by_key(|(body, _)| body.stamp()) else {
+            return;
+        };
+        let certificates =
+            authors(description.stamp()).filter_map(|(_, statement)| statement.certificate.clone());
         let mut authors: Vec<_> = certificates.take(MAX_AUTHORS + 1).collect();
         if authors.len() > MAX_AUTHORS {
             authors.clear();
         }
-        let is_throttled = |first: &Timestamp| now.since(*first) < ADOPTION_INTERVAL * MAX_ADOPTIONS as u32;
+        let is_throttled =
+            |first: &Timestamp| now.since(*first) < ADOPTION_INTERVAL * MAX_ADOPTIONS as u32;
         if self.adopted.len() == MAX_ADOPTIONS {
             if self.adopted.front().is_some_and(is_throttled) {
                 return;
@@ -313,7 +382,13 @@ impl DescriptionExchange {
             self.adopted.pop_front();
         }
         self.adopted.push_back(now);
-        self.adopt(AttributedDescription { description, authors }, node);
+        self.adopt(
+            AttributedDescription {
+                description,
+                authors,
+            },
+            node,
+        );
     }
 
     /// The node on whose statement a description is adopted: of those that state it, an operator's, or the leader where no
@@ -324,9 +399,15 @@ impl DescriptionExchange {
     ) -> Option<&'a NodeName> {
         let is_leader = |author: &NodeName| self.leader == Leader::Other(author.clone());
         let has_none = self.current().is_none();
-        let entitled =
-            authors.clone().find(|(author, statement)| statement.may_describe || has_none && is_leader(author));
-        let many = || authors.clone().nth(MIN_WITNESSES - 1).and_then(|_| authors.clone().next());
+        let entitled = authors
+            .clone()
+            .find(|(author, statement)| statement.may_describe || has_none && is_leader(author));
+        let many = || {
+            authors
+                .clone()
+                .nth(MIN_WITNESSES - 1)
+                .and_then(|_| authors.clone().next())
+        };
         entitled.or_else(many).map(|(author, _)| author)
     }
 
@@ -335,13 +416,17 @@ impl DescriptionExchange {
         self.history.replace(next);
         self.unproven.retain(|body| body.stamp() > stamp);
         self.published = None;
-        self.effects.push(DescriptionEffect::Adopt { description, stated_by });
+        self.effects.push(DescriptionEffect::Adopt {
+            description,
+            stated_by,
+        });
     }
 
     fn publish(&mut self, description: Arc<CellDescription>, now: Timestamp) {
         self.is_due = false;
         self.published = Some((now, self.published.map_or(0, |(_, times)| times) + 1));
-        self.effects.push(DescriptionEffect::Publish { description });
+        self.effects
+            .push(DescriptionEffect::Publish { description });
     }
 
     /// Publishes what somebody lacks: the leader to all, another candidate to a leader that is behind.
@@ -349,7 +434,9 @@ impl DescriptionExchange {
         if let Some(description) = self.current().cloned()
             && self.may_lead
             && self.is_lacking(description.stamp())
-            && self.published.is_none_or(|(at, times)| now.since(at) >= interval_after(times))
+            && self
+                .published
+                .is_none_or(|(at, times)| now.since(at) >= interval_after(times))
         {
             self.publish(description, now);
         }

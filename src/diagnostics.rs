@@ -129,7 +129,14 @@ impl TroubleKind {
 
     /// True if it is noted for each message, so that its rate tells something.
     fn is_counted(self) -> bool {
-        matches!(self, Self::Malformed | Self::MessageRefused | Self::NotFused | Self::NotPermitted | Self::Overload)
+        matches!(
+            self,
+            Self::Malformed
+                | Self::MessageRefused
+                | Self::NotFused
+                | Self::NotPermitted
+                | Self::Overload
+        )
     }
 
     /// True if hosts without the cell's key can cause it, from as many addresses as they like.
@@ -210,7 +217,13 @@ impl KnownTrouble {
 
 impl TroubleRegister {
     /// Notes a trouble of the node itself, or about another; returns it if it is news for the log.
-    pub fn note(&mut self, kind: TroubleKind, about: Option<&str>, cause: &str, now: Timestamp) -> Option<Trouble> {
+    pub fn note(
+        &mut self,
+        kind: TroubleKind,
+        about: Option<&str>,
+        cause: &str,
+        now: Timestamp,
+    ) -> Option<Trouble> {
         self.note_with(kind, about, || cause.to_owned(), kind.remedy(), now)
     }
 
@@ -239,13 +252,25 @@ impl TroubleRegister {
                 let cause = cause();
                 let gist = gist(&cause);
                 if is_due || gist != entry.gist {
-                    let per_second =
-                        if is_present && kind.is_counted() { entry.times / age.as_secs().max(1) } else { 0 };
-                    let rate = if per_second > 0 { format!(", {per_second} a second") } else { String::new() };
-                    (entry.shown, entry.shown_at, entry.gist, entry.times) = (shown(&cause, &rate), now, gist, 0);
+                    let per_second = if is_present && kind.is_counted() {
+                        entry.times / age.as_secs().max(1)
+                    } else {
+                        0
+                    };
+                    let rate = if per_second > 0 {
+                        format!(", {per_second} a second")
+                    } else {
+                        String::new()
+                    };
+                    (entry.shown, entry.shown_at, entry.gist, entry.times) =
+                        (shown(&cause, &rate), now, gist, 0);
                 }
             }
-            let interval = if entry.gist == entry.logged_gist { LOG_INTERVAL } else { NEW_CAUSE_INTERVAL };
+            let interval = if entry.gist == entry.logged_gist {
+                LOG_INTERVAL
+            } else {
+                NEW_CAUSE_INTERVAL
+            };
             return (now.since(entry.logged_at) >= interval).then(|| {
                 (entry.logged_at, entry.logged_gist) = (now, entry.gist.clone());
                 entry.shown.clone()
@@ -253,7 +278,8 @@ impl TroubleRegister {
         }
         if !self.make_room(&key, now) {
             let (about, kind) = (key.0.unwrap_or_default(), kind.as_str());
-            let cause = format!("there are more troubles than have room here, such as {kind} of {about}");
+            let cause =
+                format!("there are more troubles than have room here, such as {kind} of {about}");
             return self.note(TroubleKind::NotShown, None, &cause, now);
         }
         let cause = cause();
@@ -281,7 +307,10 @@ impl TroubleRegister {
 
     /// Notes that all troubles of a kind are over, whomever they are about.
     pub fn settle_all(&mut self, kind: TroubleKind) {
-        let of_kind = self.entries.iter_mut().filter(|((_, noted), _)| *noted == kind);
+        let of_kind = self
+            .entries
+            .iter_mut()
+            .filter(|((_, noted), _)| *noted == kind);
         of_kind.for_each(|(_, entry)| entry.is_settled = true);
     }
 
@@ -302,16 +331,22 @@ impl TroubleRegister {
             return true;
         }
         self.make_room_in(MAX_ABOUT_ONE, now, |(other, _)| other == about)
-            && (!kind.is_of_strangers() || self.make_room_in(MAX_OF_STRANGERS, now, |(_, kind)| kind.is_of_strangers()))
+            && (!kind.is_of_strangers()
+                || self.make_room_in(MAX_OF_STRANGERS, now, |(_, kind)| kind.is_of_strangers()))
             && self.make_room_in(MAX_ABOUT_OTHERS, now, |(other, _)| other.is_some())
     }
 
     /// The same for one crowd of at most so many entries.
     fn make_room_in(&mut self, most: usize, now: Timestamp, is_in: impl Fn(&Key) -> bool) -> bool {
         while self.entries.keys().filter(|key| is_in(key)).count() >= most {
-            let lapsed = self.entries.iter().filter(|(key, entry)| is_in(key) && !entry.is_present(key.1, now));
+            let lapsed = self
+                .entries
+                .iter()
+                .filter(|(key, entry)| is_in(key) && !entry.is_present(key.1, now));
             let oldest = lapsed.min_by_key(|(_, entry)| entry.seen_at);
-            let Some(key) = oldest.map(|(key, _)| key.clone()) else { return false };
+            let Some(key) = oldest.map(|(key, _)| key.clone()) else {
+                return false;
+            };
             self.entries.remove(&key);
         }
         true
@@ -333,12 +368,18 @@ fn shortened(text: &str, max_bytes: usize) -> String {
         return plain_text(text, max_bytes);
     }
     let cut = plain_text(text, max_bytes - ELLIPSIS.len());
-    cut.rsplit_once(' ').map_or(&*cut, |(words, _)| words).to_owned() + ELLIPSIS
+    cut.rsplit_once(' ')
+        .map_or(&*cut, |(words, _)| words)
+        .to_owned()
+        + ELLIPSIS
 }
 
 /// A cause without its figures.
 fn gist(cause: &str) -> String {
-    cause.chars().filter(|letter| !letter.is_ascii_digit() && !matches!(letter, '.' | '-')).collect()
+    cause
+        .chars()
+        .filter(|letter| !letter.is_ascii_digit() && !matches!(letter, '.' | '-'))
+        .collect()
 }
 
 #[cfg(test)]
@@ -352,7 +393,8 @@ mod tests {
     }
 
     fn shown(register: &TroubleRegister, now: Timestamp) -> Vec<String> {
-        let text = |trouble: Trouble| format!("{}: {}", trouble.about.unwrap_or_default(), trouble.cause);
+        let text =
+            |trouble: Trouble| format!("{}: {}", trouble.about.unwrap_or_default(), trouble.cause);
         register.present(now).into_iter().map(text).collect()
     }
 
@@ -361,30 +403,69 @@ mod tests {
         let mut register = TroubleRegister::default();
         let mut lines = 0;
         for s in 0..7300 {
-            let news = register.note(TroubleKind::Malformed, Some("watson"), &format!("{s} reports"), at(s));
+            let news = register.note(
+                TroubleKind::Malformed,
+                Some("watson"),
+                &format!("{s} reports"),
+                at(s),
+            );
             lines += usize::from(news.is_some());
         }
         assert_eq!(lines, 3);
-        assert_eq!(shown(&register, at(7300)), ["watson: 7290 reports, 1 a second"], "words change every ten seconds");
+        assert_eq!(
+            shown(&register, at(7300)),
+            ["watson: 7290 reports, 1 a second"],
+            "words change every ten seconds"
+        );
         assert!(register.present(at(7310)).is_empty());
-        assert!(register.note(TroubleKind::Malformed, Some("watson"), "9 reports", at(7400)).is_none());
-        assert_eq!(shown(&register, at(7400)), ["watson: 9 reports"], "it is back, and was logged within the hour");
+        assert!(
+            register
+                .note(
+                    TroubleKind::Malformed,
+                    Some("watson"),
+                    "9 reports",
+                    at(7400)
+                )
+                .is_none()
+        );
+        assert_eq!(
+            shown(&register, at(7400)),
+            ["watson: 9 reports"],
+            "it is back, and was logged within the hour"
+        );
     }
 
     #[test]
     fn a_long_cause_ends_after_a_whole_word() {
         let mut register = TroubleRegister::default();
-        register.note(TroubleKind::ImplausibleSize, None, &"`camera.projection` is 180 ".repeat(20), at(1));
+        register.note(
+            TroubleKind::ImplausibleSize,
+            None,
+            &"`camera.projection` is 180 ".repeat(20),
+            at(1),
+        );
         let [cause] = shown(&register, at(1)).try_into().unwrap();
-        assert!(cause.ends_with(" …") && cause.len() <= MAX_TROUBLE_TEXT + 2, "{cause}");
+        assert!(
+            cause.ends_with(" …") && cause.len() <= MAX_TROUBLE_TEXT + 2,
+            "{cause}"
+        );
         let last = cause.trim_end_matches(" …").rsplit(' ').next();
-        assert!(["`camera.projection`", "is", "180"].map(Some).contains(&last), "{cause}");
+        assert!(
+            ["`camera.projection`", "is", "180"]
+                .map(Some)
+                .contains(&last),
+            "{cause}"
+        );
     }
 
     #[test]
     fn what_lasts_is_over_when_its_part_says_so() {
         let mut register = TroubleRegister::default();
-        assert!(register.note(TroubleKind::Camera, None, "no frame for 5 s", at(1)).is_some());
+        assert!(
+            register
+                .note(TroubleKind::Camera, None, "no frame for 5 s", at(1))
+                .is_some()
+        );
         assert_eq!(register.present(at(100_000)).len(), 1);
         register.settle(TroubleKind::Camera, None);
         assert!(register.present(at(100_000)).is_empty());
@@ -394,19 +475,39 @@ mod tests {
     #[test]
     fn invented_names_find_no_room_and_leave_none_of_theirs_behind() {
         let mut register = TroubleRegister::default();
-        register.note(TroubleKind::ClockOff, Some("gauss"), "its clock is 5.0 s ahead", at(0));
+        register.note(
+            TroubleKind::ClockOff,
+            Some("gauss"),
+            "its clock is 5.0 s ahead",
+            at(0),
+        );
         for n in 0..1000 {
-            register.note(TroubleKind::Malformed, Some(&format!("v{n}")), "a\nb\u{202E}", at(0));
+            register.note(
+                TroubleKind::Malformed,
+                Some(&format!("v{n}")),
+                "a\nb\u{202E}",
+                at(0),
+            );
         }
         register.note(TroubleKind::Camera, None, "no frame", at(1));
         let present = register.present(at(1));
         assert_eq!(present.len(), MAX_ABOUT_OTHERS + 2);
-        let own = present.iter().take(2).map(|own| (own.kind.as_str(), own.about.as_deref()));
-        assert_eq!(own.collect::<Vec<_>>(), [("camera", None), ("not_shown", None)]);
+        let own = present
+            .iter()
+            .take(2)
+            .map(|own| (own.kind.as_str(), own.about.as_deref()));
+        assert_eq!(
+            own.collect::<Vec<_>>(),
+            [("camera", None), ("not_shown", None)]
+        );
         assert_eq!(present[2].about.as_deref(), Some("gauss"));
         assert_eq!(present[3].cause, "a b ");
         register.note(TroubleKind::Malformed, Some("late"), "x", at(60));
-        assert_eq!(shown(&register, at(60)), [": no frame", "late: x"], "lapsed ones give way");
+        assert_eq!(
+            shown(&register, at(60)),
+            [": no frame", "late: x"],
+            "lapsed ones give way"
+        );
     }
 
     #[test]
@@ -414,18 +515,45 @@ mod tests {
         let mut register = TroubleRegister::default();
         let lines = (0..100).filter(|host| {
             let about = format!("10.0.0.{host}");
-            register.note(TroubleKind::WrongKey, Some(&about), "heard with another key", at(0)).is_some()
+            register
+                .note(
+                    TroubleKind::WrongKey,
+                    Some(&about),
+                    "heard with another key",
+                    at(0),
+                )
+                .is_some()
         });
-        assert_eq!(lines.count(), MAX_OF_STRANGERS + 1, "the last says that there are more");
-        assert!(register.note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0)).is_some());
+        assert_eq!(
+            lines.count(),
+            MAX_OF_STRANGERS + 1,
+            "the last says that there are more"
+        );
+        assert!(
+            register
+                .note(TroubleKind::Malformed, Some("watson"), "x_m is NaN", at(0))
+                .is_some()
+        );
         assert_eq!(register.present(at(0)).len(), MAX_OF_STRANGERS + 2);
     }
 
     #[test]
     fn another_cause_is_shown_at_once_and_logged_within_a_minute() {
         let mut register = TroubleRegister::default();
-        register.note(TroubleKind::BrokerRefuses, Some("hub:1883"), "wrong password", at(0));
-        let mut note = |s| register.note(TroubleKind::BrokerRefuses, Some("hub:1883"), "certificate expired", at(s));
+        register.note(
+            TroubleKind::BrokerRefuses,
+            Some("hub:1883"),
+            "wrong password",
+            at(0),
+        );
+        let mut note = |s| {
+            register.note(
+                TroubleKind::BrokerRefuses,
+                Some("hub:1883"),
+                "certificate expired",
+                at(s),
+            )
+        };
         assert!(note(1).is_none());
         assert_eq!(note(60).unwrap().cause, "certificate expired");
         assert!(note(200).is_none(), "once");
@@ -437,7 +565,10 @@ mod tests {
         for about in ["", "a".repeat(200).as_str(), "a\u{202E}b"] {
             let mut register = TroubleRegister::default();
             register.note(TroubleKind::BrokerRefuses, Some(about), "refused", at(0));
-            assert!(register.present(at(0))[0].about.is_some(), "it is not the node's own");
+            assert!(
+                register.present(at(0))[0].about.is_some(),
+                "it is not the node's own"
+            );
             register.settle(TroubleKind::BrokerRefuses, Some(about));
             assert!(register.present(at(0)).is_empty());
         }
@@ -448,10 +579,21 @@ mod tests {
         let manual = include_str!("../docs/troubleshooting.md");
         let (_, tests) = manual.split_once("| kind | test |").unwrap();
         for kind in TroubleKind::ALL {
-            assert!(manual.contains(&format!("\n| `{}` |", kind.as_str())), "{kind:?}");
-            assert!(tests.lines().any(|row| row.contains(&format!("`{}`", kind.as_str()))), "no test makes {kind:?}");
+            assert!(
+                manual.contains(&format!("\n| `{}` |", kind.as_str())),
+                "{kind:?}"
+            );
+            assert!(
+                tests
+                    .lines()
+                    .any(|row| row.contains(&format!("`{}`", kind.as_str()))),
+                "no test makes {kind:?}"
+            );
             assert_eq!(TroubleKind::named(kind.as_str()), Some(*kind));
-            assert!((10..MAX_TROUBLE_TEXT).contains(&kind.remedy().len()), "{kind:?}");
+            assert!(
+                (10..MAX_TROUBLE_TEXT).contains(&kind.remedy().len()),
+                "{kind:?}"
+            );
         }
     }
 }

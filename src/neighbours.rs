@@ -122,10 +122,15 @@ impl Neighbours {
         }
         self.forget_silent(received_at);
         let AdmittedMap { age } = self.filter.admit(topic, &message, received_at)?;
-        let CellMap { cell, origin, map, .. } = message;
+        let CellMap {
+            cell, origin, map, ..
+        } = message;
         let fused_at = received_at - age;
         let clock_us = fused_at.micros_from(map.fused_at_us);
-        let (change, area) = (FrameChange::new(&origin, &self.origin), CoveredArea::of(topic.tile));
+        let (change, area) = (
+            FrameChange::new(&origin, &self.origin),
+            CoveredArea::of(topic.tile),
+        );
         let losses = self.losses.entry(cell.clone()).or_default();
         let mut near = Vec::new();
         for mut object in map.objects {
@@ -136,8 +141,9 @@ impl Neighbours {
             }
             change.apply(&place, &mut object);
             let earliest = fused_at - MAX_SEEN_FOR;
-            object.first_seen_us =
-                object.first_seen_us.map(|first_seen| first_seen.shifted(clock_us).clamp(earliest, fused_at));
+            object.first_seen_us = object
+                .first_seen_us
+                .map(|first_seen| first_seen.shifted(clock_us).clamp(earliest, fused_at));
             object.contributors.clear();
             if object.scores.len() > MAX_SCORES {
                 object.scores.clear();
@@ -160,15 +166,25 @@ impl Neighbours {
         let held: usize = self.cells.values().map(|map| map.objects.len()).sum();
         let room = MAX_OBJECTS.saturating_sub(held).min(MAX_OBJECTS_EACH);
         losses.refused += near.len().saturating_sub(room) as u64;
-        let objects = near.into_iter().take(room).map(|(_, object)| object).collect();
+        let objects = near
+            .into_iter()
+            .take(room)
+            .map(|(_, object)| object)
+            .collect();
         self.cells.insert(cell, NeighbourMap { fused_at, objects });
         Ok(())
     }
 
     /// Takes a map of this cell, closed at `now`: it tells where this cell is.
     pub fn observe_own(&mut self, map: &GlobalMap, now: Timestamp) {
-        let objects = map.objects.iter().map(|object| Point2::new(object.x_m, object.y_m));
-        let places = map.landmarks.iter().map(|place| Point2::new(place.x_m, place.y_m));
+        let objects = map
+            .objects
+            .iter()
+            .map(|object| Point2::new(object.x_m, object.y_m));
+        let places = map
+            .landmarks
+            .iter()
+            .map(|place| Point2::new(place.x_m, place.y_m));
         self.extent.observe(objects.chain(places), now);
     }
 
@@ -178,7 +194,11 @@ impl Neighbours {
         let of_cell = |(cell, map): (&NodeName, &NeighbourMap)| {
             let (cell, age_s) = (cell.clone(), now.since(map.fused_at).as_secs_f64());
             let objects = map.objects.clone().into_iter();
-            objects.map(move |object| NeighbourObject { cell: cell.clone(), age_s, object })
+            objects.map(move |object| NeighbourObject {
+                cell: cell.clone(),
+                age_s,
+                object,
+            })
         };
         self.cells.iter().flat_map(of_cell).collect()
     }
@@ -189,7 +209,8 @@ impl Neighbours {
     }
 
     fn forget_silent(&mut self, now: Timestamp) {
-        self.cells.retain(|_, map| now.since(map.fused_at) <= MAX_AGE);
+        self.cells
+            .retain(|_, map| now.since(map.fused_at) <= MAX_AGE);
         self.filter.forget_silent(now);
         let filter = &self.filter;
         self.losses.retain(|cell, _| filter.knows(cell));

@@ -79,7 +79,9 @@ config_section! {
 impl PaceConfig {
     /// The reported covariance; without one, its default reaches the gate in metres and in sigmas alike.
     fn covariance(&self, object: &PerceivedObject) -> Covariance {
-        object.covariance().unwrap_or_else(|| Covariance::isotropic(self.gate_m / self.gate_sigmas))
+        object
+            .covariance()
+            .unwrap_or_else(|| Covariance::isotropic(self.gate_m / self.gate_sigmas))
     }
 
     fn max_age(&self) -> Duration {
@@ -88,7 +90,11 @@ impl PaceConfig {
 
     /// The gate between a detection and its landmark.
     pub fn gate(&self) -> LandmarkGate {
-        LandmarkGate { radius_m: self.gate_m, sigmas: self.gate_sigmas, floor_m: self.position_floor_m }
+        LandmarkGate {
+            radius_m: self.gate_m,
+            sigmas: self.gate_sigmas,
+            floor_m: self.position_floor_m,
+        }
     }
 }
 
@@ -123,7 +129,9 @@ impl Pace {
     #[must_use]
     pub(crate) fn configured(self, config: PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         match (self, config.mode) {
-            (Self::Paper(pace), PaceMode::Paper) => Self::Paper(pace.configured(&config, landmarks)),
+            (Self::Paper(pace), PaceMode::Paper) => {
+                Self::Paper(pace.configured(&config, landmarks))
+            }
             (Self::Bayes(pace), PaceMode::Bayes) => Self::Bayes(pace.configured(config, landmarks)),
             _ => Self::new(config, landmarks),
         }

@@ -82,7 +82,10 @@ impl Default for ReplayConfig {
             aggregator: NodeName::from_static("replay"),
             fusion,
             landmarks: Vec::new(),
-            limits: Limits { objects: usize::MAX, ..Limits::default() },
+            limits: Limits {
+                objects: usize::MAX,
+                ..Limits::default()
+            },
             passes: None,
         }
     }
@@ -116,7 +119,12 @@ pub struct Summary {
 impl Summary {
     /// Number of used lines.
     pub fn used(&self) -> u64 {
-        self.lines - self.rejected.values().map(|rejections| rejections.lines).sum::<u64>()
+        self.lines
+            - self
+                .rejected
+                .values()
+                .map(|rejections| rejections.lines)
+                .sum::<u64>()
     }
 
     /// Number of rejected lines, but for those of an algorithm that the cell does not run, and with `may_repeat` for those
@@ -127,7 +135,10 @@ impl Summary {
             RejectReason::OutOfOrder => !may_repeat,
             _ => true,
         };
-        let faults = self.rejected.iter().filter(|(reason, _)| is_fault(**reason));
+        let faults = self
+            .rejected
+            .iter()
+            .filter(|(reason, _)| is_fault(**reason));
         faults.map(|(_, rejections)| rejections.lines).sum()
     }
 }
@@ -168,7 +179,12 @@ impl Replay {
     /// A replay without lines; `config` is taken as valid.
     pub fn new(mut config: ReplayConfig) -> Self {
         if config.passes.is_some() {
-            let FusionConfig { algorithms, window, vote, .. } = &mut config.fusion;
+            let FusionConfig {
+                algorithms,
+                window,
+                vote,
+                ..
+            } = &mut config.fusion;
             *algorithms = Algorithms::Vote;
             (vote.weighted.freshness_s, vote.weighted.hysteresis) = (FOREVER_S, 0.0);
             vote.weighted.smoothing_share = 0.0;
@@ -201,12 +217,22 @@ impl Replay {
     }
 
     /// Takes the next report of a recording without lines; it counts as one line.
-    pub fn report(&mut self, kind: ReportKind, report: ObjectReport, received_at: Timestamp) -> Vec<FusedLine> {
+    pub fn report(
+        &mut self,
+        kind: ReportKind,
+        report: ObjectReport,
+        received_at: Timestamp,
+    ) -> Vec<FusedLine> {
         self.number += 1;
         self.summary.lines += 1;
         let checked = report.check_values(&self.config.limits);
         self.push(match checked {
-            Ok(()) => Ok(RecordedReport { kind, at: received_at, is_placed: true, report }),
+            Ok(()) => Ok(RecordedReport {
+                kind,
+                at: received_at,
+                is_placed: true,
+                report,
+            }),
             Err(InvalidValue { field, reason }) => Err(Flaw::new(reason, field, "is not valid")),
         })
     }
@@ -258,7 +284,11 @@ impl Replay {
             }
             Err(flaw) => self.reject(self.number, flaw),
         }
-        if self.ahead.len() > LOOKAHEAD { self.process_next() } else { Vec::new() }
+        if self.ahead.len() > LOOKAHEAD {
+            self.process_next()
+        } else {
+            Vec::new()
+        }
     }
 
     fn reject(&mut self, number: u64, flaw: Flaw) {
@@ -274,10 +304,17 @@ impl Replay {
     /// Takes the oldest of the lines that were read ahead.
     fn process_next(&mut self) -> Vec<FusedLine> {
         let mut output = Vec::new();
-        let Some((number, mut line)) = self.ahead.pop_front() else { return output };
-        let is_plausible = self.clock.is_plausible(line.at, self.ahead.iter().map(|(_, line)| line.at));
+        let Some((number, mut line)) = self.ahead.pop_front() else {
+            return output;
+        };
+        let is_plausible = self
+            .clock
+            .is_plausible(line.at, self.ahead.iter().map(|(_, line)| line.at));
         if !is_plausible && self.config.passes.is_none() {
-            self.reject(number, flaw::of_time_ahead(line.at != line.report.captured_at_us));
+            self.reject(
+                number,
+                flaw::of_time_ahead(line.at != line.report.captured_at_us),
+            );
             return output;
         }
         let before = self.clock.now();
@@ -292,8 +329,15 @@ impl Replay {
         }
         self.close_due_rounds(before, now, &mut output);
         self.learn_landmarks(&line);
-        let votes = if line.kind == ReportKind::VoteDetections { line.report.objects.len() as u64 } else { 0 };
-        match self.cell(now).report(line.kind, &Arc::new(line.report), now) {
+        let votes = if line.kind == ReportKind::VoteDetections {
+            line.report.objects.len() as u64
+        } else {
+            0
+        };
+        match self
+            .cell(now)
+            .report(line.kind, &Arc::new(line.report), now)
+        {
             Ok(fused) => {
                 self.summary.late += u64::from(is_late);
                 self.summary.votes += votes;
@@ -307,8 +351,21 @@ impl Replay {
     }
 
     fn cell(&mut self, now: Timestamp) -> &mut Aggregator {
-        let ReplayConfig { aggregator, fusion, landmarks, .. } = &self.config;
-        self.cell.get_or_insert_with(|| Aggregator::new(aggregator.clone(), 1, fusion.clone(), landmarks.clone(), now))
+        let ReplayConfig {
+            aggregator,
+            fusion,
+            landmarks,
+            ..
+        } = &self.config;
+        self.cell.get_or_insert_with(|| {
+            Aggregator::new(
+                aggregator.clone(),
+                1,
+                fusion.clone(),
+                landmarks.clone(),
+                now,
+            )
+        })
     }
 
     /// Closes the rounds that were due before `now`; of a silence since `before`, only those at its beginning.
@@ -322,7 +379,11 @@ impl Replay {
         let period = Duration::from_secs_f64(self.config.fusion.round.period_s);
         let silent_from = before + SILENCE.max(3 * period);
         while let Some(deadline) = self.cell.as_ref().map(Aggregator::deadline) {
-            let patience = if self.pending { Duration::ZERO } else { period / 2 };
+            let patience = if self.pending {
+                Duration::ZERO
+            } else {
+                period / 2
+            };
             let due = deadline.max(before);
             if due + patience >= now || deadline > silent_from {
                 break;
@@ -349,10 +410,20 @@ impl Replay {
 
     /// Writes a round. Algorithms without reports yet write nothing; with passes, only the last one writes.
     fn write(&mut self, fused: Option<Fused>, output: &mut Vec<FusedLine>) {
-        let Some(Fused { map, verdicts, .. }) = fused.filter(|_| self.config.passes.is_none()) else { return };
+        let Some(Fused { map, verdicts, .. }) = fused.filter(|_| self.config.passes.is_none())
+        else {
+            return;
+        };
         let known = output.len();
-        output.extend(map.filter(|_| self.heard[ReportKind::Detections as usize]).map(FusedLine::Map));
-        output.extend(verdicts.filter(|_| self.heard[ReportKind::VoteDetections as usize]).map(FusedLine::Verdicts));
+        output.extend(
+            map.filter(|_| self.heard[ReportKind::Detections as usize])
+                .map(FusedLine::Map),
+        );
+        output.extend(
+            verdicts
+                .filter(|_| self.heard[ReportKind::VoteDetections as usize])
+                .map(FusedLine::Verdicts),
+        );
         self.summary.written += (output.len() - known) as u64;
     }
 
@@ -366,7 +437,11 @@ impl Replay {
         for object in &line.report.objects {
             let Some(id) = &object.landmark else { continue };
             if self.learnt.len() < MAX_LEARNT_LANDMARKS && self.learnt.insert(id.clone()) {
-                fresh.push(Landmark::from(&LandmarkConfig::at(id.clone(), object.x_m, object.y_m)));
+                fresh.push(Landmark::from(&LandmarkConfig::at(
+                    id.clone(),
+                    object.x_m,
+                    object.y_m,
+                )));
             }
         }
         if !fresh.is_empty() {

@@ -63,7 +63,11 @@ impl Counts {
 
     /// Counts one vote.
     pub(crate) fn add(&mut self, correct: bool) {
-        let count = if correct { &mut self.correct } else { &mut self.incorrect };
+        let count = if correct {
+            &mut self.correct
+        } else {
+            &mut self.incorrect
+        };
         *count = count.saturating_add(1);
     }
 

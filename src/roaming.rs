@@ -68,7 +68,12 @@ pub struct CellChoice {
 impl CellChoice {
     /// The choice among `cells` of a vehicle that is in `present`.
     pub fn new(cells: Vec<KnownCell>, present: NodeName) -> Self {
-        Self { cells, present, next: None, failed: BTreeMap::new() }
+        Self {
+            cells,
+            present,
+            next: None,
+            failed: BTreeMap::new(),
+        }
     }
 
     /// The cell in which the vehicle takes part.
@@ -77,9 +82,17 @@ impl CellChoice {
     }
 
     /// Takes the vehicle's position at `now`, none if it is not known. The same again lets time pass.
-    pub fn observe(&mut self, place: Option<&GeographicPosition>, now: Timestamp) -> Option<CellMove> {
+    pub fn observe(
+        &mut self,
+        place: Option<&GeographicPosition>,
+        now: Timestamp,
+    ) -> Option<CellMove> {
         self.failed.retain(|_, until| *until > now);
-        if let Some((next, _)) = self.next.clone().filter(|(_, since)| now.since(*since) > JOIN_TIMEOUT) {
+        if let Some((next, _)) = self
+            .next
+            .clone()
+            .filter(|(_, since)| now.since(*since) > JOIN_TIMEOUT)
+        {
             self.fail(&next, now);
             return Some(CellMove::GiveUp(next));
         }
@@ -95,9 +108,13 @@ impl CellChoice {
             self.failed.insert(left.clone(), now + TURN_PAUSE);
             return Some(CellMove::GiveUp(left));
         }
-        let others =
-            self.cells.iter().filter(|cell| cell.name != self.present && !self.failed.contains_key(&cell.name));
-        let nearest = others.map(|cell| (cell.outside_m(place), &cell.name)).min_by(|a, b| a.0.total_cmp(&b.0))?;
+        let others = self
+            .cells
+            .iter()
+            .filter(|cell| cell.name != self.present && !self.failed.contains_key(&cell.name));
+        let nearest = others
+            .map(|cell| (cell.outside_m(place), &cell.name))
+            .min_by(|a, b| a.0.total_cmp(&b.0))?;
         let (nearest_m, name) = (nearest.0, nearest.1.clone());
         if nearest_m > 0.0 || nearest_m + MARGIN_M >= present_m {
             return None;
@@ -108,7 +125,9 @@ impl CellChoice {
 
     /// Notes that the vehicle follows in the next cell; true if that is its cell from now on.
     pub fn enter(&mut self, cell: &NodeName) -> bool {
-        let Some((next, _)) = self.next.take_if(|(next, _)| next == cell) else { return false };
+        let Some((next, _)) = self.next.take_if(|(next, _)| next == cell) else {
+            return false;
+        };
         self.present = next;
         true
     }
@@ -136,7 +155,12 @@ mod tests {
     }
 
     fn middle() -> GeographicOrigin {
-        GeographicOrigin { latitude_deg: LATITUDE_DEG, longitude_deg: LONGITUDE_DEG, height_m: 0.0, rotation_deg: 0.0 }
+        GeographicOrigin {
+            latitude_deg: LATITUDE_DEG,
+            longitude_deg: LONGITUDE_DEG,
+            height_m: 0.0,
+            rotation_deg: 0.0,
+        }
     }
 
     /// A place on a road through the middles of all cells.
@@ -147,9 +171,21 @@ mod tests {
     /// Three cells in a row, each with a radius of 200 m.
     fn cells() -> Vec<KnownCell> {
         let cell = |number| {
-            let GeographicPosition { latitude_deg, longitude_deg, .. } = at(SPACING_M * number as f64, 0.0);
-            let origin = GeographicOrigin { latitude_deg, longitude_deg, ..middle() };
-            KnownCell { name: name(number), origin, radius_m: 200.0 }
+            let GeographicPosition {
+                latitude_deg,
+                longitude_deg,
+                ..
+            } = at(SPACING_M * number as f64, 0.0);
+            let origin = GeographicOrigin {
+                latitude_deg,
+                longitude_deg,
+                ..middle()
+            };
+            KnownCell {
+                name: name(number),
+                origin,
+                radius_m: 200.0,
+            }
         };
         (0..3).map(cell).collect()
     }
@@ -197,7 +233,20 @@ mod tests {
 
     #[test]
     fn a_vehicle_that_turns_back_stays_and_one_outside_of_all_cells_too() {
-        assert_eq!(drive(|s| (if s < 11.7 { 13.9 * s } else { 13.9 * (23.4 - s) }, 0.0), 20.0), []);
+        assert_eq!(
+            drive(
+                |s| (
+                    if s < 11.7 {
+                        13.9 * s
+                    } else {
+                        13.9 * (23.4 - s)
+                    },
+                    0.0
+                ),
+                20.0
+            ),
+            []
+        );
         assert_eq!(drive(|s| (0.0, 13.9 * s), 60.0), []);
     }
 
@@ -205,12 +254,26 @@ mod tests {
     fn a_cell_that_does_not_answer_is_given_up_and_tried_again_later() {
         let mut choice = CellChoice::new(cells(), name(0));
         let place = at(SPACING_M, 0.0);
-        assert_eq!(choice.observe(Some(&place), s(0.0)), Some(CellMove::Join(name(1))));
+        assert_eq!(
+            choice.observe(Some(&place), s(0.0)),
+            Some(CellMove::Join(name(1)))
+        );
         assert_eq!(choice.observe(Some(&place), s(14.0)), None);
-        assert_eq!(choice.observe(None, s(15.5)), Some(CellMove::GiveUp(name(1))), "also where no position is known");
+        assert_eq!(
+            choice.observe(None, s(15.5)),
+            Some(CellMove::GiveUp(name(1))),
+            "also where no position is known"
+        );
         assert_eq!(choice.present(), &name(0));
-        assert_eq!(choice.observe(Some(&place), s(40.0)), None, "it is left alone");
-        assert_eq!(choice.observe(Some(&place), s(46.0)), Some(CellMove::Join(name(1))));
+        assert_eq!(
+            choice.observe(Some(&place), s(40.0)),
+            None,
+            "it is left alone"
+        );
+        assert_eq!(
+            choice.observe(Some(&place), s(46.0)),
+            Some(CellMove::Join(name(1)))
+        );
         assert!(!choice.enter(&name(2)), "only the next cell is entered");
         choice.fail(&name(1), s(47.0));
         assert!(!choice.enter(&name(1)));
@@ -220,22 +283,35 @@ mod tests {
     fn a_vehicle_that_goes_to_and_fro_joins_once_in_some_seconds() {
         let mut choice = CellChoice::new(cells(), name(0));
         let places = [at(SPACING_M, 0.0), at(0.0, 0.0)];
-        let moves = (0..100).filter_map(|tick| choice.observe(Some(&places[tick % 2]), s(0.2 * tick as f64)));
-        let joins = moves.filter(|step| matches!(step, CellMove::Join(_))).count();
+        let moves = (0..100)
+            .filter_map(|tick| choice.observe(Some(&places[tick % 2]), s(0.2 * tick as f64)));
+        let joins = moves
+            .filter(|step| matches!(step, CellMove::Join(_)))
+            .count();
         assert!((2..=4).contains(&joins), "{joins} in 20 s");
     }
 
     #[test]
     fn a_vehicle_high_above_the_sea_changes_cells_too() {
         let mut choice = CellChoice::new(cells(), name(0));
-        let place = GeographicPosition { height_m: 1500.0, ..at(SPACING_M, 0.0) };
-        assert_eq!(choice.observe(Some(&place), s(0.0)), Some(CellMove::Join(name(1))));
+        let place = GeographicPosition {
+            height_m: 1500.0,
+            ..at(SPACING_M, 0.0)
+        };
+        assert_eq!(
+            choice.observe(Some(&place), s(0.0)),
+            Some(CellMove::Join(name(1)))
+        );
     }
 
     #[test]
     fn the_other_side_of_the_earth_is_far_away() {
         let mut choice = CellChoice::new(cells(), name(2));
-        let place = GeographicPosition { latitude_deg: -52.2, longitude_deg: -159.0, height_m: 0.0 };
+        let place = GeographicPosition {
+            latitude_deg: -52.2,
+            longitude_deg: -159.0,
+            height_m: 0.0,
+        };
         assert_eq!(choice.observe(Some(&place), s(0.0)), None);
     }
 

@@ -43,7 +43,8 @@ use crate::model::time::Timestamp;
 use crate::perception::landmark::Landmark;
 use crate::reputation::{Evidence, ReputationLedger};
 use crate::wire::{
-    ForeignVotes, LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation, Verdict,
+    ForeignVotes, LabelReading, Limits, ObjectReport, PerceivedObject, RejectReason, Reputation,
+    Verdict,
 };
 use configured_method::ConfiguredMethod;
 use method::NewVote;
@@ -118,7 +119,10 @@ impl Vote {
         Self {
             config,
             open: landmarks.is_empty(),
-            landmarks: landmarks.into_iter().map(|l| (l.id.clone(), Some(l))).collect(),
+            landmarks: landmarks
+                .into_iter()
+                .map(|l| (l.id.clone(), Some(l)))
+                .collect(),
             arrivals: VecDeque::new(),
             last_reports: BTreeMap::new(),
             method,
@@ -131,21 +135,36 @@ impl Vote {
     #[must_use]
     pub(crate) fn configured(mut self, config: VoteConfig, landmarks: Vec<Landmark>) -> Self {
         if config.mode != self.config.mode {
-            return Self { last_reports: self.last_reports, ..Self::new(config, landmarks) };
+            return Self {
+                last_reports: self.last_reports,
+                ..Self::new(config, landmarks)
+            };
         }
         let method = self.method.get_mut();
         method.configure(&config);
         let is_open = landmarks.is_empty();
-        let mut known: BTreeMap<_, _> = landmarks.into_iter().map(|l| (l.id.clone(), Some(l))).collect();
+        let mut known: BTreeMap<_, _> = landmarks
+            .into_iter()
+            .map(|l| (l.id.clone(), Some(l)))
+            .collect();
         if is_open {
-            self.arrivals.extend(self.landmarks.keys().filter(|_| !self.open).cloned());
+            self.arrivals
+                .extend(self.landmarks.keys().filter(|_| !self.open).cloned());
             known.extend(self.landmarks.into_keys().map(|id| (id, None)));
         } else {
             self.arrivals.clear();
             known.keys().for_each(|id| method.add_landmark(id.clone()));
-            self.landmarks.keys().filter(|id| !known.contains_key(*id)).for_each(|id| method.remove_landmark(id));
+            self.landmarks
+                .keys()
+                .filter(|id| !known.contains_key(*id))
+                .for_each(|id| method.remove_landmark(id));
         }
-        Self { config, open: is_open, landmarks: known, ..self }
+        Self {
+            config,
+            open: is_open,
+            landmarks: known,
+            ..self
+        }
     }
 
     /// True if a location of this id is listed; `None` without a list, where reports name the locations.
@@ -157,7 +176,11 @@ impl Vote {
     ///
     /// # Errors
     /// The reason why the report was not used; nothing has changed then.
-    pub fn observe(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
+    pub fn observe(
+        &mut self,
+        report: &ObjectReport,
+        received_at: Timestamp,
+    ) -> Result<(), RejectReason> {
         self.observe_part(report, &report.node, received_at)
     }
 
@@ -171,19 +194,39 @@ impl Vote {
         part: &NodeName,
         received_at: Timestamp,
     ) -> Result<(), RejectReason> {
-        report.validate(&Limits { objects: usize::MAX, ..Limits::default() })?;
+        report.validate(&Limits {
+            objects: usize::MAX,
+            ..Limits::default()
+        })?;
         if !self.last_reports.contains_key(&report.node) {
             self.evict_silent_vehicles(received_at)?;
         }
-        let new = || LastReport { received_at, parts: BTreeMap::new(), frames: 0 };
-        let last = self.last_reports.entry(report.node.clone()).or_insert_with(new);
-        if last.parts.get(part).is_some_and(|last| !last.is_before(report)) {
+        let new = || LastReport {
+            received_at,
+            parts: BTreeMap::new(),
+            frames: 0,
+        };
+        let last = self
+            .last_reports
+            .entry(report.node.clone())
+            .or_insert_with(new);
+        if last
+            .parts
+            .get(part)
+            .is_some_and(|last| !last.is_before(report))
+        {
             return Err(RejectReason::OutOfOrder);
         }
         if last.parts.len() >= MAX_PARTS && !last.parts.contains_key(part) {
             last.parts.clear();
         }
-        last.parts.insert(part.clone(), PartReport { seq: report.seq, captured_at: report.captured_at_us });
+        last.parts.insert(
+            part.clone(),
+            PartReport {
+                seq: report.seq,
+                captured_at: report.captured_at_us,
+            },
+        );
         (last.received_at, last.frames) = (received_at, last.frames.saturating_add(1));
         let objects = match self.config.mode {
             VoteMode::Weighted => self.one_per_landmark(&report.objects),
@@ -205,10 +248,15 @@ impl Vote {
             return Ok(());
         }
         let rank = |(node, last): (&NodeName, &LastReport)| {
-            (self.method.get().is_proven(node), last.received_at, node.clone())
+            (
+                self.method.get().is_proven(node),
+                last.received_at,
+                node.clone(),
+            )
         };
         let mut silent: Vec<_> = self.last_reports.iter().map(rank).collect();
-        silent.retain(|(is_proven, last, _)| now.since(*last) >= RETENTION[usize::from(*is_proven)]);
+        silent
+            .retain(|(is_proven, last, _)| now.since(*last) >= RETENTION[usize::from(*is_proven)]);
         silent.sort();
         silent.truncate(self.config.max_vehicles.div_ceil(EVICTION_DIVISOR));
         let nodes: BTreeSet<NodeName> = silent.into_iter().map(|(.., node)| node).collect();
@@ -228,9 +276,15 @@ impl Vote {
             match best.entry(object.landmark.as_ref()) {
                 Entry::Vacant(free) => *free.insert(object),
                 Entry::Occupied(mut kept) => {
-                    let landmark = object.landmark.as_ref().and_then(|id| self.landmarks.get(id)?.as_ref());
+                    let landmark = object
+                        .landmark
+                        .as_ref()
+                        .and_then(|id| self.landmarks.get(id)?.as_ref());
                     let rank = |object: &PerceivedObject| {
-                        (!self.is_sign(landmark, self.voted_label(landmark, &object.label)), object.confidence)
+                        (
+                            !self.is_sign(landmark, self.voted_label(landmark, &object.label)),
+                            object.confidence,
+                        )
                     };
                     if rank(object) > rank(kept.get()) {
                         kept.insert(object);
@@ -244,8 +298,16 @@ impl Vote {
     }
 
     /// Counts one object as a vote; false if it does not count as one.
-    fn add_vote(&mut self, report: &ObjectReport, object: &PerceivedObject, pose: Option<Pose>, at: Timestamp) -> bool {
-        let Some(id) = object.landmark.as_ref().filter(|_| object.confidence > 0.0) else { return false };
+    fn add_vote(
+        &mut self,
+        report: &ObjectReport,
+        object: &PerceivedObject,
+        pose: Option<Pose>,
+        at: Timestamp,
+    ) -> bool {
+        let Some(id) = object.landmark.as_ref().filter(|_| object.confidence > 0.0) else {
+            return false;
+        };
         let known = self.landmarks.get(id);
         if known.is_none() && !self.open {
             return false;
@@ -273,7 +335,13 @@ impl Vote {
             range_bearing,
             at,
         };
-        let Some(forgotten) = self.method.get_mut().make_room_for(&vote, self.config.max_labels) else { return false };
+        let Some(forgotten) = self
+            .method
+            .get_mut()
+            .make_room_for(&vote, self.config.max_labels)
+        else {
+            return false;
+        };
         self.ignored += forgotten as u64;
         if !self.landmarks.contains_key(id) {
             self.open_landmark(id);
@@ -285,7 +353,9 @@ impl Vote {
     /// The label that a stated one counts as.
     fn voted_label<'a>(&'a self, landmark: Option<&'a Landmark>, stated: &'a Label) -> &'a Label {
         let synonym = landmark.and_then(|landmark| landmark.synonym(stated));
-        synonym.or_else(|| self.config.synonyms.get(stated)).unwrap_or(stated)
+        synonym
+            .or_else(|| self.config.synonyms.get(stated))
+            .unwrap_or(stated)
     }
 
     /// True if a voted label is that of the landmark's vacancy sign.
@@ -296,14 +366,25 @@ impl Vote {
 
     /// Notes that a vehicle read a landmark's vacancy sign. True if it is behind an object, and no vote against that: at
     /// least as many other vehicles read an object there as read the sign. Those do not count that were mostly wrong.
-    fn is_behind_object(&mut self, landmark: &LandmarkId, sign: &Label, node: &NodeName, at: Timestamp) -> bool {
+    fn is_behind_object(
+        &mut self,
+        landmark: &LandmarkId,
+        sign: &Label,
+        node: &NodeName,
+        at: Timestamp,
+    ) -> bool {
         let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
         let signs = self.signs.entry(landmark.clone()).or_default();
         signs.insert(node.clone(), at);
         signs.retain(|_, read_at| at.since(*read_at) < freshness);
         let readings = self.method.get().readings(landmark);
-        let objects = readings.iter().filter(|(label, _)| *label != sign).flat_map(|(_, nodes)| nodes);
-        let objects = objects.filter(|other| *other != node && self.method.get().is_trusted(other)).count();
+        let objects = readings
+            .iter()
+            .filter(|(label, _)| *label != sign)
+            .flat_map(|(_, nodes)| nodes);
+        let objects = objects
+            .filter(|other| *other != node && self.method.get().is_trusted(other))
+            .count();
         objects > 0 && objects >= signs.len()
     }
 
@@ -312,12 +393,20 @@ impl Vote {
         let mut readings = self.method.get().readings(landmark);
         let freshness = Duration::from_secs_f64(self.config.weighted.freshness_s);
         let known = self.landmarks.get(landmark).and_then(Option::as_ref);
-        if let (Some(sign), Some(signs)) = (known.and_then(|l| l.vacancy.as_ref()), self.signs.get(landmark)) {
+        if let (Some(sign), Some(signs)) = (
+            known.and_then(|l| l.vacancy.as_ref()),
+            self.signs.get(landmark),
+        ) {
             let votes: BTreeSet<NodeName> = readings.values().flatten().cloned().collect();
-            let fresh = signs.iter().filter(|(node, at)| now.since(**at) < freshness && !votes.contains(*node));
+            let fresh = signs
+                .iter()
+                .filter(|(node, at)| now.since(**at) < freshness && !votes.contains(*node));
             let fresh: Vec<_> = fresh.map(|(node, _)| node.clone()).collect();
             if !fresh.is_empty() {
-                readings.entry(self.voted_label(known, &sign.label).clone()).or_default().extend(fresh);
+                readings
+                    .entry(self.voted_label(known, &sign.label).clone())
+                    .or_default()
+                    .extend(fresh);
             }
         }
         let sorted = readings.into_iter().map(|(label, mut nodes)| {
@@ -340,7 +429,9 @@ impl Vote {
 
     /// Whether a vehicle has sent a packet's worth of frames since the last verdict (`paper` mode).
     pub fn is_packet_complete(&self) -> bool {
-        self.last_reports.values().any(|last| last.frames >= self.config.paper.frames_per_verdict)
+        self.last_reports
+            .values()
+            .any(|last| last.frames >= self.config.paper.frames_per_verdict)
     }
 
     /// Whether any vehicle has sent a frame since the last verdict (`paper` mode).
@@ -350,10 +441,15 @@ impl Vote {
 
     /// Ends the round: judges the landmarks that changed.
     pub fn close(&mut self, now: Timestamp) -> VoteRound {
-        self.last_reports.values_mut().for_each(|last| last.frames = 0);
+        self.last_reports
+            .values_mut()
+            .for_each(|last| last.frames = 0);
         let (changed, evidence) = self.method.get_mut().close(now);
         let verdicts = if self.open {
-            changed.iter().filter_map(|landmark| self.method.get().verdict(landmark)).collect()
+            changed
+                .iter()
+                .filter_map(|landmark| self.method.get().verdict(landmark))
+                .collect()
         } else {
             self.verdicts()
         };
@@ -368,7 +464,10 @@ impl Vote {
 
     /// The verdict of every landmark as of the last round, by landmark.
     pub fn verdicts(&self) -> Vec<Verdict> {
-        self.landmarks.keys().filter_map(|landmark| self.method.get().verdict(landmark)).collect()
+        self.landmarks
+            .keys()
+            .filter_map(|landmark| self.method.get().verdict(landmark))
+            .collect()
     }
 
     /// Judges the stored votes `passes` times, starting from equal trust; returns the verdict of every landmark.

@@ -47,7 +47,9 @@ pub use cell_map::{CellMap, NeighbourObject};
 pub use cell_reputation::{CellReputation, ForeignVotes};
 pub use client_refusals::{ClientRefusal, ClientRefusals};
 pub use codec::{Encoding, decode, decode_entries, decode_report, decode_share, encode};
-pub use description::{CellDescription, ContentHash, DescriptionStamp, DescriptionStatus, InvalidHash};
+pub use description::{
+    CellDescription, ContentHash, DescriptionStamp, DescriptionStatus, InvalidHash,
+};
 pub use flaw::Flaw;
 pub use ledger::{LedgerEntry, LedgerMark, LedgerShare, LedgerSignature};
 pub use object::{FieldOfView, FusedObject, PerceivedObject, PoseCorrection};
@@ -57,8 +59,8 @@ pub use reputation_topic::ReputationTopic;
 pub use topic::{ReportKind, Topic, Topics};
 pub use trouble::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 pub use validation::{
-    InvalidEntry, InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER, MAX_SHARE_ENTRIES,
-    Payload, check_fused_at,
+    InvalidEntry, InvalidValue, Limits, MAX_DESCRIPTION_BYTES, MAX_FUSED_AHEAD_S, MAX_INTEGER,
+    MAX_SHARE_ENTRIES, Payload, check_fused_at,
 };
 
 use crate::model::epoch::Epoch;
@@ -163,7 +165,14 @@ pub struct WirePose {
 impl WirePose {
     /// A pose in the plane, in metres and radians; nothing else is known.
     pub fn new(x_m: f64, y_m: f64, heading_rad: f64) -> Self {
-        Self { x_m, y_m, heading_rad, height_m: None, pitch_rad: None, roll_rad: None }
+        Self {
+            x_m,
+            y_m,
+            heading_rad,
+            height_m: None,
+            pitch_rad: None,
+            roll_rad: None,
+        }
     }
 }
 
@@ -445,7 +454,9 @@ impl NodeStatus {
 }
 
 /// The configured role of a node.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
+)]
 #[serde(rename_all = "lowercase")]
 #[cbor(index_only)]
 pub enum Role {
@@ -461,7 +472,9 @@ pub enum Role {
 }
 
 /// The present state of a node.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
+)]
 #[serde(rename_all = "lowercase")]
 #[cbor(index_only)]
 pub enum NodeState {

@@ -97,13 +97,22 @@ fn name(index: usize) -> NodeName {
 
 fn config(index: usize) -> ElectionConfig {
     let role = [Role::Edge, Role::Auto, Role::Auto, Role::Cav][index];
-    ElectionConfig { role, stable_ms: 200, join_ms: 100, handover_ms: 900, ..ElectionConfig::default() }
+    ElectionConfig {
+        role,
+        stable_ms: 200,
+        join_ms: 100,
+        handover_ms: 900,
+        ..ElectionConfig::default()
+    }
 }
 
 fn settings(index: usize) -> NodeSettings {
     let election = config(index);
     NodeSettings {
-        plane: DataPlane { external: None, embedded: true },
+        plane: DataPlane {
+            external: None,
+            embedded: true,
+        },
         round_period: Duration::from_millis(100),
         keeps_reputations: false,
         status: NodeStatus::starting(name(index), Uuid::nil(), election.role, ""),
@@ -116,7 +125,12 @@ fn broker(index: usize) -> SocketAddr {
 }
 
 fn member(index: usize) -> SeenMember {
-    SeenMember { name: name(index), run: 1, broker: Some(broker(index).into()), is_on_this_machine: false }
+    SeenMember {
+        name: name(index),
+        run: 1,
+        broker: Some(broker(index).into()),
+        is_on_this_machine: false,
+    }
 }
 
 impl Cell {
@@ -151,19 +165,42 @@ impl Cell {
         let node = &mut self.nodes[index];
         node.clock = node.clock + Duration::from_millis(1);
         node.leadership = Leadership::default();
-        node.machine = Some(LeadershipNode::new(settings(index), node.persisted, &node.leadership, node.clock));
+        node.machine = Some(LeadershipNode::new(
+            settings(index),
+            node.persisted,
+            &node.leadership,
+            node.clock,
+        ));
         node.filter = RoundFilter::new(node.persisted, node.clock);
         node.last = None;
-        self.handle(index, Input::OwnBroker { address: Some(broker(index)) });
-        self.handle(index, Input::LinkChanged { broker: broker(index).into(), state: LinkState::Up });
+        self.handle(
+            index,
+            Input::OwnBroker {
+                address: Some(broker(index)),
+            },
+        );
+        self.handle(
+            index,
+            Input::LinkChanged {
+                broker: broker(index).into(),
+                state: LinkState::Up,
+            },
+        );
         for peer in (0..self.nodes.len()).filter(|peer| *peer != index) {
-            self.handle(index, Input::MemberAlive { member: member(peer) });
+            self.handle(
+                index,
+                Input::MemberAlive {
+                    member: member(peer),
+                },
+            );
         }
     }
 
     fn handle(&mut self, index: usize, input: Input) {
         let node = &mut self.nodes[index];
-        let Some(machine) = &mut node.machine else { return };
+        let Some(machine) = &mut node.machine else {
+            return;
+        };
         let effects = machine.handle(input, node.clock);
         self.carry_out(index, effects);
     }
@@ -172,14 +209,17 @@ impl Cell {
     fn tick(&mut self, index: usize) -> Vec<Effect> {
         loop {
             let node = &mut self.nodes[index];
-            let Some(machine) = &mut node.machine else { return Vec::new() };
+            let Some(machine) = &mut node.machine else {
+                return Vec::new();
+            };
             node.clock = node.clock.max(machine.next_deadline());
             let effects = machine.handle(Input::Wake, node.clock);
             if !effects.contains(&Effect::Look) {
                 return effects;
             }
-            let (looks, others): (Vec<_>, Vec<_>) =
-                effects.into_iter().partition(|effect| matches!(effect, Effect::Look | Effect::AskParts));
+            let (looks, others): (Vec<_>, Vec<_>) = effects
+                .into_iter()
+                .partition(|effect| matches!(effect, Effect::Look | Effect::AskParts));
             self.carry_out(index, looks);
             if !others.is_empty() {
                 return others;
@@ -210,7 +250,9 @@ impl Cell {
         match effect {
             Effect::PersistTerm { term } => node.persisted = term,
             Effect::TellLeadership { leadership } => node.leadership = leadership,
-            Effect::Lead { epoch, first_round, .. } => {
+            Effect::Lead {
+                epoch, first_round, ..
+            } => {
                 self.led_unwritten |= epoch.term > node.persisted;
                 *self.led.entry(epoch.clone()).or_default() += 1;
                 node.publishing = Some((epoch, first_round));
@@ -218,15 +260,25 @@ impl Cell {
             Effect::StopPublishing { .. } => node.publishing = None,
             Effect::Send { to, message } => {
                 let known = (0..nodes).find(|index| name(*index) == to);
-                self.packets.extend(known.map(|to| Packet::Election(to, message)));
+                self.packets
+                    .extend(known.map(|to| Packet::Election(to, message)));
             }
             Effect::Look => {
-                let members = (0..nodes).filter(|peer| *peer != index).map(member).collect();
+                let members = (0..nodes)
+                    .filter(|peer| *peer != index)
+                    .map(member)
+                    .collect();
                 let rounds_due = node.clock.micros() / 100_000;
-                return Some(Input::Looked { rounds_due, load_percent: 0, members });
+                return Some(Input::Looked {
+                    rounds_due,
+                    load_percent: 0,
+                    members,
+                });
             }
             Effect::AskParts => {
-                let links = (0..nodes).map(|index| (broker(index).into(), LinkState::Up)).collect();
+                let links = (0..nodes)
+                    .map(|index| (broker(index).into(), LinkState::Up))
+                    .collect();
                 let sample = HealthSample {
                     broker_serves: true,
                     links: Some(links),
@@ -248,8 +300,14 @@ impl Cell {
 
     fn publish(&mut self, index: usize) {
         let node = &mut self.nodes[index];
-        let Some((epoch, next)) = &mut node.publishing else { return };
-        let map = Map { epoch: epoch.clone(), round: *next, fused_at: node.clock };
+        let Some((epoch, next)) = &mut node.publishing else {
+            return;
+        };
+        let map = Map {
+            epoch: epoch.clone(),
+            round: *next,
+            fused_at: node.clock,
+        };
         *next += 1;
         for to in (0..self.nodes.len()).filter(|to| *to != index) {
             self.packets.push(Packet::Map(to, map.clone()));
@@ -259,17 +317,29 @@ impl Cell {
 
     fn accept(&mut self, index: usize, map: Map) {
         let node = &mut self.nodes[index];
-        let Map { epoch, round, fused_at } = map;
+        let Map {
+            epoch,
+            round,
+            fused_at,
+        } = map;
         let map = GlobalMap::new(&epoch, round, fused_at);
-        let accepted = node.filter.accept_map(&map, Origin::Claimed, node.clock, &node.leadership);
+        let accepted = node
+            .filter
+            .accept_map(&map, Origin::Claimed, node.clock, &node.leadership);
         if node.machine.is_none() || accepted.is_err() {
             return;
         }
         let is_elected = node.leadership.present_epoch() == Some(&epoch);
         let was_quiet = node.leadership.leader().is_none()
-            && node.last.as_ref().is_none_or(|(_, _, at)| node.clock.since(*at) >= EPOCH_MEMORY);
+            && node
+                .last
+                .as_ref()
+                .is_none_or(|(_, _, at)| node.clock.since(*at) >= EPOCH_MEMORY);
         self.went_back |= epoch.term < node.accepted && !is_elected && !was_quiet;
-        self.accepted_twice |= node.last.as_ref().is_some_and(|(of, last, _)| *of == epoch && *last >= round);
+        self.accepted_twice |= node
+            .last
+            .as_ref()
+            .is_some_and(|(of, last, _)| *of == epoch && *last >= round);
         node.accepted = node.accepted.max(epoch.term);
         node.last = Some((epoch.clone(), round, node.clock));
         self.handle(index, Input::RoundAccepted { epoch, round });
@@ -279,7 +349,14 @@ impl Cell {
         match packet {
             Packet::Election(to, message) => {
                 let from = message.from.clone();
-                self.handle(to, Input::Receive { from, rights: Rights::ALL, message });
+                self.handle(
+                    to,
+                    Input::Receive {
+                        from,
+                        rights: Rights::ALL,
+                        message,
+                    },
+                );
             }
             Packet::Map(to, map) => self.accept(to, map),
         }
@@ -288,7 +365,13 @@ impl Cell {
     /// A connection to a node's broker breaks, and its port refuses.
     fn refuse(&mut self, to: usize, about: usize) {
         for state in [LinkState::Up, LinkState::Down, LinkState::Refused] {
-            self.handle(to, Input::LinkChanged { broker: broker(about).into(), state });
+            self.handle(
+                to,
+                Input::LinkChanged {
+                    broker: broker(about).into(),
+                    state,
+                },
+            );
         }
     }
 
@@ -302,7 +385,9 @@ impl Cell {
             }
             let due = |node: &Node| Some(node.machine.as_ref()?.next_deadline().since(node.clock));
             let next = self.nodes.iter().filter_map(due).min().unwrap_or(left);
-            let step = next.clamp(Duration::from_millis(1), Duration::from_millis(20)).min(left);
+            let step = next
+                .clamp(Duration::from_millis(1), Duration::from_millis(20))
+                .min(left);
             left -= step;
             for index in 0..self.nodes.len() {
                 let node = &mut self.nodes[index];
@@ -316,8 +401,18 @@ impl Cell {
         let mut quiet = self.clone();
         // A peer that fell silent counts as heard for 2.5 idle beats (6.25 s); then come `stable_ms` and a handover.
         quiet.run_quietly(14_000);
-        let running = || quiet.nodes.iter().filter_map(|node| node.machine.as_ref()).map(LeadershipNode::election);
-        let candidates = quiet.nodes.iter().take(3).any(|node| node.machine.is_some());
+        let running = || {
+            quiet
+                .nodes
+                .iter()
+                .filter_map(|node| node.machine.as_ref())
+                .map(LeadershipNode::election)
+        };
+        let candidates = quiet
+            .nodes
+            .iter()
+            .take(3)
+            .any(|node| node.machine.is_some());
         let leaders = running().filter(|election| election.is_leading()).count();
         let followed: BTreeSet<_> = running().map(Election::leader).collect();
         leaders == usize::from(candidates) && (!candidates || followed.len() == 1)
@@ -327,7 +422,11 @@ impl Cell {
 impl CellModel {
     /// True if to let this state settle: it takes thousands of steps, so a fixed sample of the last ones has to do.
     fn settles(&self, cell: &Cell) -> bool {
-        let clocks: u64 = cell.nodes.iter().map(|node| node.clock.micros() / 1000).sum();
+        let clocks: u64 = cell
+            .nodes
+            .iter()
+            .map(|node| node.clock.micros() / 1000)
+            .sum();
         cell.steps.is_multiple_of(self.depth.min(20))
             && (clocks + cell.packets.len() as u64).is_multiple_of(self.sample)
     }
@@ -343,8 +442,14 @@ impl Model for CellModel {
 
     fn actions(&self, cell: &Cell, actions: &mut Vec<Action>) {
         for packet in 0..cell.packets.len() {
-            actions.push(Action::Deliver { packet, again: false });
-            actions.push(Action::Deliver { packet, again: true });
+            actions.push(Action::Deliver {
+                packet,
+                again: false,
+            });
+            actions.push(Action::Deliver {
+                packet,
+                again: true,
+            });
         }
         for (index, node) in cell.nodes.iter().enumerate() {
             if node.machine.is_none() {
@@ -368,11 +473,17 @@ impl Model for CellModel {
         let mut cell = last.clone();
         cell.steps += 1;
         match action {
-            Action::Deliver { packet, again: false } => {
+            Action::Deliver {
+                packet,
+                again: false,
+            } => {
                 let packet = cell.packets.remove(packet);
                 cell.deliver(packet);
             }
-            Action::Deliver { packet, again: true } => cell.deliver(last.packets[packet].clone()),
+            Action::Deliver {
+                packet,
+                again: true,
+            } => cell.deliver(last.packets[packet].clone()),
             Action::Tick(index) => {
                 let effects = cell.tick(index);
                 cell.carry_out(index, effects);
@@ -405,17 +516,28 @@ impl Model for CellModel {
             Property::always("never two leaderships with one epoch", |_, cell: &Cell| {
                 cell.led.values().all(|count| *count == 1)
             }),
-            Property::always("the term is on disk before it is led in", |_, cell: &Cell| !cell.led_unwritten),
+            Property::always(
+                "the term is on disk before it is led in",
+                |_, cell: &Cell| !cell.led_unwritten,
+            ),
             // But to the elected leader's, and to a lone publisher's after a while without any round.
-            Property::always("terms accepted by a node never go back, restarts included", |_, cell: &Cell| {
-                !cell.went_back
+            Property::always(
+                "terms accepted by a node never go back, restarts included",
+                |_, cell: &Cell| !cell.went_back,
+            ),
+            Property::always("no round is accepted twice in a row", |_, cell: &Cell| {
+                !cell.accepted_twice
             }),
-            Property::always("no round is accepted twice in a row", |_, cell: &Cell| !cell.accepted_twice),
-            Property::always("a quiet component converges", |model: &Self, cell: &Cell| {
-                !model.settles(cell) || cell.converges()
-            }),
+            Property::always(
+                "a quiet component converges",
+                |model: &Self, cell: &Cell| !model.settles(cell) || cell.converges(),
+            ),
             Property::sometimes("two lead at once", |_, cell: &Cell| {
-                cell.nodes.iter().filter(|node| node.publishing.is_some()).count() > 1
+                cell.nodes
+                    .iter()
+                    .filter(|node| node.publishing.is_some())
+                    .count()
+                    > 1
             }),
         ]
     }
@@ -444,20 +566,39 @@ fn settled(nodes: usize) -> Vec<Cell> {
 
 #[test]
 fn three_nodes_in_every_order() {
-    let model = CellModel { initial: settled(3), depth: 4, sample: 61 };
-    let checker = model.checker().finish_when(HasDiscoveries::AnyFailures).spawn_bfs().join();
-    println!("{} states, {} of them different", checker.state_count(), checker.unique_state_count());
+    let model = CellModel {
+        initial: settled(3),
+        depth: 4,
+        sample: 61,
+    };
+    let checker = model
+        .checker()
+        .finish_when(HasDiscoveries::AnyFailures)
+        .spawn_bfs()
+        .join();
+    println!(
+        "{} states, {} of them different",
+        checker.state_count(),
+        checker.unique_state_count()
+    );
     checker.assert_no_discovery("never two leaderships with one epoch");
     checker.assert_no_discovery("the term is on disk before it is led in");
     checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
     checker.assert_no_discovery("no round is accepted twice in a row");
     checker.assert_no_discovery("a quiet component converges");
-    assert!(checker.unique_state_count() > 10_000, "the model hardly moves");
+    assert!(
+        checker.unique_state_count() > 10_000,
+        "the model hardly moves"
+    );
 }
 
 #[test]
 fn four_nodes_in_long_random_orders() {
-    let model = CellModel { initial: settled(4), depth: 120, sample: 1 };
+    let model = CellModel {
+        initial: settled(4),
+        depth: 120,
+        sample: 1,
+    };
     let checker = model
         .checker()
         .finish_when(HasDiscoveries::AnyFailures)
@@ -470,5 +611,8 @@ fn four_nodes_in_long_random_orders() {
     checker.assert_no_discovery("terms accepted by a node never go back, restarts included");
     checker.assert_no_discovery("no round is accepted twice in a row");
     checker.assert_no_discovery("a quiet component converges");
-    assert!(checker.discovery("two lead at once").is_some(), "the walks never split the cell");
+    assert!(
+        checker.discovery("two lead at once").is_some(),
+        "the walks never split the cell"
+    );
 }

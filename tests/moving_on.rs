@@ -38,7 +38,10 @@ struct Cell {
 impl Cell {
     fn new(algorithms: Algorithms) -> Self {
         let now = Timestamp(1_700_000_000_000_000);
-        let config = FusionConfig { algorithms, ..FusionConfig::default() };
+        let config = FusionConfig {
+            algorithms,
+            ..FusionConfig::default()
+        };
         Self {
             aggregator: Aggregator::new(name("edge"), 1, config, Vec::new(), now),
             ledger: ReputationLedger::default(),
@@ -50,13 +53,22 @@ impl Cell {
     }
 
     fn take(&mut self, reputations: ForeignReputations) {
-        self.aggregator.command(&Command::TakeForeign { reputations: Arc::new(reputations) }, self.now);
+        self.aggregator.command(
+            &Command::TakeForeign {
+                reputations: Arc::new(reputations),
+            },
+            self.now,
+        );
     }
 
     /// Takes reports of all vehicles, and returns the rounds that they close, one at least. Evidence goes into the ledger.
     fn fuse(&mut self, kind: ReportKind, reports: Vec<ObjectReport>) -> Vec<Fused> {
         let now = self.now;
-        let taken = reports.into_iter().map(|report| self.aggregator.report(kind, &Arc::new(report), now).unwrap());
+        let taken = reports.into_iter().map(|report| {
+            self.aggregator
+                .report(kind, &Arc::new(report), now)
+                .unwrap()
+        });
         let mut rounds: Vec<_> = taken.collect::<Vec<_>>().into_iter().flatten().collect();
         rounds.extend(self.aggregator.close_early(now));
         rounds.iter().for_each(|fused| self.record(fused));
@@ -65,13 +77,18 @@ impl Cell {
     }
 
     fn record(&mut self, fused: &Fused) {
-        fused.evidence.iter().for_each(|vote| self.ledger.record(1, &name("edge"), vote));
+        fused
+            .evidence
+            .iter()
+            .for_each(|vote| self.ledger.record(1, &name("edge"), vote));
     }
 
     /// A round of votes, half a second after the last; names of liars begin with `liar`. Returns the number of right verdicts.
     fn vote(&mut self, vehicles: &[String], rng: &mut ChaCha8Rng) -> usize {
         self.now = self.now + Duration::from_millis(500);
-        let other = |truth: usize, rng: &mut ChaCha8Rng| (truth + rng.random_range(1..LABELS.len())) % LABELS.len();
+        let other = |truth: usize, rng: &mut ChaCha8Rng| {
+            (truth + rng.random_range(1..LABELS.len())) % LABELS.len()
+        };
         if self.round.is_multiple_of(6) {
             self.now = self.now + Duration::from_secs(3);
             self.truths = std::array::from_fn(|_| rng.random_range(0..LABELS.len()));
@@ -89,13 +106,24 @@ impl Cell {
                 ..PerceivedObject::new(LABELS[label(place, rng)], 0.8, 0.0, 0.0)
             };
             let objects = (0..LANDMARKS).map(object).collect();
-            reports.push(ObjectReport { objects, ..ObjectReport::new(name(vehicle), self.round, self.now) });
+            reports.push(ObjectReport {
+                objects,
+                ..ObjectReport::new(name(vehicle), self.round, self.now)
+            });
         }
         let rounds = self.fuse(ReportKind::VoteDetections, reports);
-        let verdicts = rounds.into_iter().filter_map(|fused| fused.verdicts).flat_map(|verdicts| verdicts.verdicts);
-        let verdicts: BTreeMap<_, _> = verdicts.map(|verdict| (verdict.landmark, verdict.label)).collect();
+        let verdicts = rounds
+            .into_iter()
+            .filter_map(|fused| fused.verdicts)
+            .flat_map(|verdicts| verdicts.verdicts);
+        let verdicts: BTreeMap<_, _> = verdicts
+            .map(|verdict| (verdict.landmark, verdict.label))
+            .collect();
         let is_right = |place: &usize| {
-            let label = verdicts.get(format!("place-{place}").as_str()).cloned().flatten();
+            let label = verdicts
+                .get(format!("place-{place}").as_str())
+                .cloned()
+                .flatten();
             label.as_deref() == Some(LABELS[self.truths[*place]])
         };
         (0..LANDMARKS).filter(is_right).count()
@@ -111,7 +139,9 @@ impl Cell {
 
 fn vehicles(honest: usize, liars: usize) -> Vec<String> {
     let honest = (0..honest).map(|number| format!("honest-{number}"));
-    honest.chain((0..liars).map(|number| format!("liar-{number}"))).collect()
+    honest
+        .chain((0..liars).map(|number| format!("liar-{number}")))
+        .collect()
 }
 
 /// Percent of right verdicts in a new cell [after](AFTER_MOVE) honest vehicles and liars have come to it. They come from so many
@@ -130,9 +160,20 @@ fn after_move(honest: usize, liars: usize, cells: usize, has_lying_cell: bool) -
             origin.told(&format!("cell-{cell}"), &mut foreign);
         }
         for vehicle in movers.iter().filter(|_| has_lying_cell) {
-            let (correct, incorrect) = if vehicle.starts_with("liar") { (1_000_000, 0) } else { (0, 1_000_000) };
+            let (correct, incorrect) = if vehicle.starts_with("liar") {
+                (1_000_000, 0)
+            } else {
+                (0, 1_000_000)
+            };
             let all = Counts { correct, incorrect };
-            foreign.merge(&name("lying"), &name(vehicle), CellCounts { all, ..CellCounts::default() });
+            foreign.merge(
+                &name("lying"),
+                &name(vehicle),
+                CellCounts {
+                    all,
+                    ..CellCounts::default()
+                },
+            );
         }
         let mut target = Cell::new(Algorithms::Vote);
         target.take(foreign);
@@ -143,8 +184,10 @@ fn after_move(honest: usize, liars: usize, cells: usize, has_lying_cell: bool) -
             }
         }
     }
-    let percent =
-        |n: usize| 100.0 * right[n] as f64 / (SEEDS as usize * AFTER_MOVE[n].clone().count() * LANDMARKS) as f64;
+    let percent = |n: usize| {
+        100.0 * right[n] as f64
+            / (SEEDS as usize * AFTER_MOVE[n].clone().count() * LANDMARKS) as f64
+    };
     [percent(0), percent(1)]
 }
 
@@ -181,7 +224,13 @@ fn invented(said: &[(u64, u64)]) -> [f64; 2] {
     let mut cell = Cell::new(Algorithms::Pace);
     let mut foreign = ForeignReputations::default();
     for (number, (correct, incorrect)) in said.iter().enumerate() {
-        let counts = CellCounts { all: Counts { correct: *correct, incorrect: *incorrect }, ..CellCounts::default() };
+        let counts = CellCounts {
+            all: Counts {
+                correct: *correct,
+                incorrect: *incorrect,
+            },
+            ..CellCounts::default()
+        };
         foreign.merge(&name(&format!("cell-{number}")), &name("liar"), counts);
     }
     cell.take(foreign);
@@ -194,12 +243,23 @@ fn invented(said: &[(u64, u64)]) -> [f64; 2] {
             ..ObjectReport::new(name(node), round, cell.now)
         };
         let reports = vec![report("liar", 0.0), report("newcomer", 500.0)];
-        let map = cell.fuse(ReportKind::Detections, reports).pop().unwrap().map.unwrap();
+        let map = cell
+            .fuse(ReportKind::Detections, reports)
+            .pop()
+            .unwrap()
+            .map
+            .unwrap();
         let near = |x_m: f64| {
-            let near = map.objects.iter().filter(move |object| (object.x_m - x_m).abs() < 10.0);
+            let near = map
+                .objects
+                .iter()
+                .filter(move |object| (object.x_m - x_m).abs() < 10.0);
             near.map(|object| object.confidence).fold(0.0, f64::max)
         };
-        assert!(round < 3 || near(500.0) > 0.5, "a newcomer of whom nobody says anything is believed");
+        assert!(
+            round < 3 || near(500.0) > 0.5,
+            "a newcomer of whom nobody says anything is believed"
+        );
         confidences.push(near(0.0));
     }
     [confidences[0], confidences[19]]
@@ -207,13 +267,21 @@ fn invented(said: &[(u64, u64)]) -> [f64; 2] {
 
 #[test]
 fn a_liar_that_moves_on_is_no_newcomer_to_tracks() {
-    let [stranger, of_one, of_three, proven] =
-        [&[][..], &[(5, 60)], &[(5, 60), (8, 90), (0, 40)], &[(400, 3)]].map(invented);
+    let [stranger, of_one, of_three, proven] = [
+        &[][..],
+        &[(5, 60)],
+        &[(5, 60), (8, 90), (0, 40)],
+        &[(400, 3)],
+    ]
+    .map(invented);
     println!(
         "confidence of an invented car in the first map and after 2 s: of a stranger {stranger:.2?}, a liar by one cell \
          {of_one:.2?}, by three {of_three:.2?}, a proven vehicle {proven:.2?}"
     );
-    assert!(stranger[1] > 0.9 && proven == stranger, "trust in a newcomer is full already");
+    assert!(
+        stranger[1] > 0.9 && proven == stranger,
+        "trust in a newcomer is full already"
+    );
     assert!(of_one[0] < stranger[0] - 0.1 && of_one[1] < stranger[1] - 0.1);
     assert_eq!(of_three, [0.0, 0.0]);
 }
@@ -222,25 +290,55 @@ fn a_liar_that_moves_on_is_no_newcomer_to_tracks() {
 #[test]
 fn in_paper_mode_nobody_hears_other_cells() {
     let mut votes = [false, true].map(|hears| {
-        let mut config = FusionConfig { algorithms: Algorithms::Vote, ..FusionConfig::default() };
+        let mut config = FusionConfig {
+            algorithms: Algorithms::Vote,
+            ..FusionConfig::default()
+        };
         config.vote.mode = ecod::vote::VoteMode::Paper;
         let mut cell = Cell {
-            aggregator: Aggregator::new(name("edge"), 1, config, Vec::new(), Timestamp(1_700_000_000_000_000)),
+            aggregator: Aggregator::new(
+                name("edge"),
+                1,
+                config,
+                Vec::new(),
+                Timestamp(1_700_000_000_000_000),
+            ),
             ..Cell::new(Algorithms::Vote)
         };
         let mut foreign = ForeignReputations::default();
-        let all = Counts { correct: 0, incorrect: 1000 };
-        foreign.merge(&name("a"), &name("honest-0"), CellCounts { all, ..CellCounts::default() });
+        let all = Counts {
+            correct: 0,
+            incorrect: 1000,
+        };
+        foreign.merge(
+            &name("a"),
+            &name("honest-0"),
+            CellCounts {
+                all,
+                ..CellCounts::default()
+            },
+        );
         if hears {
             cell.take(foreign);
         }
         let report = ObjectReport {
-            objects: vec![PerceivedObject { landmark: Some("x".into()), ..PerceivedObject::new("cup", 0.8, 0.0, 0.0) }],
+            objects: vec![PerceivedObject {
+                landmark: Some("x".into()),
+                ..PerceivedObject::new("cup", 0.8, 0.0, 0.0)
+            }],
             ..ObjectReport::new(name("honest-0"), 1, cell.now)
         };
-        cell.aggregator.report(ReportKind::VoteDetections, &Arc::new(report), cell.now).unwrap();
-        (cell.aggregator.end_packet(cell.now).unwrap(), cell.aggregator.reputations())
+        cell.aggregator
+            .report(ReportKind::VoteDetections, &Arc::new(report), cell.now)
+            .unwrap();
+        (
+            cell.aggregator.end_packet(cell.now).unwrap(),
+            cell.aggregator.reputations(),
+        )
     });
-    assert_eq!(std::mem::take(&mut votes[0].1), std::mem::take(&mut votes[1].1));
+    assert_eq!(
+        std::mem::take(&mut votes[0].1),
+        std::mem::take(&mut votes[1].1)
+    );
     assert_eq!(votes[0].0, votes[1].0);
 }

@@ -65,13 +65,23 @@ fn paper_reference(
             if near.is_empty() {
                 return (None, 0.0, rho.position.x, rho.position.y);
             }
-            let score = |label: &Label| near.iter().filter(|o| o.label == *label).map(|o| o.confidence).sum::<f64>();
+            let score = |label: &Label| {
+                near.iter()
+                    .filter(|o| o.label == *label)
+                    .map(|o| o.confidence)
+                    .sum::<f64>()
+            };
             let mut candidates: Vec<Label> = near.iter().map(|o| o.label.clone()).collect();
             candidates.sort();
             candidates.dedup();
-            let best = candidates.iter().rev().max_by(|a, b| score(a).total_cmp(&score(b))).unwrap();
-            let (sum, squares): (f64, f64) =
-                near.iter().fold((0.0, 0.0), |(s, q), o| (s + o.confidence, q + o.confidence * o.confidence));
+            let best = candidates
+                .iter()
+                .rev()
+                .max_by(|a, b| score(a).total_cmp(&score(b)))
+                .unwrap();
+            let (sum, squares): (f64, f64) = near.iter().fold((0.0, 0.0), |(s, q), o| {
+                (s + o.confidence, q + o.confidence * o.confidence)
+            });
             let n = near.len() as f64;
             (
                 Some(best.clone()),
@@ -84,8 +94,14 @@ fn paper_reference(
 }
 
 fn any_object() -> impl Strategy<Value = PerceivedObject> {
-    (0..4usize, 0..=16u32, -3.0..3.0f64, -3.0..3.0f64)
-        .prop_map(|(label, c, x, y)| object(["car", "van", "cup", "mouse"][label], f64::from(c) / 16.0, x, y))
+    (0..4usize, 0..=16u32, -3.0..3.0f64, -3.0..3.0f64).prop_map(|(label, c, x, y)| {
+        object(
+            ["car", "van", "cup", "mouse"][label],
+            f64::from(c) / 16.0,
+            x,
+            y,
+        )
+    })
 }
 
 proptest! {
@@ -136,38 +152,80 @@ proptest! {
 #[test]
 fn two_plates_cannot_share_a_spot() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
-    pace.observe(&report("a", vec![object("FAR", 0.99, 0.3, 0.0), object("NEAR", 0.9, 0.05, 0.0)], &[]), START);
+    pace.observe(
+        &report(
+            "a",
+            vec![
+                object("FAR", 0.99, 0.3, 0.0),
+                object("NEAR", 0.9, 0.05, 0.0),
+            ],
+            &[],
+        ),
+        START,
+    );
     assert_eq!(labels(&pace.close(START).landmarks), [Some("NEAR")]);
 }
 
 #[test]
 fn a_row_of_cars_seen_from_a_wrong_pose_is_kept_in_order() {
-    let config = PaceConfig { gate_m: 1.0, ..PaceConfig::default() };
-    let mut pace = pace(config, (0..3).map(|n| landmark(n, f64::from(n as u32), 0.0)).collect());
-    let row = vec![object("A", 0.9, 0.55, 0.0), object("B", 0.9, 1.6, 0.0), object("C", 0.9, 1.9, 0.0)];
+    let config = PaceConfig {
+        gate_m: 1.0,
+        ..PaceConfig::default()
+    };
+    let mut pace = pace(
+        config,
+        (0..3)
+            .map(|n| landmark(n, f64::from(n as u32), 0.0))
+            .collect(),
+    );
+    let row = vec![
+        object("A", 0.9, 0.55, 0.0),
+        object("B", 0.9, 1.6, 0.0),
+        object("C", 0.9, 1.9, 0.0),
+    ];
     pace.observe(&report("a", row, &[]), START);
-    assert_eq!(labels(&pace.close(START).landmarks), [Some("A"), Some("B"), Some("C")]);
+    assert_eq!(
+        labels(&pace.close(START).landmarks),
+        [Some("A"), Some("B"), Some("C")]
+    );
     let row = vec![object("D", 0.9, 0.05, 0.0), object("E", 0.9, 0.4, 0.0)];
     pace.observe(&report("a", row, &[]), frame(20));
-    assert_eq!(labels(&pace.close(frame(20)).landmarks), [Some("D"), Some("E"), None], "second choice");
+    assert_eq!(
+        labels(&pace.close(frame(20)).landmarks),
+        [Some("D"), Some("E"), None],
+        "second choice"
+    );
 }
 
 #[test]
 fn a_detection_goes_to_one_landmark_only() {
-    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0), landmark(1, 0.6, 0.0)]);
-    pace.observe(&report("a", vec![object("car", 0.9, 0.25, 0.0)], &[]), START);
+    let mut pace = pace(
+        PaceConfig::default(),
+        vec![landmark(0, 0.0, 0.0), landmark(1, 0.6, 0.0)],
+    );
+    pace.observe(
+        &report("a", vec![object("car", 0.9, 0.25, 0.0)], &[]),
+        START,
+    );
     assert_eq!(labels(&pace.close(START).landmarks), [Some("car"), None]);
 }
 
 #[test]
 fn empty_is_known_only_where_somebody_looked() {
-    let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0), landmark(1, 5.0, 0.0)]);
+    let mut pace = pace(
+        PaceConfig::default(),
+        vec![landmark(0, 0.0, 0.0), landmark(1, 5.0, 0.0)],
+    );
     for n in 0..3 {
         pace.observe(&report("a", vec![], &["slot-0"]), frame(n));
     }
     let round = pace.close(frame(2));
     assert_eq!(labels(&round.landmarks), [None, None]);
-    assert_eq!(round.landmarks[0].observers, [NodeName::new("a").unwrap()], "looked at and known to be empty");
+    assert_eq!(
+        round.landmarks[0].observers,
+        [NodeName::new("a").unwrap()],
+        "looked at and known to be empty"
+    );
     assert!(round.landmarks[1].observers.is_empty(), "never looked at");
     assert_eq!(round.landmarks[0].confidence, 0.0);
 }
@@ -176,14 +234,20 @@ fn empty_is_known_only_where_somebody_looked() {
 fn a_label_survives_misses_and_goes_when_the_object_has_gone() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
     for n in 0..5 {
-        pace.observe(&report("a", vec![object("car", 0.9, 0.0, 0.0)], &["slot-0"]), frame(n));
+        pace.observe(
+            &report("a", vec![object("car", 0.9, 0.0, 0.0)], &["slot-0"]),
+            frame(n),
+        );
     }
     let mut lasted = 0;
     for n in 5..30 {
         pace.observe(&report("a", vec![], &["slot-0"]), frame(n));
         lasted += u32::from(pace.close(frame(n)).landmarks[0].label.is_some());
     }
-    assert!((5..=15).contains(&lasted), "kept for {lasted} frames of 100 ms after the object had left");
+    assert!(
+        (5..=15).contains(&lasted),
+        "kept for {lasted} frames of 100 ms after the object had left"
+    );
 }
 
 #[test]
@@ -193,7 +257,10 @@ fn the_fresh_reading_of_one_outweighs_the_blindness_of_others() {
         for blind in ["b", "c", "d"] {
             pace.observe(&report(blind, vec![], &["slot-0"]), frame(n));
         }
-        pace.observe(&report("a", vec![object("ABC", 0.95, 0.0, 0.0)], &["slot-0"]), frame(n));
+        pace.observe(
+            &report("a", vec![object("ABC", 0.95, 0.0, 0.0)], &["slot-0"]),
+            frame(n),
+        );
     }
     assert_eq!(labels(&pace.close(frame(19)).landmarks), [Some("ABC")]);
 }
@@ -209,11 +276,21 @@ fn a_silent_vehicle_is_forgotten() {
 #[test]
 fn precise_vehicles_move_the_position_more() {
     let mut pace = pace(
-        PaceConfig { position_floor_m: 0.01, gate_sigmas: 10.0, ..PaceConfig::default() },
+        PaceConfig {
+            position_floor_m: 0.01,
+            gate_sigmas: 10.0,
+            ..PaceConfig::default()
+        },
         vec![landmark(0, 0.0, 0.0)],
     );
-    let precise = PerceivedObject { covariance_m2: Some([1e-4, 0.0, 1e-4]), ..object("car", 0.9, 0.1, 0.0) };
-    let vague = PerceivedObject { covariance_m2: Some([1e-1, 0.0, 1e-1]), ..object("car", 0.9, -0.1, 0.0) };
+    let precise = PerceivedObject {
+        covariance_m2: Some([1e-4, 0.0, 1e-4]),
+        ..object("car", 0.9, 0.1, 0.0)
+    };
+    let vague = PerceivedObject {
+        covariance_m2: Some([1e-1, 0.0, 1e-1]),
+        ..object("car", 0.9, -0.1, 0.0)
+    };
     pace.observe(&report("precise", vec![precise], &[]), START);
     pace.observe(&report("vague", vec![vague], &[]), START);
     let round = pace.close(START);
@@ -223,27 +300,43 @@ fn precise_vehicles_move_the_position_more() {
 #[test]
 fn a_vacancy_sign_yields_to_the_car_before_it() {
     let spot = Landmark {
-        vacancy: Some(VacancySign { label: "EMPTY".into(), position: Point2::new(-0.1, 0.0) }),
+        vacancy: Some(VacancySign {
+            label: "EMPTY".into(),
+            position: Point2::new(-0.1, 0.0),
+        }),
         ..landmark(0, 0.0, 0.0)
     };
-    let config = PaceConfig { gate_m: 0.05, ..PaceConfig::default() };
+    let config = PaceConfig {
+        gate_m: 0.05,
+        ..PaceConfig::default()
+    };
     let sign = report("side", vec![object("EMPTY", 1.0, -0.1, 0.0)], &[]);
     let mut pace = pace(config, vec![spot]);
     pace.observe(&sign, START);
     assert_eq!(labels(&pace.close(START).landmarks), [Some("EMPTY")]);
-    pace.observe(&report("front", vec![object("ABCD123", 0.6, 0.0, 0.0)], &[]), START);
+    pace.observe(
+        &report("front", vec![object("ABCD123", 0.6, 0.0, 0.0)], &[]),
+        START,
+    );
     assert_eq!(labels(&pace.close(START).landmarks), [Some("ABCD123")]);
 }
 
 #[test]
 fn a_place_that_was_looked_at_takes_the_vacancy_label_without_a_sign_in_view() {
     let spot = Landmark {
-        vacancy: Some(VacancySign { label: "EMPTY".into(), position: Point2::new(-0.1, 0.0) }),
+        vacancy: Some(VacancySign {
+            label: "EMPTY".into(),
+            position: Point2::new(-0.1, 0.0),
+        }),
         ..landmark(0, 0.0, 0.0)
     };
     let mut pace = pace(PaceConfig::default(), vec![spot]);
     pace.observe(&report("a", vec![], &["slot-0"]), frame(0));
-    assert_eq!(labels(&pace.close(frame(0)).landmarks), [None], "one look is not enough");
+    assert_eq!(
+        labels(&pace.close(frame(0)).landmarks),
+        [None],
+        "one look is not enough"
+    );
     for n in 1..5 {
         pace.observe(&report("a", vec![], &["slot-0"]), frame(n));
     }
@@ -253,11 +346,24 @@ fn a_place_that_was_looked_at_takes_the_vacancy_label_without_a_sign_in_view() {
 #[test]
 fn flicker_within_the_lead_does_not_change_the_label() {
     let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
-    pace.observe(&report("a", vec![object("car", 0.80, 0.0, 0.0)], &[]), START);
+    pace.observe(
+        &report("a", vec![object("car", 0.80, 0.0, 0.0)], &[]),
+        START,
+    );
     assert_eq!(labels(&pace.close(START).landmarks), [Some("car")]);
-    pace.observe(&report("b", vec![object("van", 0.85, 0.0, 0.0)], &[]), START);
-    assert_eq!(labels(&pace.close(START).landmarks), [Some("car")], "van leads by less than the lead");
-    pace.observe(&report("c", vec![object("van", 0.85, 0.0, 0.0)], &[]), START);
+    pace.observe(
+        &report("b", vec![object("van", 0.85, 0.0, 0.0)], &[]),
+        START,
+    );
+    assert_eq!(
+        labels(&pace.close(START).landmarks),
+        [Some("car")],
+        "van leads by less than the lead"
+    );
+    pace.observe(
+        &report("c", vec![object("van", 0.85, 0.0, 0.0)], &[]),
+        START,
+    );
     assert_eq!(labels(&pace.close(START).landmarks), [Some("van")]);
 }
 
@@ -267,21 +373,40 @@ fn a_sole_claim_against_several_that_look_is_not_published() {
     let facing = |node: &str, listed: bool| {
         let seen = listed.then(|| vec!["slot-0".into()]);
         let pose = Some(WirePose::new(-5.0, 0.0, 0.0));
-        let view = Some(FieldOfView { range_m: 30.0, angle_rad: 1.0 });
-        ObjectReport { seen, pose, view, ..report(node, Vec::new(), &[]) }
+        let view = Some(FieldOfView {
+            range_m: 30.0,
+            angle_rad: 1.0,
+        });
+        ObjectReport {
+            seen,
+            pose,
+            view,
+            ..report(node, Vec::new(), &[])
+        }
     };
-    for (lookers, listed, expected) in
-        [(1, true, Some("car")), (3, true, Some("car")), (4, true, None), (4, false, None), (0, true, Some("car"))]
-    {
+    for (lookers, listed, expected) in [
+        (1, true, Some("car")),
+        (3, true, Some("car")),
+        (4, true, None),
+        (4, false, None),
+        (0, true, Some("car")),
+    ] {
         let mut pace = pace(PaceConfig::default(), vec![landmark(0, 0.0, 0.0)]);
         let mut published = Vec::new();
         for n in 0..30 {
-            pace.observe(&report("mallory", vec![object("car", 1.0, 0.0, 0.0)], &["slot-0"]), frame(n));
+            pace.observe(
+                &report("mallory", vec![object("car", 1.0, 0.0, 0.0)], &["slot-0"]),
+                frame(n),
+            );
             for looker in 0..lookers {
                 pace.observe(&facing(&format!("honest-{looker}"), listed), frame(n));
             }
             published = pace.close(frame(n)).landmarks;
         }
-        assert_eq!(labels(&published), [expected], "{lookers} look, listed: {listed}");
+        assert_eq!(
+            labels(&published),
+            [expected],
+            "{lookers} look, listed: {listed}"
+        );
     }
 }

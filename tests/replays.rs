@@ -17,18 +17,33 @@ struct Lot {
 }
 
 fn lot() -> ReplayConfig {
-    let Lot { name, fusion, landmarks } = toml::from_str(include_str!("../examples/recordings/lot.toml")).unwrap();
+    let Lot {
+        name,
+        fusion,
+        landmarks,
+    } = toml::from_str(include_str!("../examples/recordings/lot.toml")).unwrap();
     let landmarks = landmarks.iter().map(Landmark::from).collect();
-    ReplayConfig { aggregator: name.parse().unwrap(), fusion, landmarks, ..ReplayConfig::default() }
+    ReplayConfig {
+        aggregator: name.parse().unwrap(),
+        fusion,
+        landmarks,
+        ..ReplayConfig::default()
+    }
 }
 
 /// Digest of all lines of output.
 fn digest(config: ReplayConfig) -> String {
     let mut replay = Replay::new(config);
     let recording = include_str!("../examples/recordings/lot.jsonl");
-    let mut rounds: Vec<FusedLine> = recording.lines().flat_map(|line| replay.line(line.as_bytes())).collect();
+    let mut rounds: Vec<FusedLine> = recording
+        .lines()
+        .flat_map(|line| replay.line(line.as_bytes()))
+        .collect();
     rounds.extend(replay.finish().0);
-    let lines: Vec<_> = rounds.iter().map(|round| serde_json::to_string(round).unwrap()).collect();
+    let lines: Vec<_> = rounds
+        .iter()
+        .map(|round| serde_json::to_string(round).unwrap())
+        .collect();
     assert!(!lines.is_empty());
     Uuid::new_v5(&Uuid::NAMESPACE_OID, lines.join("\n").as_bytes()).to_string()
 }
@@ -47,10 +62,19 @@ fn a_known_cell_is_replayed_to_the_byte() {
 
 #[test]
 fn a_cell_that_learns_its_locations_is_replayed_to_the_byte() {
-    check(ReplayConfig::default(), "106fcb8e-1695-5b81-92f1-ad2266e4920b");
+    check(
+        ReplayConfig::default(),
+        "106fcb8e-1695-5b81-92f1-ad2266e4920b",
+    );
 }
 
 #[test]
 fn passes_over_all_votes_are_replayed_to_the_byte() {
-    check(ReplayConfig { passes: Some(20), ..ReplayConfig::default() }, "a4963860-e793-58c8-98c9-f7c5d9b63b04");
+    check(
+        ReplayConfig {
+            passes: Some(20),
+            ..ReplayConfig::default()
+        },
+        "a4963860-e793-58c8-98c9-f7c5d9b63b04",
+    );
 }

@@ -38,7 +38,11 @@ fn imports_run_downward_without_a_circle() {
             Err(circle) => circles.push(house.explain(&parent, &circle)),
         }
     }
-    assert!(circles.is_empty(), "rooms that import each other:\n{}", circles.concat());
+    assert!(
+        circles.is_empty(),
+        "rooms that import each other:\n{}",
+        circles.concat()
+    );
 }
 
 /// Names that every actor or program has one of.
@@ -59,13 +63,19 @@ fn one_type_name_means_one_thing() {
                 _ => continue,
             };
             // One of two that stand for each other.
-            if !attributes.iter().any(|attribute| attribute.path().is_ident("cfg")) {
+            if !attributes
+                .iter()
+                .any(|attribute| attribute.path().is_ident("cfg"))
+            {
                 named.entry(name.to_string()).or_default().insert(module);
             }
         }
     }
     named.retain(|name, modules| modules.len() > 1 && !IDIOMS.contains(&name.as_str()));
-    assert!(named.is_empty(), "type names that mean several things: {named:#?}");
+    assert!(
+        named.is_empty(),
+        "type names that mean several things: {named:#?}"
+    );
 }
 
 #[test]
@@ -73,14 +83,33 @@ fn a_circle_is_found_and_named() {
     let graph = |edges: &[(&str, &str)]| {
         let mut graph = BTreeMap::<String, BTreeSet<String>>::new();
         for (from, to) in edges {
-            graph.entry((*from).into()).or_default().insert((*to).into());
+            graph
+                .entry((*from).into())
+                .or_default()
+                .insert((*to).into());
             graph.entry((*to).into()).or_default();
         }
         graph
     };
-    let tower = floors(&graph(&[("roof", "hall"), ("hall", "cellar"), ("roof", "cellar")]));
-    assert_eq!(tower, Ok(vec![vec!["cellar".into()], vec!["hall".into()], vec!["roof".into()]]));
-    let knot = floors(&graph(&[("roof", "hall"), ("hall", "attic"), ("attic", "hall"), ("hall", "cellar")]));
+    let tower = floors(&graph(&[
+        ("roof", "hall"),
+        ("hall", "cellar"),
+        ("roof", "cellar"),
+    ]));
+    assert_eq!(
+        tower,
+        Ok(vec![
+            vec!["cellar".into()],
+            vec!["hall".into()],
+            vec!["roof".into()]
+        ])
+    );
+    let knot = floors(&graph(&[
+        ("roof", "hall"),
+        ("hall", "attic"),
+        ("attic", "hall"),
+        ("hall", "cellar"),
+    ]));
     assert_eq!(knot, Err(BTreeSet::from(["attic".into(), "hall".into()])));
 }
 
@@ -101,7 +130,11 @@ impl House {
         let mut imports = BTreeSet::new();
         for (module, path) in &modules {
             let file = syn::parse_file(&fs::read_to_string(path).unwrap()).unwrap();
-            let mut reader = Reader { module, modules: &modules, imports: &mut imports };
+            let mut reader = Reader {
+                module,
+                modules: &modules,
+                imports: &mut imports,
+            };
             reader.visit_file(&file);
         }
         Self { modules, imports }
@@ -119,10 +152,15 @@ impl House {
     /// The rooms of a parent, each with the rooms that it imports.
     fn rooms(&self, parent: &Module) -> BTreeMap<String, BTreeSet<String>> {
         let room = |module: &Module| {
-            (module.len() > parent.len() && module.starts_with(parent)).then(|| module[parent.len()].clone())
+            (module.len() > parent.len() && module.starts_with(parent))
+                .then(|| module[parent.len()].clone())
         };
-        let mut rooms: BTreeMap<_, BTreeSet<_>> =
-            self.modules.keys().filter_map(room).map(|name| (name, BTreeSet::new())).collect();
+        let mut rooms: BTreeMap<_, BTreeSet<_>> = self
+            .modules
+            .keys()
+            .filter_map(room)
+            .map(|name| (name, BTreeSet::new()))
+            .collect();
         for (from, to) in &self.imports {
             if let (Some(from), Some(to)) = (room(from), room(to))
                 && from != to
@@ -136,18 +174,22 @@ impl House {
     /// The imports that tie a circle.
     fn explain(&self, parent: &Module, circle: &BTreeSet<String>) -> String {
         let inside = |module: &Module| {
-            module.len() > parent.len() && module.starts_with(parent) && circle.contains(&module[parent.len()])
+            module.len() > parent.len()
+                && module.starts_with(parent)
+                && circle.contains(&module[parent.len()])
         };
-        let tied = self
-            .imports
-            .iter()
-            .filter(|(from, to)| inside(from) && inside(to) && from[parent.len()] != to[parent.len()]);
-        tied.map(|(from, to)| format!("  {} -> {}\n", from.join("::"), to.join("::"))).collect()
+        let tied = self.imports.iter().filter(|(from, to)| {
+            inside(from) && inside(to) && from[parent.len()] != to[parent.len()]
+        });
+        tied.map(|(from, to)| format!("  {} -> {}\n", from.join("::"), to.join("::")))
+            .collect()
     }
 }
 
 /// Rooms by floor, the lowest first; or the rooms that lie on a circle or between two.
-fn floors(rooms: &BTreeMap<String, BTreeSet<String>>) -> Result<Vec<Vec<String>>, BTreeSet<String>> {
+fn floors(
+    rooms: &BTreeMap<String, BTreeSet<String>>,
+) -> Result<Vec<Vec<String>>, BTreeSet<String>> {
     let mut placed = BTreeSet::new();
     let mut floors = Vec::new();
     while placed.len() < rooms.len() {
@@ -167,9 +209,17 @@ fn floors(rooms: &BTreeMap<String, BTreeSet<String>>) -> Result<Vec<Vec<String>>
 
 /// Rooms that are not placed and that a room of the same kind imports.
 fn tied(rooms: &BTreeMap<String, BTreeSet<String>>, placed: &BTreeSet<String>) -> BTreeSet<String> {
-    let mut left: BTreeSet<_> = rooms.keys().filter(|room| !placed.contains(*room)).cloned().collect();
+    let mut left: BTreeSet<_> = rooms
+        .keys()
+        .filter(|room| !placed.contains(*room))
+        .cloned()
+        .collect();
     loop {
-        let imported: BTreeSet<_> = left.iter().flat_map(|room| rooms[room].intersection(&left)).cloned().collect();
+        let imported: BTreeSet<_> = left
+            .iter()
+            .flat_map(|room| rooms[room].intersection(&left))
+            .cloned()
+            .collect();
         if imported.len() == left.len() {
             return left;
         }
@@ -179,16 +229,24 @@ fn tied(rooms: &BTreeMap<String, BTreeSet<String>>, placed: &BTreeSet<String>) -
 
 /// Notes the modules of a folder; `lib.rs` is the crate itself.
 fn collect(folder: &Path, parent: &[String], modules: &mut BTreeMap<Module, PathBuf>) {
-    let Ok(entries) = fs::read_dir(folder) else { return };
+    let Ok(entries) = fs::read_dir(folder) else {
+        return;
+    };
     for path in entries.map(|entry| entry.unwrap().path()) {
         let stem = path.file_stem().unwrap().to_str().unwrap().to_owned();
         if stem == "tests" || stem == "bin" {
             continue;
         }
-        let module = if stem == "lib" { parent.to_vec() } else { [parent, &[stem]].concat() };
+        let module = if stem == "lib" {
+            parent.to_vec()
+        } else {
+            [parent, &[stem]].concat()
+        };
         if path.is_dir() {
             collect(&path, &module, modules);
-        } else if path.extension().is_some_and(|extension| extension == "rs") && path.file_stem().unwrap() != "main" {
+        } else if path.extension().is_some_and(|extension| extension == "rs")
+            && path.file_stem().unwrap() != "main"
+        {
             modules.insert(module, path);
         }
     }
@@ -236,7 +294,10 @@ impl Reader<'_> {
             syn::UseTree::Name(name) => self.note(&with(&name.ident)),
             syn::UseTree::Rename(rename) => self.note(&with(&rename.ident)),
             syn::UseTree::Glob(_) => self.note(before),
-            syn::UseTree::Group(group) => group.items.iter().for_each(|tree| self.note_tree(before, tree)),
+            syn::UseTree::Group(group) => group
+                .items
+                .iter()
+                .for_each(|tree| self.note_tree(before, tree)),
         }
     }
 }
@@ -247,7 +308,11 @@ impl<'ast> Visit<'ast> for Reader<'_> {
     }
 
     fn visit_path(&mut self, path: &'ast syn::Path) {
-        let names: Vec<_> = path.segments.iter().map(|segment| segment.ident.to_string()).collect();
+        let names: Vec<_> = path
+            .segments
+            .iter()
+            .map(|segment| segment.ident.to_string())
+            .collect();
         if names.len() > 1 {
             self.note(&names);
         }
@@ -257,7 +322,10 @@ impl<'ast> Visit<'ast> for Reader<'_> {
     fn visit_item_mod(&mut self, item: &'ast syn::ItemMod) {
         let is_test = item.attrs.iter().any(|attribute| {
             attribute.path().is_ident("cfg")
-                && attribute.meta.require_list().is_ok_and(|list| list.tokens.to_string() == "test")
+                && attribute
+                    .meta
+                    .require_list()
+                    .is_ok_and(|list| list.tokens.to_string() == "test")
         });
         if !is_test {
             visit::visit_item_mod(self, item);

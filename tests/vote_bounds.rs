@@ -20,7 +20,10 @@ fn statement() -> impl Strategy<Value = Statement> {
 
 fn rounds() -> impl Strategy<Value = Vec<(u64, Vec<Statement>)>> {
     let gap_ms = prop_oneof![Just(100u64), Just(700), Just(2500)];
-    proptest::collection::vec((gap_ms, proptest::collection::vec(statement(), 0..20)), 1..12)
+    proptest::collection::vec(
+        (gap_ms, proptest::collection::vec(statement(), 0..20)),
+        1..12,
+    )
 }
 
 /// The reports of a round, each vehicle's statements in one.
@@ -29,20 +32,33 @@ fn reports(seq: u64, at: Timestamp, statements: &[Statement], scale: f64) -> Vec
     for &(vehicle, landmark, label, confidence, distance) in statements {
         let object = PerceivedObject {
             landmark: Some(format!("place-{landmark}").into()),
-            ..PerceivedObject::new(format!("label-{label}").as_str(), confidence * scale, 0.0, 0.0)
+            ..PerceivedObject::new(
+                format!("label-{label}").as_str(),
+                confidence * scale,
+                0.0,
+                0.0,
+            )
         };
-        objects.entry(vehicle).or_insert_with(|| (distance, Vec::new())).1.push(object);
+        objects
+            .entry(vehicle)
+            .or_insert_with(|| (distance, Vec::new()))
+            .1
+            .push(object);
     }
-    let report = |(vehicle, (distance, objects)): (usize, (f64, Vec<PerceivedObject>))| ObjectReport {
-        objects,
-        pose: Some(WirePose::new(-distance, 0.0, 0.0)),
-        ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).unwrap(), seq, at)
-    };
+    let report =
+        |(vehicle, (distance, objects)): (usize, (f64, Vec<PerceivedObject>))| ObjectReport {
+            objects,
+            pose: Some(WirePose::new(-distance, 0.0, 0.0)),
+            ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).unwrap(), seq, at)
+        };
     objects.into_iter().map(report).collect()
 }
 
 fn labels(verdicts: &[Verdict]) -> BTreeMap<LandmarkId, Option<Label>> {
-    verdicts.iter().map(|v| (v.landmark.clone(), v.label.clone())).collect()
+    verdicts
+        .iter()
+        .map(|v| (v.landmark.clone(), v.label.clone()))
+        .collect()
 }
 
 proptest! {

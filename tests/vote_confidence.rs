@@ -24,7 +24,9 @@ fn accuracy(state: impl Fn(usize, f64, f64) -> f64) -> (f64, f64) {
     };
     for seed in 0..2 {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let skills: Vec<f64> = (0..VEHICLES).map(|_| rng.random_range(0.45..0.85)).collect();
+        let skills: Vec<f64> = (0..VEHICLES)
+            .map(|_| rng.random_range(0.45..0.85))
+            .collect();
         let mut config = VoteConfig::default();
         config.weighted.freshness_s = 1e9;
         let mut vote = Vote::new(config, Vec::new());
@@ -39,16 +41,28 @@ fn accuracy(state: impl Fn(usize, f64, f64) -> f64) -> (f64, f64) {
                 let label = if rng.random_bool(p) { truth } else { wrong };
                 let object = PerceivedObject {
                     landmark: Some(item.to_string().into()),
-                    ..PerceivedObject::new(label.to_string(), state(vehicle, p, rng.random_range(0.0..1.0)), 0.0, 0.0)
+                    ..PerceivedObject::new(
+                        label.to_string(),
+                        state(vehicle, p, rng.random_range(0.0..1.0)),
+                        0.0,
+                        0.0,
+                    )
                 };
                 let report = ObjectReport {
                     objects: vec![object],
-                    ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).unwrap(), item as u64, at)
+                    ..ObjectReport::new(
+                        NodeName::new(format!("v{vehicle}")).unwrap(),
+                        item as u64,
+                        at,
+                    )
                 };
                 vote.observe(&report, at).unwrap();
             }
             let at_once = vote.close(at).verdicts;
-            online += at_once.iter().filter(|v| v.landmark.as_str() == item.to_string() && right(v, &truths)).count();
+            online += at_once
+                .iter()
+                .filter(|v| v.landmark.as_str() == item.to_string() && right(v, &truths))
+                .count();
         }
         refined += vote.refine(10).iter().filter(|v| right(v, &truths)).count();
     }
@@ -67,7 +81,9 @@ fn confidences_help_when_they_tell_and_do_no_harm_when_they_do_not() {
     let telling: [(&str, Statement); 3] = [
         ("calibrated", |_, p, _| p),
         ("overconfident", |_, p, _| p.powf(0.25)),
-        ("on scales of their own", |vehicle, p, _| p * (0.3 + 0.1 * vehicle as f64).min(1.0)),
+        ("on scales of their own", |vehicle, p, _| {
+            p * (0.3 + 0.1 * vehicle as f64).min(1.0)
+        }),
     ];
     for (name, state) in telling {
         let (telling_online, telling_refined) = accuracy(state);

@@ -20,7 +20,13 @@ fn report(node: &str, seq: u64, votes: &[(String, String)]) -> (ObjectReport, Ti
         ..PerceivedObject::new(label.as_str(), 0.8, 0.0, 0.0)
     };
     let objects = votes.iter().map(object).collect();
-    (ObjectReport { objects, ..ObjectReport::new(NodeName::new(node).unwrap(), seq, at) }, at)
+    (
+        ObjectReport {
+            objects,
+            ..ObjectReport::new(NodeName::new(node).unwrap(), seq, at)
+        },
+        at,
+    )
 }
 
 fn say(vote: &mut Vote, node: &str, seq: u64, votes: &[(String, String)]) {
@@ -34,7 +40,9 @@ fn vote_for(landmark: &str, label: &str) -> (String, String) {
 
 /// A vehicle's round of `count` labels that nobody has heard before, each at a place of its own.
 fn inventions(round: u64, count: usize) -> Vec<(String, String)> {
-    (0..count).map(|n| (format!("nowhere-{n}"), format!("invented-{round}-{n}"))).collect()
+    (0..count)
+        .map(|n| (format!("nowhere-{n}"), format!("invented-{round}-{n}")))
+        .collect()
 }
 
 #[test]
@@ -51,7 +59,9 @@ fn new_labels_are_heard_while_one_vehicle_invents_labels_without_end() {
         let mut lies = inventions(2 * round + 1, 300);
         lies.push(vote_for("known", &format!("invented-{round}")));
         say(&mut vote, "liar", 2 * round + 1, &lies);
-        let verdicts = vote.close(START + ROUND * u32::try_from(2 * round + 1).unwrap()).verdicts;
+        let verdicts = vote
+            .close(START + ROUND * u32::try_from(2 * round + 1).unwrap())
+            .verdicts;
         let label = |landmark: &str| {
             verdicts
                 .iter()
@@ -69,13 +79,32 @@ fn new_labels_are_heard_while_one_vehicle_invents_labels_without_end() {
 
 #[test]
 fn a_vehicle_alone_goes_on_with_the_labels_that_it_stated_last() {
-    let mut vote = Vote::new(VoteConfig { max_labels: 16, ..VoteConfig::default() }, Vec::new());
+    let mut vote = Vote::new(
+        VoteConfig {
+            max_labels: 16,
+            ..VoteConfig::default()
+        },
+        Vec::new(),
+    );
     for round in 0..100 {
-        say(&mut vote, "a", round, &[vote_for("x", &format!("thing-{}", round / 5)), vote_for("y", "cup")]);
-        let verdicts = vote.close(START + ROUND * u32::try_from(round).unwrap()).verdicts;
+        say(
+            &mut vote,
+            "a",
+            round,
+            &[
+                vote_for("x", &format!("thing-{}", round / 5)),
+                vote_for("y", "cup"),
+            ],
+        );
+        let verdicts = vote
+            .close(START + ROUND * u32::try_from(round).unwrap())
+            .verdicts;
         assert_eq!(verdicts[1].label.as_deref(), Some("cup"));
         if round % 5 == 4 {
-            assert_eq!(verdicts[0].label, Some(format!("thing-{}", round / 5).into()));
+            assert_eq!(
+                verdicts[0].label,
+                Some(format!("thing-{}", round / 5).into())
+            );
         }
     }
     assert_eq!(vote.ignored(), 0);
@@ -86,22 +115,48 @@ fn a_ledger_full_of_labels_leaves_room_for_the_cells_own() {
     let mut ledger = ReputationLedger::default();
     for number in 0..300 {
         let label = format!("invented-{number:03}").into();
-        let evidence = Evidence { node: NodeName::from_static("liar"), label, correct: false };
+        let evidence = Evidence {
+            node: NodeName::from_static("liar"),
+            label,
+            correct: false,
+        };
         ledger.record(1, &NodeName::from_static("edge"), &evidence);
     }
     for mode in [VoteMode::Weighted, VoteMode::Paper] {
-        let mut vote = Vote::new(VoteConfig { mode, ..VoteConfig::default() }, Vec::new());
+        let mut vote = Vote::new(
+            VoteConfig {
+                mode,
+                ..VoteConfig::default()
+            },
+            Vec::new(),
+        );
         vote.adopt(&ledger);
-        ["a", "b"].iter().for_each(|node| say(&mut vote, node, 1, &[vote_for("x", "zebra")]));
-        assert_eq!(vote.close(START + ROUND).verdicts[0].label.as_deref(), Some("zebra"));
+        ["a", "b"]
+            .iter()
+            .for_each(|node| say(&mut vote, node, 1, &[vote_for("x", "zebra")]));
+        assert_eq!(
+            vote.close(START + ROUND).verdicts[0].label.as_deref(),
+            Some("zebra")
+        );
     }
 }
 
 #[test]
 fn votes_that_leave_with_their_labels_are_counted() {
-    let mut vote = Vote::new(VoteConfig { max_labels: 8, ..VoteConfig::default() }, Vec::new());
+    let mut vote = Vote::new(
+        VoteConfig {
+            max_labels: 8,
+            ..VoteConfig::default()
+        },
+        Vec::new(),
+    );
     say(&mut vote, "a", 1, &inventions(1, 20));
-    let lost = vote.close(START + ROUND).verdicts.iter().filter(|verdict| verdict.label.is_none()).count();
+    let lost = vote
+        .close(START + ROUND)
+        .verdicts
+        .iter()
+        .filter(|verdict| verdict.label.is_none())
+        .count();
     assert!(lost >= 12, "{lost} of 20 labels lost");
     assert_eq!(vote.ignored(), lost as u64);
 }
@@ -110,21 +165,46 @@ fn votes_that_leave_with_their_labels_are_counted() {
 fn synonyms_of_the_cell_hold_everywhere_and_a_landmarks_own_go_first() {
     for mode in [VoteMode::Weighted, VoteMode::Paper] {
         let synonyms = [("vase".into(), "sports ball".into())].into();
-        let config = VoteConfig { mode, synonyms, ..VoteConfig::default() };
+        let config = VoteConfig {
+            mode,
+            synonyms,
+            ..VoteConfig::default()
+        };
         let landmark = |id: &str, own: &[(&str, &str)]| Landmark {
             id: id.into(),
             position: Point2::origin(),
             facing_rad: None,
             vacancy: None,
-            synonyms: own.iter().map(|&(from, label)| Synonym { from: from.into(), label: label.into() }).collect(),
+            synonyms: own
+                .iter()
+                .map(|&(from, label)| Synonym {
+                    from: from.into(),
+                    label: label.into(),
+                })
+                .collect(),
         };
-        let known = vec![landmark("x", &[("vase", "bottle")]), landmark("y", &[("mug", "cup")])];
+        let known = vec![
+            landmark("x", &[("vase", "bottle")]),
+            landmark("y", &[("mug", "cup")]),
+        ];
         for landmarks in [known, Vec::new()] {
-            let own = if landmarks.is_empty() { "sports ball" } else { "bottle" };
+            let own = if landmarks.is_empty() {
+                "sports ball"
+            } else {
+                "bottle"
+            };
             let mut vote = Vote::new(config.clone(), landmarks);
-            say(&mut vote, "a", 1, &[vote_for("x", "vase"), vote_for("y", "vase")]);
+            say(
+                &mut vote,
+                "a",
+                1,
+                &[vote_for("x", "vase"), vote_for("y", "vase")],
+            );
             let verdicts = vote.close(START + ROUND).verdicts;
-            let labels: Vec<_> = verdicts.iter().map(|verdict| verdict.label.as_deref()).collect();
+            let labels: Vec<_> = verdicts
+                .iter()
+                .map(|verdict| verdict.label.as_deref())
+                .collect();
             assert_eq!(labels, [Some(own), Some("sports ball")], "{mode:?}");
         }
     }

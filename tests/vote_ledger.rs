@@ -17,7 +17,15 @@ fn name(node: &str) -> NodeName {
 fn record(ledger: &mut ReputationLedger, node: &str, votes: usize, correct: bool) {
     let label = if correct { "cup" } else { "mouse" };
     for _ in 0..votes {
-        ledger.record(1, &name("edge"), &Evidence { node: name(node), label: label.into(), correct });
+        ledger.record(
+            1,
+            &name("edge"),
+            &Evidence {
+                node: name(node),
+                label: label.into(),
+                correct,
+            },
+        );
     }
 }
 
@@ -25,11 +33,20 @@ fn record(ledger: &mut ReputationLedger, node: &str, votes: usize, correct: bool
 fn verdict(vote: &mut Vote, votes: &[(&str, &str)]) -> Option<String> {
     let at = START + Duration::from_millis(1);
     for (node, label) in votes {
-        let object = PerceivedObject { landmark: Some("x".into()), ..PerceivedObject::new(*label, 0.8, 0.0, 0.0) };
-        let report = ObjectReport { objects: vec![object], ..ObjectReport::new(name(node), 1, at) };
+        let object = PerceivedObject {
+            landmark: Some("x".into()),
+            ..PerceivedObject::new(*label, 0.8, 0.0, 0.0)
+        };
+        let report = ObjectReport {
+            objects: vec![object],
+            ..ObjectReport::new(name(node), 1, at)
+        };
         vote.observe(&report, at).unwrap();
     }
-    vote.close(at).verdicts[0].label.as_deref().map(str::to_owned)
+    vote.close(at).verdicts[0]
+        .label
+        .as_deref()
+        .map(str::to_owned)
 }
 
 #[test]
@@ -48,7 +65,10 @@ fn a_restart_does_not_trust_who_was_right_for_long_and_turned() {
     let trusted = vote.reputations();
     assert!(trusted[&name("turncoat")].score < 0.35, "{trusted:?}");
     assert!(trusted[&name("honest")].score > 0.9, "{trusted:?}");
-    assert_eq!(verdict(&mut vote, &[("turncoat", "mouse"), ("honest", "cup")]).as_deref(), Some("cup"));
+    assert_eq!(
+        verdict(&mut vote, &[("turncoat", "mouse"), ("honest", "cup")]).as_deref(),
+        Some("cup")
+    );
 }
 
 #[test]
@@ -79,18 +99,36 @@ fn a_standby_that_counted_the_latest_votes_itself_takes_over_those_before() {
         round += 1;
         let at = START + Duration::from_secs(3) * round;
         for node in ["a", "b", "c"] {
-            let object = PerceivedObject { landmark: Some("x".into()), ..PerceivedObject::new("cup", 0.8, 0.0, 0.0) };
-            let report = ObjectReport { objects: vec![object], ..ObjectReport::new(name(node), round.into(), at) };
+            let object = PerceivedObject {
+                landmark: Some("x".into()),
+                ..PerceivedObject::new("cup", 0.8, 0.0, 0.0)
+            };
+            let report = ObjectReport {
+                objects: vec![object],
+                ..ObjectReport::new(name(node), round.into(), at)
+            };
             vote.observe(&report, at).unwrap();
         }
-        vote.close(at).evidence.iter().for_each(|vote| ledger.record(2, &name("edge"), vote));
+        vote.close(at)
+            .evidence
+            .iter()
+            .for_each(|vote| ledger.record(2, &name("edge"), vote));
     }
     let before = vote.reputations();
     vote.adopt(&ledger);
     let after = vote.reputations();
-    assert!((before[&name("c")].score - after[&name("c")].score).abs() < 0.01, "all of c's votes were counted here");
-    assert!(after[&name("a")].score < before[&name("a")].score - 0.2, "{before:?} {after:?}");
-    assert!(after[&name("b")].score >= before[&name("b")].score, "{before:?} {after:?}");
+    assert!(
+        (before[&name("c")].score - after[&name("c")].score).abs() < 0.01,
+        "all of c's votes were counted here"
+    );
+    assert!(
+        after[&name("a")].score < before[&name("a")].score - 0.2,
+        "{before:?} {after:?}"
+    );
+    assert!(
+        after[&name("b")].score >= before[&name("b")].score,
+        "{before:?} {after:?}"
+    );
 }
 
 #[test]
@@ -103,7 +141,17 @@ fn evidence_that_is_withdrawn_no_longer_counts() {
     vote.adopt(&forged);
     assert!(vote.reputations()[&name("liar")].score > 0.9);
     vote.adopt(&ReputationLedger::default());
-    let scores: Vec<f64> = vote.reputations().into_values().map(|vehicle| vehicle.score).collect();
-    assert!(scores.iter().all(|score| (score - scores[0]).abs() < 1e-9), "all are strangers again: {scores:?}");
-    assert_eq!(verdict(&mut vote, &[("liar", "mouse"), ("a", "cup"), ("b", "cup")]).as_deref(), Some("cup"));
+    let scores: Vec<f64> = vote
+        .reputations()
+        .into_values()
+        .map(|vehicle| vehicle.score)
+        .collect();
+    assert!(
+        scores.iter().all(|score| (score - scores[0]).abs() < 1e-9),
+        "all are strangers again: {scores:?}"
+    );
+    assert_eq!(
+        verdict(&mut vote, &[("liar", "mouse"), ("a", "cup"), ("b", "cup")]).as_deref(),
+        Some("cup")
+    );
 }

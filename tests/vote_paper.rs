@@ -42,7 +42,8 @@ impl Reference {
             let turn = (dy.atan2(dx) - heading).to_degrees().rem_euclid(360.0);
             let angle = turn.min(360.0 - turn);
             let visibility = 0.7 * (1.0 - distance / 2.54) + 0.3 * angle / 360.0;
-            *self.scores.entry((place, label)).or_insert(0.0) += reputation * confidence * visibility;
+            *self.scores.entry((place, label)).or_insert(0.0) +=
+                reputation * confidence * visibility;
             self.votes.entry(*vehicle).or_default().push((place, label));
         }
     }
@@ -62,10 +63,14 @@ impl Reference {
     fn close(&mut self) {
         let verdicts: Vec<_> = (0..PLACES.len()).map(|place| self.verdict(place)).collect();
         for (vehicle, votes) in std::mem::take(&mut self.votes) {
-            let correct = votes.iter().filter(|(place, label)| verdicts[*place] == Some(*label)).count() as f64;
+            let correct = votes
+                .iter()
+                .filter(|(place, label)| verdicts[*place] == Some(*label))
+                .count() as f64;
             let incorrect = votes.len() as f64 - correct;
             let reputation = self.reputations.entry(vehicle).or_insert(0.5);
-            *reputation = (*reputation + 0.01 * (correct - incorrect) / votes.len() as f64).clamp(0.3, 1.0);
+            *reputation =
+                (*reputation + 0.01 * (correct - incorrect) / votes.len() as f64).clamp(0.3, 1.0);
         }
     }
 }
@@ -88,13 +93,18 @@ fn wire((vehicle, (x_m, y_m, heading_rad), detections): &Report, seq: u64) -> Ob
     ObjectReport {
         pose: Some(WirePose::new(*x_m, *y_m, *heading_rad)),
         objects: detections.iter().map(object).collect(),
-        ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).unwrap(), seq, START + Duration::from_millis(seq))
+        ..ObjectReport::new(
+            NodeName::new(format!("v{vehicle}")).unwrap(),
+            seq,
+            START + Duration::from_millis(seq),
+        )
     }
 }
 
 fn report() -> impl Strategy<Value = Report> {
     let confidence = prop_oneof![Just(0.0), 0.01..1.0, Just(1.0)];
-    let detections = proptest::collection::vec((0..PLACES.len(), 0..LABELS.len(), confidence), 0..6);
+    let detections =
+        proptest::collection::vec((0..PLACES.len(), 0..LABELS.len(), confidence), 0..6);
     (0usize..4, (-2.0..2.0, -2.0..2.0, -3.0..3.0), detections)
 }
 
@@ -139,9 +149,16 @@ proptest! {
 #[test]
 fn visibility_grows_off_axis_as_printed() {
     let score = |heading: f64| {
-        let config = VoteConfig { mode: VoteMode::Paper, ..VoteConfig::default() };
+        let config = VoteConfig {
+            mode: VoteMode::Paper,
+            ..VoteConfig::default()
+        };
         let mut vote = Vote::new(config, vec![landmark(0)]);
-        vote.observe(&wire(&(0, (-1.0, 0.0, heading), vec![(0, 0, 1.0)]), 1), START).unwrap();
+        vote.observe(
+            &wire(&(0, (-1.0, 0.0, heading), vec![(0, 0, 1.0)]), 1),
+            START,
+        )
+        .unwrap();
         vote.close(START).verdicts[0].score
     };
     assert!(score(1.0) > score(0.0));

@@ -24,7 +24,9 @@ struct Cell {
 fn run(cell: &Cell, seed: u64) -> (f64, usize) {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
-    let truths: Vec<usize> = (0..cell.landmarks).map(|_| rng.random_range(0..LABELS.len())).collect();
+    let truths: Vec<usize> = (0..cell.landmarks)
+        .map(|_| rng.random_range(0..LABELS.len()))
+        .collect();
     let mut now = Timestamp(1_700_000_000_000_000);
     let (mut right, mut changes) = (0, 0);
     let mut shown = vec![None; cell.landmarks];
@@ -36,12 +38,18 @@ fn run(cell: &Cell, seed: u64) -> (f64, usize) {
                 (false, true) => truth,
                 (false, false) => (truth + rng.random_range(1..LABELS.len())) % LABELS.len(),
             };
-            let objects = truths.iter().enumerate().map(|(place, &truth)| PerceivedObject {
-                landmark: Some(format!("place-{place}").into()),
-                ..PerceivedObject::new(LABELS[see(truth)], 0.8, 0.0, 0.0)
-            });
+            let objects = truths
+                .iter()
+                .enumerate()
+                .map(|(place, &truth)| PerceivedObject {
+                    landmark: Some(format!("place-{place}").into()),
+                    ..PerceivedObject::new(LABELS[see(truth)], 0.8, 0.0, 0.0)
+                });
             let node = NodeName::new(format!("vehicle-{vehicle}")).unwrap();
-            let report = ObjectReport { objects: objects.collect(), ..ObjectReport::new(node, round, now) };
+            let report = ObjectReport {
+                objects: objects.collect(),
+                ..ObjectReport::new(node, round, now)
+            };
             vote.observe(&report, now).unwrap();
         }
         for verdict in vote.close(now).verdicts {
@@ -53,7 +61,10 @@ fn run(cell: &Cell, seed: u64) -> (f64, usize) {
             shown[place] = verdict.label;
         }
     }
-    (100.0 * right as f64 / (ROUNDS as usize / 2 * cell.landmarks) as f64, changes)
+    (
+        100.0 * right as f64 / (ROUNDS as usize / 2 * cell.landmarks) as f64,
+        changes,
+    )
 }
 
 #[test]
@@ -61,8 +72,17 @@ fn verdicts_about_objects_that_stay_are_right_and_do_not_flicker() {
     for (vehicles, liars) in [(3, 0), (5, 0), (3, 1), (5, 2), (9, 4)] {
         for landmarks in [1, 3, 6] {
             for seed in 1..=3 {
-                let (right, changes) = run(&Cell { vehicles, liars, landmarks }, seed);
-                let cell = format!("{vehicles} vehicles, {liars} liars, {landmarks} landmarks, seed {seed}");
+                let (right, changes) = run(
+                    &Cell {
+                        vehicles,
+                        liars,
+                        landmarks,
+                    },
+                    seed,
+                );
+                let cell = format!(
+                    "{vehicles} vehicles, {liars} liars, {landmarks} landmarks, seed {seed}"
+                );
                 assert!(right >= 99.0, "{cell}: {right} % right");
                 assert!(changes <= landmarks, "{cell}: {changes} changes");
             }
@@ -79,13 +99,29 @@ fn vehicles_that_waver_do_not_outvote_one_that_is_sure() {
     for round in 0..ROUNDS {
         now = now + PERIOD;
         for (vehicle, bowl) in [("riemann", 0.6), ("galileo", 0.55), ("watson", 0.0)] {
-            let label = if rng.random_bool(bowl) { "bowl" } else { "sports ball" };
-            let object =
-                PerceivedObject { landmark: Some("place".into()), ..PerceivedObject::new(label, 0.5, 0.0, 0.0) };
+            let label = if rng.random_bool(bowl) {
+                "bowl"
+            } else {
+                "sports ball"
+            };
+            let object = PerceivedObject {
+                landmark: Some("place".into()),
+                ..PerceivedObject::new(label, 0.5, 0.0, 0.0)
+            };
             let node = NodeName::new(vehicle).unwrap();
-            vote.observe(&ObjectReport { objects: vec![object], ..ObjectReport::new(node, round, now) }, now).unwrap();
+            vote.observe(
+                &ObjectReport {
+                    objects: vec![object],
+                    ..ObjectReport::new(node, round, now)
+                },
+                now,
+            )
+            .unwrap();
         }
         right += usize::from(vote.close(now).verdicts[0].label.as_deref() == Some("sports ball"));
     }
-    assert!(right as f64 >= 0.95 * ROUNDS as f64, "{right} of {ROUNDS} right");
+    assert!(
+        right as f64 >= 0.95 * ROUNDS as f64,
+        "{right} of {ROUNDS} right"
+    );
 }

@@ -13,31 +13,55 @@ fn say(vote: &mut Vote, node: &str, seq: u64, votes: &[(&str, &str)]) {
         ..PerceivedObject::new(label, 0.8, 0.0, 0.0)
     };
     let objects = votes.iter().map(object).collect();
-    let report = ObjectReport { objects, ..ObjectReport::new(NodeName::new(node).unwrap(), seq, AT) };
+    let report = ObjectReport {
+        objects,
+        ..ObjectReport::new(NodeName::new(node).unwrap(), seq, AT)
+    };
     vote.observe(&report, AT).unwrap();
 }
 
 fn on<'a>(verdicts: &'a [Verdict], landmark: &str) -> &'a Verdict {
-    verdicts.iter().find(|verdict| verdict.landmark.as_str() == landmark).unwrap()
+    verdicts
+        .iter()
+        .find(|verdict| verdict.landmark.as_str() == landmark)
+        .unwrap()
 }
 
 #[test]
 fn who_corrects_an_answer_has_answered_once_and_is_believed_as_much_as_who_did_not_err() {
-    let weighted = WeightedConfig { freshness_s: 1e9, smoothing_share: 0.0, ..WeightedConfig::default() };
-    let config = VoteConfig { weighted, ..VoteConfig::default() };
+    let weighted = WeightedConfig {
+        freshness_s: 1e9,
+        smoothing_share: 0.0,
+        ..WeightedConfig::default()
+    };
+    let config = VoteConfig {
+        weighted,
+        ..VoteConfig::default()
+    };
     let answers = |labels: &[&str]| {
         let mut vote = Vote::new(config.clone(), Vec::new());
         say(&mut vote, "b", 1, &[("y", "cup"), ("z", "mouse")]);
-        (1..).zip(labels).for_each(|(seq, label)| say(&mut vote, "a", seq, &[("x", label)]));
+        (1..)
+            .zip(labels)
+            .for_each(|(seq, label)| say(&mut vote, "a", seq, &[("x", label)]));
         let online = on(&vote.close(AT).verdicts, "x").clone();
         (online, on(&vote.refine(10), "x").clone())
     };
     let once = answers(&["mouse"]);
-    for labels in [&["cup", "mouse"][..], &["cup", "cup", "mouse"], &["mouse", "mouse"]] {
+    for labels in [
+        &["cup", "mouse"][..],
+        &["cup", "cup", "mouse"],
+        &["mouse", "mouse"],
+    ] {
         let corrected = answers(labels);
         for (now, once) in [(corrected.0, &once.0), (corrected.1, &once.1)] {
             assert_eq!(now.label.as_deref(), Some("mouse"), "{labels:?}");
-            assert!((now.score - once.score).abs() < 1e-9, "{labels:?}: {} instead of {}", now.score, once.score);
+            assert!(
+                (now.score - once.score).abs() < 1e-9,
+                "{labels:?}: {} instead of {}",
+                now.score,
+                once.score
+            );
         }
     }
 }
@@ -45,7 +69,11 @@ fn who_corrects_an_answer_has_answered_once_and_is_believed_as_much_as_who_did_n
 #[test]
 fn where_all_waver_the_votes_on_other_places_still_count() {
     let mut vote = Vote::new(VoteConfig::default(), Vec::new());
-    for (node, first, second) in [("a", "cup", "mouse"), ("b", "mouse", "cup"), ("f", "cup", "mouse")] {
+    for (node, first, second) in [
+        ("a", "cup", "mouse"),
+        ("b", "mouse", "cup"),
+        ("f", "cup", "mouse"),
+    ] {
         let place = if node == "f" { "alone" } else { "x" };
         say(&mut vote, node, 1, &[(place, first)]);
         say(&mut vote, node, 2, &[(place, second)]);
@@ -62,6 +90,16 @@ fn where_all_waver_the_votes_on_other_places_still_count() {
     let verdicts = vote.refine(1);
     let labels = ["y", "z"].map(|place| on(&verdicts, place).label.as_deref());
     assert_eq!(labels, [Some("cup"), Some("mouse")]);
-    assert!(verdicts.iter().flat_map(|verdict| verdict.votes.values()).all(|score| score.is_finite()), "{verdicts:?}");
-    assert!(vote.reputations().values().all(|reputation| reputation.score.is_finite()));
+    assert!(
+        verdicts
+            .iter()
+            .flat_map(|verdict| verdict.votes.values())
+            .all(|score| score.is_finite()),
+        "{verdicts:?}"
+    );
+    assert!(
+        vote.reputations()
+            .values()
+            .all(|reputation| reputation.score.is_finite())
+    );
 }

@@ -149,7 +149,8 @@ fn parse() -> Result<Cli, Failure> {
 /// Names the command of another program, and how to get that.
 fn elsewhere(instead: &str) -> Failure {
     let program = instead.split(' ').next().unwrap_or_default();
-    let build = format!("build that program from the sources by `cargo build --release --bin {program}`");
+    let build =
+        format!("build that program from the sources by `cargo build --release --bin {program}`");
     Failure::usage(anyhow!("run `{instead}` instead; {build}"))
 }
 
@@ -200,7 +201,10 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
 /// When it cannot be written.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut output = std::io::stdout().lock();
-    match output.write_all(text.as_bytes()).and_then(|()| output.flush()) {
+    match output
+        .write_all(text.as_bytes())
+        .and_then(|()| output.flush())
+    {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
         written => written.context("cannot write to standard output"),
     }
@@ -215,16 +219,25 @@ impl From<anyhow::Error> for Failure {
 impl Failure {
     /// A node whose name is another's.
     fn name_taken(error: anyhow::Error) -> Self {
-        Self { error, code: NAME_TAKEN }
+        Self {
+            error,
+            code: NAME_TAKEN,
+        }
     }
 
     /// A configuration or argument that cannot be used.
     pub fn usage(error: impl Into<anyhow::Error>) -> Self {
-        Self { error: error.into(), code: USAGE }
+        Self {
+            error: error.into(),
+            code: USAGE,
+        }
     }
 
     /// Input of which nothing, or too little, could be used.
     fn rejected(error: anyhow::Error) -> Self {
-        Self { error, code: REJECTED }
+        Self {
+            error,
+            code: REJECTED,
+        }
     }
 }

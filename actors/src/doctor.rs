@@ -46,15 +46,30 @@ pub enum CheckResult {
 
 impl Finding {
     fn fine(check: &'static str, seen: impl Into<String>) -> Self {
-        Self { check, verdict: CheckResult::Fine, seen: seen.into(), fix: None }
+        Self {
+            check,
+            verdict: CheckResult::Fine,
+            seen: seen.into(),
+            fix: None,
+        }
     }
 
     fn doubtful(check: &'static str, seen: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { check, verdict: CheckResult::Doubtful, seen: seen.into(), fix: Some(fix.into()) }
+        Self {
+            check,
+            verdict: CheckResult::Doubtful,
+            seen: seen.into(),
+            fix: Some(fix.into()),
+        }
     }
 
     fn broken(check: &'static str, seen: impl Into<String>, fix: impl Into<String>) -> Self {
-        Self { check, verdict: CheckResult::Broken, seen: seen.into(), fix: Some(fix.into()) }
+        Self {
+            check,
+            verdict: CheckResult::Broken,
+            seen: seen.into(),
+            fix: Some(fix.into()),
+        }
     }
 }
 
@@ -87,10 +102,17 @@ pub async fn examine(config: &NodeConfig, file: &Path) -> Vec<Finding> {
 
 /// Checks that values look as if they had the units of their keys.
 fn units(config: &NodeConfig) -> impl Iterator<Item = Finding> {
-    config.doubtful_units().into_iter().filter_map(|(kind, cause)| {
-        let check = if kind == TroubleKind::ImplausibleSize { "sizes" } else { "units" };
-        Some(Finding::doubtful(check, cause?, kind.remedy()))
-    })
+    config
+        .doubtful_units()
+        .into_iter()
+        .filter_map(|(kind, cause)| {
+            let check = if kind == TroubleKind::ImplausibleSize {
+                "sizes"
+            } else {
+                "units"
+            };
+            Some(Finding::doubtful(check, cause?, kind.remedy()))
+        })
 }
 
 #[cfg(test)]
@@ -109,8 +131,11 @@ mod tests {
     use crate::transport::pki::{Authority, TlsConfig};
 
     fn config() -> NodeConfig {
-        let mut config =
-            NodeConfig { name: Some(NodeName::from_static("edge")), role: Role::Edge, ..NodeConfig::default() };
+        let mut config = NodeConfig {
+            name: Some(NodeName::from_static("edge")),
+            role: Role::Edge,
+            ..NodeConfig::default()
+        };
         config.listen = Some("127.0.0.1:0".parse().unwrap());
         config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
         config.membership.multicast.enabled = false;
@@ -132,17 +157,31 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let mut config = config();
         config.state_dir = Some(directory.path().into());
-        config.record = Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.path().join("a/b")) });
+        config.record = Some(RecordConfig {
+            min_free_mb: 0,
+            ..RecordConfig::new(directory.path().join("a/b"))
+        });
         let findings = examine(&config, Path::new("node.toml")).await;
-        assert!(findings.iter().all(|finding| finding.verdict < CheckResult::Broken), "{findings:?}");
-        assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0, "nothing is left behind");
+        assert!(
+            findings
+                .iter()
+                .all(|finding| finding.verdict < CheckResult::Broken),
+            "{findings:?}"
+        );
+        assert_eq!(
+            std::fs::read_dir(directory.path()).unwrap().count(),
+            0,
+            "nothing is left behind"
+        );
     }
 
     /// Issues certificates for 60 days into the directory.
     fn certificates(config: &NodeConfig, directory: &Path) -> TlsConfig {
         let (now, name) = (crate::platform::clock::now(), NodeName::from_static("edge"));
         let mut authority = Authority::init(directory, &config.cell, now).unwrap();
-        authority.issue(&name, Role::Edge, Duration::from_secs(60 * 86_400), now).unwrap();
+        authority
+            .issue(&name, Role::Edge, Duration::from_secs(60 * 86_400), now)
+            .unwrap();
         let (certificate, key) = authority.files_of(&name);
         TlsConfig {
             ca: authority.ca(),
@@ -175,20 +214,39 @@ mod tests {
     async fn a_certificate_of_another_ca_or_a_revoked_one_is_broken() {
         let (directory, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
         let mut config = config();
-        let (files, others) = (certificates(&config, directory.path()), certificates(&config, elsewhere.path()));
+        let (files, others) = (
+            certificates(&config, directory.path()),
+            certificates(&config, elsewhere.path()),
+        );
         for ca in [&files, &others] {
             std::fs::set_permissions(&ca.key, Permissions::from_mode(0o600)).unwrap();
         }
         config.tls = Some(files.clone());
-        assert_eq!(finding(&config, "certificates").await.verdict, CheckResult::Fine);
-        config.tls = Some(TlsConfig { ca: others.ca, revocation_list: None, ..files.clone() });
+        assert_eq!(
+            finding(&config, "certificates").await.verdict,
+            CheckResult::Fine
+        );
+        config.tls = Some(TlsConfig {
+            ca: others.ca,
+            revocation_list: None,
+            ..files.clone()
+        });
         let found = finding(&config, "certificates").await;
-        assert!(found.verdict == CheckResult::Broken && found.seen.contains("does not accept"), "{found:?}");
+        assert!(
+            found.verdict == CheckResult::Broken && found.seen.contains("does not accept"),
+            "{found:?}"
+        );
         let now = crate::platform::clock::now();
-        Authority::open(directory.path()).unwrap().revoke(&NodeName::from_static("edge"), now).unwrap();
+        Authority::open(directory.path())
+            .unwrap()
+            .revoke(&NodeName::from_static("edge"), now)
+            .unwrap();
         config.tls = Some(files);
         let found = finding(&config, "certificates").await;
-        assert!(found.verdict == CheckResult::Broken && found.seen.to_lowercase().contains("revoked"), "{found:?}");
+        assert!(
+            found.verdict == CheckResult::Broken && found.seen.to_lowercase().contains("revoked"),
+            "{found:?}"
+        );
     }
 
     #[tokio::test]
@@ -200,12 +258,17 @@ mod tests {
         config.tls = Some(files);
         let finding = finding(&config, "certificates").await;
         assert_eq!(finding.verdict, CheckResult::Broken);
-        assert!(finding.seen.contains("revoked.pem") && finding.fix.unwrap().contains("revoked.pem"));
+        assert!(
+            finding.seen.contains("revoked.pem") && finding.fix.unwrap().contains("revoked.pem")
+        );
     }
 
     #[tokio::test]
     async fn ports_in_use_are_named() {
-        let (tcp, udp) = (TcpListener::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+        let (tcp, udp) = (
+            TcpListener::bind("127.0.0.1:0").unwrap(),
+            UdpSocket::bind("127.0.0.1:0").unwrap(),
+        );
         let mut config = config();
         config.listen = tcp.local_addr().ok();
         config.membership.bind = udp.local_addr().ok();
@@ -213,8 +276,16 @@ mod tests {
         (config.dashboard.enabled, config.dashboard.listen) = (true, page.local_addr().ok());
         for (check, port, key) in [
             ("broker port", tcp.local_addr().unwrap().port(), "`listen`"),
-            ("gossip port", udp.local_addr().unwrap().port(), "`membership.bind`"),
-            ("dashboard", page.local_addr().unwrap().port(), "`dashboard.listen`"),
+            (
+                "gossip port",
+                udp.local_addr().unwrap().port(),
+                "`membership.bind`",
+            ),
+            (
+                "dashboard",
+                page.local_addr().unwrap().port(),
+                "`dashboard.listen`",
+            ),
         ] {
             let finding = finding(&config, check).await;
             assert_eq!(finding.verdict, CheckResult::Broken);
@@ -223,23 +294,41 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_door_that_cannot_listen_where_it_is_told_to_is_broken_and_a_free_port_will_do_otherwise() {
+    async fn a_door_that_cannot_listen_where_it_is_told_to_is_broken_and_a_free_port_will_do_otherwise()
+     {
         let port = TcpListener::bind("127.0.0.1:0").unwrap();
-        let cav = NodeConfig { role: Role::Cav, listen: port.local_addr().ok(), ..config() };
-        let mut beside_another_broker = NodeConfig { role: Role::Auto, ..cav.clone() };
+        let cav = NodeConfig {
+            role: Role::Cav,
+            listen: port.local_addr().ok(),
+            ..config()
+        };
+        let mut beside_another_broker = NodeConfig {
+            role: Role::Auto,
+            ..cav.clone()
+        };
         beside_another_broker.mqtt.broker = port.local_addr().ok().map(Into::into);
         for config in [&cav, &beside_another_broker] {
             let found = finding(config, "broker port").await;
-            assert!(found.verdict == CheckResult::Broken && found.fix.unwrap().contains("`listen`"));
+            assert!(
+                found.verdict == CheckResult::Broken && found.fix.unwrap().contains("`listen`")
+            );
         }
-        let unset = NodeConfig { listen: None, ..cav.clone() };
+        let unset = NodeConfig {
+            listen: None,
+            ..cav.clone()
+        };
         // Somebody has it: this test or another.
         let _taken = TcpListener::bind(unset.broker_listen());
         let found = finding(&unset, "broker port").await;
         assert!(found.verdict == CheckResult::Doubtful && found.fix.unwrap().contains("`listen`"));
         let mut closed = cav;
         closed.broker.door = false;
-        assert!(examine(&closed, Path::new("node.toml")).await.iter().all(|finding| finding.check != "broker port"));
+        assert!(
+            examine(&closed, Path::new("node.toml"))
+                .await
+                .iter()
+                .all(|finding| finding.check != "broker port")
+        );
     }
 
     #[cfg(feature = "camera")]
@@ -249,34 +338,55 @@ mod tests {
         let mut config = config();
         config.pose.listen = taken.local_addr().ok();
         let finding = finding(&config, "pose port").await;
-        assert!(finding.verdict == CheckResult::Broken && finding.fix.unwrap().contains("`pose.listen`"));
+        assert!(
+            finding.verdict == CheckResult::Broken
+                && finding.fix.unwrap().contains("`pose.listen`")
+        );
     }
 
     #[tokio::test]
-    async fn a_page_that_can_have_another_port_is_not_broken_and_one_switched_off_is_not_looked_for() {
+    async fn a_page_that_can_have_another_port_is_not_broken_and_one_switched_off_is_not_looked_for()
+     {
         // Somebody has it: this test or another.
         let _taken = TcpListener::bind(crate::observe::dashboard::DEFAULT_ADDRESS);
         let mut config = config();
         config.dashboard.enabled = true;
         assert!(finding(&config, "dashboard").await.verdict < CheckResult::Broken);
         config.dashboard.enabled = false;
-        assert!(examine(&config, Path::new("node.toml")).await.iter().all(|finding| finding.check != "dashboard"));
+        assert!(
+            examine(&config, Path::new("node.toml"))
+                .await
+                .iter()
+                .all(|finding| finding.check != "dashboard")
+        );
     }
 
     #[tokio::test]
     async fn a_floor_plan_that_is_not_there_is_broken() {
         let mut config = config();
-        let point = |metres: f64| FloorPlanPoint { pixel: [metres; 2], position_m: [metres; 2] };
+        let point = |metres: f64| FloorPlanPoint {
+            pixel: [metres; 2],
+            position_m: [metres; 2],
+        };
         let image = "/nowhere/plan.png".into();
         config.dashboard.enabled = true;
-        config.dashboard.floor_plan = Some(FloorPlanConfig { image, points: [point(0.0), point(1.0)] });
+        config.dashboard.floor_plan = Some(FloorPlanConfig {
+            image,
+            points: [point(0.0), point(1.0)],
+        });
         let finding = finding(&config, "floor plan").await;
-        assert!(finding.verdict == CheckResult::Broken && finding.seen.contains("No such file"), "{finding:?}");
+        assert!(
+            finding.verdict == CheckResult::Broken && finding.seen.contains("No such file"),
+            "{finding:?}"
+        );
     }
 
     /// A vehicle that moves between the cells of a file.
     fn moving(file: &Path) -> NodeConfig {
-        let mut config = NodeConfig { cells: Some(file.to_owned()), ..config() };
+        let mut config = NodeConfig {
+            cells: Some(file.to_owned()),
+            ..config()
+        };
         config.pose.listen = Some("127.0.0.1:0".parse().unwrap());
         config
     }
@@ -285,44 +395,84 @@ mod tests {
     async fn a_file_of_cells_that_cannot_be_used_is_broken() {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("cells.toml");
-        std::fs::write(&file, "[[cells]]\nname = \"elsewhere\"\nlatitude_deg = 1\nlongitude_deg = 2\n").unwrap();
+        std::fs::write(
+            &file,
+            "[[cells]]\nname = \"elsewhere\"\nlatitude_deg = 1\nlongitude_deg = 2\n",
+        )
+        .unwrap();
         let finding = finding(&moving(&file), "cells").await;
-        assert!(finding.verdict == CheckResult::Broken && finding.seen.contains("not among"), "{finding:?}");
+        assert!(
+            finding.verdict == CheckResult::Broken && finding.seen.contains("not among"),
+            "{finding:?}"
+        );
     }
 
     #[tokio::test]
     async fn a_cell_whose_files_are_missing_is_doubtful() {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("cells.toml");
-        let cell = |name, more| format!("[[cells]]\nname = \"{name}\"\nlatitude_deg = 1\nlongitude_deg = 2\n{more}");
-        std::fs::write(&file, cell("cell", "") + &cell("elsewhere", "key_file = \"gone.key\"\n")).unwrap();
+        let cell = |name, more| {
+            format!("[[cells]]\nname = \"{name}\"\nlatitude_deg = 1\nlongitude_deg = 2\n{more}")
+        };
+        std::fs::write(
+            &file,
+            cell("cell", "") + &cell("elsewhere", "key_file = \"gone.key\"\n"),
+        )
+        .unwrap();
         let finding = finding(&moving(&file), "cells").await;
-        assert!(finding.verdict == CheckResult::Doubtful && finding.seen.contains("gone.key"), "{finding:?}");
+        assert!(
+            finding.verdict == CheckResult::Doubtful && finding.seen.contains("gone.key"),
+            "{finding:?}"
+        );
     }
 
     #[tokio::test]
     async fn a_cell_that_does_not_accept_the_nodes_certificate_is_doubtful() {
         let (directory, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
-        let (own, other) = (certificates(&config(), directory.path()), certificates(&config(), elsewhere.path()));
+        let (own, other) = (
+            certificates(&config(), directory.path()),
+            certificates(&config(), elsewhere.path()),
+        );
         let file = directory.path().join("cells.toml");
         let cell = |name, ca: &Path| {
-            format!("[[cells]]\nname = \"{name}\"\nlatitude_deg = 1\nlongitude_deg = 2\nca = {ca:?}\n")
+            format!(
+                "[[cells]]\nname = \"{name}\"\nlatitude_deg = 1\nlongitude_deg = 2\nca = {ca:?}\n"
+            )
         };
         std::fs::write(&file, cell("cell", &own.ca) + &cell("elsewhere", &other.ca)).unwrap();
-        let finding = finding(&NodeConfig { tls: Some(own), ..moving(&file) }, "cells").await;
+        let finding = finding(
+            &NodeConfig {
+                tls: Some(own),
+                ..moving(&file)
+            },
+            "cells",
+        )
+        .await;
         assert_eq!(finding.verdict, CheckResult::Doubtful, "{finding:?}");
-        assert!(finding.seen.contains("cell elsewhere: it does not accept"), "{finding:?}");
+        assert!(
+            finding.seen.contains("cell elsewhere: it does not accept"),
+            "{finding:?}"
+        );
         assert!(!finding.seen.contains("cell cell"), "{finding:?}");
     }
 
     #[cfg(feature = "foxglove")]
     #[tokio::test]
     async fn a_live_port_in_use_is_named() {
-        let (live, directory) = (TcpListener::bind("127.0.0.1:0").unwrap(), tempfile::tempdir().unwrap());
+        let (live, directory) = (
+            TcpListener::bind("127.0.0.1:0").unwrap(),
+            tempfile::tempdir().unwrap(),
+        );
         let live_port = Some(live.local_addr().unwrap().port());
-        let record = Some(RecordConfig { live_port, ..RecordConfig::new(directory.path()) });
+        let record = Some(RecordConfig {
+            live_port,
+            ..RecordConfig::new(directory.path())
+        });
         let finding = finding(&NodeConfig { record, ..config() }, "live port").await;
-        assert!(finding.verdict == CheckResult::Broken && finding.fix.unwrap().contains("`record.live_port`"));
+        assert!(
+            finding.verdict == CheckResult::Broken
+                && finding.fix.unwrap().contains("`record.live_port`")
+        );
     }
 
     #[tokio::test]
@@ -331,14 +481,23 @@ mod tests {
         config.listen = Some("192.0.2.1:1883".parse().unwrap());
         config.map_log = Some("/no/such/maps".into());
         let port = finding(&config, "broker port").await;
-        assert!(port.verdict == CheckResult::Broken && port.fix.unwrap().contains("an address of this machine"));
+        assert!(
+            port.verdict == CheckResult::Broken
+                && port.fix.unwrap().contains("an address of this machine")
+        );
         let log = finding(&config, "map log").await;
-        assert!(log.verdict == CheckResult::Broken && log.seen.contains("/no/such"), "{log:?}");
+        assert!(
+            log.verdict == CheckResult::Broken && log.seen.contains("/no/such"),
+            "{log:?}"
+        );
     }
 
     #[tokio::test]
     async fn an_external_broker_must_be_there() {
-        let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let address = TcpListener::bind("127.0.0.1:0")
+            .unwrap()
+            .local_addr()
+            .unwrap();
         let mut config = config();
         config.mqtt.broker = Some(address.into());
         let finding = finding(&config, "broker").await;
@@ -348,11 +507,17 @@ mod tests {
 
     #[tokio::test]
     async fn a_region_that_is_not_there_is_doubtful() {
-        let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let address = TcpListener::bind("127.0.0.1:0")
+            .unwrap()
+            .local_addr()
+            .unwrap();
         let mut config = config();
         config.uplink.broker = Some(address.into());
         let finding = finding(&config, "uplink").await;
-        assert!(finding.verdict == CheckResult::Doubtful && finding.seen.contains(&address.to_string()), "{finding:?}");
+        assert!(
+            finding.verdict == CheckResult::Doubtful && finding.seen.contains(&address.to_string()),
+            "{finding:?}"
+        );
     }
 
     #[tokio::test]
@@ -362,10 +527,27 @@ mod tests {
         let seeds = ["127.0.0.1:17884", "[::1]:17884", "egde.invalid:17884"].map(str::to_owned);
         config.membership.seeds = seeds.to_vec();
         let findings = examine(&config, Path::new("node.toml")).await;
-        let findings: Vec<_> = findings.into_iter().filter(|finding| finding.check == "seed").collect();
+        let findings: Vec<_> = findings
+            .into_iter()
+            .filter(|finding| finding.check == "seed")
+            .collect();
         let verdicts: Vec<_> = findings.iter().map(|finding| finding.verdict).collect();
-        assert_eq!(verdicts, [CheckResult::Fine, CheckResult::Doubtful, CheckResult::Doubtful], "{findings:?}");
-        assert!(findings.iter().zip(&seeds).all(|(finding, seed)| finding.seen.contains(seed)), "{findings:?}");
+        assert_eq!(
+            verdicts,
+            [
+                CheckResult::Fine,
+                CheckResult::Doubtful,
+                CheckResult::Doubtful
+            ],
+            "{findings:?}"
+        );
+        assert!(
+            findings
+                .iter()
+                .zip(&seeds)
+                .all(|(finding, seed)| finding.seen.contains(seed)),
+            "{findings:?}"
+        );
     }
 
     /// An edge on loopback, and the configuration of a node that has it as its seed.
@@ -387,13 +569,26 @@ mod tests {
     async fn the_cell_is_looked_at_with_the_key() {
         let (edge, mut config) = edge_and_seeded("correct horse battery").await;
         let found = finding(&config, "cell").await;
-        assert!(found.verdict == CheckResult::Fine && found.seen.contains("ux-lot is led by edge"), "{found:?}");
-        config.membership.key = Some(crate::platform::secret::Secret::new("another horse battery"));
+        assert!(
+            found.verdict == CheckResult::Fine && found.seen.contains("ux-lot is led by edge"),
+            "{found:?}"
+        );
+        config.membership.key = Some(crate::platform::secret::Secret::new(
+            "another horse battery",
+        ));
         let found = finding(&config, "cell").await;
-        assert!(found.verdict == CheckResult::Doubtful && found.seen == "no node of ux-lot answers", "{found:?}");
+        assert!(
+            found.verdict == CheckResult::Doubtful && found.seen == "no node of ux-lot answers",
+            "{found:?}"
+        );
         assert!(found.fix.unwrap().contains("the key"));
         let troubles = edge.troubles();
-        assert!(troubles.iter().any(|(_, trouble)| trouble.cause.contains("another key")), "{troubles:?}");
+        assert!(
+            troubles
+                .iter()
+                .any(|(_, trouble)| trouble.cause.contains("another key")),
+            "{troubles:?}"
+        );
         edge.stop().await;
     }
 
@@ -401,22 +596,39 @@ mod tests {
     #[tokio::test]
     async fn what_the_unit_does_not_let_the_service_write_is_doubtful() {
         let unit = include_str!("../../packaging/systemd/ecod-node.service");
-        for line in
-            ["ProtectSystem=strict", "StateDirectory=ecod", "ExecStart=/usr/bin/ecod-node --config /etc/ecod/node.toml"]
-        {
+        for line in [
+            "ProtectSystem=strict",
+            "StateDirectory=ecod",
+            "ExecStart=/usr/bin/ecod-node --config /etc/ecod/node.toml",
+        ] {
             assert!(unit.lines().any(|found| found == line), "{line}");
         }
         let directory = tempfile::tempdir().unwrap();
         let mut config = config();
-        config.record = Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.path().join("log")) });
+        config.record = Some(RecordConfig {
+            min_free_mb: 0,
+            ..RecordConfig::new(directory.path().join("log"))
+        });
         let of_service = Path::new("/etc/ecod/node.toml");
         let findings = examine(&config, of_service).await;
-        let found: Vec<_> = findings.iter().filter(|finding| finding.check == "service").collect();
-        assert!(found.len() == 1 && found[0].verdict == CheckResult::Doubtful, "{findings:?}");
+        let found: Vec<_> = findings
+            .iter()
+            .filter(|finding| finding.check == "service")
+            .collect();
         assert!(
-            found[0].fix.as_ref().is_some_and(|fix| fix.contains("`record.dir`") && fix.contains("ReadWritePaths"))
+            found.len() == 1 && found[0].verdict == CheckResult::Doubtful,
+            "{findings:?}"
         );
-        assert!(storage::service(&config, Path::new("node.toml")).is_empty(), "another node may write where it likes");
+        assert!(
+            found[0]
+                .fix
+                .as_ref()
+                .is_some_and(|fix| fix.contains("`record.dir`") && fix.contains("ReadWritePaths"))
+        );
+        assert!(
+            storage::service(&config, Path::new("node.toml")).is_empty(),
+            "another node may write where it likes"
+        );
         config.record = Some(RecordConfig::new("/var/lib/ecod/log"));
         config.state_dir = Some("/var/lib/ecod".into());
         assert!(storage::service(&config, of_service).is_empty());
@@ -429,13 +641,25 @@ mod tests {
         std::fs::write(&short, "short").unwrap();
         std::fs::write(&file, "").unwrap();
         let mut config = config();
-        assert_eq!(finding(&config, "cell key").await.verdict, CheckResult::Doubtful);
+        assert_eq!(
+            finding(&config, "cell key").await.verdict,
+            CheckResult::Doubtful
+        );
         config.membership.key_file = Some(short);
-        assert_eq!(finding(&config, "cell key").await.verdict, CheckResult::Broken);
+        assert_eq!(
+            finding(&config, "cell key").await.verdict,
+            CheckResult::Broken
+        );
         config.state_dir = Some(file.join("below"));
         let found = finding(&config, "state directory").await;
-        assert!(found.verdict == CheckResult::Broken && found.seen.contains("below"), "{found:?}");
-        config.record = Some(RecordConfig { min_free_mb: 1_000_000_000, ..RecordConfig::new(directory.path()) });
+        assert!(
+            found.verdict == CheckResult::Broken && found.seen.contains("below"),
+            "{found:?}"
+        );
+        config.record = Some(RecordConfig {
+            min_free_mb: 1_000_000_000,
+            ..RecordConfig::new(directory.path())
+        });
         let found = finding(&config, "log directory").await;
         assert!(found.verdict == CheckResult::Broken && found.fix.unwrap().contains("min_free_mb"));
     }

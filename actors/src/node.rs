@@ -42,7 +42,9 @@ use ecod::leadership::Leadership;
 use ecod::leadership::readiness::Readiness;
 use ecod::model::names::NodeName;
 use ecod::wire::{CellDescription, Reputations, Trouble, Verdicts};
-use ractor::{Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, RpcReplyPort, SupervisionEvent};
+use ractor::{
+    Actor, ActorCell, ActorId, ActorProcessingErr, ActorRef, RpcReplyPort, SupervisionEvent,
+};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::MissedTickBehavior;
@@ -160,23 +162,41 @@ pub fn start(config: NodeConfig) -> Starting {
 }
 
 /// Starts a node of a vehicle as far as its presence goes.
-async fn start_with(vehicle: (VehicleParts, Presence), config: NodeConfig) -> Result<NodeHandle, NodeError> {
-    let security = config.security().map_err(|error| NodeError::Failed(error.to_string()))?;
+async fn start_with(
+    vehicle: (VehicleParts, Presence),
+    config: NodeConfig,
+) -> Result<NodeHandle, NodeError> {
+    let security = config
+        .security()
+        .map_err(|error| NodeError::Failed(error.to_string()))?;
     if let Some(credentials) = &security.credentials {
         let checked = credentials.check_rights(config.role, config.election.priority);
         checked.map_err(|error| NodeError::Failed(error.to_string()))?;
     }
     let (failed, failure) = watch::channel(None);
     let held = HeldDescription::at_start(&config)?;
-    let floor_plan = config.dashboard.load_floor_plan().map_err(|error| NodeError::Failed(error.to_string()))?;
-    let builder = NodeBuilder::new(vehicle, config, security, held, failed).with_floor_plan(floor_plan);
-    let (newest, broker, gossip) = (builder.newest(), builder.broker_address(), builder.gossip_address());
+    let floor_plan = config
+        .dashboard
+        .load_floor_plan()
+        .map_err(|error| NodeError::Failed(error.to_string()))?;
+    let builder =
+        NodeBuilder::new(vehicle, config, security, held, failed).with_floor_plan(floor_plan);
+    let (newest, broker, gossip) = (
+        builder.newest(),
+        builder.broker_address(),
+        builder.gossip_address(),
+    );
     let (members, leadership) = (builder.members(), builder.leadership());
     let (dashboard, listens_at) = (builder.dashboard_address(), builder.listens_at());
     let (slots, counters) = (builder.slots().clone(), builder.counters());
-    let (live_state, shared, name) = (builder.live_state(), builder.shared(), builder.name().clone());
+    let (live_state, shared, name) = (
+        builder.live_state(),
+        builder.shared(),
+        builder.name().clone(),
+    );
     let started = Actor::spawn(None, Supervisor, builder).await;
-    let (supervisor, ended) = started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
+    let (supervisor, ended) =
+        started.map_err(|error| NodeError::Failed(cause(error).to_string()))?;
     supervisor.send_interval(HEALTH_PERIOD, || NodeMessage::LogHealth);
     Ok(NodeHandle {
         supervisor,
@@ -256,7 +276,11 @@ impl NodeHandle {
     /// Present troubles of the cell: those of this node, and those that others tell in their statuses.
     pub fn troubles(&self) -> Vec<(Option<NodeName>, Trouble)> {
         let leader = self.leadership().borrow().leader().cloned();
-        self.live_state.troubles(&self.name, leader.as_ref(), self.counters.troubles().present())
+        self.live_state.troubles(
+            &self.name,
+            leader.as_ref(),
+            self.counters.troubles().present(),
+        )
     }
 
     /// Has the supervisor tell a service manager that the node runs, and how it is, until it ends.
@@ -270,7 +294,12 @@ impl NodeHandle {
     /// # Errors
     /// [`NodeError`] always says why; the node never ends well by itself.
     pub async fn failed(&mut self) -> Result<(), NodeError> {
-        let why = self.failure.wait_for(Option::is_some).await.ok().and_then(|why| why.clone());
+        let why = self
+            .failure
+            .wait_for(Option::is_some)
+            .await
+            .ok()
+            .and_then(|why| why.clone());
         Err(why.unwrap_or_else(|| NodeError::Failed("the supervisor ended".into())))
     }
 
@@ -293,8 +322,12 @@ impl Actor for Supervisor {
         myself: ActorRef<Self::Msg>,
         builder: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let mut state =
-            SupervisorState { builder, running: HashMap::new(), restarts: Restarts::default(), manager: None };
+        let mut state = SupervisorState {
+            builder,
+            running: HashMap::new(),
+            restarts: Restarts::default(),
+            manager: None,
+        };
         for part in state.builder.parts() {
             state.start(part, &myself.get_cell()).await?;
         }
@@ -311,7 +344,11 @@ impl Actor for Supervisor {
             NodeMessage::LogHealth => state.log_health(),
             NodeMessage::ReportTo { mut manager } => {
                 manager.started();
-                tokio::spawn(watch_readiness(state.builder.vitals(), manager.period(), myself));
+                tokio::spawn(watch_readiness(
+                    state.builder.vitals(),
+                    manager.period(),
+                    myself,
+                ));
                 state.manager = Some(manager);
             }
             NodeMessage::Describe { description } => {
@@ -348,9 +385,13 @@ impl Actor for Supervisor {
                 (actor, why.unwrap_or_else(|| "stopped".into()))
             }
             SupervisionEvent::ActorFailed(actor, error) => (actor, error.to_string()),
-            SupervisionEvent::ActorStarted(_) | SupervisionEvent::ProcessGroupChanged(_) => return Ok(()),
+            SupervisionEvent::ActorStarted(_) | SupervisionEvent::ProcessGroupChanged(_) => {
+                return Ok(());
+            }
         };
-        let Some(part) = state.running.remove(&actor.get_id()) else { return Ok(()) };
+        let Some(part) = state.running.remove(&actor.get_id()) else {
+            return Ok(());
+        };
         tracing::warn!(?part, why, "part ended, starting it anew");
         let restarted = if state.restarts.allow(clock::now()) {
             state.start(part, &myself.get_cell()).await
@@ -361,7 +402,11 @@ impl Actor for Supervisor {
         restarted.inspect_err(|error| state.builder.give_up(NodeError::Failed(error.to_string())))
     }
 
-    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
         if let Some(manager) = &mut state.manager {
             manager.stopping();
         }
@@ -379,7 +424,11 @@ impl SupervisorState {
         tracing::info!(events = ?snapshot.events, rejects = ?snapshot.rejects, ?shed, ?frames, "health");
     }
 
-    async fn start(&mut self, part: ActorKind, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+    async fn start(
+        &mut self,
+        part: ActorKind,
+        supervisor: &ActorCell,
+    ) -> Result<(), ActorProcessingErr> {
         let actor = self.builder.start(part, supervisor.clone()).await?;
         self.running.insert(actor, part);
         Ok(())
@@ -394,7 +443,10 @@ async fn watch_readiness(vitals: Vitals, period: Duration, supervisor: ActorRef<
     loop {
         ticks.tick().await;
         let readiness = vitals.readiness(&vitals.probe().await);
-        if supervisor.cast(NodeMessage::NoteReadiness { readiness }).is_err() {
+        if supervisor
+            .cast(NodeMessage::NoteReadiness { readiness })
+            .is_err()
+        {
             break;
         }
     }

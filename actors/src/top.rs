@@ -58,8 +58,15 @@ pub struct CellView {
 
 impl CellView {
     /// State of the node's cell; history and scroll position continue from `before`.
-    pub fn of(node: &NodeHandle, config: &NodeConfig, before: Option<Self>, now: Timestamp) -> Self {
-        let (history, scroll) = before.map(|before| (before.history, before.scroll)).unwrap_or_default();
+    pub fn of(
+        node: &NodeHandle,
+        config: &NodeConfig,
+        before: Option<Self>,
+        now: Timestamp,
+    ) -> Self {
+        let (history, scroll) = before
+            .map(|before| (before.history, before.scroll))
+            .unwrap_or_default();
         let mut view = Self {
             cell: config.cell.clone(),
             patience: patience(&config.fusion),
@@ -80,8 +87,14 @@ impl CellView {
 
     /// Adds the leadership of the newest round to the history.
     fn update_history(&mut self) {
-        let Some((epoch, received_at)) = self.newest_round() else { return };
-        if self.history.back().is_none_or(|(newest, _)| *newest != epoch) {
+        let Some((epoch, received_at)) = self.newest_round() else {
+            return;
+        };
+        if self
+            .history
+            .back()
+            .is_none_or(|(newest, _)| *newest != epoch)
+        {
             self.history.push_back((epoch, received_at));
         }
         while self.history.len() > HISTORY {
@@ -97,7 +110,11 @@ impl CellView {
 /// Draws the cell, and limits the scroll position to the last line.
 pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
     // Two lines for each trouble, and the borders.
-    let told = if view.troubles.is_empty() { 0 } else { 2 + 2 * view.troubles.len().min(MAX_TROUBLES) as u16 };
+    let told = if view.troubles.is_empty() {
+        0
+    } else {
+        2 + 2 * view.troubles.len().min(MAX_TROUBLES) as u16
+    };
     let [head, wrong, places, below, foot] = Layout::vertical([
         Constraint::Length(4),
         Constraint::Length(told),
@@ -106,7 +123,8 @@ pub fn draw(frame: &mut Frame<'_>, view: &mut CellView) {
         Constraint::Length(1),
     ])
     .areas(frame.area());
-    let [nodes, losses] = Layout::horizontal([Constraint::Percentage(60), Constraint::Percentage(40)]).areas(below);
+    let [nodes, losses] =
+        Layout::horizontal([Constraint::Percentage(60), Constraint::Percentage(40)]).areas(below);
     let table = locations(view, places.height);
     frame.render_widget(summary(view), head);
     frame.render_widget(troubles(view), wrong);
@@ -120,32 +138,73 @@ fn summary(view: &CellView) -> Paragraph<'_> {
     let leader = match (view.leadership.leader(), &view.leadership.epoch) {
         (Some(leader), Some(epoch)) => {
             let since = view.history.back().filter(|(newest, _)| newest == epoch);
-            let since = since.map_or_else(String::new, |(_, at)| format!(", seen for {}", span(view.now.since(*at))));
-            let standby = view.leadership.standby.as_ref().map_or_else(String::new, |name| format!(", next {name}"));
-            Span::from(format!("{leader} leads in term {}{since}{standby}", epoch.term)).bold()
+            let since = since.map_or_else(String::new, |(_, at)| {
+                format!(", seen for {}", span(view.now.since(*at)))
+            });
+            let standby = view
+                .leadership
+                .standby
+                .as_ref()
+                .map_or_else(String::new, |name| format!(", next {name}"));
+            Span::from(format!(
+                "{leader} leads in term {}{since}{standby}",
+                epoch.term
+            ))
+            .bold()
         }
         _ => Span::from("no leader").bold().red(),
     };
-    let freshness = match view.newest_round().map(|(_, received_at)| view.now.since(received_at)) {
+    let freshness = match view
+        .newest_round()
+        .map(|(_, received_at)| view.now.since(received_at))
+    {
         Some(age) if view.patience.is_some_and(|patience| age > patience) => {
-            Span::from(format!("STALE: no round for {}", span(age))).bold().red()
+            Span::from(format!("STALE: no round for {}", span(age)))
+                .bold()
+                .red()
         }
         Some(age) => Span::from(format!("newest round {} ms old", age.as_millis())).green(),
         None => Span::from("no round yet").yellow(),
     };
-    let before: Vec<_> = view.history.iter().rev().skip(1).map(|(epoch, _)| epoch.to_string()).collect();
-    let before = if before.is_empty() { String::new() } else { format!("  before: {}", before.join(", ")) };
-    let lines = vec![Line::from(vec![leader, "  ".into(), freshness]), Line::from(before).dim()];
+    let before: Vec<_> = view
+        .history
+        .iter()
+        .rev()
+        .skip(1)
+        .map(|(epoch, _)| epoch.to_string())
+        .collect();
+    let before = if before.is_empty() {
+        String::new()
+    } else {
+        format!("  before: {}", before.join(", "))
+    };
+    let lines = vec![
+        Line::from(vec![leader, "  ".into(), freshness]),
+        Line::from(before).dim(),
+    ];
     Paragraph::new(lines).block(Block::bordered().title(format!(" cell {} ", view.cell)))
 }
 
 /// The first troubles with their remedies.
 fn troubles(view: &CellView) -> Paragraph<'_> {
-    let lines = view.troubles.iter().take(MAX_TROUBLES).flat_map(|(by, Trouble { about, cause, remedy, .. })| {
-        let by = by.as_ref().map(NodeName::as_str);
-        let about = about.as_deref().or(by).unwrap_or("this observer");
-        [Line::from(format!("{about}: {cause}")).yellow(), Line::from(format!("  -> {remedy}")).dim()]
-    });
+    let lines = view.troubles.iter().take(MAX_TROUBLES).flat_map(
+        |(
+            by,
+            Trouble {
+                about,
+                cause,
+                remedy,
+                ..
+            },
+        )| {
+            let by = by.as_ref().map(NodeName::as_str);
+            let about = about.as_deref().or(by).unwrap_or("this observer");
+            [
+                Line::from(format!("{about}: {cause}")).yellow(),
+                Line::from(format!("  -> {remedy}")).dim(),
+            ]
+        },
+    );
     let title = match view.troubles.len() {
         all if all > MAX_TROUBLES => format!(" {MAX_TROUBLES} of {all} troubles "),
         _ => " troubles ".to_owned(),
@@ -164,43 +223,101 @@ fn locations(view: &mut CellView, height: u16) -> Table<'static> {
         all if all > room => format!(" what is where, {} to {last} of {all} ", first + 1),
         _ => " what is where ".to_owned(),
     };
-    let widths = [16, 16, 6, 16, 7].map(Constraint::Length).into_iter().chain([Constraint::Fill(1)]);
-    let head = Row::new(["place", "what", "sure", "voted", "lead", "seen by"]).style(Style::new().bold());
-    Table::new(rows.into_iter().skip(first).take(room), widths).header(head).block(Block::bordered().title(title))
+    let widths = [16, 16, 6, 16, 7]
+        .map(Constraint::Length)
+        .into_iter()
+        .chain([Constraint::Fill(1)]);
+    let head =
+        Row::new(["place", "what", "sure", "voted", "lead", "seen by"]).style(Style::new().bold());
+    Table::new(rows.into_iter().skip(first).take(room), widths)
+        .header(head)
+        .block(Block::bordered().title(title))
 }
 
 fn location_rows(view: &CellView) -> Vec<Row<'static>> {
-    let verdicts = || view.verdicts.iter().flat_map(|received| &received.message.verdicts);
+    let verdicts = || {
+        view.verdicts
+            .iter()
+            .flat_map(|received| &received.message.verdicts)
+    };
     let landmarks = || view.map.iter().flat_map(|received| &received.map.landmarks);
-    let row = |place: String, label: &str, confidence: Option<f64>, verdict: Option<&Verdict>, by: &[NodeName]| {
+    let row = |place: String,
+               label: &str,
+               confidence: Option<f64>,
+               verdict: Option<&Verdict>,
+               by: &[NodeName]| {
         let voted = verdict.map_or("", |verdict| verdict.label.as_deref().unwrap_or("-"));
         let [confidence, margin] = [confidence, verdict.map(|verdict| verdict.margin)]
             .map(|number| number.map_or_else(String::new, |number| format!("{number:.2}")));
-        let by = by.iter().map(NodeName::as_str).collect::<Vec<_>>().join(" ");
-        Row::new([place, label.to_owned(), confidence, voted.to_owned(), margin, by])
+        let by = by
+            .iter()
+            .map(NodeName::as_str)
+            .collect::<Vec<_>>()
+            .join(" ");
+        Row::new([
+            place,
+            label.to_owned(),
+            confidence,
+            voted.to_owned(),
+            margin,
+            by,
+        ])
     };
     let mapped = landmarks().map(|entry| {
         let verdict = verdicts().find(|verdict| verdict.landmark == entry.id);
-        let nothing = if entry.observers.is_empty() { "unknown" } else { "empty" };
+        let nothing = if entry.observers.is_empty() {
+            "unknown"
+        } else {
+            "empty"
+        };
         let label = entry.label.as_deref().unwrap_or(nothing);
-        row(entry.id.to_string(), label, Some(entry.confidence), verdict, &entry.contributors)
+        row(
+            entry.id.to_string(),
+            label,
+            Some(entry.confidence),
+            verdict,
+            &entry.contributors,
+        )
     });
-    let voted_only = verdicts().filter(|verdict| landmarks().all(|entry| entry.id != verdict.landmark));
     let voted_only =
-        voted_only.map(|verdict| row(verdict.landmark.to_string(), "", None, Some(verdict), &verdict.contributors));
-    let objects = view.map.iter().flat_map(|received| &received.map.objects).map(|object| {
-        let place = format!("{:.1}, {:.1} m", object.x_m, object.y_m);
-        row(place, &object.label, Some(object.confidence), None, &object.contributors)
+        verdicts().filter(|verdict| landmarks().all(|entry| entry.id != verdict.landmark));
+    let voted_only = voted_only.map(|verdict| {
+        row(
+            verdict.landmark.to_string(),
+            "",
+            None,
+            Some(verdict),
+            &verdict.contributors,
+        )
     });
+    let objects = view
+        .map
+        .iter()
+        .flat_map(|received| &received.map.objects)
+        .map(|object| {
+            let place = format!("{:.1}, {:.1} m", object.x_m, object.y_m);
+            row(
+                place,
+                &object.label,
+                Some(object.confidence),
+                None,
+                &object.contributors,
+            )
+        });
     mapped.chain(voted_only).chain(objects).collect()
 }
 
 fn vehicles(view: &CellView) -> Table<'_> {
-    let reputations = view.reputations.as_ref().map(|received| &received.message.reputations);
+    let reputations = view
+        .reputations
+        .as_ref()
+        .map(|received| &received.message.reputations);
     let trusted = |node: &NodeName| {
         reputations
             .and_then(|reputations| reputations.get(node))
-            .map_or_else(String::new, |it| format!("{:.2} {}+ {}-", it.score, it.correct, it.incorrect))
+            .map_or_else(String::new, |it| {
+                format!("{:.2} {}+ {}-", it.score, it.correct, it.incorrect)
+            })
     };
     let members = view.members.iter().map(|member| {
         let part = match &view.leadership {
@@ -217,25 +334,70 @@ fn vehicles(view: &CellView) -> Table<'_> {
     });
     // Vehicles that take part over MQTT only.
     let is_member = |node: &NodeName| view.members.iter().any(|member| member.name == *node);
-    let others = reputations.into_iter().flat_map(|reputations| reputations.keys()).filter(|node| !is_member(node));
-    let others = others.map(|node| Row::new([node.to_string(), "mqtt".to_owned(), String::new(), trusted(node)]));
+    let others = reputations
+        .into_iter()
+        .flat_map(|reputations| reputations.keys())
+        .filter(|node| !is_member(node));
+    let others = others.map(|node| {
+        Row::new([
+            node.to_string(),
+            "mqtt".to_owned(),
+            String::new(),
+            trusted(node),
+        ])
+    });
     let rows: Vec<_> = members.chain(others).collect();
-    let title = format!(" {} node{} ", rows.len(), if rows.len() == 1 { "" } else { "s" });
-    let widths = [Constraint::Fill(1), Constraint::Length(5), Constraint::Length(6), Constraint::Length(20)];
+    let title = format!(
+        " {} node{} ",
+        rows.len(),
+        if rows.len() == 1 { "" } else { "s" }
+    );
+    let widths = [
+        Constraint::Fill(1),
+        Constraint::Length(5),
+        Constraint::Length(6),
+        Constraint::Length(20),
+    ];
     let head = Row::new(["node", "role", "", "trust, right+ wrong-"]).style(Style::new().bold());
-    Table::new(rows, widths).header(head).block(Block::bordered().title(title))
+    Table::new(rows, widths)
+        .header(head)
+        .block(Block::bordered().title(title))
 }
 
 fn counted(view: &CellView) -> Table<'_> {
     // Copies that come a second way are no loss.
     const COPIES: &str = "out_of_order";
-    const SHOWN: [&str; 5] = ["inbox_full", "publish_refused", "disconnected", "connect_failed", "record_dropped"];
-    let events = view.counters.events.iter().filter(|(name, _)| SHOWN.contains(name));
-    let rejects = view.counters.rejects.iter().filter(|(name, _)| **name != COPIES);
-    let counts = events.chain(rejects).chain(&view.counters.shed).filter(|(_, times)| **times > 0);
-    let rows: Vec<_> = counts.map(|(name, times)| Row::new([name.replace('_', " "), times.to_string()])).collect();
-    let title = if rows.is_empty() { " nothing lost here " } else { " lost here " };
-    Table::new(rows, [Constraint::Fill(1), Constraint::Length(10)]).block(Block::bordered().title(title))
+    const SHOWN: [&str; 5] = [
+        "inbox_full",
+        "publish_refused",
+        "disconnected",
+        "connect_failed",
+        "record_dropped",
+    ];
+    let events = view
+        .counters
+        .events
+        .iter()
+        .filter(|(name, _)| SHOWN.contains(name));
+    let rejects = view
+        .counters
+        .rejects
+        .iter()
+        .filter(|(name, _)| **name != COPIES);
+    let counts = events
+        .chain(rejects)
+        .chain(&view.counters.shed)
+        .filter(|(_, times)| **times > 0);
+    let rows: Vec<_> = counts
+        .map(|(name, times)| Row::new([name.replace('_', " "), times.to_string()]))
+        .collect();
+    let title = if rows.is_empty() {
+        " nothing lost here "
+    } else {
+        " lost here "
+    };
+    Table::new(rows, [Constraint::Fill(1), Constraint::Length(10)])
+        .block(Block::bordered().title(title))
 }
 
 fn span(time: Duration) -> String {
@@ -309,9 +471,15 @@ mod tests {
                 role: Role::Auto,
                 certificate: None,
             }],
-            map: Some(ReceivedMap { received_at: Timestamp(7_000_000), map: Arc::new(map) }),
+            map: Some(ReceivedMap {
+                received_at: Timestamp(7_000_000),
+                map: Arc::new(map),
+            }),
             verdicts: None,
-            reputations: Some(Received { received_at: Timestamp(7_000_000), message: Arc::new(reputations) }),
+            reputations: Some(Received {
+                received_at: Timestamp(7_000_000),
+                message: Arc::new(reputations),
+            }),
             troubles: Vec::new(),
             counters: Counters::default().snapshot(),
             scroll: 0,
@@ -345,7 +513,10 @@ mod tests {
         ] {
             assert!(text.contains(part), "{part}: {text}");
         }
-        assert!(text.contains("nothing lost here") && !text.contains("STALE"), "{text}");
+        assert!(
+            text.contains("nothing lost here") && !text.contains("STALE"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -360,22 +531,40 @@ mod tests {
         };
         view.troubles = (0..6).map(|n| (Some(name("edge")), trouble(n))).collect();
         let text = shown(&mut view, 100, 40);
-        for part in
-            ["4 of 6 troubles", "edge: its clock is 5.0 s ahead", "v3: its clock", "-> run a time service", "slot-0"]
-        {
+        for part in [
+            "4 of 6 troubles",
+            "edge: its clock is 5.0 s ahead",
+            "v3: its clock",
+            "-> run a time service",
+            "slot-0",
+        ] {
             assert!(text.contains(part), "{part}: {text}");
         }
     }
 
     #[test]
     fn an_old_round_is_not_passed_off_as_fresh() {
-        assert!(shown(&mut view(Timestamp(10_000_000)), 100, 30).contains("newest round 3000 ms old"));
-        assert!(shown(&mut view(Timestamp(12_000_000)), 100, 30).contains("STALE: no round for 5 s"));
-        let mut by_packets = CellView { patience: None, ..view(Timestamp(12_000_000)) };
+        assert!(
+            shown(&mut view(Timestamp(10_000_000)), 100, 30).contains("newest round 3000 ms old")
+        );
+        assert!(
+            shown(&mut view(Timestamp(12_000_000)), 100, 30).contains("STALE: no round for 5 s")
+        );
+        let mut by_packets = CellView {
+            patience: None,
+            ..view(Timestamp(12_000_000))
+        };
         assert!(shown(&mut by_packets, 100, 30).contains("newest round 5000 ms old"));
-        let mut alone = CellView { leadership: Leadership::default(), map: None, ..view(Timestamp(0)) };
+        let mut alone = CellView {
+            leadership: Leadership::default(),
+            map: None,
+            ..view(Timestamp(0))
+        };
         let text = shown(&mut alone, 100, 30);
-        assert!(text.contains("no leader") && text.contains("no round yet"), "{text}");
+        assert!(
+            text.contains("no leader") && text.contains("no round yet"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -384,14 +573,28 @@ mod tests {
             "schema": SCHEMA_VERSION, "aggregator": "euclid", "epoch": 4, "round": 9, "fused_at_us": 0, "verdicts": []
         }))
         .unwrap();
-        let verdicts = Some(Received { received_at: Timestamp(6_900_000), message: Arc::new(verdicts) });
+        let verdicts = Some(Received {
+            received_at: Timestamp(6_900_000),
+            message: Arc::new(verdicts),
+        });
         let history = [(Epoch::new(3, name("edge")), Timestamp(0))].into();
-        for (now_us, freshness) in [(7_200_000, "newest round 300 ms old"), (12_000_000, "STALE: no round for 5 s")] {
+        for (now_us, freshness) in [
+            (7_200_000, "newest round 300 ms old"),
+            (12_000_000, "STALE: no round for 5 s"),
+        ] {
             let (verdicts, history) = (verdicts.clone(), VecDeque::clone(&history));
-            let mut voting = CellView { map: None, verdicts, history, ..view(Timestamp(now_us)) };
+            let mut voting = CellView {
+                map: None,
+                verdicts,
+                history,
+                ..view(Timestamp(now_us))
+            };
             voting.update_history();
             let text = shown(&mut voting, 100, 30);
-            assert!(text.contains(freshness) && text.contains("before: edge@3"), "{text}");
+            assert!(
+                text.contains(freshness) && text.contains("before: edge@3"),
+                "{text}"
+            );
         }
     }
 
@@ -401,8 +604,18 @@ mod tests {
         for vehicle in ["euclid", "gauss"] {
             counters.shed(ShedReason::ReportReplaced, vehicle);
         }
-        let text = shown(&mut CellView { counters: counters.snapshot(), ..view(Timestamp(7_200_000)) }, 100, 30);
-        assert!(text.contains(" lost here ") && text.contains("report replaced"), "{text}");
+        let text = shown(
+            &mut CellView {
+                counters: counters.snapshot(),
+                ..view(Timestamp(7_200_000))
+            },
+            100,
+            30,
+        );
+        assert!(
+            text.contains(" lost here ") && text.contains("report replaced"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -410,10 +623,16 @@ mod tests {
         // Two locations and an object, and room for two lines.
         let (mut view, height) = (view(Timestamp(7_200_000)), 4 + 5 + 9 + 1);
         let text = shown(&mut view, 100, height);
-        assert!(text.contains("what is where, 1 to 2 of 3") && !text.contains("van"), "{text}");
+        assert!(
+            text.contains("what is where, 1 to 2 of 3") && !text.contains("van"),
+            "{text}"
+        );
         view.scroll += 40;
         let text = shown(&mut view, 100, height);
-        assert!(text.contains("what is where, 2 to 3 of 3") && text.contains("van"), "{text}");
+        assert!(
+            text.contains("what is where, 2 to 3 of 3") && text.contains("van"),
+            "{text}"
+        );
         assert_eq!(view.scroll, 1);
     }
 

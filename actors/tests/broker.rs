@@ -4,9 +4,12 @@
 
 use std::net::{SocketAddr, TcpStream};
 
-use ecod_actors::transport::broker::{BrokerConfig, BrokerError, BrokerHealth, EmbeddedBroker, MqttBroker};
+use ecod_actors::transport::broker::{
+    BrokerConfig, BrokerError, BrokerHealth, EmbeddedBroker, MqttBroker,
+};
 
-const LOOPBACK: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
+const LOOPBACK: SocketAddr =
+    SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 0);
 
 fn threads() -> usize {
     std::fs::read_dir("/proc/self/task").unwrap().count()
@@ -29,7 +32,10 @@ fn starts_stops_and_restarts_without_leaving_anything() {
     assert!(matches!(broker.start(LOOPBACK), Err(BrokerError::Running(at)) if at == address));
     broker.stop();
     assert_eq!(broker.health(), BrokerHealth::Stopped);
-    assert!(TcpStream::connect(address).is_err(), "the port is free again");
+    assert!(
+        TcpStream::connect(address).is_err(),
+        "the port is free again"
+    );
     assert_eq!(threads(), idle);
 
     let taken = std::net::TcpListener::bind(address).unwrap();
@@ -38,5 +44,9 @@ fn starts_stops_and_restarts_without_leaving_anything() {
     assert!(error.to_string().contains(&address.to_string()), "{error}");
     assert_eq!((broker.health(), threads()), (BrokerHealth::Stopped, idle));
     drop(taken);
-    assert_eq!(broker.start(address).unwrap(), address, "the same broker starts once the port is free");
+    assert_eq!(
+        broker.start(address).unwrap(),
+        address,
+        "the same broker starts once the port is free"
+    );
 }

@@ -32,9 +32,14 @@ async fn a_camera_that_is_missing_is_counted_each_time_and_the_node_lives_on() {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    timeout(PATIENCE, counted).await.expect("it is tried again and counted");
+    timeout(PATIENCE, counted)
+        .await
+        .expect("it is tried again and counted");
     let mut newest = node.newest_map();
-    timeout(PATIENCE, newest.wait_for(Option::is_some)).await.expect("it serves itself").unwrap();
+    timeout(PATIENCE, newest.wait_for(Option::is_some))
+        .await
+        .expect("it serves itself")
+        .unwrap();
     node.stop().await;
 }
 
@@ -49,8 +54,15 @@ async fn a_node_whose_detector_cannot_be_built_says_why() {
         source = { kind = "images", path = "frames" }
         detector = { kind = "recorded", path = "no-such-recording.jsonl" }
     "#;
-    let error = node::start(toml::from_str(toml).unwrap()).await.err().expect("there is no recording").to_string();
-    assert!(error.contains("no-such-recording.jsonl") && error.contains("No such file"), "{error}");
+    let error = node::start(toml::from_str(toml).unwrap())
+        .await
+        .err()
+        .expect("there is no recording")
+        .to_string();
+    assert!(
+        error.contains("no-such-recording.jsonl") && error.contains("No such file"),
+        "{error}"
+    );
 }
 
 /// Two cameras back to back report as one witness: the map has what is before and what is behind the vehicle.
@@ -61,10 +73,17 @@ async fn a_vehicle_with_two_cameras_sees_both_ways_and_is_one_witness() {
     let box_ = r#"{"x_min":300,"y_min":220,"x_max":340,"y_max":260}"#;
     let line = format!(r#"[{{"label":"crate","confidence":0.9,"bounding_box":{box_}}}]"#);
     std::fs::write(&detections, line + "\n").unwrap();
-    let (photos, frames) =
-        (Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/photos"), folder.path().join("frames"));
-    let photo = std::fs::read_dir(photos).unwrap().map(|entry| entry.unwrap().path());
-    let photo = photo.filter(|path| path.extension().is_some_and(|extension| extension == "jpg")).min().unwrap();
+    let (photos, frames) = (
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/photos"),
+        folder.path().join("frames"),
+    );
+    let photo = std::fs::read_dir(photos)
+        .unwrap()
+        .map(|entry| entry.unwrap().path());
+    let photo = photo
+        .filter(|path| path.extension().is_some_and(|extension| extension == "jpg"))
+        .min()
+        .unwrap();
     std::fs::create_dir(&frames).unwrap();
     std::fs::copy(photo, frames.join("frame.jpg")).unwrap();
     let camera = format!(
@@ -84,13 +103,29 @@ async fn a_vehicle_with_two_cameras_sees_both_ways_and_is_one_witness() {
     let mut newest = node.newest_map();
     let both_ways = |received: &Option<ReceivedMap>| {
         let objects = received.iter().flat_map(|received| &received.map.objects);
-        let of = |side: f64| objects.clone().filter(move |object| object.x_m * side > 1.0).count();
+        let of = |side: f64| {
+            objects
+                .clone()
+                .filter(move |object| object.x_m * side > 1.0)
+                .count()
+        };
         (of(1.0), of(-1.0)) == (1, 1)
-            && objects.clone().all(|object| object.contributors == ["euclid"].map(NodeName::from_static))
+            && objects
+                .clone()
+                .all(|object| object.contributors == ["euclid"].map(NodeName::from_static))
     };
-    let seen = timeout(PATIENCE, newest.wait_for(both_ways)).await.map(drop);
-    let map = newest.borrow().as_ref().map(|received| received.map.objects.clone());
-    assert!(seen.is_ok(), "one object on each side: {map:?}, {:?}", node.counters().troubles().present());
+    let seen = timeout(PATIENCE, newest.wait_for(both_ways))
+        .await
+        .map(drop);
+    let map = newest
+        .borrow()
+        .as_ref()
+        .map(|received| received.map.objects.clone());
+    assert!(
+        seen.is_ok(),
+        "one object on each side: {map:?}, {:?}",
+        node.counters().troubles().present()
+    );
     node.stop().await;
 }
 
@@ -114,11 +149,19 @@ async fn a_source_that_ends_is_a_trouble_each_time() {
         );
         let node = node::start(toml::from_str(&toml).unwrap()).await.unwrap();
         let told = async {
-            while !node.counters().troubles().present().iter().any(|trouble| trouble.cause.contains("have ended")) {
+            while !node
+                .counters()
+                .troubles()
+                .present()
+                .iter()
+                .any(|trouble| trouble.cause.contains("have ended"))
+            {
                 tokio::time::sleep(Duration::from_millis(20)).await;
             }
         };
-        timeout(Duration::from_secs(10), told).await.expect("the end is told");
+        timeout(Duration::from_secs(10), told)
+            .await
+            .expect("the end is told");
         node.stop().await;
     }
 }

@@ -54,7 +54,12 @@ async fn cav(name: &str, edge: &NodeHandle) -> NodeHandle {
 
 fn report(node: &str, label: &str, slot: i32) -> Arc<ObjectReport> {
     Arc::new(ObjectReport {
-        objects: vec![PerceivedObject::new(label, 0.9, f64::from(slot) * 3.0 + 0.1, 0.0)],
+        objects: vec![PerceivedObject::new(
+            label,
+            0.9,
+            f64::from(slot) * 3.0 + 0.1,
+            0.0,
+        )],
         ..ObjectReport::new(NodeName::new(node).unwrap(), 1, clock::now())
     })
 }
@@ -73,15 +78,24 @@ async fn reported(
     let newest = receiver.newest_map();
     let settled = async {
         loop {
-            let message = GatewayMessage::PublishReport { kind: ReportKind::Detections, report: make() };
+            let message = GatewayMessage::PublishReport {
+                kind: ReportKind::Detections,
+                report: make(),
+            };
             reporter.slots().gateway.send(message);
             tokio::time::sleep(Duration::from_millis(50)).await;
-            if let Some(received) = newest.borrow().as_ref().filter(|received| wanted(&received.map)) {
+            if let Some(received) = newest
+                .borrow()
+                .as_ref()
+                .filter(|received| wanted(&received.map))
+            {
                 return Arc::clone(&received.map);
             }
         }
     };
-    timeout(PATIENCE, settled).await.expect("the map never became as wanted")
+    timeout(PATIENCE, settled)
+        .await
+        .expect("the map never became as wanted")
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -89,9 +103,15 @@ async fn what_one_vehicle_sees_reaches_another() {
     let edge = edge().await;
     let (euclid, galileo) = (cav("euclid", &edge).await, cav("galileo", &edge).await);
     let sees = || report("euclid", "ABC123", 1);
-    let map = reported(&euclid, &galileo, sees, |map| label(map, 1) == Some("ABC123")).await;
+    let map = reported(&euclid, &galileo, sees, |map| {
+        label(map, 1) == Some("ABC123")
+    })
+    .await;
     assert_eq!(map.aggregator.as_str(), "edge");
-    assert_eq!(map.landmarks[1].contributors, [NodeName::from_static("euclid")]);
+    assert_eq!(
+        map.landmarks[1].contributors,
+        [NodeName::from_static("euclid")]
+    );
     assert_eq!(label(&map, 0), None);
     for node in [euclid, galileo, edge] {
         node.stop().await;
@@ -107,7 +127,11 @@ async fn rounds_go_on_in_order_and_old_ones_are_refused() {
     for _ in 0..10 {
         timeout(PATIENCE, newest.changed()).await.unwrap().unwrap();
         let map = newest.borrow_and_update().clone().unwrap().map;
-        assert!((map.epoch, map.round) > last, "{:?} after {last:?}", (map.epoch, map.round));
+        assert!(
+            (map.epoch, map.round) > last,
+            "{:?} after {last:?}",
+            (map.epoch, map.round)
+        );
         last = (map.epoch, map.round);
     }
     euclid.stop().await;
@@ -117,23 +141,42 @@ async fn rounds_go_on_in_order_and_old_ones_are_refused() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_cell_goes_on_when_any_part_is_killed() {
     let log = tempfile::tempdir().unwrap();
-    let record = Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(log.path()) });
-    let edge = node::start(NodeConfig { record, ..config("edge", Role::Edge) }).await.unwrap();
+    let record = Some(RecordConfig {
+        min_free_mb: 0,
+        ..RecordConfig::new(log.path())
+    });
+    let edge = node::start(NodeConfig {
+        record,
+        ..config("edge", Role::Edge)
+    })
+    .await
+    .unwrap();
     let gossip = edge.gossip_address();
     let euclid = cav("euclid", &edge).await;
     let sees = |name: &'static str| move || report("euclid", name, 2);
-    reported(&euclid, &euclid, sees("before"), |map| label(map, 2) == Some("before")).await;
+    reported(&euclid, &euclid, sees("before"), |map| {
+        label(map, 2) == Some("before")
+    })
+    .await;
 
     let kills: [(&str, &dyn Fn()); 9] = [
         ("election", &|| edge.slots().election.get().unwrap().kill()),
-        ("membership", &|| edge.slots().membership.get().unwrap().kill()),
+        ("membership", &|| {
+            edge.slots().membership.get().unwrap().kill()
+        }),
         ("recorder", &|| edge.slots().recorder.get().unwrap().kill()),
         ("fuser", &|| edge.slots().fuser.get().unwrap().kill()),
-        ("edge-gateway", &|| edge.slots().gateway.get().unwrap().kill()),
-        ("edge-follower", &|| edge.slots().follower.get().unwrap().kill()),
+        ("edge-gateway", &|| {
+            edge.slots().gateway.get().unwrap().kill()
+        }),
+        ("edge-follower", &|| {
+            edge.slots().follower.get().unwrap().kill()
+        }),
         ("broker", &|| edge.slots().broker.get().unwrap().kill()),
         ("gateway", &|| euclid.slots().gateway.get().unwrap().kill()),
-        ("follower", &|| euclid.slots().follower.get().unwrap().kill()),
+        ("follower", &|| {
+            euclid.slots().follower.get().unwrap().kill()
+        }),
     ];
     for (part, kill) in kills {
         let term = edge.leadership().borrow().epoch.clone().unwrap().term;
@@ -141,9 +184,16 @@ async fn the_cell_goes_on_when_any_part_is_killed() {
         eprintln!("killed {part}");
         // An election that starts anew has no state directory to tell it that the term is used.
         let is_fresh = |map: &GlobalMap| part != "election" || map.epoch > term;
-        reported(&euclid, &euclid, sees(part), |map| label(map, 2) == Some(part) && is_fresh(map)).await;
+        reported(&euclid, &euclid, sees(part), |map| {
+            label(map, 2) == Some(part) && is_fresh(map)
+        })
+        .await;
     }
-    assert_eq!(edge.gossip_address(), gossip, "others find the membership where it was");
+    assert_eq!(
+        edge.gossip_address(),
+        gossip,
+        "others find the membership where it was"
+    );
     euclid.stop().await;
     edge.stop().await;
 }
@@ -158,16 +208,31 @@ async fn the_cell_goes_on_under_another_candidate_when_a_supervisor_is_killed() 
         config.membership.seeds = seeds.clone();
         others.push(node::start(config).await.unwrap());
     }
-    let [gauss, euclid] = &others[..] else { panic!("two were started") };
-    let led_by =
-        |name: &'static str| move |map: &GlobalMap| map.aggregator.as_str() == name && label(map, 0) == Some("x");
+    let [gauss, euclid] = &others[..] else {
+        panic!("two were started")
+    };
+    let led_by = |name: &'static str| {
+        move |map: &GlobalMap| map.aggregator.as_str() == name && label(map, 0) == Some("x")
+    };
     reported(euclid, euclid, || report("euclid", "x", 0), led_by("edge")).await;
     let standby = async {
         let mut leadership = gauss.leadership();
-        leadership.wait_for(|leadership| leadership.position == Position::StandingBy).await.map(drop)
+        leadership
+            .wait_for(|leadership| leadership.position == Position::StandingBy)
+            .await
+            .map(drop)
     };
-    timeout(PATIENCE, standby).await.expect("gauss stands by").unwrap();
-    edge.slots().fuser.get().unwrap().try_get_supervisor().unwrap().kill();
+    timeout(PATIENCE, standby)
+        .await
+        .expect("gauss stands by")
+        .unwrap();
+    edge.slots()
+        .fuser
+        .get()
+        .unwrap()
+        .try_get_supervisor()
+        .unwrap()
+        .kill();
     reported(euclid, euclid, || report("euclid", "x", 0), led_by("gauss")).await;
     for node in others {
         node.stop().await;
@@ -198,16 +263,27 @@ async fn a_part_that_keeps_ending_makes_the_node_give_up() {
 async fn a_killed_supervisor_fails_the_node_and_takes_its_parts_with_it() {
     let mut edge = edge().await;
     let address = edge.broker_address().unwrap();
-    let supervisor = edge.slots().fuser.get().unwrap().try_get_supervisor().unwrap();
+    let supervisor = edge
+        .slots()
+        .fuser
+        .get()
+        .unwrap()
+        .try_get_supervisor()
+        .unwrap();
     supervisor.kill();
-    let error = timeout(Duration::from_secs(5), edge.failed()).await.expect("within bounds").unwrap_err();
+    let error = timeout(Duration::from_secs(5), edge.failed())
+        .await
+        .expect("within bounds")
+        .unwrap_err();
     assert!(error.to_string().contains("supervisor"), "{error}");
     let closed = async {
         while tokio::net::TcpStream::connect(address).await.is_ok() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     };
-    timeout(PATIENCE, closed).await.expect("the broker ends with its supervisor");
+    timeout(PATIENCE, closed)
+        .await
+        .expect("the broker ends with its supervisor");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -226,15 +302,37 @@ async fn a_second_node_of_a_name_takes_no_part_and_says_why() {
             .as_ref()
             .is_some_and(|epoch| (epoch.term, epoch.leader.as_str()) == (1, "edge"))
     };
-    timeout(PATIENCE, euclid.leadership().wait_for(|now| now.position == Position::StandingBy)).await.unwrap().unwrap();
+    timeout(
+        PATIENCE,
+        euclid
+            .leadership()
+            .wait_for(|now| now.position == Position::StandingBy),
+    )
+    .await
+    .unwrap()
+    .unwrap();
     let mut second = node::start(near("euclid", Role::Cav)).await.unwrap();
-    let error = timeout(PATIENCE, second.failed()).await.expect("it gives up").unwrap_err();
-    assert!(error.to_string().contains("another running node of the cell lot-1 is called euclid"), "{error}");
-    let twin = |trouble: &Trouble| trouble.kind == "name_taken" && trouble.about.as_deref() == Some("euclid");
+    let error = timeout(PATIENCE, second.failed())
+        .await
+        .expect("it gives up")
+        .unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .contains("another running node of the cell lot-1 is called euclid"),
+        "{error}"
+    );
+    let twin = |trouble: &Trouble| {
+        trouble.kind == "name_taken" && trouble.about.as_deref() == Some("euclid")
+    };
     let own = second.counters().troubles().present();
     assert!(own.iter().any(twin), "{own:?}");
     let seen = edge.counters().troubles().present();
-    assert!(seen.iter().any(|trouble| twin(trouble) && trouble.cause.contains("at 127.0.0.1:")), "{seen:?}");
+    assert!(
+        seen.iter()
+            .any(|trouble| twin(trouble) && trouble.cause.contains("at 127.0.0.1:")),
+        "{seen:?}"
+    );
     second.stop().await;
     tokio::time::sleep(Duration::from_secs(1)).await;
     assert!(of_edge(&edge) && of_edge(&euclid) && edge.members().borrow().len() == 1);
@@ -255,7 +353,13 @@ async fn top_leaves_the_cell_when_its_terminal_is_closed() {
         .env("ECOD_MEMBERSHIP__BIND", "127.0.0.1:0");
     let mut top = top.spawn(side).unwrap();
     let members = edge.members();
-    timeout(PATIENCE, members.clone().wait_for(|members| members.len() == 1)).await.expect("it joins").unwrap();
+    timeout(
+        PATIENCE,
+        members.clone().wait_for(|members| members.len() == 1),
+    )
+    .await
+    .expect("it joins")
+    .unwrap();
     drop(terminal);
     let ended = async {
         loop {
@@ -277,7 +381,10 @@ async fn top_leaves_the_cell_when_its_terminal_is_closed() {
 async fn a_busy_port_is_an_error_that_names_it() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();
-    let config = NodeConfig { listen: Some(address), ..config("edge", Role::Edge) };
+    let config = NodeConfig {
+        listen: Some(address),
+        ..config("edge", Role::Edge)
+    };
     let error = node::start(config).await.err().expect("the port is busy");
     assert!(error.to_string().contains(&address.to_string()), "{error}");
 }

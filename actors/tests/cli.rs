@@ -9,7 +9,9 @@ use ecod_actors::platform::state_file::StateFile;
 
 fn ecod_node() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-    for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+    for (key, _) in
+        std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
+    {
         command.env_remove(key);
     }
     command.stdin(Stdio::null());
@@ -23,7 +25,9 @@ fn stderr(output: &Output) -> String {
 /// The printed configuration of a node whose environment is as given.
 fn printed(environment: &[(&str, &str)]) -> Output {
     let mut command = ecod_node();
-    command.args(["--role", "edge", "--print-config"]).envs(environment.iter().copied());
+    command
+        .args(["--role", "edge", "--print-config"])
+        .envs(environment.iter().copied());
     command.output().unwrap()
 }
 
@@ -40,24 +44,49 @@ fn environment_values_that_look_like_numbers_are_text_where_text_is_wanted() {
     let output = printed(&environment);
     assert!(output.status.success(), "{}", stderr(&output));
     let text = String::from_utf8(output.stdout).unwrap();
-    for line in ["cell = \"42\"", "name = \"007\"", "user = \"1e5\"", "version = \"5\"", "keep_alive_s = 7"] {
+    for line in [
+        "cell = \"42\"",
+        "name = \"007\"",
+        "user = \"1e5\"",
+        "version = \"5\"",
+        "keep_alive_s = 7",
+    ] {
         assert!(text.contains(line), "{line} is not in\n{text}");
     }
-    assert!(text.contains("# `mqtt.password` is set but not shown") && !text.contains("12345"), "{text}");
+    assert!(
+        text.contains("# `mqtt.password` is set but not shown") && !text.contains("12345"),
+        "{text}"
+    );
 }
 
 #[test]
 fn errors_in_the_environment_name_the_variable_and_show_no_password() {
-    let output = printed(&[("ECOD_MQTT__KEEP_ALIVE_S", "soon"), ("ECOD_MQTT__PASSWORD", "hush4711")]);
+    let output = printed(&[
+        ("ECOD_MQTT__KEEP_ALIVE_S", "soon"),
+        ("ECOD_MQTT__PASSWORD", "hush4711"),
+    ]);
     let error = stderr(&output);
     assert_eq!(output.status.code(), Some(2), "{error}");
-    assert!(error.contains("ECOD_MQTT__KEEP_ALIVE_S") && error.contains("soon"), "{error}");
+    assert!(
+        error.contains("ECOD_MQTT__KEEP_ALIVE_S") && error.contains("soon"),
+        "{error}"
+    );
     let output = printed(&[("ECOD_MQTT__KEEP_ALIVE_S", "70000")]);
-    assert!(stderr(&output).contains("ECOD_MQTT__KEEP_ALIVE_S: ") && stderr(&output).contains("70000"));
+    assert!(
+        stderr(&output).contains("ECOD_MQTT__KEEP_ALIVE_S: ") && stderr(&output).contains("70000")
+    );
     let output = printed(&[("ECOD_MQTT__PASSWORD", "***"), ("ECOD_MQTT__USER", "u")]);
-    assert!(stderr(&output).contains("not printed"), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains("not printed"),
+        "{}",
+        stderr(&output)
+    );
     let output = printed(&[("ECOD_MQTT__PASSWORD", "hush4711")]);
-    assert!(stderr(&output).contains("`mqtt.password`") && !stderr(&output).contains("4711"), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains("`mqtt.password`") && !stderr(&output).contains("4711"),
+        "{}",
+        stderr(&output)
+    );
 }
 
 #[test]
@@ -67,18 +96,33 @@ fn the_page_is_there_unless_it_is_switched_off() {
         (None, &[][..], true, None),
         (Some(off), &[], false, None),
         (Some(off), &["--dashboard"], true, None),
-        (None, &["--dashboard", "127.0.0.1:8081"], true, Some("127.0.0.1:8081")),
+        (
+            None,
+            &["--dashboard", "127.0.0.1:8081"],
+            true,
+            Some("127.0.0.1:8081"),
+        ),
         (None, &["--no-dashboard"], false, None),
     ] {
         let mut command = ecod_node();
-        command.args(["--role", "edge", "--print-config"]).args(flags).envs(environment);
+        command
+            .args(["--role", "edge", "--print-config"])
+            .args(flags)
+            .envs(environment);
         let output = command.output().unwrap();
         let printed: toml::Table = String::from_utf8(output.stdout).unwrap().parse().unwrap();
         let page = &printed["dashboard"];
         assert_eq!(page["enabled"].as_bool(), Some(enabled), "{flags:?}");
-        assert_eq!(page.get("listen").and_then(toml::Value::as_str), listen, "{flags:?}");
+        assert_eq!(
+            page.get("listen").and_then(toml::Value::as_str),
+            listen,
+            "{flags:?}"
+        );
     }
-    let both = ecod_node().args(["--role", "edge", "--dashboard", "--no-dashboard"]).output().unwrap();
+    let both = ecod_node()
+        .args(["--role", "edge", "--dashboard", "--no-dashboard"])
+        .output()
+        .unwrap();
     assert_eq!(both.status.code(), Some(2));
 }
 
@@ -86,16 +130,31 @@ fn the_page_is_there_unless_it_is_switched_off() {
 fn only_what_is_not_a_default_is_printed_on_request() {
     let changed = |environment: &[(&str, &str)]| {
         let mut command = ecod_node();
-        command.args(["--role", "edge", "--print-config", "--changed"]).envs(environment.iter().copied());
+        command
+            .args(["--role", "edge", "--print-config", "--changed"])
+            .envs(environment.iter().copied());
         String::from_utf8(command.output().unwrap().stdout).unwrap()
     };
     assert_eq!(changed(&[]), "name = \"edge\"\nrole = \"edge\"\n");
     let gate = ("ECOD_FUSION__PACE__GATE_M", "1.5");
     let expected = "name = \"edge\"\nrole = \"edge\"\n\n[fusion.pace]\ngate_m = 1.5\n";
-    assert_eq!(changed(&[gate, ("ECOD_FUSION__PACE__POSITION_FLOOR_M", "0.05")]), expected);
-    assert!(changed(&[("ECOD_DASHBOARD__TOKEN", "correct-horse")]).starts_with("# `dashboard.token` is set"));
-    let alone = ecod_node().args(["--role", "edge", "--changed"]).output().unwrap();
-    assert!(alone.status.code() == Some(2) && stderr(&alone).contains("--print-config"), "{}", stderr(&alone));
+    assert_eq!(
+        changed(&[gate, ("ECOD_FUSION__PACE__POSITION_FLOOR_M", "0.05")]),
+        expected
+    );
+    assert!(
+        changed(&[("ECOD_DASHBOARD__TOKEN", "correct-horse")])
+            .starts_with("# `dashboard.token` is set")
+    );
+    let alone = ecod_node()
+        .args(["--role", "edge", "--changed"])
+        .output()
+        .unwrap();
+    assert!(
+        alone.status.code() == Some(2) && stderr(&alone).contains("--print-config"),
+        "{}",
+        stderr(&alone)
+    );
 }
 
 /// A period in milliseconds is warned of by the node that starts and by `doctor`, with key, value and remedy.
@@ -104,35 +163,71 @@ fn values_in_another_unit_are_named_at_the_start_and_by_doctor() {
     let mut file = tempfile::NamedTempFile::new().unwrap();
     let offline = "listen = \"127.0.0.1:0\"\n[membership]\nbind = \"127.0.0.1:0\"\nmulticast = { enabled = false }\n\
         [dashboard]\nenabled = false\n";
-    write!(file, "role = \"edge\"\n{offline}[fusion.round]\nperiod_s = 50").unwrap();
-    let expected =
-        ["`fusion.round.period_s` is 50, and should be in seconds", "correct it in this node's configuration"];
+    write!(
+        file,
+        "role = \"edge\"\n{offline}[fusion.round]\nperiod_s = 50"
+    )
+    .unwrap();
+    let expected = [
+        "`fusion.round.period_s` is 50, and should be in seconds",
+        "correct it in this node's configuration",
+    ];
     let mut started = ecod_node();
-    started.args(["--log-format", "text", "--stop-at-eof", "--config"]).arg(file.path());
+    started
+        .args(["--log-format", "text", "--stop-at-eof", "--config"])
+        .arg(file.path());
     let log = stderr(&started.output().unwrap());
-    assert!(expected.iter().all(|part| log.contains(part)) && log.contains("WARN"), "{log}");
-    let checked = ecod_node().arg("doctor").arg("--config").arg(file.path()).output().unwrap();
+    assert!(
+        expected.iter().all(|part| log.contains(part)) && log.contains("WARN"),
+        "{log}"
+    );
+    let checked = ecod_node()
+        .arg("doctor")
+        .arg("--config")
+        .arg(file.path())
+        .output()
+        .unwrap();
     let said = String::from_utf8(checked.stdout).unwrap();
-    let line = said.lines().find(|line| line.starts_with("warn  units")).unwrap_or_else(|| panic!("{said}"));
+    let line = said
+        .lines()
+        .find(|line| line.starts_with("warn  units"))
+        .unwrap_or_else(|| panic!("{said}"));
     assert!(expected.iter().all(|part| line.contains(part)), "{line}");
 }
 
 #[test]
 fn a_listening_address_without_ip_is_told_what_is_missing() {
     for listen in ["1883", "localhost:1883", "127.0.0.1:80000"] {
-        let output = ecod_node().args(["--role", "edge", "--listen", listen]).output().unwrap();
+        let output = ecod_node()
+            .args(["--role", "edge", "--listen", listen])
+            .output()
+            .unwrap();
         let error = stderr(&output);
-        assert!(output.status.code() == Some(2) && error.contains("0.0.0.0:1883") && error.contains(listen), "{error}");
+        assert!(
+            output.status.code() == Some(2)
+                && error.contains("0.0.0.0:1883")
+                && error.contains(listen),
+            "{error}"
+        );
     }
 }
 
 #[test]
 fn a_reader_that_has_seen_enough_is_no_failure() {
     for arguments in [&["schema"][..], &["--role", "edge", "--print-config"]] {
-        let mut node = ecod_node().args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut node = ecod_node()
+            .args(arguments)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
         drop(node.stdout.take());
         let output = node.wait_with_output().unwrap();
-        assert_eq!((output.status.code(), stderr(&output)), (Some(0), String::new()), "{arguments:?}");
+        assert_eq!(
+            (output.status.code(), stderr(&output)),
+            (Some(0), String::new()),
+            "{arguments:?}"
+        );
     }
 }
 
@@ -144,7 +239,11 @@ fn startup_errors_are_plain_and_name_what_is_wrong() {
     let bound = gossip.local_addr().unwrap().to_string();
     let camera = "[camera.source]\nkind = \"images\"\npath = \"frames\"\n[camera.detector]\n";
     let cases = [
-        (String::new(), vec!["--listen", &address], vec!["`listen`", &*address, "in use"]),
+        (
+            String::new(),
+            vec!["--listen", &address],
+            vec!["`listen`", &*address, "in use"],
+        ),
         (
             format!("[membership]\nbind = \"{bound}\""),
             vec!["--listen", "127.0.0.1:0"],
@@ -168,12 +267,21 @@ fn startup_errors_are_plain_and_name_what_is_wrong() {
         let mut file = tempfile::NamedTempFile::new().unwrap();
         write!(file, "role = \"edge\"\n{toml}").unwrap();
         let mut node = ecod_node();
-        node.args(["--stop-at-eof", "--config"]).arg(file.path()).args(flags).env("RUST_LOG", "off");
+        node.args(["--stop-at-eof", "--config"])
+            .arg(file.path())
+            .args(flags)
+            .env("RUST_LOG", "off");
         let output = node.output().unwrap();
         let error = stderr(&output);
         assert_eq!(output.status.code(), Some(1), "{error}");
-        assert!(parts.iter().all(|part| error.contains(part)), "{parts:?} not in {error}");
-        assert!(!error.contains("panicked") && error.lines().count() == 1, "{error}");
+        assert!(
+            parts.iter().all(|part| error.contains(part)),
+            "{parts:?} not in {error}"
+        );
+        assert!(
+            !error.contains("panicked") && error.lines().count() == 1,
+            "{error}"
+        );
     }
 }
 
@@ -181,17 +289,39 @@ fn startup_errors_are_plain_and_name_what_is_wrong() {
 #[test]
 fn ranging_by_the_ground_asks_for_the_height_of_the_camera() {
     let mut file = tempfile::NamedTempFile::new().unwrap();
-    let camera = "source = { kind = \"images\", path = \"frames\" }\ndetector = { kind = \"coco\" }";
-    writeln!(file, "[camera]\n{camera}\nprojection = {{ ranging = \"ground\" }}").unwrap();
+    let camera =
+        "source = { kind = \"images\", path = \"frames\" }\ndetector = { kind = \"coco\" }";
+    writeln!(
+        file,
+        "[camera]\n{camera}\nprojection = {{ ranging = \"ground\" }}"
+    )
+    .unwrap();
     let printed = |height: &str| {
         let mut command = ecod_node();
-        command.arg("--config").arg(file.path()).arg("--print-config").env("ECOD_CAMERA__MOUNT__HEIGHT_M", height);
+        command
+            .arg("--config")
+            .arg(file.path())
+            .arg("--print-config")
+            .env("ECOD_CAMERA__MOUNT__HEIGHT_M", height);
         command.output().unwrap()
     };
-    assert!(printed("1.2").status.success(), "{}", stderr(&printed("1.2")));
-    let unknown = ecod_node().arg("--config").arg(file.path()).arg("--print-config").output().unwrap();
+    assert!(
+        printed("1.2").status.success(),
+        "{}",
+        stderr(&printed("1.2"))
+    );
+    let unknown = ecod_node()
+        .arg("--config")
+        .arg(file.path())
+        .arg("--print-config")
+        .output()
+        .unwrap();
     assert_eq!(unknown.status.code(), Some(2));
-    assert!(stderr(&unknown).contains("`camera.mount.height_m`"), "{}", stderr(&unknown));
+    assert!(
+        stderr(&unknown).contains("`camera.mount.height_m`"),
+        "{}",
+        stderr(&unknown)
+    );
     assert_eq!(printed("-1").status.code(), Some(2));
 }
 
@@ -199,10 +329,18 @@ fn ranging_by_the_ground_asks_for_the_height_of_the_camera() {
 fn an_observer_that_cannot_record_says_so_and_ends() {
     let file = tempfile::NamedTempFile::new().unwrap();
     let dir = file.path().join("log");
-    let output = ecod_node().arg("record").arg("--dir").arg(&dir).output().unwrap();
+    let output = ecod_node()
+        .arg("record")
+        .arg("--dir")
+        .arg(&dir)
+        .output()
+        .unwrap();
     let error = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{error}");
-    assert!(error.contains(dir.to_str().unwrap()) && error.contains("Not a directory"), "{error}");
+    assert!(
+        error.contains(dir.to_str().unwrap()) && error.contains("Not a directory"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -227,10 +365,18 @@ fn a_node_ends_well_while_its_camera_runs() {
     let mut config = tempfile::NamedTempFile::new().unwrap();
     let source = format!("kind = \"images\"\npath = {photos:?}\nfps = 500\nlooping = true");
     let camera = format!("[camera.source]\n{source}\n[camera.detector]\nkind = \"placard\"");
-    write!(config, "role = \"cav\"\nname = \"sees\"\n[mqtt]\nbroker = \"127.0.0.1:1\"\n{camera}").unwrap();
+    write!(
+        config,
+        "role = \"cav\"\nname = \"sees\"\n[mqtt]\nbroker = \"127.0.0.1:1\"\n{camera}"
+    )
+    .unwrap();
     for _ in 0..5 {
         let mut node = ecod_node();
-        node.arg("--config").arg(config.path()).arg("--stop-at-eof").stdin(Stdio::piped()).stderr(Stdio::null());
+        node.arg("--config")
+            .arg(config.path())
+            .arg("--stop-at-eof")
+            .stdin(Stdio::piped())
+            .stderr(Stdio::null());
         let mut node = node.spawn().unwrap();
         std::thread::sleep(std::time::Duration::from_millis(500));
         drop(node.stdin.take());
@@ -242,7 +388,15 @@ fn a_node_ends_well_while_its_camera_runs() {
 #[test]
 fn a_vehicle_without_a_camera_is_told_that_only_programs_report() {
     let mut node = ecod_node();
-    node.args(["--role", "cav", "--name", "blind", "--broker", "127.0.0.1:1", "--stop-at-eof"]);
+    node.args([
+        "--role",
+        "cav",
+        "--name",
+        "blind",
+        "--broker",
+        "127.0.0.1:1",
+        "--stop-at-eof",
+    ]);
     node.stdin(Stdio::piped()).stderr(Stdio::piped());
     let mut node = node.spawn().unwrap();
     let mut log = BufReader::new(node.stderr.take().unwrap()).lines();
@@ -259,24 +413,44 @@ fn a_command_of_another_program_is_told_where_it_is() {
         (&["bench", "--costs"], "`ecod-lab bench`"),
         (&["eval", "--truth", "truth.json"], "`ecod-lab eval`"),
         (&["region"], "`ecod-region`"),
-        (&["report", "log", "--truth", "truth.json"], "`ecod-lab report --truth`"),
+        (
+            &["report", "log", "--truth", "truth.json"],
+            "`ecod-lab report --truth`",
+        ),
     ] {
         let output = ecod_node().args(arguments).output().unwrap();
         let error = stderr(&output);
-        assert_eq!((output.status.code(), error.lines().count()), (Some(2), 1), "{error}");
+        assert_eq!(
+            (output.status.code(), error.lines().count()),
+            (Some(2), 1),
+            "{error}"
+        );
         let program = run.trim_matches('`').split(' ').next().unwrap();
-        assert!(error.contains(run) && error.contains(&format!("--bin {program}`")), "{error}");
+        assert!(
+            error.contains(run) && error.contains(&format!("--bin {program}`")),
+            "{error}"
+        );
     }
     let typo = ecod_node().arg("demos").output().unwrap();
-    assert!(typo.status.code() == Some(2) && stderr(&typo).contains("unrecognized"), "{}", stderr(&typo));
+    assert!(
+        typo.status.code() == Some(2) && stderr(&typo).contains("unrecognized"),
+        "{}",
+        stderr(&typo)
+    );
 }
 
 /// From nothing to a node with certificates, and what it says when they are another's.
 #[test]
 fn certificates_are_made_used_and_revoked_by_command() {
     let directory = tempfile::tempdir().unwrap();
-    let pki =
-        |arguments: &[&str]| ecod_node().current_dir(directory.path()).arg("pki").args(arguments).output().unwrap();
+    let pki = |arguments: &[&str]| {
+        ecod_node()
+            .current_dir(directory.path())
+            .arg("pki")
+            .args(arguments)
+            .output()
+            .unwrap()
+    };
     let made = pki(&["init", "--cell", "lot"]);
     assert!(made.status.success(), "{}", stderr(&made));
     assert!(stderr(&pki(&["init", "--cell", "lot"])).contains("has a CA already"));
@@ -286,17 +460,35 @@ fn certificates_are_made_used_and_revoked_by_command() {
     std::fs::write(directory.path().join("edge.toml"), issued.stdout).unwrap();
     let doctor = |name: &str| {
         let mut command = ecod_node();
-        command.current_dir(directory.path()).envs([("ECOD_NAME", name), ("ECOD_ROLE", "edge")]);
-        let output = command.args(["doctor", "--config", "edge.toml"]).output().unwrap();
+        command
+            .current_dir(directory.path())
+            .envs([("ECOD_NAME", name), ("ECOD_ROLE", "edge")]);
+        let output = command
+            .args(["doctor", "--config", "edge.toml"])
+            .output()
+            .unwrap();
         let text = String::from_utf8(output.stdout).unwrap();
-        text.lines().find(|line| line.contains("certificates")).unwrap_or_else(|| panic!("{text}")).to_owned()
+        text.lines()
+            .find(|line| line.contains("certificates"))
+            .unwrap_or_else(|| panic!("{text}"))
+            .to_owned()
     };
     let fine = doctor("edge");
-    assert!(fine.starts_with("ok") && fine.contains("days left"), "{fine}");
+    assert!(
+        fine.starts_with("ok") && fine.contains("days left"),
+        "{fine}"
+    );
     let foreign = doctor("gauss");
-    assert!(foreign.starts_with("FAIL") && foreign.contains("is for edge, this node is gauss"), "{foreign}");
+    assert!(
+        foreign.starts_with("FAIL") && foreign.contains("is for edge, this node is gauss"),
+        "{foreign}"
+    );
     let revoked = pki(&["revoke", "edge"]);
-    assert!(String::from_utf8_lossy(&revoked.stdout).contains("revoked 1 of edge"), "{}", stderr(&revoked));
+    assert!(
+        String::from_utf8_lossy(&revoked.stdout).contains("revoked 1 of edge"),
+        "{}",
+        stderr(&revoked)
+    );
 }
 
 /// A node whose evidence and term an earlier version let others poison.
@@ -304,23 +496,39 @@ fn certificates_are_made_used_and_revoked_by_command() {
 fn evidence_and_term_are_reset_while_the_node_is_stopped() {
     let directory = tempfile::tempdir().unwrap();
     let path = |name: &str| directory.path().join(name);
-    std::fs::write(path("edge.toml"), "name = \"edge\"\nrole = \"edge\"\ncell = \"lot\"\nstate_dir = \".\"\n").unwrap();
+    std::fs::write(
+        path("edge.toml"),
+        "name = \"edge\"\nrole = \"edge\"\ncell = \"lot\"\nstate_dir = \".\"\n",
+    )
+    .unwrap();
     std::fs::write(path("lot.edge.reputations.json"), "{\"poisoned\":1}").unwrap();
     std::fs::write(path("lot.edge.term.json"), "9007199254740991").unwrap();
     let reset = |arguments: &[&str]| {
         let mut command = ecod_node();
-        command.current_dir(directory.path()).args(["reset", "--config", "edge.toml"]).args(arguments).output().unwrap()
+        command
+            .current_dir(directory.path())
+            .args(["reset", "--config", "edge.toml"])
+            .args(arguments)
+            .output()
+            .unwrap()
     };
     assert_eq!(reset(&[]).status.code(), Some(2), "says what to reset");
     let cell = |name: &str| NodeName::new(name).unwrap();
     let running = StateFile::lock(directory.path(), &cell("lot"), &cell("edge")).unwrap();
     let refused = reset(&["--reputations"]);
-    assert!(!refused.status.success() && stderr(&refused).contains("stop it"), "{}", stderr(&refused));
+    assert!(
+        !refused.status.success() && stderr(&refused).contains("stop it"),
+        "{}",
+        stderr(&refused)
+    );
     drop(running);
     let done = reset(&["--reputations", "--term"]);
     assert!(done.status.success(), "{}", stderr(&done));
     let text = std::fs::read_to_string(path("lot.edge.reputations.json")).unwrap();
-    assert!(text.contains("reset_at_us") && !text.contains("poisoned"), "{text}");
+    assert!(
+        text.contains("reset_at_us") && !text.contains("poisoned"),
+        "{text}"
+    );
     assert!(!path("lot.edge.term.json").exists());
     let vehicle = ecod_node()
         .current_dir(directory.path())
@@ -328,28 +536,53 @@ fn evidence_and_term_are_reset_while_the_node_is_stopped() {
         .args(["reset", "--config", "edge.toml", "--reputations"])
         .output()
         .unwrap();
-    assert!(stderr(&vehicle).contains("never leads"), "{}", stderr(&vehicle));
+    assert!(
+        stderr(&vehicle).contains("never leads"),
+        "{}",
+        stderr(&vehicle)
+    );
 }
 
 /// As a package installs them: the program, and beside it one without OpenCV.
 #[test]
 fn a_node_without_camera_goes_on_as_the_program_without_opencv() {
     let prefix = tempfile::tempdir().unwrap();
-    let (bin, lib) = (prefix.path().join("bin"), prefix.path().join("lib/ecod-node"));
+    let (bin, lib) = (
+        prefix.path().join("bin"),
+        prefix.path().join("lib/ecod-node"),
+    );
     std::fs::create_dir_all(&bin).unwrap();
     std::fs::create_dir_all(&lib).unwrap();
     let (program, other) = (bin.join("ecod-node"), lib.join("ecod-node"));
     std::fs::copy(env!("CARGO_BIN_EXE_ecod-node"), &program).unwrap();
     std::fs::write(&other, "#!/bin/sh\necho \"without camera: $@\"\n").unwrap();
     std::fs::set_permissions(&other, std::fs::Permissions::from_mode(0o755)).unwrap();
-    let run = |arguments: &[&str]| Command::new(&program).args(arguments).stdin(Stdio::null()).output().unwrap();
+    let run = |arguments: &[&str]| {
+        Command::new(&program)
+            .args(arguments)
+            .stdin(Stdio::null())
+            .output()
+            .unwrap()
+    };
     let edge = run(&["--role", "edge", "--name", "kerb", "--no-dashboard"]);
-    assert_eq!(String::from_utf8_lossy(&edge.stdout), "without camera: --role edge --name kerb --no-dashboard\n");
+    assert_eq!(
+        String::from_utf8_lossy(&edge.stdout),
+        "without camera: --role edge --name kerb --no-dashboard\n"
+    );
 
     let config = prefix.path().join("node.toml");
     let text = "role = \"cav\"\nname = \"kerb\"\nlisten = \"127.0.0.1:0\"\n[membership]\nbind = \"127.0.0.1:0\"\nseeds = [\"127.0.0.1:9\"]\n\
                 [camera.source]\nkind = \"images\"\npath = \"no-such-directory\"\n[camera.detector]\nkind = \"placard\"\n";
     std::fs::write(&config, text).unwrap();
-    let vehicle = run(&["--config", config.to_str().unwrap(), "--no-dashboard", "--stop-at-eof"]);
-    assert!(vehicle.stdout.is_empty(), "{}", String::from_utf8_lossy(&vehicle.stdout));
+    let vehicle = run(&[
+        "--config",
+        config.to_str().unwrap(),
+        "--no-dashboard",
+        "--stop-at-eof",
+    ]);
+    assert!(
+        vehicle.stdout.is_empty(),
+        "{}",
+        String::from_utf8_lossy(&vehicle.stdout)
+    );
 }

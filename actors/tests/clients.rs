@@ -40,7 +40,10 @@ async fn edge(tls: Option<TlsConfig>) -> (NodeHandle, SocketAddr) {
     config.validate().unwrap();
     let node = node::start(config).await.unwrap();
     let mut maps = node.newest_map();
-    tokio::time::timeout(Duration::from_secs(30), maps.wait_for(Option::is_some)).await.unwrap().unwrap();
+    tokio::time::timeout(Duration::from_secs(30), maps.wait_for(Option::is_some))
+        .await
+        .unwrap()
+        .unwrap();
     let broker = node.broker_address().unwrap();
     (node, broker)
 }
@@ -55,7 +58,10 @@ fn said(output: &Output) -> String {
 
 /// True if a program is there that the test needs.
 fn found(program: &str, arguments: &[&str]) -> bool {
-    Command::new(program).args(arguments).output().is_ok_and(|output| output.status.success())
+    Command::new(program)
+        .args(arguments)
+        .output()
+        .is_ok_and(|output| output.status.success())
 }
 
 /// The commands in the section of that name, one script a code block.
@@ -64,31 +70,46 @@ fn commands(document: &str, section: &str) -> Vec<String> {
     let (_, rest) = text.split_once(&format!("\n## {section}\n")).unwrap();
     let section = rest.split("\n## ").next().unwrap();
     let blocks = section.split("```sh\n").skip(1);
-    blocks.map(|block| block.split("```").next().unwrap().to_owned()).collect()
+    blocks
+        .map(|block| block.split("```").next().unwrap().to_owned())
+        .collect()
 }
 
 /// The first two blocks are run as they are, but for the port: the first reports, the second waits for a map and for verdicts.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_documented_commands_of_mosquitto_report_and_receive() {
     let is_installed = found("sh", &["-c", "command -v mosquitto_pub mosquitto_sub"]);
-    assert!(is_installed, "mosquitto_pub is missing: install Debian's package mosquitto-clients");
+    assert!(
+        is_installed,
+        "mosquitto_pub is missing: install Debian's package mosquitto-clients"
+    );
     let (node, broker) = edge(None).await;
     let (maps, verdicts) = (node.newest_map(), node.newest_verdicts());
     let output = tokio::task::spawn_blocking(move || {
         let scripts = commands("docs/protocol.md", "From a shell");
-        let [report, receive, _with_certificates] = &*scripts else { panic!("{scripts:?}") };
+        let [report, receive, _with_certificates] = &*scripts else {
+            panic!("{scripts:?}")
+        };
         let run = |script: &str| {
             let script = script.replace("-p 1883", &format!("-p {}", broker.port()));
             let mut shell = Command::new("sh");
-            shell.args(["-e", "-c", &script]).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+            shell
+                .args(["-e", "-c", &script])
+                .stdin(Stdio::null())
+                .stdout(Stdio::piped())
+                .stderr(Stdio::piped());
             shell.spawn().unwrap()
         };
         let mut reporter = run(report);
         // The second script begins when the cell has fused.
         let has_fused = || {
             let (map, verdicts) = (maps.borrow(), verdicts.borrow());
-            let seen = map.as_ref().and_then(|newest| newest.map.landmarks[0].label.as_deref());
-            let agreed = verdicts.as_ref().and_then(|newest| newest.message.verdicts[0].label.as_deref());
+            let seen = map
+                .as_ref()
+                .and_then(|newest| newest.map.landmarks[0].label.as_deref());
+            let agreed = verdicts
+                .as_ref()
+                .and_then(|newest| newest.message.verdicts[0].label.as_deref());
             seen == Some("car") && agreed == Some("car")
         };
         let deadline = Instant::now() + Duration::from_secs(30);
@@ -104,11 +125,22 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
     node.stop().await;
     let said = said(&output);
     assert!(output.status.success(), "{said}");
-    let messages: Vec<serde_json::Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    let [map, verdicts] = &*messages else { panic!("{said}") };
-    assert_eq!((&map["landmarks"][0]["id"], &map["landmarks"][0]["label"]), (&"slot-0".into(), &"car".into()));
+    let messages: Vec<serde_json::Value> = said
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    let [map, verdicts] = &*messages else {
+        panic!("{said}")
+    };
     assert_eq!(
-        (&verdicts["verdicts"][0]["landmark"], &verdicts["verdicts"][0]["label"]),
+        (&map["landmarks"][0]["id"], &map["landmarks"][0]["label"]),
+        (&"slot-0".into(), &"car".into())
+    );
+    assert_eq!(
+        (
+            &verdicts["verdicts"][0]["landmark"],
+            &verdicts["verdicts"][0]["label"]
+        ),
         (&"slot-0".into(), &"car".into())
     );
 }
@@ -117,23 +149,41 @@ async fn the_documented_commands_of_mosquitto_report_and_receive() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_documented_commands_of_mosquitto_receive_by_a_nodes_certificate() {
     let directory = tempfile::tempdir().unwrap();
-    let (cell, name) = (NodeName::from_static("lot-1"), NodeName::from_static("edge"));
+    let (cell, name) = (
+        NodeName::from_static("lot-1"),
+        NodeName::from_static("edge"),
+    );
     let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
-    authority.issue(&name, Role::Edge, Duration::from_secs(86_400), clock::now()).unwrap();
+    authority
+        .issue(&name, Role::Edge, Duration::from_secs(86_400), clock::now())
+        .unwrap();
     let (certificate, key) = authority.files_of(&name);
     std::fs::copy(&certificate, directory.path().join("node.pem")).unwrap();
     std::fs::copy(&key, directory.path().join("node.key")).unwrap();
-    let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
+    let tls = TlsConfig {
+        ca: authority.ca(),
+        certificate,
+        key,
+        revocation_list: None,
+        city: None,
+    };
     let (node, broker) = edge(Some(tls)).await;
     let output = tokio::task::spawn_blocking(move || {
         let scripts = commands("docs/protocol.md", "From a shell");
-        let [_report, _receive, with_certificates] = &*scripts else { panic!("{scripts:?}") };
+        let [_report, _receive, with_certificates] = &*scripts else {
+            panic!("{scripts:?}")
+        };
         let script = with_certificates.replace("/etc/ecod", directory.path().to_str().unwrap());
         let script = script.replace("-p 8883", &format!("-W 30 -p {}", broker.port()));
-        Command::new("sh").args(["-e", "-c", &script]).stdin(Stdio::null()).output().unwrap()
+        Command::new("sh")
+            .args(["-e", "-c", &script])
+            .stdin(Stdio::null())
+            .output()
+            .unwrap()
     });
     let output = output.await.unwrap();
     node.stop().await;
-    let map: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{}", said(&output)));
+    let map: serde_json::Value =
+        serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{}", said(&output)));
     assert_eq!(map["aggregator"], "edge");
 }

@@ -41,7 +41,10 @@ fn config(seeds: &[SocketAddr]) -> MembershipConfig {
         key: Some(Secret::new("5e".repeat(32))),
         bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),
         seeds: seeds.iter().map(ToString::to_string).collect(),
-        multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
+        multicast: MulticastConfig {
+            enabled: false,
+            ..MulticastConfig::default()
+        },
         // Patient, as the machine that runs this may be busy.
         probe_ms: 200,
         reply_ms: 80,
@@ -70,16 +73,34 @@ impl Node {
         };
         let (actor, _) = Actor::spawn(None, Membership, arguments).await.unwrap();
         let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000).unwrap();
-        Self { name, actor, address, events, members, counters }
+        Self {
+            name,
+            actor,
+            address,
+            events,
+            members,
+            counters,
+        }
     }
 
     async fn sees(&mut self, names: &[&str]) {
         let wanted: BTreeSet<_> = names.iter().copied().collect();
         let complete = |members: &Vec<Member>| {
-            members.iter().map(|member| member.name.as_str()).collect::<BTreeSet<_>>() == wanted
+            members
+                .iter()
+                .map(|member| member.name.as_str())
+                .collect::<BTreeSet<_>>()
+                == wanted
         };
-        let seen = timeout(SOON, self.members.wait_for(complete)).await.map(|_| ());
-        assert!(seen.is_ok(), "{} sees {:?}, not {names:?}", self.name, self.members.borrow());
+        let seen = timeout(SOON, self.members.wait_for(complete))
+            .await
+            .map(|_| ());
+        assert!(
+            seen.is_ok(),
+            "{} sees {:?}, not {names:?}",
+            self.name,
+            self.members.borrow()
+        );
     }
 
     async fn counts(&self, event: FrameEvent, at_least: u64) {
@@ -88,7 +109,11 @@ impl Node {
                 sleep(Duration::from_millis(5)).await;
             }
         };
-        assert!(timeout(SOON, counted).await.is_ok(), "{:?}", self.counters.snapshot());
+        assert!(
+            timeout(SOON, counted).await.is_ok(),
+            "{:?}",
+            self.counters.snapshot()
+        );
     }
 
     fn events(&self) -> Vec<MembershipEvent> {
@@ -97,7 +122,8 @@ impl Node {
 
     /// Events but for suspicions, which a busy machine brings about and takes back.
     fn changes(&self) -> Vec<MembershipEvent> {
-        let is_change = |event: &MembershipEvent| !matches!(event, MembershipEvent::Suspected { .. });
+        let is_change =
+            |event: &MembershipEvent| !matches!(event, MembershipEvent::Suspected { .. });
         self.events().into_iter().filter(is_change).collect()
     }
 }
@@ -105,7 +131,11 @@ impl Node {
 async fn all_see_each_other(nodes: &mut [Node]) {
     let names: Vec<_> = nodes.iter().map(|node| node.name.clone()).collect();
     for node in nodes {
-        let others: Vec<_> = names.iter().filter(|name| **name != node.name).map(NodeName::as_str).collect();
+        let others: Vec<_> = names
+            .iter()
+            .filter(|name| **name != node.name)
+            .map(NodeName::as_str)
+            .collect();
         node.sees(&others).await;
     }
 }
@@ -127,7 +157,9 @@ async fn five_nodes_find_each_other_by_one_seed_and_miss_one_that_dies() {
     dead.actor.kill();
     all_see_each_other(&mut nodes).await;
     for node in &nodes {
-        assert!(node.events().contains(&MembershipEvent::Down { name: dead.name.clone() }));
+        assert!(node.events().contains(&MembershipEvent::Down {
+            name: dead.name.clone()
+        }));
     }
     let back = Node::start("node-3", config(&[nodes[0].address])).await;
     nodes.push(back);
@@ -139,19 +171,35 @@ async fn datagrams_and_broker_addresses_reach_the_others() {
     let mut nodes = five().await;
     let payload = Bytes::from_static(b"who leads?");
     let reached = |members: &Vec<Member>| {
-        let member = members.iter().find(|member| member.name.as_str() == "node-2");
+        let member = members
+            .iter()
+            .find(|member| member.name.as_str() == "node-2");
         member.and_then(|member| member.broker) == Some(SocketAddr::from(([127, 0, 0, 1], 1883)))
     };
-    assert!(timeout(SOON, nodes[4].members.wait_for(reached)).await.is_ok());
+    assert!(
+        timeout(SOON, nodes[4].members.wait_for(reached))
+            .await
+            .is_ok()
+    );
     let received = |event: &MembershipEvent| match event {
-        MembershipEvent::Received { from, payload: received, .. } => from.as_str() == "node-2" && *received == payload,
+        MembershipEvent::Received {
+            from,
+            payload: received,
+            ..
+        } => from.as_str() == "node-2" && *received == payload,
         _ => false,
     };
     let arrived = async {
         // One that waits for a session too long is lost.
         while !nodes[4].events().iter().any(received) {
             let to = nodes[4].name.clone();
-            nodes[1].actor.cast(MembershipMessage::Send { to, payload: payload.clone() }).unwrap();
+            nodes[1]
+                .actor
+                .cast(MembershipMessage::Send {
+                    to,
+                    payload: payload.clone(),
+                })
+                .unwrap();
             sleep(Duration::from_millis(50)).await;
         }
     };
@@ -164,10 +212,20 @@ async fn nodes_find_each_other_by_multicast() {
     let probe = std::net::UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
     let port = probe.local_addr().unwrap().port();
     drop(probe);
-    let multicast = MulticastConfig { port, interface: Some(Ipv4Addr::LOCALHOST), ..MulticastConfig::default() };
+    let multicast = MulticastConfig {
+        port,
+        interface: Some(Ipv4Addr::LOCALHOST),
+        ..MulticastConfig::default()
+    };
     let carried = loopback_has_multicast(&multicast).await;
-    assert!(carried, "loopback carries no multicast on this machine: `ip link set lo multicast on`");
-    let config = || MembershipConfig { multicast: multicast.clone(), ..config(&[]) };
+    assert!(
+        carried,
+        "loopback carries no multicast on this machine: `ip link set lo multicast on`"
+    );
+    let config = || MembershipConfig {
+        multicast: multicast.clone(),
+        ..config(&[])
+    };
     let mut nodes = Vec::new();
     for name in ["node-1", "node-2", "node-3"] {
         nodes.push(Node::start(name, config()).await);
@@ -183,7 +241,9 @@ async fn loopback_has_multicast(config: &MulticastConfig) -> bool {
         socket2::SockRef::from(&sender).set_multicast_if_v4(&Ipv4Addr::LOCALHOST)?;
         sender.send_to(b"?", (config.group, config.port)).await?;
         let mut buffer = [0; 8];
-        timeout(Duration::from_secs(2), receiver.recv_from(&mut buffer)).await.map_err(std::io::Error::other)??;
+        timeout(Duration::from_secs(2), receiver.recv_from(&mut buffer))
+            .await
+            .map_err(std::io::Error::other)??;
         Ok::<_, std::io::Error>(())
     };
     exchange.await.is_ok()
@@ -192,15 +252,30 @@ async fn loopback_has_multicast(config: &MulticastConfig) -> bool {
 #[tokio::test]
 async fn a_node_with_another_key_is_not_seen_and_counted() {
     let first = Node::start("node-1", config(&[])).await;
-    let wrong = MembershipConfig { key: Some(Secret::new("another passphrase")), ..config(&[first.address]) };
+    let wrong = MembershipConfig {
+        key: Some(Secret::new("another passphrase")),
+        ..config(&[first.address])
+    };
     let second = Node::start("node-2", wrong).await;
     first.counts(FrameEvent::BadSeal, 2).await;
     let kinds = |node: &Node| -> Vec<_> {
-        let kind = |event| if let MembershipEvent::Troubled { kind, .. } = event { Some(kind) } else { None };
+        let kind = |event| {
+            if let MembershipEvent::Troubled { kind, .. } = event {
+                Some(kind)
+            } else {
+                None
+            }
+        };
         node.events().into_iter().map(kind).collect()
     };
     for node in [first, second] {
-        assert!(kinds(&node).iter().all(|kind| *kind == Some(TroubleKind::WrongKey)), "{:?}", node.events());
+        assert!(
+            kinds(&node)
+                .iter()
+                .all(|kind| *kind == Some(TroubleKind::WrongKey)),
+            "{:?}",
+            node.events()
+        );
     }
 }
 
@@ -236,7 +311,10 @@ async fn recorded_frames_change_nothing() {
         loop {
             let (length, from) = relay.recv_from(&mut buffer).await.unwrap();
             tape.lock().unwrap().push(buffer[..length].to_vec());
-            relay.send_to(&buffer[..length], if from == one { two } else { one }).await.unwrap();
+            relay
+                .send_to(&buffer[..length], if from == one { two } else { one })
+                .await
+                .unwrap();
         }
     });
     first.sees(&["node-2"]).await;

@@ -27,8 +27,7 @@ use tokio::time::timeout;
 const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Half a metre of car, 40 pixels high: 6.6 m ahead of the default camera.
-const DETECTIONS: &str =
-    r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]"#;
+const DETECTIONS: &str = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]"#;
 const AHEAD_M: f64 = 6.6;
 
 const SPEED_MPS: f64 = 2.0;
@@ -54,7 +53,14 @@ fn cell() -> NodeConfig {
 async fn edge() -> NodeHandle {
     let name = Some(NodeName::from_static("edge"));
     let listen = Some("127.0.0.1:0".parse().unwrap());
-    node::start(NodeConfig { name, role: Role::Edge, listen, ..cell() }).await.unwrap()
+    node::start(NodeConfig {
+        name,
+        role: Role::Edge,
+        listen,
+        ..cell()
+    })
+    .await
+    .unwrap()
 }
 
 /// A vehicle that always has half a metre of car ahead.
@@ -63,7 +69,11 @@ fn vehicle(name: &'static str, pose: PoseConfig, directory: &Path) -> NodeConfig
     std::fs::create_dir(&directory).unwrap();
     let frames = directory.join("frames");
     std::fs::create_dir(&frames).unwrap();
-    std::fs::write(frames.join("0.ppm"), [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat()).unwrap();
+    std::fs::write(
+        frames.join("0.ppm"),
+        [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat(),
+    )
+    .unwrap();
     let detections = directory.join("detections.jsonl");
     std::fs::write(&detections, DETECTIONS).unwrap();
     let camera = format!(
@@ -72,8 +82,18 @@ fn vehicle(name: &'static str, pose: PoseConfig, directory: &Path) -> NodeConfig
          projection = {{ ranging = \"box_height\", sizes.default = {{ width_m = 0.5, height_m = 0.5 }} }}"
     );
     let camera = Some(toml::from_str(&camera).unwrap());
-    let (name, listen) = (Some(NodeName::from_static(name)), Some("127.0.0.1:0".parse().unwrap()));
-    let config = NodeConfig { name, role: Role::Cav, listen, pose, camera, ..cell() };
+    let (name, listen) = (
+        Some(NodeName::from_static(name)),
+        Some("127.0.0.1:0".parse().unwrap()),
+    );
+    let config = NodeConfig {
+        name,
+        role: Role::Cav,
+        listen,
+        pose,
+        camera,
+        ..cell()
+    };
     config.validate().unwrap();
     config
 }
@@ -83,13 +103,20 @@ async fn onlooker(broker: SocketAddr) -> (AsyncClient, EventLoop) {
     let mut options = MqttOptions::new("onlooker", broker.ip().to_string(), broker.port());
     options.set_keep_alive(Duration::from_secs(60));
     let (client, events) = AsyncClient::new(options, 64);
-    client.subscribe("ecod/v1/road/#", QoS::AtMostOnce).await.unwrap();
+    client
+        .subscribe("ecod/v1/road/#", QoS::AtMostOnce)
+        .await
+        .unwrap();
     (client, events)
 }
 
 /// An address that was free a moment ago.
 async fn free_address() -> SocketAddr {
-    UdpSocket::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap()
+    UdpSocket::bind("127.0.0.1:0")
+        .await
+        .unwrap()
+        .local_addr()
+        .unwrap()
 }
 
 /// The next report on a topic of a vehicle, such as `detections/euclid`.
@@ -114,7 +141,14 @@ async fn a_vehicle_that_drives_sees_from_where_it_was() {
     let poses = free_address().await;
     let edge = edge().await;
     let broker = edge.broker_address().unwrap();
-    let mut config = vehicle("euclid", PoseConfig { listen: Some(poses), ..PoseConfig::default() }, directory.path());
+    let mut config = vehicle(
+        "euclid",
+        PoseConfig {
+            listen: Some(poses),
+            ..PoseConfig::default()
+        },
+        directory.path(),
+    );
     config.mqtt.broker = Some(broker.into());
     let vehicle = node::start(config).await.unwrap();
     let (_client, mut events) = onlooker(broker).await;
@@ -125,14 +159,20 @@ async fn a_vehicle_that_drives_sees_from_where_it_was() {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    timeout(PATIENCE, unplaced).await.expect("frames are looked at");
+    timeout(PATIENCE, unplaced)
+        .await
+        .expect("frames are looked at");
 
     let started = clock::now();
     let mut tasks = JoinSet::new();
     tasks.spawn(async move {
         loop {
             let now = clock::now();
-            let pose = format!(r#"{{"x_m":{},"y_m":0,"heading_rad":0,"captured_at_us":{}}}"#, x_m(started, now), now.0);
+            let pose = format!(
+                r#"{{"x_m":{},"y_m":0,"heading_rad":0,"captured_at_us":{}}}"#,
+                x_m(started, now),
+                now.0
+            );
             localisation.send_to(pose.as_bytes(), poses).await.unwrap();
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
@@ -148,10 +188,16 @@ async fn a_vehicle_that_drives_sees_from_where_it_was() {
             assert!((pose.x_m - true_x_m).abs() < 0.1, "{pose:?} is {true_x_m}");
             distances.push(pose.x_m);
         }
-        assert!((object.x_m - pose.x_m - AHEAD_M).abs() < 0.1, "{object:?} from {pose:?}");
+        assert!(
+            (object.x_m - pose.x_m - AHEAD_M).abs() < 0.1,
+            "{object:?} from {pose:?}"
+        );
         has_stopped = true_x_m == STOPS_AT_M && (pose.x_m - STOPS_AT_M).abs() < 0.01;
     }
-    assert!(distances.is_sorted() && distances.len() > 3, "{distances:?}");
+    assert!(
+        distances.is_sorted() && distances.len() > 3,
+        "{distances:?}"
+    );
 
     // At the spot its report is a vote too.
     let vote = timeout(PATIENCE, async {
@@ -162,7 +208,9 @@ async fn a_vehicle_that_drives_sees_from_where_it_was() {
             }
         }
     });
-    let vote = vote.await.expect("what stands at the spot is put to the vote");
+    let vote = vote
+        .await
+        .expect("what stands at the spot is put to the vote");
     assert_eq!(vote.objects[0].landmark.as_deref(), Some("spot"));
     tasks.shutdown().await;
     vehicle.stop().await;
@@ -172,7 +220,8 @@ async fn a_vehicle_that_drives_sees_from_where_it_was() {
 /// 12.4 m east and 3.1 m south of the origin, by PROJ.
 const LATITUDE_DEG: f64 = 52.229_647_740_62;
 const LONGITUDE_DEG: f64 = 21.012_410_179_60;
-const ORIGIN: &str = "[origin]\nlatitude_deg = 52.2296756\nlongitude_deg = 21.0122287\nheight_m = 113\n";
+const ORIGIN: &str =
+    "[origin]\nlatitude_deg = 52.2296756\nlongitude_deg = 21.0122287\nheight_m = 113\n";
 
 /// `ecod-node cell set` at a node.
 async fn describe(node: &NodeHandle, text: String) {
@@ -181,10 +230,18 @@ async fn describe(node: &NodeHandle, text: String) {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(&file, text).unwrap();
         let mut program = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-        program.args(["cell", "set", "--cell", "road", "--door", &door]).arg(file.path()).output().unwrap()
+        program
+            .args(["cell", "set", "--cell", "road", "--door", &door])
+            .arg(file.path())
+            .output()
+            .unwrap()
     };
     let output = tokio::task::spawn_blocking(set).await.unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
 }
 
 async fn readiness(node: &NodeHandle) -> String {
@@ -203,11 +260,19 @@ async fn until(what: &str, condition: impl AsyncFn() -> bool) {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    timeout(PATIENCE, met).await.unwrap_or_else(|_| panic!("not true in time: {what}"));
+    timeout(PATIENCE, met)
+        .await
+        .unwrap_or_else(|_| panic!("not true in time: {what}"));
 }
 
 /// Reads reports until one is from here.
-async fn report_from(events: &mut EventLoop, topic: &str, x_m: f64, y_m: f64, heading_rad: f64) -> ObjectReport {
+async fn report_from(
+    events: &mut EventLoop,
+    topic: &str,
+    x_m: f64,
+    y_m: f64,
+    heading_rad: f64,
+) -> ObjectReport {
     let mut last = None;
     let found = timeout(PATIENCE, async {
         loop {
@@ -222,7 +287,9 @@ async fn report_from(events: &mut EventLoop, topic: &str, x_m: f64, y_m: f64, he
         }
     });
     let found = found.await;
-    found.unwrap_or_else(|_| panic!("no report on {topic} from {x_m}, {y_m}, {heading_rad}; last {last:?}"))
+    found.unwrap_or_else(|_| {
+        panic!("no report on {topic} from {x_m}, {y_m}, {heading_rad}; last {last:?}")
+    })
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -238,16 +305,26 @@ async fn poses_on_earth_follow_the_origin_of_the_cell() {
     };
     let mut config = vehicle("euclid", earth, directory.path());
     config.membership.seeds = seeds.clone();
-    (config.dashboard.enabled, config.dashboard.listen) = (true, Some("127.0.0.1:0".parse().unwrap()));
+    (config.dashboard.enabled, config.dashboard.listen) =
+        (true, Some("127.0.0.1:0".parse().unwrap()));
     let standing = node::start(config).await.unwrap();
     let poses = free_address().await;
-    let mut config = vehicle("gauss", PoseConfig { listen: Some(poses), ..PoseConfig::default() }, directory.path());
+    let mut config = vehicle(
+        "gauss",
+        PoseConfig {
+            listen: Some(poses),
+            ..PoseConfig::default()
+        },
+        directory.path(),
+    );
     config.membership.seeds = seeds;
     let driving = node::start(config).await.unwrap();
     let mut tasks = JoinSet::new();
     let localisation = UdpSocket::bind("127.0.0.1:0").await.unwrap();
     tasks.spawn(async move {
-        let pose = format!(r#"{{"latitude_deg":{LATITUDE_DEG},"longitude_deg":{LONGITUDE_DEG},"azimuth_deg":90}}"#);
+        let pose = format!(
+            r#"{{"latitude_deg":{LATITUDE_DEG},"longitude_deg":{LONGITUDE_DEG},"azimuth_deg":90}}"#
+        );
         loop {
             let _ = localisation.send_to(pose.as_bytes(), poses).await;
             tokio::time::sleep(Duration::from_millis(20)).await;
@@ -255,9 +332,20 @@ async fn poses_on_earth_follow_the_origin_of_the_cell() {
     });
 
     // Nobody has said where on Earth the cell is.
-    until("poses are refused", async || driving.counters().events(Event::PoseRejected) > 3).await;
-    until("frames are not placed", async || standing.counters().events(Event::FrameWithoutPose) > 3).await;
-    let told = ["503", "`pose.latitude_deg`", "no origin", "ecod-node cell set"];
+    until("poses are refused", async || {
+        driving.counters().events(Event::PoseRejected) > 3
+    })
+    .await;
+    until("frames are not placed", async || {
+        standing.counters().events(Event::FrameWithoutPose) > 3
+    })
+    .await;
+    let told = [
+        "503",
+        "`pose.latitude_deg`",
+        "no origin",
+        "ecod-node cell set",
+    ];
     until("that is told", async || {
         let answer = readiness(&standing).await;
         told.iter().all(|part| answer.contains(part))
@@ -268,9 +356,15 @@ async fn poses_on_earth_follow_the_origin_of_the_cell() {
     describe(&edge, ORIGIN.into()).await;
     let report = report_from(&mut events, "detections/euclid", 12.4, -3.1, -FRAC_PI_2).await;
     let object = &report.objects[0];
-    assert!((object.x_m - 12.4).abs() < 0.1 && (object.y_m + 3.1 + AHEAD_M).abs() < 0.1, "south of it: {object:?}");
+    assert!(
+        (object.x_m - 12.4).abs() < 0.1 && (object.y_m + 3.1 + AHEAD_M).abs() < 0.1,
+        "south of it: {object:?}"
+    );
     report_from(&mut events, "detections/gauss", 12.4, -3.1, 0.0).await;
-    until("the vehicle is ready", async || readiness(&standing).await.contains("following edge")).await;
+    until("the vehicle is ready", async || {
+        readiness(&standing).await.contains("following edge")
+    })
+    .await;
 
     // The x axis is now north, and y west.
     describe(&edge, format!("{ORIGIN}rotation_deg = 90\n")).await;

@@ -35,7 +35,10 @@ async fn edge(change: impl FnOnce(&mut NodeConfig)) -> (NodeHandle, SocketAddr) 
         cell: NodeName::from_static("lot"),
         role: Role::Edge,
         listen: Some("127.0.0.1:0".parse().unwrap()),
-        landmarks: vec![LandmarkConfig::at("west", 0.0, 0.0), LandmarkConfig::at("east", 3.0, 0.0)],
+        landmarks: vec![
+            LandmarkConfig::at("west", 0.0, 0.0),
+            LandmarkConfig::at("east", 3.0, 0.0),
+        ],
         ..NodeConfig::default()
     };
     config.membership.bind = Some("127.0.0.1:0".parse().unwrap());
@@ -45,7 +48,10 @@ async fn edge(change: impl FnOnce(&mut NodeConfig)) -> (NodeHandle, SocketAddr) 
     config.validate().unwrap();
     let edge = node::start(config).await.unwrap();
     let mut maps = edge.newest_map();
-    tokio::time::timeout(PATIENCE, maps.wait_for(Option::is_some)).await.unwrap().unwrap();
+    tokio::time::timeout(PATIENCE, maps.wait_for(Option::is_some))
+        .await
+        .unwrap()
+        .unwrap();
     let broker = edge.broker_address().unwrap();
     (edge, broker)
 }
@@ -59,13 +65,25 @@ fn connect(broker: SocketAddr, vehicle: &str, tasks: &mut JoinSet<()>) -> AsyncC
     client
 }
 
-async fn publish(client: &AsyncClient, vehicle: &str, seq: u64, x_m: f64) -> Result<(), ClientError> {
+async fn publish(
+    client: &AsyncClient,
+    vehicle: &str,
+    seq: u64,
+    x_m: f64,
+) -> Result<(), ClientError> {
     let report = ObjectReport {
         objects: vec![PerceivedObject::new("car", 0.9, x_m, 0.0)],
         ..ObjectReport::new(NodeName::new(vehicle).unwrap(), seq, clock::now())
     };
     let topic = format!("ecod/v1/lot/detections/{vehicle}");
-    client.publish(topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json)).await
+    client
+        .publish(
+            topic,
+            QoS::AtMostOnce,
+            false,
+            encode(&report, Encoding::Json),
+        )
+        .await
 }
 
 /// A report every `period`, for as long as the connection is served.
@@ -97,9 +115,14 @@ async fn answers(edge: &NodeHandle, client: &AsyncClient, first: u64) -> Vec<Wai
         let sent = Instant::now();
         publish(client, "euclid", seq, x_m).await.unwrap();
         let shows = |received: &Option<ecod_actors::messages::newest::ReceivedMap>| {
-            received.as_ref().is_some_and(|received| (received.map.landmarks[1].x_m - x_m).abs() < 1e-4)
+            received
+                .as_ref()
+                .is_some_and(|received| (received.map.landmarks[1].x_m - x_m).abs() < 1e-4)
         };
-        tokio::time::timeout(PATIENCE, maps.wait_for(shows)).await.expect("every report is answered").unwrap();
+        tokio::time::timeout(PATIENCE, maps.wait_for(shows))
+            .await
+            .expect("every report is answered")
+            .unwrap();
         waits.push((sent, Instant::now()));
         tokio::time::sleep(Duration::from_millis(100).saturating_sub(sent.elapsed())).await;
     }
@@ -107,7 +130,12 @@ async fn answers(edge: &NodeHandle, client: &AsyncClient, first: u64) -> Vec<Wai
 }
 
 fn shed(edge: &NodeHandle, source: &str) -> u64 {
-    edge.counters().all_shed().iter().filter(|shed| shed.source == source).map(|shed| shed.times).sum()
+    edge.counters()
+        .all_shed()
+        .iter()
+        .filter(|shed| shed.source == source)
+        .map(|shed| shed.times)
+        .sum()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -119,7 +147,11 @@ async fn one_flooding_vehicle_does_not_delay_anothers_reports() {
     let quiet = sorted_times(&answers(&edge, &euclid, 0).await);
 
     let mallory = connect(broker, "mallory", &mut tasks);
-    tasks.spawn(flood(mallory, "mallory".to_owned(), Duration::from_micros(10)));
+    tasks.spawn(flood(
+        mallory,
+        "mallory".to_owned(),
+        Duration::from_micros(10),
+    ));
     let sleepers = Sleepers::start();
     let answers = answers(&edge, &euclid, 100).await;
     let longest = sleepers.wake().longest(&answers);
@@ -127,10 +159,21 @@ async fn one_flooding_vehicle_does_not_delay_anothers_reports() {
     let [quiet_median, flooded_median] = [&quiet, &flooded].map(|times| times[times.len() / 2]);
     let left_out = shed(&edge, "mallory");
     println!("median {quiet_median:?}, beside a flood {flooded_median:?}; {left_out} left out");
-    assert!(flooded_median < quiet_median + Duration::from_millis(50), "{quiet:?} {flooded:?}");
+    assert!(
+        flooded_median < quiet_median + Duration::from_millis(50),
+        "{quiet:?} {flooded:?}"
+    );
     assert!(longest < Duration::from_secs(1), "{longest:?} {flooded:?}");
-    assert!(left_out > 500, "the flood was {left_out} messages more than is taken");
-    assert!(edge.counters().all_shed().iter().any(|shed| shed.reason == ShedReason::BrokerThrottled));
+    assert!(
+        left_out > 500,
+        "the flood was {left_out} messages more than is taken"
+    );
+    assert!(
+        edge.counters()
+            .all_shed()
+            .iter()
+            .any(|shed| shed.reason == ShedReason::BrokerThrottled)
+    );
     assert_eq!(shed(&edge, "euclid"), 0);
     tasks.shutdown().await;
     edge.stop().await;
@@ -148,16 +191,24 @@ async fn ten_times_more_than_is_taken_leaves_period_and_memory_alone() {
     }
     let mut maps = edge.newest_map();
     let all_report = maps.wait_for(|received| {
-        received.as_ref().is_some_and(|received| received.map.landmarks[0].contributors.len() == VEHICLES)
+        received
+            .as_ref()
+            .is_some_and(|received| received.map.landmarks[0].contributors.len() == VEHICLES)
     });
-    tokio::time::timeout(PATIENCE, all_report).await.unwrap().unwrap();
+    tokio::time::timeout(PATIENCE, all_report)
+        .await
+        .unwrap()
+        .unwrap();
     tokio::time::sleep(Duration::from_secs(1)).await;
 
     let sleepers = Sleepers::start();
     let (begun, before) = (Instant::now(), resident_bytes());
     let (mut last, mut gaps) = (begun, Vec::new());
     while begun.elapsed() < Duration::from_secs(3) {
-        tokio::time::timeout(PATIENCE, maps.changed()).await.unwrap().unwrap();
+        tokio::time::timeout(PATIENCE, maps.changed())
+            .await
+            .unwrap()
+            .unwrap();
         let now = Instant::now();
         gaps.push((last, now));
         last = now;
@@ -167,12 +218,21 @@ async fn ten_times_more_than_is_taken_leaves_period_and_memory_alone() {
     let gaps = sorted_times(&gaps);
     let grown_mb = resident_bytes().saturating_sub(before) as f64 / 1e6;
     let median = gaps[gaps.len() / 2];
-    println!("rounds {median:?} apart, at most {longest:?} while the machine ran; {grown_mb:.1} MB more");
+    println!(
+        "rounds {median:?} apart, at most {longest:?} while the machine ran; {grown_mb:.1} MB more"
+    );
     assert!(median < Duration::from_millis(130), "{gaps:?}");
-    assert!(longest < Duration::from_millis(500), "{gaps:?} {stood_still:?}");
+    assert!(
+        longest < Duration::from_millis(500),
+        "{gaps:?} {stood_still:?}"
+    );
     assert!(grown_mb < 16.0, "{grown_mb}");
     for index in 0..VEHICLES {
-        assert!(shed(&edge, &format!("v{index}")) > 100, "{:?}", edge.counters().all_shed());
+        assert!(
+            shed(&edge, &format!("v{index}")) > 100,
+            "{:?}",
+            edge.counters().all_shed()
+        );
     }
     tasks.shutdown().await;
     edge.stop().await;
@@ -211,13 +271,21 @@ impl Sleepers {
             })
         };
         let count = 2 * thread::available_parallelism().map_or(1, NonZero::get);
-        Self { threads: (0..count).map(sleep).collect(), wanted }
+        Self {
+            threads: (0..count).map(sleep).collect(),
+            wanted,
+        }
     }
 
     /// Ends them.
     fn wake(self) -> StoodStill {
         self.wanted.store(false, Ordering::Relaxed);
-        StoodStill(self.threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect())
+        StoodStill(
+            self.threads
+                .into_iter()
+                .flat_map(|thread| thread.join().unwrap())
+                .collect(),
+        )
     }
 }
 
@@ -225,9 +293,17 @@ impl StoodStill {
     /// The longest wait, less what a sleeper overslept during it.
     fn longest(&self, waits: &[Wait]) -> Duration {
         let overslept = |(from, until): &Wait| {
-            self.0.iter().map(|(due, woke)| (*woke).min(*until).saturating_duration_since((*due).max(*from))).max()
+            self.0
+                .iter()
+                .map(|(due, woke)| {
+                    (*woke)
+                        .min(*until)
+                        .saturating_duration_since((*due).max(*from))
+                })
+                .max()
         };
-        let running = |wait: &Wait| (wait.1 - wait.0).saturating_sub(overslept(wait).unwrap_or_default());
+        let running =
+            |wait: &Wait| (wait.1 - wait.0).saturating_sub(overslept(wait).unwrap_or_default());
         waits.iter().map(running).max().unwrap_or_default()
     }
 }
@@ -235,6 +311,9 @@ impl StoodStill {
 /// Memory of this process, node and vehicles together.
 fn resident_bytes() -> u64 {
     let text = std::fs::read_to_string("/proc/self/status").unwrap();
-    let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix("VmRSS:"))
+        .unwrap();
     line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
 }

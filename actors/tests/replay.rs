@@ -42,25 +42,51 @@ fn text(path: &Path) -> &str {
 
 /// Replays the example and returns the output.
 fn replay_lot(folder: &TempDir, name: &str) -> PathBuf {
-    let (config, input, output) =
-        (example("recordings/lot.toml"), example("recordings/lot.jsonl"), folder.path().join(name));
-    let arguments = ["replay", "--config", text(&config), "--input", text(&input), "--output", text(&output)];
+    let (config, input, output) = (
+        example("recordings/lot.toml"),
+        example("recordings/lot.jsonl"),
+        folder.path().join(name),
+    );
+    let arguments = [
+        "replay",
+        "--config",
+        text(&config),
+        "--input",
+        text(&input),
+        "--output",
+        text(&output),
+    ];
     let run = ecod(&arguments);
     assert!(run.status.success(), "{}", said(&run));
-    assert!(said(&run).starts_with("96 lines, 96 used, "), "{}", said(&run));
+    assert!(
+        said(&run).starts_with("96 lines, 96 used, "),
+        "{}",
+        said(&run)
+    );
     output
 }
 
 #[test]
 fn equal_inputs_give_byte_equal_outputs_by_file_and_by_pipe() {
     let folder = TempDir::new().unwrap();
-    let (first, second) = (replay_lot(&folder, "1.jsonl"), replay_lot(&folder, "2.jsonl"));
+    let (first, second) = (
+        replay_lot(&folder, "1.jsonl"),
+        replay_lot(&folder, "2.jsonl"),
+    );
     let bytes = fs::read(first).unwrap();
     assert!(!bytes.is_empty());
     assert!(bytes == fs::read(second).unwrap());
     let config = example("recordings/lot.toml");
     let recording = fs::read(example("recordings/lot.jsonl")).unwrap();
-    let arguments = ["replay", "--config", text(&config), "--input", "-", "--output", "-"];
+    let arguments = [
+        "replay",
+        "--config",
+        text(&config),
+        "--input",
+        "-",
+        "--output",
+        "-",
+    ];
     assert!(ecod_with_input(&arguments, &recording).stdout == bytes);
 }
 
@@ -76,7 +102,18 @@ fn lines_that_cannot_be_used_are_counted_by_reason() {
     input.push(b'\n');
     input.extend_from_slice(&first[..first.len() / 2]);
     for (most, code) in [("82", 3), ("84", 0)] {
-        let run = ecod_with_input(&["replay", "--input", "-", "--output", "-", "--max-rejected", most], &input);
+        let run = ecod_with_input(
+            &[
+                "replay",
+                "--input",
+                "-",
+                "--output",
+                "-",
+                "--max-rejected",
+                most,
+            ],
+            &input,
+        );
         assert_eq!(run.status.code(), Some(code));
         let said = said(&run);
         for part in [
@@ -87,7 +124,11 @@ fn lines_that_cannot_be_used_are_counted_by_reason() {
         ] {
             assert!(said.contains(part), "{said}");
         }
-        assert_eq!(said.contains("5 of 6 reports were rejected, more than 82 % (--max-rejected)"), code == 3, "{said}");
+        assert_eq!(
+            said.contains("5 of 6 reports were rejected, more than 82 % (--max-rejected)"),
+            code == 3,
+            "{said}"
+        );
         assert_eq!(run.stdout.iter().filter(|byte| **byte == b'\n').count(), 1);
     }
 }
@@ -97,17 +138,31 @@ fn lines_that_cannot_be_used_are_counted_by_reason() {
 fn votes_by_name_are_used_without_positions_and_detections_are_told_what_they_lack() {
     let line = |topic: &str| {
         let object = r#"{"label":"cup","confidence":0.9,"landmark":"table"}"#;
-        let report =
-            format!(r#""schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,"objects":[{object}]"#);
+        let report = format!(
+            r#""schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,"objects":[{object}]"#
+        );
         format!("{{{report},\"topic\":\"{topic}\"}}\n")
     };
-    let run = |topic: &str| ecod_with_input(&["replay", "--input", "-", "--output", "-"], line(topic).as_bytes());
+    let run = |topic: &str| {
+        ecod_with_input(
+            &["replay", "--input", "-", "--output", "-"],
+            line(topic).as_bytes(),
+        )
+    };
     let votes = run("vote_detections");
-    assert!(votes.status.success() && said(&votes).contains("1 lines, 1 used"), "{}", said(&votes));
+    assert!(
+        votes.status.success() && said(&votes).contains("1 lines, 1 used"),
+        "{}",
+        said(&votes)
+    );
     assert!(String::from_utf8_lossy(&votes.stdout).contains(r#""landmark":"table","label":"cup""#));
     let detections = run("detections");
     assert_eq!(detections.status.code(), Some(3));
-    assert!(said(&detections).contains("line 1: objects[0]: missing field `x_m`"), "{}", said(&detections));
+    assert!(
+        said(&detections).contains("line 1: objects[0]: missing field `x_m`"),
+        "{}",
+        said(&detections)
+    );
 }
 
 /// Votes for locations that the configuration does not have, and positions in centimetres, are readable and change nothing.
@@ -118,11 +173,17 @@ fn reports_of_which_none_has_an_effect_fail() {
     fs::write(&cell, "[[landmarks]]\nid = \"table\"\nx_m = 3\ny_m = 0\n").unwrap();
     let vote = |landmark: &str, vehicle_m: u32| {
         let pose = format!(r#""pose":{{"x_m":{vehicle_m},"y_m":0,"heading_rad":0}}"#);
-        let object = format!(r#"{{"label":"cup","confidence":0.9,"x_m":3,"y_m":0,"landmark":"{landmark}"}}"#);
+        let object = format!(
+            r#"{{"label":"cup","confidence":0.9,"x_m":3,"y_m":0,"landmark":"{landmark}"}}"#
+        );
         format!(r#"{pose},"topic":"vote_detections","objects":[{object}]"#)
     };
-    let detection = |x_m: u32| format!(r#""objects":[{{"label":"cup","confidence":0.9,"x_m":{x_m},"y_m":0}}]"#);
-    let (no_vote, no_object) = ("1 of 1 votes do not count", "no report has an object at a known location");
+    let detection =
+        |x_m: u32| format!(r#""objects":[{{"label":"cup","confidence":0.9,"x_m":{x_m},"y_m":0}}]"#);
+    let (no_vote, no_object) = (
+        "1 of 1 votes do not count",
+        "no report has an object at a known location",
+    );
     for (report, problem) in [
         (vote("table", 0), None),
         (vote("tabel", 0), Some(no_vote)),
@@ -130,24 +191,62 @@ fn reports_of_which_none_has_an_effect_fail() {
         (detection(3), None),
         (detection(300), Some(no_object)),
     ] {
-        let line = format!(r#"{{"schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,{report}}}"#);
-        let arguments = ["replay", "--config", text(&cell), "--input", "-", "--output", "-"];
+        let line = format!(
+            r#"{{"schema":1,"node":"v1","seq":1,"captured_at_us":1700000000000000,{report}}}"#
+        );
+        let arguments = [
+            "replay",
+            "--config",
+            text(&cell),
+            "--input",
+            "-",
+            "--output",
+            "-",
+        ];
         let run = ecod_with_input(&arguments, line.as_bytes());
-        assert_eq!(run.status.code(), Some(if problem.is_some() { 3 } else { 0 }), "{report}: {}", said(&run));
-        assert!(problem.is_none_or(|problem| said(&run).contains(problem)), "{report}: {}", said(&run));
+        assert_eq!(
+            run.status.code(),
+            Some(if problem.is_some() { 3 } else { 0 }),
+            "{report}: {}",
+            said(&run)
+        );
+        assert!(
+            problem.is_none_or(|problem| said(&run).contains(problem)),
+            "{report}: {}",
+            said(&run)
+        );
     }
 }
 
 #[test]
 fn input_that_is_no_recording_fails() {
     let folder = TempDir::new().unwrap();
-    let (readme, empty) = (folder.path().join("README.md"), folder.path().join("empty.jsonl"));
+    let (readme, empty) = (
+        folder.path().join("README.md"),
+        folder.path().join("empty.jsonl"),
+    );
     fs::write(&readme, "# A title\n\nSome text.\n").unwrap();
     fs::write(&empty, "").unwrap();
     for input in [&readme, &empty] {
-        let run = ecod(&["replay", "--input", text(input), "--output", "-", "--max-rejected", "100"]);
-        assert!(run.status.code() == Some(3) && run.stdout.is_empty(), "{}", said(&run));
-        assert!(said(&run).contains("no report could be used"), "{}", said(&run));
+        let run = ecod(&[
+            "replay",
+            "--input",
+            text(input),
+            "--output",
+            "-",
+            "--max-rejected",
+            "100",
+        ]);
+        assert!(
+            run.status.code() == Some(3) && run.stdout.is_empty(),
+            "{}",
+            said(&run)
+        );
+        assert!(
+            said(&run).contains("no report could be used"),
+            "{}",
+            said(&run)
+        );
     }
 }
 
@@ -155,11 +254,21 @@ fn input_that_is_no_recording_fails() {
 fn times_in_another_unit_are_told_of() {
     let line = |unit: u64| {
         let times = (0..3).map(|n| 1_732_154_400_000_000 / unit + n);
-        let lines = times
-            .map(|at| format!("{{\"schema\":1,\"node\":\"a\",\"seq\":1,\"captured_at_us\":{at},\"objects\":[]}}\n"));
-        said(&ecod_with_input(&["replay", "--input", "-", "--output", "-"], lines.collect::<String>().as_bytes()))
+        let lines = times.map(|at| {
+            format!(
+                "{{\"schema\":1,\"node\":\"a\",\"seq\":1,\"captured_at_us\":{at},\"objects\":[]}}\n"
+            )
+        });
+        said(&ecod_with_input(
+            &["replay", "--input", "-", "--output", "-"],
+            lines.collect::<String>().as_bytes(),
+        ))
     };
-    assert!(line(1000).contains("times look like milliseconds"), "{}", line(1000));
+    assert!(
+        line(1000).contains("times look like milliseconds"),
+        "{}",
+        line(1000)
+    );
     assert!(line(1_000_000).contains("times look like seconds"));
     assert!(!line(1).contains("times look like"));
 }
@@ -167,8 +276,20 @@ fn times_in_another_unit_are_told_of() {
 #[test]
 fn passes_write_one_set_of_verdicts() {
     let input = example("recordings/lot.jsonl");
-    let run = ecod(&["replay", "--input", text(&input), "--output", "-", "--passes", "4"]);
-    assert!(run.status.success() && said(&run).contains("rejected not_fused 48"), "{}", said(&run));
+    let run = ecod(&[
+        "replay",
+        "--input",
+        text(&input),
+        "--output",
+        "-",
+        "--passes",
+        "4",
+    ]);
+    assert!(
+        run.status.success() && said(&run).contains("rejected not_fused 48"),
+        "{}",
+        said(&run)
+    );
     let lines: Vec<Value> = run
         .stdout
         .split(|b| *b == b'\n')
@@ -187,23 +308,83 @@ fn what_cannot_be_done_is_said_and_changes_no_file() {
         fs::write(&path, content).unwrap();
         path
     };
-    let (recording, typo) = (file("in.jsonl", "{}\n"), file("typo.toml", "[fusion.pace]\ngat_m = 1\n"));
+    let (recording, typo) = (
+        file("in.jsonl", "{}\n"),
+        file("typo.toml", "[fusion.pace]\ngat_m = 1\n"),
+    );
     let fusion = file("fusion.toml", "[fusion]\n");
     let fusion = text(&fusion);
     let out = folder.path().join("out.jsonl");
     let (recording, out) = (text(&recording), text(&out));
     for (arguments, code, part) in [
-        (vec!["replay", "--input", "/no/such.jsonl", "--output", out], 2, "/no/such.jsonl"),
-        (vec!["replay", "--input", "/", "--output", out], 2, "directory"),
-        (vec!["replay", "--input", recording, "--output", recording], 2, "both read and written"),
-        (vec!["replay", "--config", fusion, "--input", recording, "--output", fusion], 2, "both read and written"),
-        (vec!["replay", "--input", recording, "--output", "/no/such/dir.jsonl"], 2, "/no/such/dir.jsonl"),
-        (vec!["replay", "--config", text(&typo), "--input", recording, "--output", out], 2, "fusion.pace.gat_m"),
-        (vec!["replay", "--config", "/no.toml", "--input", recording, "--output", out], 2, "/no.toml"),
-        (vec!["replay", "--input", recording, "--output", out, "--passes", "0"], 2, "--passes"),
+        (
+            vec!["replay", "--input", "/no/such.jsonl", "--output", out],
+            2,
+            "/no/such.jsonl",
+        ),
+        (
+            vec!["replay", "--input", "/", "--output", out],
+            2,
+            "directory",
+        ),
+        (
+            vec!["replay", "--input", recording, "--output", recording],
+            2,
+            "both read and written",
+        ),
+        (
+            vec![
+                "replay", "--config", fusion, "--input", recording, "--output", fusion,
+            ],
+            2,
+            "both read and written",
+        ),
+        (
+            vec![
+                "replay",
+                "--input",
+                recording,
+                "--output",
+                "/no/such/dir.jsonl",
+            ],
+            2,
+            "/no/such/dir.jsonl",
+        ),
+        (
+            vec![
+                "replay",
+                "--config",
+                text(&typo),
+                "--input",
+                recording,
+                "--output",
+                out,
+            ],
+            2,
+            "fusion.pace.gat_m",
+        ),
+        (
+            vec![
+                "replay", "--config", "/no.toml", "--input", recording, "--output", out,
+            ],
+            2,
+            "/no.toml",
+        ),
+        (
+            vec![
+                "replay", "--input", recording, "--output", out, "--passes", "0",
+            ],
+            2,
+            "--passes",
+        ),
     ] {
         let run = ecod(&arguments);
-        assert_eq!(run.status.code(), Some(code), "{arguments:?}: {}", said(&run));
+        assert_eq!(
+            run.status.code(),
+            Some(code),
+            "{arguments:?}: {}",
+            said(&run)
+        );
         assert!(said(&run).contains(part), "{arguments:?}: {}", said(&run));
     }
     assert_eq!(fs::read_to_string(recording).unwrap(), "{}\n");

@@ -7,7 +7,8 @@ use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::wire::{RegionTopic, RegionTopicKind, ReputationTopic, Topic, Topics};
 
-const REGENERATE: &str = "regenerate with: ECOD_WRITE_SCHEMAS=1 cargo test -p ecod-actors --test schema";
+const REGENERATE: &str =
+    "regenerate with: ECOD_WRITE_SCHEMAS=1 cargo test -p ecod-actors --test schema";
 
 fn docs() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs")
@@ -24,16 +25,26 @@ fn documented_schemas_are_those_of_the_code() {
             std::fs::write(&file, &current).unwrap();
         }
         let documented = std::fs::read_to_string(&file).unwrap_or_default();
-        assert!(documented == current, "{} is out of date; {REGENERATE}", file.display());
+        assert!(
+            documented == current,
+            "{} is out of date; {REGENERATE}",
+            file.display()
+        );
     }
     let documented = std::fs::read_dir(&directory).unwrap().count();
-    assert_eq!(documented, schemas.len(), "a schema of no payload in {}", directory.display());
+    assert_eq!(
+        documented,
+        schemas.len(),
+        "a schema of no payload in {}",
+        directory.display()
+    );
 }
 
 /// The text after `before` in a line, up to `end`.
 fn values<'a>(text: &'a str, before: &'a str, end: char) -> BTreeSet<&'a str> {
     let rest = text.lines().filter_map(|line| line.split_once(before));
-    rest.map(|(_, rest)| rest.split(end).next().unwrap_or(rest)).collect()
+    rest.map(|(_, rest)| rest.split(end).next().unwrap_or(rest))
+        .collect()
 }
 
 /// `make asyncapi-check` sees to the rest of the document.
@@ -52,21 +63,45 @@ fn the_asyncapi_document_has_every_topic_and_every_schema() {
         Topic::Ledger(node.clone()),
         Topic::Nodes(node.clone()),
     ];
-    let spoken = kinds.iter().map(|topic| topics.path(topic)).chain([topics.clients(&node)]);
-    let spoken: BTreeSet<String> =
-        spoken.chain(["global", "node", "received/{receiver}"].map(|level| topics.cpm(level))).collect();
+    let spoken = kinds
+        .iter()
+        .map(|topic| topics.path(topic))
+        .chain([topics.clients(&node)]);
+    let spoken: BTreeSet<String> = spoken
+        .chain(["global", "node", "received/{receiver}"].map(|level| topics.cpm(level)))
+        .collect();
     let tile: Quadkey = "0".parse().unwrap();
-    let of_region = RegionTopicKind::ALL.map(|kind| RegionTopic { tile, cell: NodeName::from_static("cell"), kind });
-    let of_vehicle = ReputationTopic { vehicle: node, cell: NodeName::from_static("cell") };
-    let spoken = &spoken | &of_region.iter().map(RegionTopic::path).chain([of_vehicle.path()]).collect();
+    let of_region = RegionTopicKind::ALL.map(|kind| RegionTopic {
+        tile,
+        cell: NodeName::from_static("cell"),
+        kind,
+    });
+    let of_vehicle = ReputationTopic {
+        vehicle: node,
+        cell: NodeName::from_static("cell"),
+    };
+    let spoken = &spoken
+        | &of_region
+            .iter()
+            .map(RegionTopic::path)
+            .chain([of_vehicle.path()])
+            .collect();
     let addresses = values(&document, "address: ", '\n');
     let documented: BTreeSet<_> = addresses
         .iter()
-        .map(|address| address.replace("{cell}", "cell").replace("{node}", "node").replace("{tile}", "0"))
+        .map(|address| {
+            address
+                .replace("{cell}", "cell")
+                .replace("{node}", "node")
+                .replace("{tile}", "0")
+        })
         .collect();
     assert_eq!(documented, spoken);
     let schemas = ecod::wire::schemas();
     let files: BTreeSet<_> = schemas.keys().map(|name| format!("{name}.json")).collect();
-    let referenced = values(&document, "$ref: 'schemas/", '\'').into_iter().map(str::to_owned).collect();
+    let referenced = values(&document, "$ref: 'schemas/", '\'')
+        .into_iter()
+        .map(str::to_owned)
+        .collect();
     assert_eq!(files, referenced);
 }

@@ -30,19 +30,37 @@ impl Service {
         let path = directory.path().join("notify");
         let socket = UnixDatagram::bind(&path).unwrap();
         let mut command = program();
-        command.args(arguments).args(["--state-dir", directory.path().to_str().unwrap()]);
-        command.env("NOTIFY_SOCKET", &path).env("WATCHDOG_USEC", WATCHDOG.as_micros().to_string());
-        let process = command.stdin(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        Self { process, socket, _directory: directory }
+        command
+            .args(arguments)
+            .args(["--state-dir", directory.path().to_str().unwrap()]);
+        command
+            .env("NOTIFY_SOCKET", &path)
+            .env("WATCHDOG_USEC", WATCHDOG.as_micros().to_string());
+        let process = command
+            .stdin(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        Self {
+            process,
+            socket,
+            _directory: directory,
+        }
     }
 
     /// The next line that the node tells, if there is one until then.
     fn hear(&self, until: Instant) -> Option<String> {
-        let left = until.saturating_duration_since(Instant::now()).max(Duration::from_millis(1));
+        let left = until
+            .saturating_duration_since(Instant::now())
+            .max(Duration::from_millis(1));
         self.socket.set_read_timeout(Some(left)).unwrap();
         let mut message = [0; 512];
         let length = self.socket.recv(&mut message).ok()?;
-        Some(String::from_utf8_lossy(&message[..length]).trim_end().to_owned())
+        Some(
+            String::from_utf8_lossy(&message[..length])
+                .trim_end()
+                .to_owned(),
+        )
     }
 
     /// All that the node tells until it tells this.
@@ -73,16 +91,24 @@ impl Drop for Service {
 
 fn program() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-    for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+    for (key, _) in
+        std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
+    {
         command.env_remove(key);
     }
-    command.env("ECOD_MEMBERSHIP__MULTICAST__ENABLED", "false").env("ECOD_DASHBOARD__ENABLED", "false");
+    command
+        .env("ECOD_MEMBERSHIP__MULTICAST__ENABLED", "false")
+        .env("ECOD_DASHBOARD__ENABLED", "false");
     command.env_remove("RUST_LOG");
     command
 }
 
 fn free_port() -> u16 {
-    UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+    UdpSocket::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .port()
 }
 
 /// The watchdog of a follower is fed while rounds of a live aggregator come, and of the aggregator while it leads; both
@@ -92,10 +118,15 @@ fn the_watchdog_is_fed_while_rounds_flow_and_only_then() {
     let gossip = format!("127.0.0.1:{}", free_port());
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("edge.toml");
-    let config = format!("role = \"edge\"\nlisten = \"127.0.0.1:0\"\n[membership]\nbind = \"{gossip}\"\n");
+    let config =
+        format!("role = \"edge\"\nlisten = \"127.0.0.1:0\"\n[membership]\nbind = \"{gossip}\"\n");
     std::fs::write(&file, config).unwrap();
     let edge = Service::start(&["--config", file.to_str().unwrap()]);
-    assert_eq!(edge.hears("READY=1").len(), 1, "nothing is told before the node runs");
+    assert_eq!(
+        edge.hears("READY=1").len(),
+        1,
+        "nothing is told before the node runs"
+    );
     edge.hears("STATUS=leading");
     edge.hears("WATCHDOG=1");
 
@@ -130,11 +161,20 @@ fn a_node_that_is_stopped_feeds_no_watchdog() {
 /// Log of a node that is told to stop as soon as it serves.
 fn log(arguments: &[&str]) -> Vec<String> {
     let mut command = program();
-    command.args(["--role", "edge", "--listen", "127.0.0.1:0", "--stop-at-eof"]).args(arguments);
-    let mut node = command.stdin(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    command
+        .args(["--role", "edge", "--listen", "127.0.0.1:0", "--stop-at-eof"])
+        .args(arguments);
+    let mut node = command
+        .stdin(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
     let mut log = BufReader::new(node.stderr.take().unwrap());
     let mut lines = Vec::new();
-    while !lines.last().is_some_and(|line: &String| line.contains("broker serves")) {
+    while !lines
+        .last()
+        .is_some_and(|line: &String| line.contains("broker serves"))
+    {
         let mut line = String::new();
         assert_ne!(log.read_line(&mut line).unwrap(), 0, "{lines:?}");
         lines.push(line);
@@ -150,22 +190,41 @@ fn log(arguments: &[&str]) -> Vec<String> {
 #[test]
 fn logs_that_no_terminal_shows_are_json() {
     for line in log(&[]) {
-        let event: serde_json::Value = serde_json::from_str(&line).unwrap_or_else(|error| panic!("{error}: {line}"));
-        assert!(event["level"].is_string() && event["message"].is_string() && event["timestamp"].is_string(), "{line}");
+        let event: serde_json::Value =
+            serde_json::from_str(&line).unwrap_or_else(|error| panic!("{error}: {line}"));
+        assert!(
+            event["level"].is_string()
+                && event["message"].is_string()
+                && event["timestamp"].is_string(),
+            "{line}"
+        );
     }
     let text = log(&["--log-format", "text"]);
     assert!(text.iter().all(|line| !line.starts_with('{')), "{text:?}");
-    assert!(text.iter().any(|line| line.contains(" INFO ") && line.contains("address=127.0.0.1:")), "{text:?}");
-    assert!(text.iter().all(|line| !line.contains("Actor{")), "the actor that wrote a line is no part of it: {text:?}");
+    assert!(
+        text.iter()
+            .any(|line| line.contains(" INFO ") && line.contains("address=127.0.0.1:")),
+        "{text:?}"
+    );
+    assert!(
+        text.iter().all(|line| !line.contains("Actor{")),
+        "the actor that wrote a line is no part of it: {text:?}"
+    );
 }
 
 /// The variable is inherited by whatever a service starts; only the stream that it names is the journal.
 #[test]
 fn an_inherited_journal_stream_is_not_taken_for_the_journal() {
     let mut command = program();
-    command.args(["--role", "edge", "--listen", "127.0.0.1:0", "--stop-at-eof"]).env("JOURNAL_STREAM", "1:1");
+    command
+        .args(["--role", "edge", "--listen", "127.0.0.1:0", "--stop-at-eof"])
+        .env("JOURNAL_STREAM", "1:1");
     let output = command.stdin(Stdio::null()).output().unwrap();
-    assert!(output.stderr.starts_with(b"{"), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.stderr.starts_with(b"{"),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
 }
 
 #[test]
@@ -174,7 +233,10 @@ fn completions_and_manual_pages_know_the_commands() {
         let output = program().args(["completions", shell]).output().unwrap();
         let script = String::from_utf8(output.stdout).unwrap();
         assert!(
-            output.status.success() && ["doctor", "log-format"].iter().all(|word| script.contains(word)),
+            output.status.success()
+                && ["doctor", "log-format"]
+                    .iter()
+                    .all(|word| script.contains(word)),
             "{shell}"
         );
     }
@@ -182,9 +244,15 @@ fn completions_and_manual_pages_know_the_commands() {
     let pages = directory.path().join("share/man1");
     assert!(program().arg("man").arg(&pages).status().unwrap().success());
     let page = |name: &str| std::fs::read_to_string(pages.join(name)).unwrap();
-    assert!(page("ecod-node.1").contains("ecod\\-node\\-doctor(1)") && page("ecod-node-replay.1").contains("passes"));
+    assert!(
+        page("ecod-node.1").contains("ecod\\-node\\-doctor(1)")
+            && page("ecod-node-replay.1").contains("passes")
+    );
     let refused = program().args(["man", "/proc/no/such"]).output().unwrap();
-    assert!(refused.status.code() == Some(1) && String::from_utf8_lossy(&refused.stderr).contains("/proc/no/such"));
+    assert!(
+        refused.status.code() == Some(1)
+            && String::from_utf8_lossy(&refused.stderr).contains("/proc/no/such")
+    );
 }
 
 /// The unit starts the program that the package installs with the file that it installs, and waits to be told.
@@ -192,10 +260,23 @@ fn completions_and_manual_pages_know_the_commands() {
 fn the_unit_fits_the_program() {
     let packaging = Path::new(env!("CARGO_MANIFEST_DIR")).join("../packaging");
     let unit = std::fs::read_to_string(packaging.join("systemd/ecod-node.service")).unwrap();
-    for line in ["Type=notify", "ExecStart=/usr/bin/ecod-node --config /etc/ecod/node.toml", "Restart=on-failure"] {
+    for line in [
+        "Type=notify",
+        "ExecStart=/usr/bin/ecod-node --config /etc/ecod/node.toml",
+        "Restart=on-failure",
+    ] {
         assert!(unit.lines().any(|other| other == line), "{line}");
     }
     let installed = packaging.join("debian/node.toml");
-    let output = program().arg("--config").arg(installed).arg("--print-config").output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let output = program()
+        .arg("--config")
+        .arg(installed)
+        .arg("--print-config")
+        .output()
+        .unwrap();
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
 }

@@ -36,7 +36,9 @@ type Spans = Arc<Mutex<Vec<(String, Span)>>>;
 /// A collector on loopback.
 async fn collector() -> (String, Spans) {
     let spans = Spans::default();
-    let routes = Router::new().route("/v1/traces", post(collect)).with_state(Arc::clone(&spans));
+    let routes = Router::new()
+        .route("/v1/traces", post(collect))
+        .with_state(Arc::clone(&spans));
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     tokio::spawn(async move {
@@ -49,22 +51,35 @@ async fn collector() -> (String, Spans) {
 }
 
 async fn collect(State(spans): State<Spans>, body: Bytes) {
-    for resource in ExportTraceServiceRequest::decode(body).unwrap().resource_spans {
-        let service = attributes(&resource.resource.unwrap().attributes).remove("service.name").unwrap();
-        for span in resource.scope_spans.into_iter().flat_map(|scope| scope.spans) {
+    for resource in ExportTraceServiceRequest::decode(body)
+        .unwrap()
+        .resource_spans
+    {
+        let service = attributes(&resource.resource.unwrap().attributes)
+            .remove("service.name")
+            .unwrap();
+        for span in resource
+            .scope_spans
+            .into_iter()
+            .flat_map(|scope| scope.spans)
+        {
             spans.lock().unwrap().push((service.clone(), span));
         }
     }
 }
 
-fn attributes(pairs: &[opentelemetry_proto::tonic::common::v1::KeyValue]) -> HashMap<String, String> {
+fn attributes(
+    pairs: &[opentelemetry_proto::tonic::common::v1::KeyValue],
+) -> HashMap<String, String> {
     let text = |value: Value| match value {
         Value::StringValue(text) => text,
         Value::IntValue(number) => number.to_string(),
         other => format!("{other:?}"),
     };
     let pairs = pairs.iter().cloned();
-    pairs.filter_map(|pair| Some((pair.key, text(pair.value?.value?)))).collect()
+    pairs
+        .filter_map(|pair| Some((pair.key, text(pair.value?.value?))))
+        .collect()
 }
 
 fn node(config: &NodeConfig, directory: &Path, collector: &str) -> Child {
@@ -95,35 +110,73 @@ struct Way {
 
 fn way(spans: &[(String, Span)]) -> Option<Way> {
     let of = |service: &str, name: &str| -> Vec<Span> {
-        spans.iter().filter(|(of, span)| of == service && span.name == name).map(|(_, span)| span.clone()).collect()
+        spans
+            .iter()
+            .filter(|(of, span)| of == service && span.name == name)
+            .map(|(_, span)| span.clone())
+            .collect()
     };
-    let child = |parent: &Span, span: &Span| parent.trace_id == span.trace_id && parent.span_id == span.parent_span_id;
+    let child = |parent: &Span, span: &Span| {
+        parent.trace_id == span.trace_id && parent.span_id == span.parent_span_id
+    };
     let linked = |from: &Span, to: &Span| {
-        from.links.iter().any(|link| link.trace_id == to.trace_id && link.span_id == to.span_id)
+        from.links
+            .iter()
+            .any(|link| link.trace_id == to.trace_id && link.span_id == to.span_id)
     };
     of("euclid", "frame").into_iter().find_map(|frame| {
         let steps = ["detect", "project", "publish"];
-        let steps = steps.map(|step| of("euclid", step).into_iter().find(|span| child(&frame, span)));
-        let report = of("edge", "report").into_iter().find(|report| child(&frame, report))?;
-        let round = of("edge", "round").into_iter().find(|round| linked(round, &frame) && linked(&report, round))?;
-        let accept = of("euclid", "accept").into_iter().find(|accept| child(&round, accept))?;
-        let published = of("edge", "publish").into_iter().any(|publish| child(&round, &publish));
-        let fused = of("edge", "fuse").into_iter().any(|fuse| child(&round, &fuse));
+        let steps = steps.map(|step| {
+            of("euclid", step)
+                .into_iter()
+                .find(|span| child(&frame, span))
+        });
+        let report = of("edge", "report")
+            .into_iter()
+            .find(|report| child(&frame, report))?;
+        let round = of("edge", "round")
+            .into_iter()
+            .find(|round| linked(round, &frame) && linked(&report, round))?;
+        let accept = of("euclid", "accept")
+            .into_iter()
+            .find(|accept| child(&round, accept))?;
+        let published = of("edge", "publish")
+            .into_iter()
+            .any(|publish| child(&round, &publish));
+        let fused = of("edge", "fuse")
+            .into_iter()
+            .any(|fuse| child(&round, &fuse));
         (published && fused).then_some(())?;
-        Some(Way { frame, steps: steps.into_iter().collect::<Option<_>>()?, report, round, accept })
+        Some(Way {
+            frame,
+            steps: steps.into_iter().collect::<Option<_>>()?,
+            report,
+            round,
+            accept,
+        })
     })
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_detection_is_followed_from_the_frame_to_the_map_that_its_vehicle_accepts() {
-    let scenes = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../examples/testbed/pace_setup1.json");
+    let scenes =
+        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../examples/testbed/pace_setup1.json");
     let testbed = Testbed::from_json(&std::fs::read_to_string(&scenes).unwrap()).unwrap();
     let scene = testbed.scene(SCENE).unwrap();
     let address = free_address().unwrap();
     let mut edge = setup::edge(&testbed, scene);
     edge.listen = Some(address);
-    let euclid = scene.cavs.iter().find(|cav| cav.name.as_str() == "euclid").unwrap();
-    let source = SourceConfig::Testbed { scenes, scene: SCENE.into(), cav: euclid.name.clone(), seed: 7 };
+    let euclid = scene
+        .cavs
+        .iter()
+        .find(|cav| cav.name.as_str() == "euclid")
+        .unwrap();
+    let source = SourceConfig::Testbed {
+        scenes,
+        scene: SCENE.into(),
+        cav: euclid.name.clone(),
+        seed: 7,
+    };
     let mut euclid = setup::cav(&testbed, scene, euclid, source);
     euclid.mqtt.broker = Some(address.into());
 
@@ -139,10 +192,18 @@ async fn a_detection_is_followed_from_the_frame_to_the_map_that_its_vehicle_acce
             }
         }
     };
-    let way = timeout(PATIENCE, followed).await.expect("no detection could be followed");
-    assert!(way.frame.parent_span_id.is_empty() && way.round.parent_span_id.is_empty(), "they begin traces");
+    let way = timeout(PATIENCE, followed)
+        .await
+        .expect("no detection could be followed");
+    assert!(
+        way.frame.parent_span_id.is_empty() && way.round.parent_span_id.is_empty(),
+        "they begin traces"
+    );
     assert_eq!(attributes(&way.report.attributes)["from"], "euclid");
-    assert_eq!(attributes(&way.accept.attributes)["round"], attributes(&way.round.attributes)["round"]);
+    assert_eq!(
+        attributes(&way.accept.attributes)["round"],
+        attributes(&way.round.attributes)["round"]
+    );
     let mut starts = vec![way.frame.start_time_unix_nano];
     starts.extend(way.steps.iter().map(|step| step.start_time_unix_nano));
     starts.extend([&way.report, &way.accept].map(|span| span.start_time_unix_nano));
@@ -155,17 +216,34 @@ async fn a_detection_is_followed_from_the_frame_to_the_map_that_its_vehicle_acce
     // The last spans go out as a node ends.
     for node in &mut nodes {
         drop(node.stdin.take());
-        assert!(timeout(PATIENCE, node.wait()).await.unwrap().unwrap().success());
+        assert!(
+            timeout(PATIENCE, node.wait())
+                .await
+                .unwrap()
+                .unwrap()
+                .success()
+        );
     }
     let spans = spans.lock().unwrap();
     let names: Vec<_> = spans.iter().map(|(_, span)| &*span.name).collect();
-    let ours = ["accept", "detect", "frame", "fuse", "project", "publish", "report", "round"];
+    let ours = [
+        "accept", "detect", "frame", "fuse", "project", "publish", "report", "round",
+    ];
     assert!(names.iter().all(|name| ours.contains(name)), "{names:?}");
     for (_, span) in &*spans {
         let attributes = attributes(&span.attributes);
-        assert!(attributes.keys().all(|key| key == "ecod.id" || !key.starts_with("ecod.")), "{attributes:?}");
+        assert!(
+            attributes
+                .keys()
+                .all(|key| key == "ecod.id" || !key.starts_with("ecod.")),
+            "{attributes:?}"
+        );
         if let Some(name) = attributes.get("ecod.id") {
-            assert_eq!((&*span.trace_id, &*span.span_id), (&id(name)[..], &id(name)[8..]), "{name}");
+            assert_eq!(
+                (&*span.trace_id, &*span.span_id),
+                (&id(name)[..], &id(name)[8..]),
+                "{name}"
+            );
         }
     }
 }

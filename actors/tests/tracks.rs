@@ -41,7 +41,9 @@ async fn until(what: &str, mut act: impl FnMut(), is_reached: impl Fn() -> bool)
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    timeout(PATIENCE, reached).await.unwrap_or_else(|_| panic!("never: {what}"));
+    timeout(PATIENCE, reached)
+        .await
+        .unwrap_or_else(|_| panic!("never: {what}"));
 }
 
 /// Has two vehicles see the same two cars, or rather have seen them some time ago.
@@ -49,21 +51,35 @@ fn see(reporter: &NodeHandle, ago: Duration) {
     static SEQ: AtomicU64 = AtomicU64::new(0);
     for node in ["euclid", "gauss"] {
         let seq = SEQ.fetch_add(1, Ordering::Relaxed);
-        let objects = [0.0, 20.0].map(|x_m| PerceivedObject::new("car", 0.9, x_m, 0.0)).to_vec();
-        let report =
-            ObjectReport { objects, ..ObjectReport::new(NodeName::from_static(node), seq, clock::now() - ago) };
-        let message = GatewayMessage::PublishReport { kind: ReportKind::Detections, report: Arc::new(report) };
+        let objects = [0.0, 20.0]
+            .map(|x_m| PerceivedObject::new("car", 0.9, x_m, 0.0))
+            .to_vec();
+        let report = ObjectReport {
+            objects,
+            ..ObjectReport::new(NodeName::from_static(node), seq, clock::now() - ago)
+        };
+        let message = GatewayMessage::PublishReport {
+            kind: ReportKind::Detections,
+            report: Arc::new(report),
+        };
         reporter.slots().gateway.send(message);
     }
 }
 
 fn map(node: &NodeHandle) -> Option<Arc<GlobalMap>> {
-    node.newest_map().borrow().as_ref().map(|newest| Arc::clone(&newest.map))
+    node.newest_map()
+        .borrow()
+        .as_ref()
+        .map(|newest| Arc::clone(&newest.map))
 }
 
 /// The identities of what is surely there.
 fn ids(map: &GlobalMap) -> Vec<Uuid> {
-    map.objects.iter().filter(|object| object.confidence > 0.5).map(|object| object.id).collect()
+    map.objects
+        .iter()
+        .filter(|object| object.confidence > 0.5)
+        .map(|object| object.id)
+        .collect()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -76,19 +92,41 @@ async fn a_cell_that_only_tracks_rates_its_vehicles_and_keeps_identities_when_it
     let look = || see(&euclid, Duration::ZERO);
 
     let rated = || {
-        let newest = euclid.newest_reputations().borrow().as_ref().map(|newest| Arc::clone(&newest.message));
-        newest.is_some_and(|newest| newest.reputations.values().filter(|vehicle| vehicle.correct > 0).count() == 2)
+        let newest = euclid
+            .newest_reputations()
+            .borrow()
+            .as_ref()
+            .map(|newest| Arc::clone(&newest.message));
+        newest.is_some_and(|newest| {
+            newest
+                .reputations
+                .values()
+                .filter(|vehicle| vehicle.correct > 0)
+                .count()
+                == 2
+        })
     };
     until("both vehicles rated", look, rated).await;
-    until("both objects there", look, || map(&euclid).is_some_and(|map| ids(&map).len() == 2)).await;
+    until("both objects there", look, || {
+        map(&euclid).is_some_and(|map| ids(&map).len() == 2)
+    })
+    .await;
     let before = ids(&map(&euclid).unwrap());
 
     let fuser = edge.slots().fuser.get().unwrap();
     fuser.kill();
-    let restarted = || edge.slots().fuser.get().is_some_and(|holder| holder.get_id() != fuser.get_id());
+    let restarted = || {
+        edge.slots()
+            .fuser
+            .get()
+            .is_some_and(|holder| holder.get_id() != fuser.get_id())
+    };
     until("a new fuser", look, restarted).await;
     let since = clock::now();
-    until("a map of the new fuser", look, || map(&euclid).is_some_and(|map| map.fused_at_us > since)).await;
+    until("a map of the new fuser", look, || {
+        map(&euclid).is_some_and(|map| map.fused_at_us > since)
+    })
+    .await;
     assert_eq!(ids(&map(&euclid).unwrap()), before);
 
     let overtaken = || {
@@ -96,9 +134,15 @@ async fn a_cell_that_only_tracks_rates_its_vehicles_and_keeps_identities_when_it
         std::thread::sleep(Duration::from_millis(5));
         see(&euclid, Duration::from_millis(100));
     };
-    until("a report out of order", overtaken, || edge.counters().events(Event::ReportOvertaken) > 0).await;
+    until("a report out of order", overtaken, || {
+        edge.counters().events(Event::ReportOvertaken) > 0
+    })
+    .await;
     let late = || see(&euclid, Duration::from_millis(700));
-    until("a late report", late, || edge.counters().events(Event::ReportLate) > 0).await;
+    until("a late report", late, || {
+        edge.counters().events(Event::ReportLate) > 0
+    })
+    .await;
     euclid.stop().await;
     edge.stop().await;
 }

@@ -62,7 +62,8 @@ fn write_clip(path: &Path, fps: f64) {
     let mjpg = VideoWriter::fourcc('M', 'J', 'P', 'G').unwrap();
     let mut writer = VideoWriter::new(path, mjpg, fps, Size::new(64, 48), true).unwrap();
     assert!(writer.is_opened().unwrap());
-    CLIP.iter().for_each(|value| writer.write(&gray(*value)).unwrap());
+    CLIP.iter()
+        .for_each(|value| writer.write(&gray(*value)).unwrap());
     writer.release().unwrap();
 }
 
@@ -74,10 +75,17 @@ fn a_video_file_plays_once_or_again_and_again() {
     let mut source = open(&format!("kind = 'video'\npath = {path:?}")).unwrap();
     let (seen, end) = play(source.as_mut());
     assert!(near(&seen, &CLIP), "{seen:?}");
-    assert_eq!(end, FrameError::Ended { origin: path.display().to_string() });
+    assert_eq!(
+        end,
+        FrameError::Ended {
+            origin: path.display().to_string()
+        }
+    );
 
     let mut source = open(&format!("kind = 'video'\npath = {path:?}\nlooping = true")).unwrap();
-    let seen: Vec<u8> = (0..5).map(|_| brightness(&source.next_frame().unwrap())).collect();
+    let seen: Vec<u8> = (0..5)
+        .map(|_| brightness(&source.next_frame().unwrap()))
+        .collect();
     assert!(near(&seen, &[40, 120, 200, 40, 120]), "{seen:?}");
 }
 
@@ -88,10 +96,20 @@ fn frames_are_dated_by_the_clock_of_the_node() {
     write_clip(&path, 10.0);
     clock::now();
     let mut source = open(&format!("kind = 'video'\npath = {path:?}\nlooping = true")).unwrap();
-    let times: Vec<_> = (0..4).map(|_| source.next_frame().unwrap().captured_at).collect();
-    assert!(times.iter().all(|time| *time <= clock::now() && clock::now().since(*time) < PATIENCE), "{times:?}");
+    let times: Vec<_> = (0..4)
+        .map(|_| source.next_frame().unwrap().captured_at)
+        .collect();
+    assert!(
+        times
+            .iter()
+            .all(|time| *time <= clock::now() && clock::now().since(*time) < PATIENCE),
+        "{times:?}"
+    );
     let apart = times[3].since(times[0]);
-    assert!(apart >= Duration::from_millis(290), "three periods of 100 ms: {apart:?}");
+    assert!(
+        apart >= Duration::from_millis(290),
+        "three periods of 100 ms: {apart:?}"
+    );
 }
 
 #[test]
@@ -102,21 +120,33 @@ fn a_pipeline_gives_frames() {
     let (seen, end) = play(source.as_mut());
     assert_eq!(seen.len(), 3);
     assert!(seen.iter().all(|value| *value > 230), "{seen:?}");
-    assert!(matches!(end, FrameError::Lost { .. }), "a live source does not end: {end}");
+    assert!(
+        matches!(end, FrameError::Lost { .. }),
+        "a live source does not end: {end}"
+    );
 }
 
 #[test]
 fn a_pipeline_with_a_missing_element_names_it_and_no_secret() {
     let pipeline = "nosuchsrc location=rtsp://user:secret@camera/1 ! appsink";
-    let error = open(&format!("kind = 'gstreamer'\npipeline = '{pipeline}'")).err().expect("missing").to_string();
-    assert!(error.starts_with("cannot open nosuchsrc location=rtsp://camera/1"), "{error}");
+    let error = open(&format!("kind = 'gstreamer'\npipeline = '{pipeline}'"))
+        .err()
+        .expect("missing")
+        .to_string();
+    assert!(
+        error.starts_with("cannot open nosuchsrc location=rtsp://camera/1"),
+        "{error}"
+    );
     assert!(!error.contains("secret"), "{error}");
 }
 
 /// A network camera on a free port that answers whoever asks as `answer` does; its address.
 fn network_camera(answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'static) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let url = format!("http://user:secret@{}/stream", listener.local_addr().unwrap());
+    let url = format!(
+        "http://user:secret@{}/stream",
+        listener.local_addr().unwrap()
+    );
     std::thread::spawn(move || {
         for visitor in listener.incoming() {
             // One that hangs up is none of the camera's business.
@@ -129,14 +159,31 @@ fn network_camera(answer: impl Fn(TcpStream) -> std::io::Result<()> + Send + 'st
 /// Motion JPEG over HTTP, the way cheap network cameras speak.
 fn motion_jpeg(mut visitor: TcpStream) -> std::io::Result<()> {
     let request = BufReader::new(visitor.try_clone()?);
-    let lines: Vec<String> = request.lines().map_while(Result::ok).take_while(|line| !line.is_empty()).collect();
-    if !lines.iter().any(|line| line.starts_with("Authorization: Basic ")) {
-        return write!(visitor, "HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"camera\"\r\n\r\n");
+    let lines: Vec<String> = request
+        .lines()
+        .map_while(Result::ok)
+        .take_while(|line| !line.is_empty())
+        .collect();
+    if !lines
+        .iter()
+        .any(|line| line.starts_with("Authorization: Basic "))
+    {
+        return write!(
+            visitor,
+            "HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: Basic realm=\"camera\"\r\n\r\n"
+        );
     }
-    write!(visitor, "HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=frame\r\n\r\n")?;
+    write!(
+        visitor,
+        "HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=frame\r\n\r\n"
+    )?;
     for value in (0..25).map(|number| 50 + 4 * number) {
         let jpeg = encode_jpeg(&gray(value), 95).unwrap();
-        write!(visitor, "--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n", jpeg.len())?;
+        write!(
+            visitor,
+            "--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n",
+            jpeg.len()
+        )?;
         visitor.write_all(&jpeg)?;
         write!(visitor, "\r\n")?;
     }
@@ -148,9 +195,17 @@ fn a_network_camera_gives_frames_until_it_hangs_up() {
     let url = network_camera(motion_jpeg);
     let mut source = open(&format!("kind = 'url'\nurl = '{url}'")).unwrap();
     let (seen, end) = play(source.as_mut());
-    assert!(seen.len() > 20 && seen.is_sorted() && seen[0].abs_diff(50) <= 4, "{seen:?}");
-    let FrameError::Lost { origin, .. } = end else { panic!("a live source does not end: {end}") };
-    assert!(origin.ends_with("/stream") && !origin.contains("secret"), "{origin}");
+    assert!(
+        seen.len() > 20 && seen.is_sorted() && seen[0].abs_diff(50) <= 4,
+        "{seen:?}"
+    );
+    let FrameError::Lost { origin, .. } = end else {
+        panic!("a live source does not end: {end}")
+    };
+    assert!(
+        origin.ends_with("/stream") && !origin.contains("secret"),
+        "{origin}"
+    );
 }
 
 #[test]
@@ -163,8 +218,14 @@ fn a_network_camera_that_says_nothing_is_given_up_in_time() {
     let asked = Instant::now();
     let error = source(&format!("kind = 'url'\nurl = '{url}'")).open(Duration::from_millis(300));
     let error = error.err().expect("nothing comes").to_string();
-    assert!(asked.elapsed() < Duration::from_secs(30), "it has a limit of its own");
-    assert!(error.starts_with("cannot open http://127.0.0.1") && !error.contains("secret"), "{error}");
+    assert!(
+        asked.elapsed() < Duration::from_secs(30),
+        "it has a limit of its own"
+    );
+    assert!(
+        error.starts_with("cannot open http://127.0.0.1") && !error.contains("secret"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -172,21 +233,33 @@ fn what_cannot_be_opened_is_named_with_its_reason() {
     let directory = tempfile::tempdir().unwrap();
     let text = directory.path().join("clip.avi");
     fs::write(&text, "not a video").unwrap();
-    for (path, reason) in
-        [(Path::new("no/such.avi"), "No such file"), (&text, "no video"), (directory.path(), "directory")]
-    {
-        let error = open(&format!("kind = 'video'\npath = {path:?}")).err().expect("cannot be opened").to_string();
-        assert!(error.starts_with(&format!("cannot open {}", path.display())) && error.contains(reason), "{error}");
+    for (path, reason) in [
+        (Path::new("no/such.avi"), "No such file"),
+        (&text, "no video"),
+        (directory.path(), "directory"),
+    ] {
+        let error = open(&format!("kind = 'video'\npath = {path:?}"))
+            .err()
+            .expect("cannot be opened")
+            .to_string();
+        assert!(
+            error.starts_with(&format!("cannot open {}", path.display())) && error.contains(reason),
+            "{error}"
+        );
     }
 }
 
 /// Programs `ecod-video` whose parent is this process, as (id, state).
 fn video_programs(parent: u32) -> BTreeSet<u32> {
-    let processes = fs::read_dir("/proc").unwrap().filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
+    let processes = fs::read_dir("/proc")
+        .unwrap()
+        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
     let is_ours = |id: &u32| {
         let status = fs::read_to_string(format!("/proc/{id}/status")).unwrap_or_default();
         let has = |line: &str| status.lines().any(|it| it == line);
-        has("Name:\tecod-video") && has(&format!("PPid:\t{parent}")) && !status.contains("State:\tZ")
+        has("Name:\tecod-video")
+            && has(&format!("PPid:\t{parent}"))
+            && !status.contains("State:\tZ")
     };
     processes.filter(is_ours).collect()
 }
@@ -228,11 +301,21 @@ fn start_node(directory: &Path, source: &str) -> Opened {
     fs::write(&config, text).unwrap();
     let log = fs::File::create(directory.join("log")).unwrap();
     let mut node = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-    node.env("RUST_LOG", "debug").args(["--stop-at-eof", "--config"]).arg(config);
-    let process = node.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(log).spawn().unwrap();
+    node.env("RUST_LOG", "debug")
+        .args(["--stop-at-eof", "--config"])
+        .arg(config);
+    let process = node
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(log)
+        .spawn()
+        .unwrap();
     let id = process.id();
     until("the node has a program", || !video_programs(id).is_empty());
-    Opened { program: *video_programs(id).first().unwrap(), process }
+    Opened {
+        program: *video_programs(id).first().unwrap(),
+        process,
+    }
 }
 
 impl Drop for Opened {
@@ -260,8 +343,12 @@ fn a_node_whose_program_is_killed_says_so_and_goes_on_with_another() {
     let (directory, source) = looping_clip();
     let node = start_node(directory.path(), &source);
     signal(node.program, Signal::SIGKILL);
-    until("the node tells of it", || log(directory.path()).contains("ecod-video ended, signal: 9 (SIGKILL)"));
-    until("frames come again", || log(directory.path()).contains("frame source runs again"));
+    until("the node tells of it", || {
+        log(directory.path()).contains("ecod-video ended, signal: 9 (SIGKILL)")
+    });
+    until("frames come again", || {
+        log(directory.path()).contains("frame source runs again")
+    });
     assert!(!video_programs(node.process.id()).contains(&node.program));
 }
 
@@ -270,8 +357,12 @@ fn a_program_that_hangs_is_killed_and_replaced() {
     let (directory, source) = looping_clip();
     let node = start_node(directory.path(), &source);
     signal(node.program, Signal::SIGSTOP);
-    until("the node tells of it", || log(directory.path()).contains("no frame for"));
-    until("frames come again", || log(directory.path()).contains("frame source runs again"));
+    until("the node tells of it", || {
+        log(directory.path()).contains("no frame for")
+    });
+    until("frames come again", || {
+        log(directory.path()).contains("frame source runs again")
+    });
     until("the one that hung is gone", || !is_running(node.program));
 }
 
@@ -281,11 +372,15 @@ fn no_program_outlives_its_node() {
     let mut stopped = start_node(directory.path(), &source);
     drop(stopped.process.stdin.take());
     assert!(stopped.process.wait().unwrap().success());
-    until("it ends with a node that stops", || !is_running(stopped.program));
+    until("it ends with a node that stops", || {
+        !is_running(stopped.program)
+    });
 
     let mut killed = start_node(directory.path(), &source);
     killed.process.kill().unwrap();
-    until("it ends with a node that is killed", || !is_running(killed.program));
+    until("it ends with a node that is killed", || {
+        !is_running(killed.program)
+    });
 }
 
 #[test]
@@ -297,13 +392,22 @@ fn secrets_of_an_address_are_on_no_command_line_and_in_no_log() {
         std::thread::sleep(PATIENCE);
         Ok(())
     });
-    let node = start_node(directory.path(), &format!("{{ kind = 'url', url = '{url}' }}"));
+    let node = start_node(
+        directory.path(),
+        &format!("{{ kind = 'url', url = '{url}' }}"),
+    );
     for file in ["cmdline", "environ"] {
         let text = fs::read(format!("/proc/{}/{file}", node.program)).unwrap();
         assert!(!String::from_utf8_lossy(&text).contains("secret"), "{file}");
     }
-    until("the camera is lost", || log(directory.path()).contains("frame source failed"));
-    assert!(!log(directory.path()).contains("secret"), "{}", log(directory.path()));
+    until("the camera is lost", || {
+        log(directory.path()).contains("frame source failed")
+    });
+    assert!(
+        !log(directory.path()).contains("secret"),
+        "{}",
+        log(directory.path())
+    );
 }
 
 #[tokio::test]

@@ -11,7 +11,8 @@ use ecod::model::names::NodeName;
 use ecod::perception::landmark::LandmarkConfig;
 use ecod::vote::VoteMode;
 use ecod::wire::{
-    ObjectReport, PerceivedObject, RejectReason, ReportKind, Reputation, Reputations, Role, Verdict, decode,
+    ObjectReport, PerceivedObject, RejectReason, ReportKind, Reputation, Reputations, Role,
+    Verdict, decode,
 };
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::messages::reputation_keeper::ReputationKeeperMessage;
@@ -60,7 +61,12 @@ async fn edge(configure: impl FnOnce(&mut NodeConfig)) -> NodeHandle {
     node::start(config).await.unwrap()
 }
 
-async fn attached(node: &str, role: Role, edge: &NodeHandle, configure: impl FnOnce(&mut NodeConfig)) -> NodeHandle {
+async fn attached(
+    node: &str,
+    role: Role,
+    edge: &NodeHandle,
+    configure: impl FnOnce(&mut NodeConfig),
+) -> NodeHandle {
     let mut config = config(node, role);
     config.mqtt.broker = edge.broker_address().map(Into::into);
     config.mqtt.retry_max_ms = 100;
@@ -73,7 +79,12 @@ async fn cav(node: &str, edge: &NodeHandle) -> NodeHandle {
 }
 
 /// A node that finds the cell by its gossip and uses the brokers of whoever leads.
-async fn member(node: &str, role: Role, other: &NodeHandle, configure: impl FnOnce(&mut NodeConfig)) -> NodeHandle {
+async fn member(
+    node: &str,
+    role: Role,
+    other: &NodeHandle,
+    configure: impl FnOnce(&mut NodeConfig),
+) -> NodeHandle {
     let mut config = config(node, role);
     config.membership.seeds = vec![other.gossip_address().unwrap().to_string()];
     configure(&mut config);
@@ -87,7 +98,11 @@ fn report(node: &str, label: &str, landmark: &str) -> Arc<ObjectReport> {
             landmark: Some(landmark.into()),
             ..PerceivedObject::new(label, 0.9, 1.0, 0.0)
         }],
-        ..ObjectReport::new(name(node), SEQ.fetch_add(1, Ordering::Relaxed), clock::now())
+        ..ObjectReport::new(
+            name(node),
+            SEQ.fetch_add(1, Ordering::Relaxed),
+            clock::now(),
+        )
     })
 }
 
@@ -99,24 +114,34 @@ async fn until(what: &str, mut act: impl FnMut(), is_reached: impl Fn() -> bool)
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    timeout(PATIENCE, reached).await.unwrap_or_else(|_| panic!("never: {what}"));
+    timeout(PATIENCE, reached)
+        .await
+        .unwrap_or_else(|_| panic!("never: {what}"));
 }
 
 /// Has two vehicles say cup and a third say dog, all over the third's connection to the broker.
 fn disagree(reporter: &NodeHandle) {
     for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
-        let message =
-            GatewayMessage::PublishReport { kind: ReportKind::VoteDetections, report: report(node, label, "ball") };
+        let message = GatewayMessage::PublishReport {
+            kind: ReportKind::VoteDetections,
+            report: report(node, label, "ball"),
+        };
         reporter.slots().gateway.send(message);
     }
 }
 
 fn verdict(node: &NodeHandle) -> Option<Verdict> {
-    node.newest_verdicts().borrow().as_ref().and_then(|newest| newest.message.verdicts.first().cloned())
+    node.newest_verdicts()
+        .borrow()
+        .as_ref()
+        .and_then(|newest| newest.message.verdicts.first().cloned())
 }
 
 fn reputations(node: &NodeHandle) -> Option<Arc<Reputations>> {
-    node.newest_reputations().borrow().as_ref().map(|newest| Arc::clone(&newest.message))
+    node.newest_reputations()
+        .borrow()
+        .as_ref()
+        .map(|newest| Arc::clone(&newest.message))
 }
 
 fn reputation(node: &NodeHandle, vehicle: &str) -> Option<Reputation> {
@@ -142,8 +167,14 @@ async fn vehicles_that_disagree_get_a_verdict_and_reputations() {
     until("a verdict by three", || disagree(&euclid), is_agreed).await;
     let verdict = agreed.into_inner().unwrap();
     assert_eq!(verdict.landmark, "ball");
-    assert!(verdict.score > verdict.votes["dog"] && verdict.score == verdict.votes["cup"], "{verdict:?}");
-    assert!((verdict.margin - (verdict.score - verdict.votes["dog"])).abs() < 1e-9, "{verdict:?}");
+    assert!(
+        verdict.score > verdict.votes["dog"] && verdict.score == verdict.votes["cup"],
+        "{verdict:?}"
+    );
+    assert!(
+        (verdict.margin - (verdict.score - verdict.votes["dog"])).abs() < 1e-9,
+        "{verdict:?}"
+    );
 
     unmasked(&euclid, &euclid).await;
     let newest = reputations(&euclid).unwrap();
@@ -152,7 +183,10 @@ async fn vehicles_that_disagree_get_a_verdict_and_reputations() {
     assert!(euclid.counters().events(Event::VerdictsAccepted) > 0);
 
     let retained = retained_reputations(&edge).await;
-    assert!(retained.reputations[&name("liar")].incorrect >= 5, "a latecomer gets them at once");
+    assert!(
+        retained.reputations[&name("liar")].incorrect >= 5,
+        "a latecomer gets them at once"
+    );
     for node in [euclid, edge] {
         node.stop().await;
     }
@@ -163,18 +197,27 @@ async fn retained_reputations(edge: &NodeHandle) -> Reputations {
     let broker = edge.broker_address().unwrap();
     let options = rumqttc::MqttOptions::new("latecomer", broker.ip().to_string(), broker.port());
     let (client, mut events) = rumqttc::AsyncClient::new(options, 8);
-    client.subscribe("ecod/v1/crossing/reputations", rumqttc::QoS::AtLeastOnce).await.unwrap();
+    client
+        .subscribe("ecod/v1/crossing/reputations", rumqttc::QoS::AtLeastOnce)
+        .await
+        .unwrap();
     let first = async {
         loop {
             // A live message may come before the retained one.
             match events.poll().await.unwrap() {
-                rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) if publish.retain => return publish,
+                rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) if publish.retain => {
+                    return publish;
+                }
                 _ => {}
             }
         }
     };
     let publish = timeout(PATIENCE, first).await.expect("nothing is retained");
-    assert_eq!(publish.qos, rumqttc::QoS::AtMostOnce, "an embedded broker holds nothing for acknowledgements");
+    assert_eq!(
+        publish.qos,
+        rumqttc::QoS::AtMostOnce,
+        "an embedded broker holds nothing for acknowledgements"
+    );
     decode(&publish.payload, &Default::default()).unwrap()
 }
 
@@ -197,15 +240,23 @@ async fn a_restarted_node_goes_on_with_its_reputations() {
         let after = edge(keep).await;
         until("reputations", || (), || reputations(&after).is_some()).await;
         let restored = reputation(&after, "liar").expect("nothing was restored");
-        assert!(restored.incorrect >= known.incorrect, "{mode:?}: {restored:?} after {known:?}");
-        assert!(restored.score <= known.score + 1e-9, "{mode:?}: {restored:?} after {known:?}");
+        assert!(
+            restored.incorrect >= known.incorrect,
+            "{mode:?}: {restored:?} after {known:?}"
+        );
+        assert!(
+            restored.score <= known.score + 1e-9,
+            "{mode:?}: {restored:?} after {known:?}"
+        );
         after.stop().await;
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_broken_state_does_not_stop_a_node() {
-    let spoil_file = |directory: &Path| std::fs::write(directory.join("crossing.edge.reputations.json"), b"{\"sch");
+    let spoil_file = |directory: &Path| {
+        std::fs::write(directory.join("crossing.edge.reputations.json"), b"{\"sch")
+    };
     let spoil_directory = |directory: &Path| std::fs::write(directory.join("occupied"), b"");
     for (state_dir, saved) in [("", true), ("occupied", false)] {
         let directory = tempfile::tempdir().unwrap();
@@ -214,11 +265,27 @@ async fn a_broken_state_does_not_stop_a_node() {
         let edge = edge(|config| config.state_dir = Some(directory.path().join(state_dir))).await;
         let euclid = cav("euclid", &edge).await;
         unmasked(&euclid, &euclid).await;
-        let event = if saved { Event::ReputationsSaved } else { Event::ReputationsNotSaved };
+        let event = if saved {
+            Event::ReputationsSaved
+        } else {
+            Event::ReputationsNotSaved
+        };
         assert!(edge.counters().events(event) > 0);
         let troubles = edge.troubles();
-        assert_eq!(troubles.iter().any(|(_, trouble)| trouble.kind == "not_saved"), !saved, "{troubles:?}");
-        assert_eq!(directory.path().join("crossing.edge.reputations.set-aside").exists(), saved);
+        assert_eq!(
+            troubles
+                .iter()
+                .any(|(_, trouble)| trouble.kind == "not_saved"),
+            !saved,
+            "{troubles:?}"
+        );
+        assert_eq!(
+            directory
+                .path()
+                .join("crossing.edge.reputations.set-aside")
+                .exists(),
+            saved
+        );
         euclid.stop().await;
         edge.stop().await;
     }
@@ -229,16 +296,26 @@ async fn killing_the_keeper_or_the_fuser_loses_nothing_that_was_published() {
     let edge = edge(|_| ()).await;
     let euclid = cav("euclid", &edge).await;
     unmasked(&euclid, &euclid).await;
-    let kills: [&dyn Fn(); 2] =
-        [&|| edge.slots().keeper.get().unwrap().kill(), &|| edge.slots().fuser.get().unwrap().kill()];
+    let kills: [&dyn Fn(); 2] = [&|| edge.slots().keeper.get().unwrap().kill(), &|| {
+        edge.slots().fuser.get().unwrap().kill()
+    }];
     for kill in kills {
         let before = reputations(&euclid).unwrap();
         let known = before.reputations[&name("liar")];
         kill();
-        let more = || reputation(&euclid, "liar").is_some_and(|liar| liar.incorrect > known.incorrect);
-        until("more evidence", || disagree(&euclid), || reputations(&euclid).unwrap() != before && more()).await;
+        let more =
+            || reputation(&euclid, "liar").is_some_and(|liar| liar.incorrect > known.incorrect);
+        until(
+            "more evidence",
+            || disagree(&euclid),
+            || reputations(&euclid).unwrap() != before && more(),
+        )
+        .await;
         let now = reputation(&euclid, "liar").unwrap();
-        assert!(now.correct >= known.correct && now.score <= known.score + 1e-9, "{now:?} after {known:?}");
+        assert!(
+            now.correct >= known.correct && now.score <= known.score + 1e-9,
+            "{now:?} after {known:?}"
+        );
     }
     euclid.stop().await;
     edge.stop().await;
@@ -248,16 +325,32 @@ async fn killing_the_keeper_or_the_fuser_loses_nothing_that_was_published() {
 async fn another_candidate_leads_with_the_same_reputations() {
     let edge = edge(|_| ()).await;
     // It never settles a vote itself: what it knows, it was told.
-    let standby = member("standby", Role::Auto, &edge, |config| config.fusion.vote.weighted.freshness_s = 1e9).await;
+    let standby = member("standby", Role::Auto, &edge, |config| {
+        config.fusion.vote.weighted.freshness_s = 1e9
+    })
+    .await;
     let euclid = member("euclid", Role::Cav, &edge, |_| ()).await;
     let from_edge = || reputations(&edge).filter(|r| r.aggregator == Some(name("edge")));
-    let settled = || from_edge().is_some_and(|r| r.reputations.get(&name("liar")).is_some_and(|l| l.incorrect >= 5));
+    let settled = || {
+        from_edge().is_some_and(|r| {
+            r.reputations
+                .get(&name("liar"))
+                .is_some_and(|l| l.incorrect >= 5)
+        })
+    };
     until("the liar unmasked", || disagree(&euclid), settled).await;
-    until("evidence replicated", || disagree(&euclid), || standby.counters().events(Event::LedgerMerged) > 2).await;
+    until(
+        "evidence replicated",
+        || disagree(&euclid),
+        || standby.counters().events(Event::LedgerMerged) > 2,
+    )
+    .await;
     // The last votes are settled and published when nothing new has come for a second, and the standby knows the same.
     let (mut last, mut since) = (from_edge().unwrap(), Instant::now());
     let known = |node: &NodeHandle| reputations(node).map(|newest| newest.reputations.clone());
-    while since.elapsed() < Duration::from_secs(1) || known(&standby).as_ref() != Some(&last.reputations) {
+    while since.elapsed() < Duration::from_secs(1)
+        || known(&standby).as_ref() != Some(&last.reputations)
+    {
         tokio::time::sleep(Duration::from_millis(20)).await;
         let newest = from_edge().unwrap();
         if newest.reputations != last.reputations {
@@ -266,18 +359,38 @@ async fn another_candidate_leads_with_the_same_reputations() {
         last = newest;
     }
     edge.stop().await;
-    let took_over = || reputations(&euclid).filter(|r| r.aggregator == Some(name("standby")) && r.epoch > last.epoch);
+    let took_over = || {
+        reputations(&euclid)
+            .filter(|r| r.aggregator == Some(name("standby")) && r.epoch > last.epoch)
+    };
     until("the standby's reputations", || (), || took_over().is_some()).await;
     assert_eq!(took_over().unwrap().reputations, last.reputations);
-    let verdicts = || euclid.newest_verdicts().borrow().as_ref().map(|newest| newest.message.aggregator.clone());
-    until("the standby's verdicts", || disagree(&euclid), || verdicts() == Some(name("standby"))).await;
+    let verdicts = || {
+        euclid
+            .newest_verdicts()
+            .borrow()
+            .as_ref()
+            .map(|newest| newest.message.aggregator.clone())
+    };
+    until(
+        "the standby's verdicts",
+        || disagree(&euclid),
+        || verdicts() == Some(name("standby")),
+    )
+    .await;
 
     // A candidate that was not there before is told all.
     let late = member("late", Role::Auto, &standby, |_| ()).await;
     let tell = || {
-        standby.slots().keeper.send(ReputationKeeperMessage::SendSnapshot { to: name("late") });
+        standby
+            .slots()
+            .keeper
+            .send(ReputationKeeperMessage::SendSnapshot { to: name("late") });
     };
-    until("a snapshot", tell, || late.counters().events(Event::LedgerMerged) > 0).await;
+    until("a snapshot", tell, || {
+        late.counters().events(Event::LedgerMerged) > 0
+    })
+    .await;
     for node in [late, standby, euclid] {
         node.stop().await;
     }
@@ -286,14 +399,25 @@ async fn another_candidate_leads_with_the_same_reputations() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_cell_runs_what_it_is_told_and_counts_the_rest() {
     for (algorithms, kind, other) in [
-        (Algorithms::Pace, ReportKind::Detections, ReportKind::VoteDetections),
-        (Algorithms::Vote, ReportKind::VoteDetections, ReportKind::Detections),
+        (
+            Algorithms::Pace,
+            ReportKind::Detections,
+            ReportKind::VoteDetections,
+        ),
+        (
+            Algorithms::Vote,
+            ReportKind::VoteDetections,
+            ReportKind::Detections,
+        ),
     ] {
         let edge = edge(|config| config.fusion.algorithms = algorithms).await;
         let euclid = cav("euclid", &edge).await;
         let send = |kind, label: &str, landmark: &str| {
             let report = report("euclid", label, landmark);
-            euclid.slots().gateway.send(GatewayMessage::PublishReport { kind, report });
+            euclid
+                .slots()
+                .gateway
+                .send(GatewayMessage::PublishReport { kind, report });
         };
         let both = || {
             send(kind, "cup", "ball");
@@ -320,25 +444,53 @@ async fn votes_that_cannot_count_are_counted() {
     let euclid = cav("euclid", &edge).await;
     let send = |report: &Arc<ObjectReport>| {
         let (kind, report) = (ReportKind::VoteDetections, Arc::clone(report));
-        euclid.slots().gateway.send(GatewayMessage::PublishReport { kind, report });
+        euclid
+            .slots()
+            .gateway
+            .send(GatewayMessage::PublishReport { kind, report });
     };
     let events = |event| edge.counters().events(event);
     let rejects = |reason| edge.counters().rejects(reason);
-    until("unknown landmark", || send(&report("euclid", "cup", "moon")), || events(Event::VoteIgnored) > 0).await;
+    until(
+        "unknown landmark",
+        || send(&report("euclid", "cup", "moon")),
+        || events(Event::VoteIgnored) > 0,
+    )
+    .await;
     let twice = report("euclid", "cup", "ball");
-    until("duplicate", || send(&twice), || rejects(RejectReason::OutOfOrder) > 0).await;
+    until(
+        "duplicate",
+        || send(&twice),
+        || rejects(RejectReason::OutOfOrder) > 0,
+    )
+    .await;
     let spoilt = |spoil: fn(&mut ObjectReport)| {
         let mut report = (*report("euclid", "cup", "ball")).clone();
         spoil(&mut report);
         Arc::new(report)
     };
     let unsure = || spoilt(|r| r.objects[0].confidence = -0.5);
-    until("confidence", || send(&unsure()), || rejects(RejectReason::ConfidenceOutOfRange) > 0).await;
+    until(
+        "confidence",
+        || send(&unsure()),
+        || rejects(RejectReason::ConfidenceOutOfRange) > 0,
+    )
+    .await;
     let far = || spoilt(|r| r.pose = Some(ecod::wire::WirePose::new(900.0, 0.0, 0.0)));
     let before = events(Event::VoteIgnored);
-    until("beyond range", || send(&far()), || events(Event::VoteIgnored) > before).await;
+    until(
+        "beyond range",
+        || send(&far()),
+        || events(Event::VoteIgnored) > before,
+    )
+    .await;
     let right = || verdict(&euclid).is_some_and(|v| v.label.as_deref() == Some("cup"));
-    until("the cell goes on", || send(&report("euclid", "cup", "ball")), right).await;
+    until(
+        "the cell goes on",
+        || send(&report("euclid", "cup", "ball")),
+        right,
+    )
+    .await;
     euclid.stop().await;
     edge.stop().await;
 }

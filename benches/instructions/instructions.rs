@@ -22,7 +22,11 @@ use gungraun::{library_benchmark, library_benchmark_group, main};
 #[bench::of_1000_boxes(workload::boxes())]
 fn projection((projection, camera, detections): (Projection, Pose, Vec<Detection>)) -> Projection {
     for detection in &detections {
-        black_box(projection.place(detection, Cut::default(), None, &camera).ok());
+        black_box(
+            projection
+                .place(detection, Cut::default(), None, &camera)
+                .ok(),
+        );
     }
     projection
 }
@@ -39,7 +43,9 @@ fn pace_round((mut pace, reports, now): (Pace, Vec<ObjectReport>, Timestamp)) ->
 
 #[library_benchmark]
 #[bench::of_1024_objects(workload::tracks())]
-fn tracks_round((mut tracker, reports, now): (Tracker, Vec<Arc<ObjectReport>>, Timestamp)) -> Tracker {
+fn tracks_round(
+    (mut tracker, reports, now): (Tracker, Vec<Arc<ObjectReport>>, Timestamp),
+) -> Tracker {
     for report in reports {
         black_box(tracker.observe(report, now));
     }
@@ -67,13 +73,22 @@ fn decode_32_objects((bytes, node): (Vec<u8>, NodeName)) -> Option<ObjectReport>
 
 #[library_benchmark]
 #[bench::of_a_beat(workload::following())]
-fn election_step((mut election, beat, now): (Election, ElectionInput, Timestamp)) -> (Election, Vec<ElectionEffect>) {
+fn election_step(
+    (mut election, beat, now): (Election, ElectionInput, Timestamp),
+) -> (Election, Vec<ElectionEffect>) {
     let effects = election.handle(beat, now);
     (election, effects)
 }
 
 library_benchmark_group!(
     name = core,
-    benchmarks = [projection, pace_round, tracks_round, vote_round, decode_32_objects, election_step]
+    benchmarks = [
+        projection,
+        pace_round,
+        tracks_round,
+        vote_round,
+        decode_32_objects,
+        election_step
+    ]
 );
 main!(library_benchmark_groups = core);

@@ -12,7 +12,9 @@ use ecod_instructions as workload;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [name, times] = &arguments[..] else { panic!("usage: ecod-work NAME 0|1|2") };
+    let [name, times] = &arguments[..] else {
+        panic!("usage: ecod-work NAME 0|1|2")
+    };
     #[cfg(feature = "detectors")]
     if detectors::detect(name, times.parse().expect("a number of times")) {
         return;
@@ -22,7 +24,11 @@ fn main() {
         "projection" => {
             let (projection, camera, detections) = workload::boxes();
             for detection in detections.iter().filter(|_| is_done) {
-                black_box(projection.place(detection, Cut::default(), None, &camera).ok());
+                black_box(
+                    projection
+                        .place(detection, Cut::default(), None, &camera)
+                        .ok(),
+                );
             }
         }
         "pace_round" => {

@@ -14,7 +14,9 @@ use ecod::model::time::Timestamp;
 use ecod::pace::{Pace, PaceConfig};
 use ecod::perception::camera::{Intrinsics, Mount};
 use ecod::perception::landmark::{Landmark, LandmarkIndex};
-use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
+use ecod::perception::projection::{
+    ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging,
+};
 use ecod::reputation::ReputationConfig;
 use ecod::tracking::{Tracker, TracksConfig};
 use ecod::vote::{Vote, VoteConfig};
@@ -28,10 +30,23 @@ const LANDMARKS: usize = 256;
 
 /// A thousand boxes, and what places them.
 pub fn boxes() -> (Projection, Pose, Vec<Detection>) {
-    let intrinsics = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
-    let size = ObjectSize { width_m: 1.8, height_m: 1.5, length_m: None, relative_sigma: 0.05 };
-    let sizes = ObjectSizes { labels: [("car".into(), size)].into(), default: Some(size) };
-    let config = ProjectionConfig { ranging: Ranging::BoxHeight, sizes, ..ProjectionConfig::default() };
+    let intrinsics =
+        Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
+    let size = ObjectSize {
+        width_m: 1.8,
+        height_m: 1.5,
+        length_m: None,
+        relative_sigma: 0.05,
+    };
+    let sizes = ObjectSizes {
+        labels: [("car".into(), size)].into(),
+        default: Some(size),
+    };
+    let config = ProjectionConfig {
+        ranging: Ranging::BoxHeight,
+        sizes,
+        ..ProjectionConfig::default()
+    };
     (
         Projection::new(config, intrinsics, Mount::default()),
         Pose::new(0.6, 0.5, 2.9),
@@ -45,7 +60,12 @@ fn detection(index: usize) -> Detection {
     Detection {
         label: "car".into(),
         confidence: 0.5 + (index % 50) as f64 / 100.0,
-        bounding_box: BoundingBox { x_min, y_min, x_max: x_min + width, y_max: y_min + height },
+        bounding_box: BoundingBox {
+            x_min,
+            y_min,
+            x_max: x_min + width,
+            y_max: y_min + height,
+        },
         corners: None,
     }
 }
@@ -54,11 +74,16 @@ fn detection(index: usize) -> Detection {
 pub fn pace() -> (Pace, Vec<ObjectReport>, Timestamp) {
     let landmarks = (0..LANDMARKS).map(landmark).collect();
     let config = PaceConfig::default();
-    let mut pace = Pace::new(config.clone(), Arc::new(LandmarkIndex::new(landmarks, config.gate_m)));
+    let mut pace = Pace::new(
+        config.clone(),
+        Arc::new(LandmarkIndex::new(landmarks, config.gate_m)),
+    );
     let mut now = NOON;
     for round in 0..10 {
         now = now + Duration::from_millis(100);
-        reports(round, now).iter().for_each(|report| pace.observe(report, now));
+        reports(round, now)
+            .iter()
+            .for_each(|report| pace.observe(report, now));
         pace.close(now);
     }
     now = now + Duration::from_millis(100);
@@ -86,7 +111,9 @@ pub fn tracks() -> (Tracker, Vec<Arc<ObjectReport>>, Timestamp) {
     let mut now = NOON;
     for round in 0..20 {
         now = now + Duration::from_millis(100);
-        reports(round, now).into_iter().for_each(|report| assert!(tracker.observe(report, now)));
+        reports(round, now)
+            .into_iter()
+            .for_each(|report| assert!(tracker.observe(report, now)));
         tracker.close(now);
     }
     now = now + Duration::from_millis(100);
@@ -95,7 +122,10 @@ pub fn tracks() -> (Tracker, Vec<Arc<ObjectReport>>, Timestamp) {
 
 /// VOTE after ten rounds, and the votes of the next: 32 vehicles, 32 votes each on 256 locations.
 pub fn vote() -> (Vote, Vec<ObjectReport>, Timestamp) {
-    let mut vote = Vote::new(VoteConfig::default(), (0..LANDMARKS).map(landmark).collect());
+    let mut vote = Vote::new(
+        VoteConfig::default(),
+        (0..LANDMARKS).map(landmark).collect(),
+    );
     let mut now = NOON;
     for round in 0..10 {
         now = now + Duration::from_millis(100);
@@ -116,17 +146,38 @@ pub fn payload(encoding: Encoding) -> (Vec<u8>, NodeName) {
 
 /// A node that follows a leader, and the leader's next beat.
 pub fn following() -> (Election, ElectionInput, Timestamp) {
-    let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 0, NOON);
-    let health = Health { broker: true, fuser: true, gateway: true, reports: true, settings: true, load_percent: 5 };
+    let mut election = Election::new(
+        ElectionConfig::default(),
+        NodeName::from_static("euclid"),
+        0,
+        NOON,
+    );
+    let health = Health {
+        broker: true,
+        fuser: true,
+        gateway: true,
+        reports: true,
+        settings: true,
+        load_percent: 5,
+    };
     election.handle(ElectionInput::Health { health }, NOON);
-    election.handle(ElectionInput::PeerAlive { peer: NodeName::from_static("edge") }, NOON);
+    election.handle(
+        ElectionInput::PeerAlive {
+            peer: NodeName::from_static("edge"),
+        },
+        NOON,
+    );
     let mut now = NOON;
     for seq in 1..100 {
         now = now + Duration::from_millis(50);
         election.handle(beat(seq), now);
         election.tick(now);
     }
-    assert_eq!(election.leader(), Some(&NodeName::from_static("edge")), "the node follows");
+    assert_eq!(
+        election.leader(),
+        Some(&NodeName::from_static("edge")),
+        "the node follows"
+    );
     (election, beat(100), now + Duration::from_millis(50))
 }
 
@@ -138,11 +189,23 @@ fn beat(seq: u64) -> ElectionInput {
         from: edge.clone(),
         run: NOON.micros(),
         seq,
-        candidacy: Candidacy { role: Role::Edge, priority: 100, load: 1, fit: true },
+        candidacy: Candidacy {
+            role: Role::Edge,
+            priority: 100,
+            load: 1,
+            fit: true,
+        },
         term: 1,
         epoch: Some(Epoch::new(1, edge)),
         hears_you: true,
-        body: Body::Beat { every_ms: 50, round: seq, followers: 1, after: None, successors, life: LifeSign::default() },
+        body: Body::Beat {
+            every_ms: 50,
+            round: seq,
+            followers: 1,
+            after: None,
+            successors,
+            life: LifeSign::default(),
+        },
         clock: None,
         description: None,
     };
@@ -169,17 +232,30 @@ fn reports(round: usize, captured_at: Timestamp) -> Vec<ObjectReport> {
         let landmark = (vehicle * 8 + n) % LANDMARKS;
         let position = place(landmark);
         let jitter = ((vehicle * 31 + n * 17 + round * 7) % 100) as f64 / 500.0 - 0.1;
-        let label = if (vehicle + n + round).is_multiple_of(10) { "truck" } else { "car" };
+        let label = if (vehicle + n + round).is_multiple_of(10) {
+            "truck"
+        } else {
+            "car"
+        };
         PerceivedObject {
             covariance_m2: Some([0.01, 0.001, 0.02]),
             landmark: Some(format!("l{landmark}").into()),
-            ..PerceivedObject::new(label, 0.5 + ((vehicle + n) % 50) as f64 / 100.0, position.x + jitter, position.y)
+            ..PerceivedObject::new(
+                label,
+                0.5 + ((vehicle + n) % 50) as f64 / 100.0,
+                position.x + jitter,
+                position.y,
+            )
         }
     };
     let report = |vehicle: usize| ObjectReport {
         pose: Some(WirePose::new(0.6, 0.5, 0.8)),
         objects: (0..OBJECTS).map(|n| object(vehicle, n)).collect(),
-        ..ObjectReport::new(NodeName::new(format!("v{vehicle}")).expect("a valid name"), round as u64 + 1, captured_at)
+        ..ObjectReport::new(
+            NodeName::new(format!("v{vehicle}")).expect("a valid name"),
+            round as u64 + 1,
+            captured_at,
+        )
     };
     (0..VEHICLES).map(report).collect()
 }

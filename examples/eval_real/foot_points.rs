@@ -6,7 +6,9 @@
 
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::perception::camera::Mount;
-use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
+use ecod::perception::projection::{
+    ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging,
+};
 use nalgebra::Point2;
 
 use super::ground_camera::GroundCamera;
@@ -14,18 +16,32 @@ use super::wildtrack::Wildtrack;
 
 /// Range in metres up to which places are judged.
 const MAX_RANGE_M: f64 = 20.0;
-const CARD: ObjectSize = ObjectSize { width_m: 0.0, height_m: 1.8, length_m: Some(0.0), relative_sigma: 0.02 };
+const CARD: ObjectSize = ObjectSize {
+    width_m: 0.0,
+    height_m: 1.8,
+    length_m: Some(0.0),
+    relative_sigma: 0.02,
+};
 
 /// Prints a table of errors in metres, by camera and in all.
 pub(super) fn print(data: &Wildtrack) {
-    println!("| WILDTRACK camera | height | pitch | boxes within 20 m | median | 90 % | median with usual depth |");
+    println!(
+        "| WILDTRACK camera | height | pitch | boxes within 20 m | median | 90 % | median with usual depth |"
+    );
     println!("|---|---|---|---|---|---|---|");
     let mut all = [Vec::new(), Vec::new()];
     for (number, camera) in data.cameras.iter().enumerate() {
         let errors = [Some(CARD), None].map(|size| errors(camera, data, number, size));
-        let Mount { height_m, pitch_rad, .. } = camera.mount;
+        let Mount {
+            height_m,
+            pitch_rad,
+            ..
+        } = camera.mount;
         let (height_m, pitch_deg) = (height_m.unwrap_or_default(), pitch_rad.to_degrees());
-        row(&format!("{} | {height_m:.2} m | {pitch_deg:.1}°", number + 1), &errors);
+        row(
+            &format!("{} | {height_m:.2} m | {pitch_deg:.1}°", number + 1),
+            &errors,
+        );
         for (all, errors) in all.iter_mut().zip(errors) {
             all.extend(errors);
         }
@@ -38,33 +54,67 @@ fn row(name: &str, [card, person]: &[Vec<f64>; 2]) {
     let share = |errors: &Vec<f64>, share: f64| {
         let mut sorted = errors.clone();
         sorted.sort_by(f64::total_cmp);
-        sorted.get((sorted.len() as f64 * share) as usize).map_or_else(|| "-".to_owned(), |error| format!("{error:.2}"))
+        sorted
+            .get((sorted.len() as f64 * share) as usize)
+            .map_or_else(|| "-".to_owned(), |error| format!("{error:.2}"))
     };
-    println!("| {name} | {} | {} | {} | {} |", card.len(), share(card, 0.5), share(card, 0.9), share(person, 0.5));
+    println!(
+        "| {name} | {} | {} | {} | {} |",
+        card.len(),
+        share(card, 0.5),
+        share(card, 0.9),
+        share(person, 0.5)
+    );
 }
 
 /// Distances of the camera's places from the nearest annotated ones; without a size, people have the usual one.
-fn errors(camera: &GroundCamera, data: &Wildtrack, number: usize, size: Option<ObjectSize>) -> Vec<f64> {
-    let labels = size.map(|size| ("person".into(), size)).into_iter().collect();
+fn errors(
+    camera: &GroundCamera,
+    data: &Wildtrack,
+    number: usize,
+    size: Option<ObjectSize>,
+) -> Vec<f64> {
+    let labels = size
+        .map(|size| ("person".into(), size))
+        .into_iter()
+        .collect();
     let config = ProjectionConfig {
         ranging: Ranging::Ground,
-        sizes: ObjectSizes { labels, default: None },
+        sizes: ObjectSizes {
+            labels,
+            default: None,
+        },
         ..ProjectionConfig::default()
     };
     let projection = Projection::new(config, camera.intrinsics, camera.mount);
     let mut errors = Vec::new();
     for (frame, boxes) in &data.boxes {
-        for [left, top, width, height, ..] in boxes.iter().filter(|cells| cells[5] as usize == number) {
+        for [left, top, width, height, ..] in
+            boxes.iter().filter(|cells| cells[5] as usize == number)
+        {
             // The middles of whole pixels.
             let (x_min, y_min) = (left + 0.5, top + 0.5);
-            let bounding_box = BoundingBox { x_min, y_min, x_max: x_min + width, y_max: y_min + height };
-            let detection = Detection { label: "person".into(), confidence: 1.0, bounding_box, corners: None };
+            let bounding_box = BoundingBox {
+                x_min,
+                y_min,
+                x_max: x_min + width,
+                y_max: y_min + height,
+            };
+            let detection = Detection {
+                label: "person".into(),
+                confidence: 1.0,
+                bounding_box,
+                corners: None,
+            };
             let cut = projection.cut(&detection);
-            let Ok(placed) = projection.place(&detection, cut, None, &camera.pose) else { continue };
+            let Ok(placed) = projection.place(&detection, cut, None, &camera.pose) else {
+                continue;
+            };
             let place = Point2::new(placed.x_m, placed.y_m);
             let people = data.positions.get(frame).into_iter().flatten();
-            let nearest =
-                people.min_by(|a, b| nalgebra::distance(*a, &place).total_cmp(&nalgebra::distance(*b, &place)));
+            let nearest = people.min_by(|a, b| {
+                nalgebra::distance(*a, &place).total_cmp(&nalgebra::distance(*b, &place))
+            });
             if let Some(person) = nearest
                 && !cut.side
                 && nalgebra::distance(person, &camera.pose.position) <= MAX_RANGE_M

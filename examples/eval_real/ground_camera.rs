@@ -29,12 +29,24 @@ impl GroundCamera {
         let verticals = [root, -root].map(|root| (middle * sin + root) / cos_square);
         let principal = |vertical: &Complex<f64>| middle + vertical * sin;
         let [columns, rows] = IMAGE.map(f64::from);
-        let off = |vertical: &Complex<f64>| (principal(vertical) - Complex::new(columns, rows) / 2.0).norm();
-        let vertical = verticals.into_iter().min_by(|a, b| off(a).total_cmp(&off(b)))?;
+        let off = |vertical: &Complex<f64>| {
+            (principal(vertical) - Complex::new(columns, rows) / 2.0).norm()
+        };
+        let vertical = verticals
+            .into_iter()
+            .min_by(|a, b| off(a).total_cmp(&off(b)))?;
         let (Complex { re: cx, im: cy }, [width, height]) = (principal(&vertical), IMAGE);
         let focal = (moments.m11 - cx * cx + vertical.re * vertical.re).sqrt();
-        let intrinsics = Intrinsics { width, height, fx: focal, fy: focal, cx, cy };
-        let [r1, r2, t] = [h1, h2, h3].map(|h| Vector3::new((h.x - cx * h.z) / focal, (h.y - cy * h.z) / focal, h.z));
+        let intrinsics = Intrinsics {
+            width,
+            height,
+            fx: focal,
+            fy: focal,
+            cx,
+            cy,
+        };
+        let [r1, r2, t] = [h1, h2, h3]
+            .map(|h| Vector3::new((h.x - cx * h.z) / focal, (h.y - cy * h.z) / focal, h.z));
         let to_world = Matrix3::from_columns(&[r1, r2, r1.cross(&r2)]).transpose();
         let position = -to_world * t / 100.0;
         let (right, down, axis) = (to_world.column(0), to_world.column(1), to_world.column(2));
@@ -45,7 +57,13 @@ impl GroundCamera {
             ..Mount::default()
         };
         let pose = Pose::new(position.x, position.y, axis.y.atan2(axis.x));
-        let is_camera = [focal, position.z, mount.pitch_rad].into_iter().all(|value| value.is_finite() && value > 0.0);
-        is_camera.then_some(Self { intrinsics, pose, mount })
+        let is_camera = [focal, position.z, mount.pitch_rad]
+            .into_iter()
+            .all(|value| value.is_finite() && value > 0.0);
+        is_camera.then_some(Self {
+            intrinsics,
+            pose,
+            mount,
+        })
     }
 }

@@ -19,8 +19,9 @@ pub(super) const TRUTH: (&str, &str) = ("AB3DMOT/scripts/KITTI/label", REPOSITOR
 
 /// The sequences on which PointRCNN was not trained, by `scripts/KITTI/evaluate_tracking.seqmap.val`. Parameters of tracks
 /// were fitted with the first six in view.
-pub(super) const SEQUENCES: [&str; 11] =
-    ["0001", "0006", "0008", "0010", "0012", "0013", "0014", "0015", "0016", "0018", "0019"];
+pub(super) const SEQUENCES: [&str; 11] = [
+    "0001", "0006", "0008", "0010", "0012", "0013", "0014", "0015", "0016", "0018", "0019",
+];
 
 const FRAME_RATE: &str = "10";
 
@@ -36,22 +37,33 @@ pub(super) fn convert(
     let folders = ["truth", "detections"].map(|kind| work.join(kind));
     folders.iter().try_for_each(fs::create_dir)?;
     let [own_truth, own_detections] = folders;
-    let read = |path: &Path| fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
+    let read = |path: &Path| {
+        fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+    };
     for sequence in sequences {
         let file = format!("{sequence}.txt");
         fs::write(own_truth.join(&file), read(&truth.join(&file))?)?;
         let mut merged = String::new();
         for class in ["Car", "Pedestrian", "Cyclist"] {
-            let path = detections.join(format!("pointrcnn_{class}_val")).join(&file);
+            let path = detections
+                .join(format!("pointrcnn_{class}_val"))
+                .join(&file);
             merged += &read(&path)?;
         }
         fs::write(own_detections.join(&file), merged)?;
     }
-    let (truth, detections) =
-        (FileFormat::Kitti.read(&own_truth, None)?, FileFormat::Kitti.read(&own_detections, None)?);
+    let (truth, detections) = (
+        FileFormat::Kitti.read(&own_truth, None)?,
+        FileFormat::Kitti.read(&own_detections, None)?,
+    );
     let mut reports = Vec::new();
     for (number, (truth, detections)) in truth.iter().zip(&detections).enumerate() {
-        reports.extend(detections.reports(number, 10.0, &NodeName::from_static("kitti"), truth.last()));
+        reports.extend(detections.reports(
+            number,
+            10.0,
+            &NodeName::from_static("kitti"),
+            truth.last(),
+        ));
     }
     let path = work.join("reports.jsonl");
     write_reports(&path, reports)?;

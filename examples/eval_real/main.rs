@@ -25,7 +25,10 @@ use wildtrack::Wildtrack;
 const LABEL_SETS: [&str; 4] = ["CF", "CF_amt", "SP", "SP_amt"];
 
 /// Paths below DIR and the repository that has them.
-const LABELS: (&str, &str) = ("truth-inference-at-scale/data/active-crowd-toolkit", "yuan-li/truth-inference-at-scale");
+const LABELS: (&str, &str) = (
+    "truth-inference-at-scale/data/active-crowd-toolkit",
+    "yuan-li/truth-inference-at-scale",
+);
 
 const COLUMNS: [&str; 17] = [
     "set",
@@ -64,11 +67,16 @@ struct Recording {
 }
 
 fn main() -> anyhow::Result<()> {
-    let (mut program, mut data, mut work) =
-        (PathBuf::from("target/release/ecod-node"), PathBuf::new(), PathBuf::from("target/eval-real"));
+    let (mut program, mut data, mut work) = (
+        PathBuf::from("target/release/ecod-node"),
+        PathBuf::new(),
+        PathBuf::from("target/eval-real"),
+    );
     let mut args = std::env::args().skip(1);
     while let Some(key) = args.next() {
-        let value = args.next().with_context(|| format!("{key} needs a value"))?;
+        let value = args
+            .next()
+            .with_context(|| format!("{key} needs a value"))?;
         match key.as_str() {
             "--program" => program = value.into(),
             "--data" => data = value.into(),
@@ -82,31 +90,49 @@ fn main() -> anyhow::Result<()> {
         if path.exists() {
             return Some(path);
         }
-        missing.push(format!("{} is missing: it is in the repository {repository} on GitHub", path.display()));
+        missing.push(format!(
+            "{} is missing: it is in the repository {repository} on GitHub",
+            path.display()
+        ));
         None
     };
     let kitti = find(kitti::DETECTIONS).zip(find(kitti::TRUTH));
-    let wildtrack = find(wildtrack::BOXES).zip(find(wildtrack::CAMERAS)).zip(find(wildtrack::TRUTH));
+    let wildtrack = find(wildtrack::BOXES)
+        .zip(find(wildtrack::CAMERAS))
+        .zip(find(wildtrack::TRUTH));
     for set in LABEL_SETS {
         let path = format!("{}/{set}", LABELS.0);
         find((path.as_str(), LABELS.1));
     }
     missing.iter().for_each(|what| eprintln!("{what}"));
-    let wildtrack = wildtrack.map(|((boxes, cameras), truth)| Wildtrack::read(&boxes, &cameras, &truth)).transpose()?;
+    let wildtrack = wildtrack
+        .map(|((boxes, cameras), truth)| Wildtrack::read(&boxes, &cameras, &truth))
+        .transpose()?;
     if let Some(wildtrack) = &wildtrack {
         foot_points::print(wildtrack);
     }
-    println!("| {} |\n|{}", COLUMNS.join(" | "), "---|".repeat(COLUMNS.len()));
+    println!(
+        "| {} |\n|{}",
+        COLUMNS.join(" | "),
+        "---|".repeat(COLUMNS.len())
+    );
     if let Some(kitti) = kitti {
         let last = &kitti::SEQUENCES[kitti::FITTED..];
         for (name, sequences) in [("KITTI", &kitti::SEQUENCES[..]), ("KITTI, last five", last)] {
-            judge(&program, &kitti::convert(name, sequences, &kitti, &folder(&work, name)?)?)?;
+            judge(
+                &program,
+                &kitti::convert(name, sequences, &kitti, &folder(&work, name)?)?,
+            )?;
         }
     }
     if let Some(wildtrack) = wildtrack {
         judge(&program, &wildtrack.convert(&folder(&work, "wildtrack")?)?)?;
     }
-    if missing.is_empty() { Ok(()) } else { bail!("{} of the data are missing", missing.len()) }
+    if missing.is_empty() {
+        Ok(())
+    } else {
+        bail!("{} of the data are missing", missing.len())
+    }
 }
 
 /// An empty folder.
@@ -120,14 +146,25 @@ fn folder(work: &Path, name: &str) -> anyhow::Result<PathBuf> {
 }
 
 fn judge(program: &Path, recording: &Recording) -> anyhow::Result<()> {
-    let Recording { name, others, reports, is_fused, .. } = recording;
+    let Recording {
+        name,
+        others,
+        reports,
+        is_fused,
+        ..
+    } = recording;
     for (method, said) in others {
         row(name, method, false, &eval(program, recording, said)?);
     }
     let maps = reports.with_file_name("maps.jsonl");
     let replay = || {
         let mut replay = Command::new(program);
-        replay.arg("replay").arg("--input").arg(reports).arg("--output").arg(&maps);
+        replay
+            .arg("replay")
+            .arg("--input")
+            .arg(reports)
+            .arg("--output")
+            .arg(&maps);
         replay
     };
     run(&mut replay())?;
@@ -136,23 +173,39 @@ fn judge(program: &Path, recording: &Recording) -> anyhow::Result<()> {
         let config = reports.with_file_name("unaligned.toml");
         fs::write(&config, UNALIGNED)?;
         run(replay().arg("--config").arg(&config))?;
-        row(name, "ecod, `align = false`", true, &eval(program, recording, &maps)?);
+        row(
+            name,
+            "ecod, `align = false`",
+            true,
+            &eval(program, recording, &maps)?,
+        );
     }
     Ok(())
 }
 
 fn eval(program: &Path, recording: &Recording, input: &Path) -> anyhow::Result<Value> {
-    let Recording { format, frame_rate, truth, reports, .. } = recording;
+    let Recording {
+        format,
+        frame_rate,
+        truth,
+        reports,
+        ..
+    } = recording;
     let result = reports.with_file_name("result.json");
     let mut eval = Command::new(program.with_file_name("ecod-lab"));
-    eval.args(["eval", "--format", format, "--frame-rate", frame_rate]).arg("--truth").arg(truth);
+    eval.args(["eval", "--format", format, "--frame-rate", frame_rate])
+        .arg("--truth")
+        .arg(truth);
     run(eval.arg("--input").arg(input).arg("--out").arg(&result))?;
     let result: Value = serde_json::from_slice(&fs::read(&result)?)?;
     Ok(result["tracks"].clone())
 }
 
 fn run(command: &mut Command) -> anyhow::Result<()> {
-    let output = command.stdin(Stdio::null()).output().with_context(|| format!("cannot run {command:?}"))?;
+    let output = command
+        .stdin(Stdio::null())
+        .output()
+        .with_context(|| format!("cannot run {command:?}"))?;
     let said = String::from_utf8_lossy(&output.stderr);
     if !output.status.success() {
         bail!("{command:?}: {said}");
@@ -165,10 +218,13 @@ fn run(command: &mut Command) -> anyhow::Result<()> {
 
 /// Prints a row of the table. Identities are those of tracks only.
 fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) {
-    let figure = |value: &Value, digits: usize| value.as_f64().map(|figure| format!("{figure:.digits$}"));
+    let figure =
+        |value: &Value, digits: usize| value.as_f64().map(|figure| format!("{figure:.digits$}"));
     let share = |value: &Value| figure(value, 1);
     let (at, calibration) = (&tracks["at_best_f1"], &tracks["calibration"]);
-    let mut cells: Vec<Option<String>> = (0..4).map(|place| share(&tracks["ap_pct"][place])).collect();
+    let mut cells: Vec<Option<String>> = (0..4)
+        .map(|place| share(&tracks["ap_pct"][place]))
+        .collect();
     cells.extend((0..3).map(|place| share(&tracks["best_moda_pct"][place])));
     cells.push(share(&tracks["best_f1_pct"]));
     cells.extend([&at["motp_m"], &at["threshold"]].map(|value| figure(value, 2)));
@@ -177,12 +233,18 @@ fn row(set: &str, method: &str, is_tracked: bool, tracks: &Value) {
     let identities = [share(&at["hota_pct"]), share(&at["idf1_pct"]), Some(counts)];
     let is_judged = is_tracked && !at["idf1_pct"].is_null();
     cells.extend(identities.map(|figure| figure.filter(|_| is_judged)));
-    let cells: Vec<String> = cells.into_iter().map(|cell| cell.unwrap_or_else(|| "-".to_owned())).collect();
+    let cells: Vec<String> = cells
+        .into_iter()
+        .map(|cell| cell.unwrap_or_else(|| "-".to_owned()))
+        .collect();
     println!("| {set} | {method} | {} |", cells.join(" | "));
 }
 
 /// Writes reports as lines.
-fn write_reports(path: &Path, reports: impl IntoIterator<Item = ObjectReport>) -> anyhow::Result<()> {
+fn write_reports(
+    path: &Path,
+    reports: impl IntoIterator<Item = ObjectReport>,
+) -> anyhow::Result<()> {
     let mut file = std::io::BufWriter::new(fs::File::create(path)?);
     for report in reports {
         writeln!(file, "{}", serde_json::to_string(&report)?)?;

@@ -21,12 +21,18 @@ use serde_json::Value;
 use super::ground_camera::GroundCamera;
 use super::{Recording, write_reports};
 
-pub(super) const BOXES: (&str, &str) =
-    ("ReST/datasets/Wildtrack/sequence1/output/MVDeTr_test.json", "chengche6230/ReST");
+pub(super) const BOXES: (&str, &str) = (
+    "ReST/datasets/Wildtrack/sequence1/output/MVDeTr_test.json",
+    "chengche6230/ReST",
+);
 
-pub(super) const CAMERAS: (&str, &str) = ("ReST/datasets/Wildtrack/metainfo.json", "chengche6230/ReST");
+pub(super) const CAMERAS: (&str, &str) =
+    ("ReST/datasets/Wildtrack/metainfo.json", "chengche6230/ReST");
 
-pub(super) const TRUTH: (&str, &str) = ("MVDet/multiview_detector/evaluation/gt-demo.txt", "hou-yz/MVDet");
+pub(super) const TRUTH: (&str, &str) = (
+    "MVDet/multiview_detector/evaluation/gt-demo.txt",
+    "hou-yz/MVDet",
+);
 
 const FRAME_RATE_HZ: f64 = 2.0;
 
@@ -59,31 +65,58 @@ pub(super) struct Wildtrack {
 
 impl Wildtrack {
     pub(super) fn read(boxes: &Path, cameras: &Path, truth: &Path) -> anyhow::Result<Self> {
-        let read = |path: &Path| fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
+        let read = |path: &Path| {
+            fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))
+        };
         let boxes = serde_json::from_str(&read(boxes)?)?;
         let cameras: Value = serde_json::from_str(&read(cameras)?)?;
-        let homographies: Vec<[[f64; 3]; 3]> = serde_json::from_value(cameras["sequence1"]["homography"].clone())?;
-        let homographies: Vec<Matrix3<f64>> =
-            homographies.iter().map(|rows| Matrix3::from_fn(|row, column| rows[row][column])).collect();
+        let homographies: Vec<[[f64; 3]; 3]> =
+            serde_json::from_value(cameras["sequence1"]["homography"].clone())?;
+        let homographies: Vec<Matrix3<f64>> = homographies
+            .iter()
+            .map(|rows| Matrix3::from_fn(|row, column| rows[row][column]))
+            .collect();
         let cameras: Option<Vec<_>> = homographies.iter().map(GroundCamera::new).collect();
         let cameras = cameras.context("a homography of no pinhole camera")?;
         let mut positions: BTreeMap<u64, Vec<Point2<f64>>> = BTreeMap::new();
         for (number, line) in read(truth)?.lines().enumerate() {
-            let cells: Option<Vec<u64>> = line.split_ascii_whitespace().map(|cell| cell.parse().ok()).collect();
-            let cells: [u64; 3] = cells
-                .and_then(|cells| cells.try_into().ok())
-                .with_context(|| format!("{}: line {}: not three numbers", truth.display(), number + 1))?;
+            let cells: Option<Vec<u64>> = line
+                .split_ascii_whitespace()
+                .map(|cell| cell.parse().ok())
+                .collect();
+            let cells: [u64; 3] =
+                cells
+                    .and_then(|cells| cells.try_into().ok())
+                    .with_context(|| {
+                        format!(
+                            "{}: line {}: not three numbers",
+                            truth.display(),
+                            number + 1
+                        )
+                    })?;
             let [frame, x, y] = cells;
             let place = [x as f64, y as f64];
             let place: [f64; 2] = std::array::from_fn(|axis| CORNER_M[axis] + GRID_M * place[axis]);
-            positions.entry(frame / TRUTH_FRAMES).or_default().push(place.into());
+            positions
+                .entry(frame / TRUTH_FRAMES)
+                .or_default()
+                .push(place.into());
         }
-        Ok(Self { boxes, homographies, cameras, positions })
+        Ok(Self {
+            boxes,
+            homographies,
+            cameras,
+            positions,
+        })
     }
 
     pub(super) fn convert(&self, work: &Path) -> anyhow::Result<Recording> {
         let (truth, reports) = (work.join("truth.txt"), work.join("reports.jsonl"));
-        let to_ground: Option<Vec<_>> = self.homographies.iter().map(|homography| homography.try_inverse()).collect();
+        let to_ground: Option<Vec<_>> = self
+            .homographies
+            .iter()
+            .map(|homography| homography.try_inverse())
+            .collect();
         let to_ground = to_ground.context("a homography has no inverse")?;
         let (mut places, mut all, mut late_fusion) = (String::new(), String::new(), String::new());
         let (mut alone, mut reported) = (vec![String::new(); to_ground.len()], Vec::new());
@@ -96,16 +129,25 @@ impl Wildtrack {
             for (camera, to_ground) in to_ground.iter().enumerate() {
                 let of_camera = boxes.iter().filter(|cells| cells[5] as usize == camera);
                 let with_foot = of_camera.filter(|[_, top, _, height, ..]| top + height < LAST_ROW);
-                let objects: Vec<PerceivedObject> = with_foot.map(|cells| object(cells, to_ground)).collect();
+                let objects: Vec<PerceivedObject> =
+                    with_foot.map(|cells| object(cells, to_ground)).collect();
                 for PerceivedObject { x_m, y_m, .. } in &objects {
                     let line = line(number, CONFIDENCE, &Point2::new(*x_m, *y_m));
                     writeln!(all, "{line}")?;
                     writeln!(alone[camera], "{line}")?;
                 }
-                let Pose { position, heading_rad } = self.cameras[camera].pose;
+                let Pose {
+                    position,
+                    heading_rad,
+                } = self.cameras[camera].pose;
                 let pose = Some(WirePose::new(position.x, position.y, heading_rad));
                 let node = NodeName::new(format!("camera-{}", camera + 1))?;
-                let report = ObjectReport { objects, pose, moving: Some(false), ..ObjectReport::new(node, number, at) };
+                let report = ObjectReport {
+                    objects,
+                    pose,
+                    moving: Some(false),
+                    ..ObjectReport::new(node, number, at)
+                };
                 latest.report(&report);
                 reported.push(report);
             }
@@ -113,17 +155,30 @@ impl Wildtrack {
                 writeln!(late_fusion, "{}", line(number, said.score, &said.position))?;
             }
         }
-        let alone = (1..).zip(alone).map(|(camera, lines)| (format!("camera {camera}"), lines));
+        let alone = (1..)
+            .zip(alone)
+            .map(|(camera, lines)| (format!("camera {camera}"), lines));
         let others = [("detections".to_owned(), all)].into_iter().chain(alone);
-        let others = others.chain([("late fusion".to_owned(), late_fusion)]).map(|(method, lines)| {
-            let path = work.join(format!("{method}.txt"));
-            fs::write(&path, lines)?;
-            anyhow::Ok((method, path))
-        });
+        let others =
+            others
+                .chain([("late fusion".to_owned(), late_fusion)])
+                .map(|(method, lines)| {
+                    let path = work.join(format!("{method}.txt"));
+                    fs::write(&path, lines)?;
+                    anyhow::Ok((method, path))
+                });
         let others = others.collect::<Result<_, _>>()?;
         fs::write(&truth, places)?;
         write_reports(&reports, reported)?;
-        Ok(Recording { name: "WILDTRACK", format: "mot", frame_rate: "2", truth, others, reports, is_fused: true })
+        Ok(Recording {
+            name: "WILDTRACK",
+            format: "mot",
+            frame_rate: "2",
+            truth,
+            others,
+            reports,
+            is_fused: true,
+        })
     }
 }
 
@@ -141,7 +196,10 @@ fn object(&[left, top, width, height, ..]: &[f64; 6], to_ground: &Matrix3<f64>) 
     };
     let (x, y) = (left + width / 2.0, top + height);
     let place = ground(x, y);
-    let steps = [ground(x + FOOT_PIXELS, y) - place, ground(x, y + FOOT_PIXELS) - place];
+    let steps = [
+        ground(x + FOOT_PIXELS, y) - place,
+        ground(x, y + FOOT_PIXELS) - place,
+    ];
     let covariance: Matrix2<f64> = steps.iter().map(|step| step * step.transpose()).sum();
     PerceivedObject {
         covariance_m2: Some([covariance[(0, 0)], covariance[(0, 1)], covariance[(1, 1)]]),

@@ -27,7 +27,9 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{FusedObject, GlobalMap, ObjectReport, ReportKind};
 use ecod_lab::eval::baselines::{LatestReports, NearestTracker, found, suppressed};
-use ecod_lab::eval::tracks::{AP_DISTANCES_M, ReliabilityBins, SaidObject, TrackEvaluation, TrackScores, TrackTruth};
+use ecod_lab::eval::tracks::{
+    AP_DISTANCES_M, ReliabilityBins, SaidObject, TrackEvaluation, TrackScores, TrackTruth,
+};
 use ecod_lab::traffic::{TrafficConfig, TrafficRecording, generate, observer_name};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -93,7 +95,9 @@ fn options() -> anyhow::Result<Options> {
             println!("{USAGE}");
             std::process::exit(0);
         }
-        let value = args.next().with_context(|| format!("{key} needs a value"))?;
+        let value = args
+            .next()
+            .with_context(|| format!("{key} needs a value"))?;
         match key.as_str() {
             "--seeds" if value == "tuning" => options.seeds = TUNING,
             "--seeds" if value == "report" => options.seeds = REPORT,
@@ -101,7 +105,10 @@ fn options() -> anyhow::Result<Options> {
             "--count" => options.count = number(&key, &value)?,
             "--seconds" => options.seconds = number(&key, &value)?,
             "--observers" => {
-                options.observers = value.split(',').map(|count| number(&key, count)).collect::<Result<_, _>>()?;
+                options.observers = value
+                    .split(',')
+                    .map(|count| number(&key, count))
+                    .collect::<Result<_, _>>()?;
             }
             "--write-table" => options.table = Some(value.into()),
             "--svg" => options.svg = Some(value.into()),
@@ -117,7 +124,9 @@ fn options() -> anyhow::Result<Options> {
 }
 
 fn number<T: FromStr<Err: Into<anyhow::Error>>>(key: &str, value: &str) -> anyhow::Result<T> {
-    value.parse().map_err(|error: T::Err| error.into().context(format!("{key} {value}")))
+    value
+        .parse()
+        .map_err(|error: T::Err| error.into().context(format!("{key} {value}")))
 }
 
 /// A kind of traffic and the name of its rows.
@@ -131,17 +140,32 @@ impl Scene {
     fn all(options: &Options) -> Vec<Self> {
         let town = |&observers: &usize| Self {
             name: observers.to_string(),
-            config: TrafficConfig { observers, duration_s: options.seconds, ..TrafficConfig::default() },
+            config: TrafficConfig {
+                observers,
+                duration_s: options.seconds,
+                ..TrafficConfig::default()
+            },
         };
         let recorded = Self {
             name: "recorded".into(),
-            config: TrafficConfig { duration_s: options.seconds, ..TrafficConfig::two_vehicle_recording() },
+            config: TrafficConfig {
+                duration_s: options.seconds,
+                ..TrafficConfig::two_vehicle_recording()
+            },
         };
         let passed = Self {
             name: "passed".into(),
-            config: TrafficConfig { duration_s: 4.0 * options.seconds, ..TrafficConfig::much_passed() },
+            config: TrafficConfig {
+                duration_s: 4.0 * options.seconds,
+                ..TrafficConfig::much_passed()
+            },
         };
-        options.observers.iter().map(town).chain([recorded, passed]).collect()
+        options
+            .observers
+            .iter()
+            .map(town)
+            .chain([recorded, passed])
+            .collect()
     }
 }
 
@@ -154,7 +178,8 @@ fn run(
     let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth)?)?;
     let judge = || TrackEvaluation::new(truth.clone());
     let (mut union, mut late, mut ours) = (judge(), judge(), judge());
-    let (mut union_tracker, mut late_tracker) = (NearestTracker::default(), NearestTracker::default());
+    let (mut union_tracker, mut late_tracker) =
+        (NearestTracker::default(), NearestTracker::default());
     let mut latest = LatestReports::default();
     for map in maps(recording, &mut |event| match event {
         Event::Report(report) => latest.report(report),
@@ -169,8 +194,17 @@ fn run(
         ours.map(&map);
     }
     let alone = (0..observers).map(|number| alone(recording, &observer_name(number), judge()));
-    let best = alone.max_by(|a, b| a.ap_pct[2].unwrap_or_default().total_cmp(&b.ap_pct[2].unwrap_or_default()));
-    Ok([best.context("no observer")?, union.result(), late.result(), ours.result()])
+    let best = alone.max_by(|a, b| {
+        a.ap_pct[2]
+            .unwrap_or_default()
+            .total_cmp(&b.ap_pct[2].unwrap_or_default())
+    });
+    Ok([
+        best.context("no observer")?,
+        union.result(),
+        late.result(),
+        ours.result(),
+    ])
 }
 
 enum Event<'a> {
@@ -184,15 +218,27 @@ const PERIOD: Duration = Duration::from_millis(100);
 
 /// Maps that an aggregator makes of a recording; `watch` hears of every report as it comes and of the time.
 fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<GlobalMap> {
-    let config = FusionConfig { algorithms: Algorithms::Pace, ..FusionConfig::default() };
+    let config = FusionConfig {
+        algorithms: Algorithms::Pace,
+        ..FusionConfig::default()
+    };
     let mut aggregator: Option<Aggregator> = None;
     let mut maps = Vec::new();
     let mut take = |fused: Option<Fused>| maps.extend(fused.and_then(|fused| fused.map));
     let mut due: Option<Timestamp> = None;
     for arrived in &recording.reports {
-        let now = arrived.received_at_us.unwrap_or(arrived.report.captured_at_us);
-        let aggregator = aggregator
-            .get_or_insert_with(|| Aggregator::new(NodeName::from_static("edge"), 1, config.clone(), Vec::new(), now));
+        let now = arrived
+            .received_at_us
+            .unwrap_or(arrived.report.captured_at_us);
+        let aggregator = aggregator.get_or_insert_with(|| {
+            Aggregator::new(
+                NodeName::from_static("edge"),
+                1,
+                config.clone(),
+                Vec::new(),
+                now,
+            )
+        });
         while aggregator.deadline() <= now {
             take(aggregator.tick(aggregator.deadline()));
         }
@@ -203,7 +249,15 @@ fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<G
         }
         watch(Event::Report(&arrived.report));
         // A rejected report is one that comes too late.
-        take(aggregator.report(ReportKind::Detections, &Arc::new(arrived.report.clone()), now).unwrap_or_default());
+        take(
+            aggregator
+                .report(
+                    ReportKind::Detections,
+                    &Arc::new(arrived.report.clone()),
+                    now,
+                )
+                .unwrap_or_default(),
+        );
     }
     due.into_iter().for_each(|due| watch(Event::Due(due)));
     if let Some(aggregator) = &mut aggregator {
@@ -215,10 +269,18 @@ fn maps(recording: &TrafficRecording, watch: &mut dyn FnMut(Event<'_>)) -> Vec<G
 /// One vehicle by itself, at the times of its captures: nothing takes time.
 fn alone(recording: &TrafficRecording, name: &NodeName, mut judge: TrackEvaluation) -> TrackScores {
     let mut tracker = NearestTracker::default();
-    let mut own: Vec<_> = recording.reports.iter().map(|arrived| &arrived.report).filter(|r| r.node == *name).collect();
+    let mut own: Vec<_> = recording
+        .reports
+        .iter()
+        .map(|arrived| &arrived.report)
+        .filter(|r| r.node == *name)
+        .collect();
     own.sort_by_key(|report| report.captured_at_us);
     for report in own {
-        judge.said(report.captured_at_us, &tracker.track(report.captured_at_us, &found(report)));
+        judge.said(
+            report.captured_at_us,
+            &tracker.track(report.captured_at_us, &found(report)),
+        );
     }
     judge.result()
 }
@@ -226,12 +288,35 @@ fn alone(recording: &TrafficRecording, name: &NodeName, mut judge: TrackEvaluati
 fn figures(scores: &TrackScores, truth_ids: usize) -> Figures {
     let at = &scores.at_best_f1;
     let [a, b, c, d] = scores.ap_pct.map(Option::unwrap_or_default);
-    let rest = [scores.best_f1_pct, at.moda_pct, at.hota_pct, at.idf1_pct, scores.calibration.confidence.ece_pct];
+    let rest = [
+        scores.best_f1_pct,
+        at.moda_pct,
+        at.hota_pct,
+        at.idf1_pct,
+        scores.calibration.confidence.ece_pct,
+    ];
     let [f1, moda, hota, idf1, error] = rest.map(Option::unwrap_or_default);
-    let of_existence =
-        scores.calibration.existence.as_ref().and_then(|existence| existence.ece_pct).unwrap_or(f64::NAN);
+    let of_existence = scores
+        .calibration
+        .existence
+        .as_ref()
+        .and_then(|existence| existence.ece_pct)
+        .unwrap_or(f64::NAN);
     let switches = at.id_switches as f64 / truth_ids.max(1) as f64;
-    [a, b, c, d, f1, moda, hota, idf1, error, of_existence, at.threshold, switches]
+    [
+        a,
+        b,
+        c,
+        d,
+        f1,
+        moda,
+        hota,
+        idf1,
+        error,
+        of_existence,
+        at.threshold,
+        switches,
+    ]
 }
 
 /// Where a recording is written to, line by line.
@@ -249,24 +334,41 @@ impl Files {
         }
         reports.flush()?;
         fs::write(file("truth.json"), serde_json::to_vec(&recording.truth)?)?;
-        Ok(Self { maps: BufWriter::new(File::create(file("late.jsonl"))?) })
+        Ok(Self {
+            maps: BufWriter::new(File::create(file("late.jsonl"))?),
+        })
     }
 
     fn map(&mut self, at: Timestamp, said: &[SaidObject]) -> anyhow::Result<()> {
         let objects = said.iter().map(|said| {
             let id = Uuid::from_u128(u128::from(said.id));
             let covariance = Covariance::isotropic(1.0);
-            FusedObject::new(id, said.label.clone(), said.score, said.position.x, said.position.y, covariance)
+            FusedObject::new(
+                id,
+                said.label.clone(),
+                said.score,
+                said.position.x,
+                said.position.y,
+                covariance,
+            )
         });
         let epoch = Epoch::new(1, NodeName::from_static("late-fusion"));
-        let map = GlobalMap { objects: objects.collect(), ..GlobalMap::new(&epoch, 1, at) };
+        let map = GlobalMap {
+            objects: objects.collect(),
+            ..GlobalMap::new(&epoch, 1, at)
+        };
         Ok(writeln!(self.maps, "{}", serde_json::to_string(&map)?)?)
     }
 }
 
 fn header() -> String {
-    let line = |cells: &mut dyn Iterator<Item = String>| format!("| {} |\n", cells.collect::<Vec<_>>().join(" | "));
-    let names = ["vehicles", "method"].into_iter().chain(FIGURES).map(str::to_owned);
+    let line = |cells: &mut dyn Iterator<Item = String>| {
+        format!("| {} |\n", cells.collect::<Vec<_>>().join(" | "))
+    };
+    let names = ["vehicles", "method"]
+        .into_iter()
+        .chain(FIGURES)
+        .map(str::to_owned);
     line(&mut names.clone()) + &line(&mut names.map(|_| "---".to_owned()))
 }
 
@@ -276,7 +378,10 @@ fn write_table(path: &Path, table: &str) -> anyhow::Result<()> {
     let text = fs::read_to_string(path).with_context(|| path.display().to_string())?;
     let (before, rest) = text.split_once(BEGIN).context("no begin marker")?;
     let (_, after) = rest.split_once(END).context("no end marker")?;
-    Ok(fs::write(path, format!("{before}{BEGIN}{table}{END}{after}"))?)
+    Ok(fs::write(
+        path,
+        format!("{before}{BEGIN}{table}{END}{after}"),
+    )?)
 }
 
 fn main() -> anyhow::Result<()> {
@@ -295,16 +400,21 @@ fn main() -> anyhow::Result<()> {
             let mut rng = ChaCha8Rng::seed_from_u64(*seed);
             let recording = generate(&config, &mut || rng.random());
             let folder = options.recordings.as_ref();
-            let mut files =
-                folder.map(|folder| Files::new(folder, &format!("{name}-{seed}"), &recording)).transpose()?;
+            let mut files = folder
+                .map(|folder| Files::new(folder, &format!("{name}-{seed}"), &recording))
+                .transpose()?;
             let mut written = Ok(());
             let mut write = |at, said: &[SaidObject]| {
                 if let (Some(files), Ok(())) = (&mut files, &written) {
                     written = files.map(at, said);
                 }
             };
-            let ids: BTreeSet<usize> =
-                recording.truth.frames.iter().flat_map(|frame| frame.objects.iter().map(|object| object.id)).collect();
+            let ids: BTreeSet<usize> = recording
+                .truth
+                .frames
+                .iter()
+                .flat_map(|frame| frame.objects.iter().map(|object| object.id))
+                .collect();
             let scores = run(&recording, config.observers + config.standing, &mut write)?;
             written?;
             calibrations.extend(scores.last().map(|ecod| ecod.calibration.clone()));
@@ -316,9 +426,16 @@ fn main() -> anyhow::Result<()> {
         }
         for (method, figures) in METHODS.iter().zip(&mean) {
             let (shares, others) = figures.split_at(PERCENTAGES);
-            let shares =
-                shares.iter().map(|figure| if figure.is_nan() { "–".to_owned() } else { format!("{figure:.1}") });
-            let cells: Vec<String> = shares.chain(others.iter().map(|figure| format!("{figure:.2}"))).collect();
+            let shares = shares.iter().map(|figure| {
+                if figure.is_nan() {
+                    "–".to_owned()
+                } else {
+                    format!("{figure:.1}")
+                }
+            });
+            let cells: Vec<String> = shares
+                .chain(others.iter().map(|figure| format!("{figure:.2}")))
+                .collect();
             let row = format!("| {name} | {method} | {} |\n", cells.join(" | "));
             print!("{row}");
             table.push_str(&row);

@@ -27,12 +27,19 @@ pub(crate) fn draw(path: &Path, stated: &[(String, Vec<ReliabilityBins>)]) -> an
     let (legend, panels) = area.split_vertically(30);
     for (number, (name, color)) in DRAWN.into_iter().enumerate() {
         let x = 20 + 130 * number as i32;
-        legend.draw(&PathElement::new([(x, 16), (x + 26, 16)], color.stroke_width(3)))?;
+        legend.draw(&PathElement::new(
+            [(x, 16), (x + 26, 16)],
+            color.stroke_width(3),
+        ))?;
         legend.draw(&Text::new(name, (x + 34, 8), ("sans-serif", 16)))?;
     }
     let confidence = |calibration: &ReliabilityBins| calibration.confidence.bins.clone();
     let existence = |calibration: &ReliabilityBins| {
-        calibration.existence.as_ref().map(|existence| existence.bins.clone()).unwrap_or_default()
+        calibration
+            .existence
+            .as_ref()
+            .map(|existence| existence.bins.clone())
+            .unwrap_or_default()
     };
     let kinds: [(&str, BinsOf); 2] = [("confidence", &confidence), ("existence", &existence)];
     for (panel, (kind, bins)) in panels.split_evenly((1, 2)).iter().zip(kinds) {
@@ -51,12 +58,22 @@ pub(crate) fn draw(path: &Path, stated: &[(String, Vec<ReliabilityBins>)]) -> an
             .y_desc("right %")
             .light_line_style(WHITE)
             .draw()?;
-        chart.draw_series(LineSeries::new([(0.0, 0.0), (100.0, 100.0)], BLACK.mix(0.4)))?;
+        chart.draw_series(LineSeries::new(
+            [(0.0, 0.0), (100.0, 100.0)],
+            BLACK.mix(0.4),
+        ))?;
         for (name, color) in DRAWN {
-            let of_scene = stated.iter().filter(|(scene, _)| scene == name).flat_map(|(_, seeds)| seeds);
+            let of_scene = stated
+                .iter()
+                .filter(|(scene, _)| scene == name)
+                .flat_map(|(_, seeds)| seeds);
             let points = pooled(of_scene.flat_map(bins));
             chart.draw_series(LineSeries::new(points.clone(), color.stroke_width(2)))?;
-            chart.draw_series(points.into_iter().map(|at| Circle::new(at, 3, color.filled())))?;
+            chart.draw_series(
+                points
+                    .into_iter()
+                    .map(|at| Circle::new(at, 3, color.filled())),
+            )?;
         }
     }
     area.present()?;
@@ -69,7 +86,12 @@ type BinsOf<'a> = &'a dyn Fn(&ReliabilityBins) -> Vec<ReliabilityBin>;
 /// Stated and right percentages of the bins of several recordings together.
 fn pooled(bins: impl Iterator<Item = ReliabilityBin>) -> Vec<(f64, f64)> {
     let mut sums = [(0u64, 0.0, 0.0); BINS];
-    for ReliabilityBin { stated_pct, right_pct, objects } in bins {
+    for ReliabilityBin {
+        stated_pct,
+        right_pct,
+        objects,
+    } in bins
+    {
         let bin = ((stated_pct / 100.0 * BINS as f64) as usize).min(BINS - 1);
         let (count, stated, right) = &mut sums[bin];
         *count += objects;
@@ -77,5 +99,7 @@ fn pooled(bins: impl Iterator<Item = ReliabilityBin>) -> Vec<(f64, f64)> {
         *right += right_pct * objects as f64;
     }
     let filled = sums.into_iter().filter(|(count, ..)| *count >= MIN_OBJECTS);
-    filled.map(|(count, stated, right)| (stated / count as f64, right / count as f64)).collect()
+    filled
+        .map(|(count, stated, right)| (stated / count as f64, right / count as f64))
+        .collect()
 }

@@ -43,7 +43,11 @@ pub(crate) struct Record {
 
 impl Cell {
     pub(crate) fn new() -> anyhow::Result<Self> {
-        Ok(Self { directory: tempfile::tempdir()?, runs: 0, nodes: BTreeMap::new() })
+        Ok(Self {
+            directory: tempfile::tempdir()?,
+            runs: 0,
+            nodes: BTreeMap::new(),
+        })
     }
 
     /// Starts a node that finds the others by their addresses; a vehicle begins to report.
@@ -54,20 +58,36 @@ impl Cell {
             role,
             listen: Some(([127, 0, 0, 1], 0).into()),
             state_dir: Some(self.directory.path().join("state")),
-            map_log: Some(self.directory.path().join(format!("{name}.{}.maps", self.runs))),
-            landmarks: PLACES.map(|(id, x_m)| LandmarkConfig::at(id, x_m, 0.0)).into(),
+            map_log: Some(
+                self.directory
+                    .path()
+                    .join(format!("{name}.{}.maps", self.runs)),
+            ),
+            landmarks: PLACES
+                .map(|(id, x_m)| LandmarkConfig::at(id, x_m, 0.0))
+                .into(),
             ..NodeConfig::default()
         };
         config.membership.bind = Some(([127, 0, 0, 1], 0).into());
         config.membership.multicast.enabled = false;
         config.dashboard.enabled = false;
-        let addresses = self.nodes.values().filter_map(|(node, _)| node.gossip_address());
+        let addresses = self
+            .nodes
+            .values()
+            .filter_map(|(node, _)| node.gossip_address());
         config.membership.seeds = addresses.map(|address| address.to_string()).collect();
         config.validate()?;
-        let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()?;
         let node = runtime.spawn(node::start(config)).await??;
         if let Some((_, seen)) = SEEN.iter().find(|(vehicle, _)| *vehicle == name) {
-            runtime.spawn(report(NodeName::new(name)?, seen, node.slots().gateway.clone()));
+            runtime.spawn(report(
+                NodeName::new(name)?,
+                seen,
+                node.slots().gateway.clone(),
+            ));
         }
         self.nodes.insert(name, (node, runtime));
         Ok(())
@@ -82,22 +102,45 @@ impl Cell {
         };
         let mut epochs = self.nodes.values().map(epoch);
         let first = epochs.next()??;
-        epochs.all(|epoch| epoch.as_ref() == Some(&first)).then_some(first)
+        epochs
+            .all(|epoch| epoch.as_ref() == Some(&first))
+            .then_some(first)
     }
 
     /// Labels of each place by the map, and by the votes.
     pub(crate) fn agreed(&self) -> (String, String) {
-        let Some((node, _)) = self.nodes.values().next() else { return Default::default() };
-        let map = node.newest_map().borrow().as_ref().map(|newest| Arc::clone(&newest.map));
-        let verdicts = node.newest_verdicts().borrow().as_ref().map(|newest| Arc::clone(&newest.message));
-        let map = map.iter().flat_map(|map| &map.landmarks).map(|place| match &place.label {
-            Some(label) => label.to_string(),
-            None if place.observers.is_empty() => "?".into(),
-            None => "-".into(),
-        });
+        let Some((node, _)) = self.nodes.values().next() else {
+            return Default::default();
+        };
+        let map = node
+            .newest_map()
+            .borrow()
+            .as_ref()
+            .map(|newest| Arc::clone(&newest.map));
+        let verdicts = node
+            .newest_verdicts()
+            .borrow()
+            .as_ref()
+            .map(|newest| Arc::clone(&newest.message));
+        let map = map
+            .iter()
+            .flat_map(|map| &map.landmarks)
+            .map(|place| match &place.label {
+                Some(label) => label.to_string(),
+                None if place.observers.is_empty() => "?".into(),
+                None => "-".into(),
+            });
         let votes = verdicts.iter().flat_map(|verdicts| &verdicts.verdicts);
-        let votes = votes.map(|verdict| verdict.label.as_ref().map_or("?".into(), ToString::to_string));
-        (map.collect::<Vec<_>>().join(" "), votes.collect::<Vec<_>>().join(" "))
+        let votes = votes.map(|verdict| {
+            verdict
+                .label
+                .as_ref()
+                .map_or("?".into(), ToString::to_string)
+        });
+        (
+            map.collect::<Vec<_>>().join(" "),
+            votes.collect::<Vec<_>>().join(" "),
+        )
     }
 
     /// Maps that all nodes took from then on, by their logs.
@@ -110,10 +153,23 @@ impl Cell {
             }
             // The last line of a killed node may be cut short.
             let text = std::fs::read_to_string(&path)?;
-            let maps: Vec<ReceivedMap> = text.lines().map_while(|line| serde_json::from_str(line).ok()).collect();
-            let place = |m: &ReceivedMap| (Epoch::new(m.map.epoch, m.map.aggregator.clone()), m.map.round);
-            for [before, after] in maps.array_windows().filter(|[_, after]| after.received_at >= from) {
-                record.gap_ms = record.gap_ms.max(after.received_at.since(before.received_at).as_millis());
+            let maps: Vec<ReceivedMap> = text
+                .lines()
+                .map_while(|line| serde_json::from_str(line).ok())
+                .collect();
+            let place = |m: &ReceivedMap| {
+                (
+                    Epoch::new(m.map.epoch, m.map.aggregator.clone()),
+                    m.map.round,
+                )
+            };
+            for [before, after] in maps
+                .array_windows()
+                .filter(|[_, after]| after.received_at >= from)
+            {
+                record.gap_ms = record
+                    .gap_ms
+                    .max(after.received_at.since(before.received_at).as_millis());
                 record.missed += after.map.round.saturating_sub(before.map.round + 1);
                 record.stale += usize::from(place(after) <= place(before));
             }
@@ -123,7 +179,10 @@ impl Cell {
 
     /// Ends all tasks of a node where they are; its connections break, and nobody is told.
     pub(crate) fn kill(&mut self, name: &str) -> anyhow::Result<()> {
-        let (node, runtime) = self.nodes.remove(name).with_context(|| format!("{name} is not there"))?;
+        let (node, runtime) = self
+            .nodes
+            .remove(name)
+            .with_context(|| format!("{name} is not there"))?;
         runtime.shutdown_background();
         drop(node);
         Ok(())
@@ -154,7 +213,10 @@ async fn report(node: NodeName, seen: &[(usize, &str)], gateway: ActorSlot<Gatew
             ..ObjectReport::new(node.clone(), seq, clock::now())
         });
         for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
-            gateway.send(GatewayMessage::PublishReport { kind, report: Arc::clone(&report) });
+            gateway.send(GatewayMessage::PublishReport {
+                kind,
+                report: Arc::clone(&report),
+            });
         }
     }
 }

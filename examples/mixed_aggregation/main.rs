@@ -59,13 +59,19 @@ const PATIENCE: Duration = Duration::from_secs(20);
 const CALM: Duration = Duration::from_secs(2);
 
 fn main() -> anyhow::Result<()> {
-    let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    let runtime = Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()?;
     runtime.block_on(async {
         let mut cell = Cell::new()?;
         let outcome = play(&mut cell).await;
         let total = cell.record(Timestamp(0))?;
         cell.stop().await;
-        println!("\nlongest gap {} ms, {} rounds missed, {} stale accepted", total.gap_ms, total.missed, total.stale);
+        println!(
+            "\nlongest gap {} ms, {} rounds missed, {} stale accepted",
+            total.gap_ms, total.missed, total.stale
+        );
         outcome?;
         ensure!(total.stale == 0, "superseded maps were accepted");
         Ok(())
@@ -76,7 +82,10 @@ fn main() -> anyhow::Result<()> {
 async fn play(cell: &mut Cell) -> anyhow::Result<()> {
     let started = clock::now();
     let age = || clock::now().since(started).as_secs_f64();
-    println!("{:>7}  {:<34}{:>8}  {:<20}votes", "time", "event", "gap", "map");
+    println!(
+        "{:>7}  {:<34}{:>8}  {:<20}votes",
+        "time", "event", "gap", "map"
+    );
     for step in SCRIPT {
         let from = clock::now();
         println!("{:>5.1} s  {}", age(), carry_out(&step, cell).await?);
@@ -85,7 +94,10 @@ async fn play(cell: &mut Cell) -> anyhow::Result<()> {
         let recovered_at = age();
         tokio::time::sleep(CALM).await;
         let (Record { gap_ms, .. }, (map, votes)) = (cell.record(from)?, cell.agreed());
-        println!("{recovered_at:>5.1} s  {:<34}{gap_ms:>5} ms  {map:<20}{votes}", format!("{epoch} leads"));
+        println!(
+            "{recovered_at:>5.1} s  {:<34}{gap_ms:>5} ms  {map:<20}{votes}",
+            format!("{epoch} leads")
+        );
     }
     Ok(())
 }
@@ -97,7 +109,10 @@ async fn carry_out(step: &Step, cell: &mut Cell) -> anyhow::Result<String> {
             "edge started".into()
         }
         Step::StartVehicles => {
-            let missing = SEEN.iter().map(|(name, _)| *name).filter(|name| !cell.nodes.contains_key(name));
+            let missing = SEEN
+                .iter()
+                .map(|(name, _)| *name)
+                .filter(|name| !cell.nodes.contains_key(name));
             let missing: Vec<_> = missing.collect();
             for name in &missing {
                 cell.start(name, Role::Auto).await?;

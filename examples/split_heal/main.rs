@@ -43,7 +43,10 @@ const NOTICE_MS: u64 = 300;
 
 fn main() -> anyhow::Result<()> {
     let mut cell = Cell::new();
-    println!("{:>7}  {:<26}{:<37}map at turing", "time", "event", "map at gauss");
+    println!(
+        "{:>7}  {:<26}{:<37}map at turing",
+        "time", "event", "map at gauss"
+    );
     cell.split(false, "the vehicles start")?;
     cell.run_for(7700)?;
     cell.tell("all is well");
@@ -77,10 +80,21 @@ impl Cell {
         fusion.vote.weighted.freshness_s = 0.5;
         let landmarks = PLACES.map(|(id, x_m)| Landmark::from(&LandmarkConfig::at(id, x_m, 0.0)));
         let vehicle = |(index, (name, _)): (u8, (&'static str, _))| {
-            Vehicle::new(NodeName::from_static(name), index, fusion.clone(), landmarks.to_vec(), START)
+            Vehicle::new(
+                NodeName::from_static(name),
+                index,
+                fusion.clone(),
+                landmarks.to_vec(),
+                START,
+            )
         };
         let vehicles = (1..).zip(SEEN).map(vehicle).collect();
-        Self { now: START, vehicles, packets: VecDeque::new(), is_split: false }
+        Self {
+            now: START,
+            vehicles,
+            packets: VecDeque::new(),
+            is_split: false,
+        }
     }
 
     /// Cuts or mends the links between the halves; the memberships find out a while later.
@@ -90,7 +104,10 @@ impl Cell {
         self.run_for(NOTICE_MS)?;
         for node in 0..SEEN.len() {
             for other in (0..SEEN.len()).filter(|other| *other != node) {
-                let (member, is_linked) = (self.vehicles[other].as_member(), self.is_linked(node, other));
+                let (member, is_linked) = (
+                    self.vehicles[other].as_member(),
+                    self.is_linked(node, other),
+                );
                 self.vehicles[node].notice(member, is_linked, self.now);
             }
         }
@@ -104,7 +121,10 @@ impl Cell {
     fn run_for(&mut self, ms: u64) -> anyhow::Result<()> {
         for _ in 0..ms {
             self.now = self.now + TRAVEL;
-            while let Some(Packet { from, to, payload, .. }) = self.packets.pop_front_if(|next| next.due <= self.now) {
+            while let Some(Packet {
+                from, to, payload, ..
+            }) = self.packets.pop_front_if(|next| next.due <= self.now)
+            {
                 let sender = self.vehicles[from].name.clone();
                 self.vehicles[to].receive(&sender, &payload, self.now)?;
             }
@@ -123,9 +143,16 @@ impl Cell {
     fn post(&mut self, from: usize) {
         for (addressee, payload) in std::mem::take(&mut self.vehicles[from].outbox) {
             for to in (0..SEEN.len()).filter(|to| *to != from) {
-                let is_meant = addressee.as_ref().is_none_or(|name| *name == self.vehicles[to].name);
+                let is_meant = addressee
+                    .as_ref()
+                    .is_none_or(|name| *name == self.vehicles[to].name);
                 if is_meant && self.is_linked(from, to) {
-                    self.packets.push_back(Packet { due: self.now + TRAVEL, from, to, payload: payload.clone() });
+                    self.packets.push_back(Packet {
+                        due: self.now + TRAVEL,
+                        from,
+                        to,
+                        payload: payload.clone(),
+                    });
                 }
             }
         }
@@ -137,32 +164,68 @@ impl Cell {
     /// Says what happened and what map each side has.
     fn tell(&self, event: &str) {
         let view = |vehicle: &Vehicle| {
-            let Some(map) = &vehicle.map else { return "none".to_owned() };
-            let labels = map.landmarks.iter().map(|place| place.label.as_deref().unwrap_or("?"));
-            format!("{}@{} #{} {}", map.aggregator, map.epoch, map.round, labels.collect::<Vec<_>>().join(" "))
+            let Some(map) = &vehicle.map else {
+                return "none".to_owned();
+            };
+            let labels = map
+                .landmarks
+                .iter()
+                .map(|place| place.label.as_deref().unwrap_or("?"));
+            format!(
+                "{}@{} #{} {}",
+                map.aggregator,
+                map.epoch,
+                map.round,
+                labels.collect::<Vec<_>>().join(" ")
+            )
         };
         let seconds = self.now.since(START).as_secs_f64();
-        println!("{seconds:>5.2} s  {event:<26}{:<37}{}", view(&self.vehicles[1]), view(&self.vehicles[3]));
+        println!(
+            "{seconds:>5.2} s  {event:<26}{:<37}{}",
+            view(&self.vehicles[1]),
+            view(&self.vehicles[3])
+        );
     }
 
     /// One leads, all have its map, and every ledger holds what was settled in every leadership once.
     fn check(&self) -> anyhow::Result<()> {
         println!("\nvotes settled, and in the ledgers of the vehicles");
-        let settled: BTreeMap<_, _> = self.vehicles.iter().flat_map(|vehicle| &vehicle.settled).collect();
+        let settled: BTreeMap<_, _> = self
+            .vehicles
+            .iter()
+            .flat_map(|vehicle| &vehicle.settled)
+            .collect();
         for (epoch, settled) in settled {
             let held = |vehicle: &Vehicle| {
-                let lane = vehicle.ledger.entries().filter(|e| e.epoch == epoch.term && e.aggregator == epoch.leader);
-                lane.map(|entry| entry.correct + entry.incorrect).sum::<u64>()
+                let lane = vehicle
+                    .ledger
+                    .entries()
+                    .filter(|e| e.epoch == epoch.term && e.aggregator == epoch.leader);
+                lane.map(|entry| entry.correct + entry.incorrect)
+                    .sum::<u64>()
             };
             let held: Vec<_> = self.vehicles.iter().map(held).collect();
             println!("{:<10}{settled:>4}  {held:?}", epoch.to_string());
             ensure!(*settled > 0, "{epoch} settled nothing");
-            ensure!(held.iter().all(|held| held == settled), "evidence of {epoch} was lost or counted twice");
+            ensure!(
+                held.iter().all(|held| held == settled),
+                "evidence of {epoch} was lost or counted twice"
+            );
         }
-        let leaders = self.vehicles.iter().filter(|vehicle| vehicle.leadership.is_leading()).count();
-        let sources = self.vehicles.iter().map(|vehicle| vehicle.map.as_ref().map(|map| (map.epoch, &map.aggregator)));
+        let leaders = self
+            .vehicles
+            .iter()
+            .filter(|vehicle| vehicle.leadership.is_leading())
+            .count();
+        let sources = self
+            .vehicles
+            .iter()
+            .map(|vehicle| vehicle.map.as_ref().map(|map| (map.epoch, &map.aggregator)));
         let sources: BTreeSet<_> = sources.collect();
-        ensure!(leaders == 1 && sources.len() == 1, "{leaders} lead, and maps come from {sources:?}");
+        ensure!(
+            leaders == 1 && sources.len() == 1,
+            "{leaders} lead, and maps come from {sources:?}"
+        );
         Ok(())
     }
 }
@@ -176,6 +239,10 @@ fn report(node: usize, now: Timestamp) -> ObjectReport {
     };
     ObjectReport {
         objects: seen.map(object).into(),
-        ..ObjectReport::new(NodeName::from_static(name), now.since(START).as_millis() as u64, now)
+        ..ObjectReport::new(
+            NodeName::from_static(name),
+            now.since(START).as_millis() as u64,
+            now,
+        )
     }
 }

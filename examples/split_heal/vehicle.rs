@@ -20,8 +20,8 @@ use ecod::model::time::Timestamp;
 use ecod::perception::landmark::Landmark;
 use ecod::reputation::ReputationLedger;
 use ecod::wire::{
-    Encoding, GlobalMap, LedgerShare, Limits, NodeStatus, ObjectReport, ReportKind, Role, decode, decode_report,
-    decode_share, encode,
+    Encoding, GlobalMap, LedgerShare, Limits, NodeStatus, ObjectReport, ReportKind, Role, decode,
+    decode_report, decode_share, encode,
 };
 use uuid::Uuid;
 
@@ -73,7 +73,10 @@ impl Vehicle {
     ) -> Self {
         let settings = NodeSettings {
             election: ElectionConfig::default(),
-            plane: DataPlane { external: None, embedded: true },
+            plane: DataPlane {
+                external: None,
+                embedded: true,
+            },
             round_period: Duration::from_secs_f64(fusion.round.period_s),
             keeps_reputations: true,
             status: NodeStatus::starting(name.clone(), Uuid::nil(), Role::Auto, ""),
@@ -96,14 +99,30 @@ impl Vehicle {
             name,
             index,
         };
-        vehicle.handle(Input::OwnBroker { address: Some(broker(index)) }, now);
-        vehicle.handle(Input::LinkChanged { broker: broker(index).into(), state: LinkState::Up }, now);
+        vehicle.handle(
+            Input::OwnBroker {
+                address: Some(broker(index)),
+            },
+            now,
+        );
+        vehicle.handle(
+            Input::LinkChanged {
+                broker: broker(index).into(),
+                state: LinkState::Up,
+            },
+            now,
+        );
         vehicle
     }
 
     pub(crate) fn as_member(&self) -> SeenMember {
         let broker = Some(broker(self.index).into());
-        SeenMember { name: self.name.clone(), run: 1, broker, is_on_this_machine: false }
+        SeenMember {
+            name: self.name.clone(),
+            run: 1,
+            broker,
+            is_on_this_machine: false,
+        }
     }
 
     /// Takes the membership's news of another vehicle.
@@ -123,7 +142,10 @@ impl Vehicle {
         }
         if now >= self.tick_at {
             self.tick_at = now + SHARE_PERIOD;
-            let shares = self.resync.tick(&mut self.ledger, &self.leadership, now).shares;
+            let shares = self
+                .resync
+                .tick(&mut self.ledger, &self.leadership, now)
+                .shares;
             self.share(&shares);
         }
         self.alarm = self.alarm.min(self.aggregator.deadline());
@@ -136,14 +158,28 @@ impl Vehicle {
         fused.map_or(Ok(()), |fused| self.publish(fused, now))
     }
 
-    pub(crate) fn receive(&mut self, from: &NodeName, payload: &Payload, now: Timestamp) -> anyhow::Result<()> {
+    pub(crate) fn receive(
+        &mut self,
+        from: &NodeName,
+        payload: &Payload,
+        now: Timestamp,
+    ) -> anyhow::Result<()> {
         let limits = Limits::default();
         match payload {
             Payload::Election(bytes) => {
                 let message = ElectionMessage::decode(bytes)?;
-                self.handle(Input::Receive { from: from.clone(), rights: Rights::ALL, message }, now);
+                self.handle(
+                    Input::Receive {
+                        from: from.clone(),
+                        rights: Rights::ALL,
+                        message,
+                    },
+                    now,
+                );
             }
-            Payload::Report(kind, bytes) => self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?,
+            Payload::Report(kind, bytes) => {
+                self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?
+            }
             Payload::Map(bytes) => self.accept(decode(bytes, &limits)?, now),
             Payload::Evidence(bytes) => self.merge(&decode_share(bytes, from, &limits)?, now),
         }
@@ -154,49 +190,90 @@ impl Vehicle {
     pub(crate) fn report(&mut self, report: ObjectReport, now: Timestamp) -> anyhow::Result<()> {
         let report = Arc::new(report);
         for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
-            self.outbox.push((None, Payload::Report(kind, encode(&*report, Encoding::Cbor))));
+            self.outbox.push((
+                None,
+                Payload::Report(kind, encode(&*report, Encoding::Cbor)),
+            ));
             self.fuse(kind, &report, now)?;
         }
         Ok(())
     }
 
-    fn fuse(&mut self, kind: ReportKind, report: &Arc<ObjectReport>, now: Timestamp) -> anyhow::Result<()> {
-        self.aggregator.report(kind, report, now)?.map_or(Ok(()), |fused| self.publish(fused, now))
+    fn fuse(
+        &mut self,
+        kind: ReportKind,
+        report: &Arc<ObjectReport>,
+        now: Timestamp,
+    ) -> anyhow::Result<()> {
+        self.aggregator
+            .report(kind, report, now)?
+            .map_or(Ok(()), |fused| self.publish(fused, now))
     }
 
     /// Publishes a round of its own, and keeps what the round says of vehicles in the lane of its epoch.
     fn publish(&mut self, fused: Fused, now: Timestamp) -> anyhow::Result<()> {
-        let Fused { epoch, map, evidence, .. } = fused;
+        let Fused {
+            epoch,
+            map,
+            evidence,
+            ..
+        } = fused;
         let shares = self.resync.record(&epoch, &evidence, &mut self.ledger);
         self.share(&shares);
         *self.settled.entry(epoch).or_default() += evidence.len() as u64;
         let map = map.context("PACE does not run")?;
-        self.outbox.push((None, Payload::Map(encode(&map, Encoding::Cbor))));
+        self.outbox
+            .push((None, Payload::Map(encode(&map, Encoding::Cbor))));
         self.accept(map, now);
         Ok(())
     }
 
     /// Takes a map that its filter accepts.
     fn accept(&mut self, map: GlobalMap, now: Timestamp) {
-        let Ok(accepted) = self.filter.accept_map(&map, Origin::Claimed, now, &self.leadership) else { return };
+        let Ok(accepted) = self
+            .filter
+            .accept_map(&map, Origin::Claimed, now, &self.leadership)
+        else {
+            return;
+        };
         self.map = Some(map);
-        self.handle(Input::RoundAccepted { epoch: accepted.epoch, round: accepted.round }, now);
+        self.handle(
+            Input::RoundAccepted {
+                epoch: accepted.epoch,
+                round: accepted.round,
+            },
+            now,
+        );
     }
 
     fn merge(&mut self, share: &LedgerShare, now: Timestamp) {
         let candidates: Vec<_> = self.members.keys().cloned().collect();
-        let Ok(merged) = self.resync.merge(share, &mut self.ledger, &candidates, &self.leadership, now, now) else {
+        let Ok(merged) = self.resync.merge(
+            share,
+            &mut self.ledger,
+            &candidates,
+            &self.leadership,
+            now,
+            now,
+        ) else {
             return;
         };
         if merged.is_news {
             self.aggregator.adopt(&self.ledger);
         }
         self.share(&merged.shares);
-        self.handle(Input::EvidenceReceived { from: share.node.clone() }, now);
+        self.handle(
+            Input::EvidenceReceived {
+                from: share.node.clone(),
+            },
+            now,
+        );
     }
 
     fn share(&mut self, shares: &[LedgerShare]) {
-        let shares = shares.iter().map(|share| (None, Payload::Evidence(encode(share, Encoding::Cbor))));
+        let shares = shares
+            .iter()
+            .map(|share| (None, Payload::Evidence(encode(share, Encoding::Cbor))));
         self.outbox.extend(shares);
     }
 
@@ -213,10 +290,15 @@ impl Vehicle {
     fn carry_out(&mut self, effect: Effect, now: Timestamp) -> Option<Input> {
         match effect {
             Effect::Send { to, message } => {
-                self.outbox.push((Some(to), Payload::Election(message.encode(Encoding::Cbor))));
+                self.outbox
+                    .push((Some(to), Payload::Election(message.encode(Encoding::Cbor))));
             }
             Effect::TellLeadership { leadership } => self.leadership = leadership,
-            Effect::Lead { epoch, first_round, first } => {
+            Effect::Lead {
+                epoch,
+                first_round,
+                first,
+            } => {
                 self.news.push(format!("{epoch} leads from #{first_round}"));
                 self.resync.lead(epoch.clone());
                 self.aggregator.lead(epoch, first_round, first, now);
@@ -231,10 +313,17 @@ impl Vehicle {
             Effect::SendSnapshot { .. } => self.share(&self.resync.snapshot(&self.ledger)),
             Effect::Look => {
                 let members = self.members.values().cloned().collect();
-                return Some(Input::Looked { rounds_due: self.rounds_due, load_percent: 0, members });
+                return Some(Input::Looked {
+                    rounds_due: self.rounds_due,
+                    load_percent: 0,
+                    members,
+                });
             }
             Effect::AskParts => {
-                let brokers = self.members.values().filter_map(|member| member.broker.clone());
+                let brokers = self
+                    .members
+                    .values()
+                    .filter_map(|member| member.broker.clone());
                 let brokers = brokers.chain([broker(self.index).into()]);
                 let links = brokers.map(|broker| (broker, LinkState::Up)).collect();
                 let sample = HealthSample {

@@ -16,7 +16,8 @@ use ecod::perception::landmark::Landmark;
 use ecod::tracking::TracksMode;
 use ecod::vote::VoteMode;
 use ecod::wire::{
-    Encoding, FieldOfView, Limits, ObjectReport, Payload, PerceivedObject, ReportKind, WirePose, decode_entries, encode,
+    Encoding, FieldOfView, Limits, ObjectReport, Payload, PerceivedObject, ReportKind, WirePose,
+    decode_entries, encode,
 };
 use libfuzzer_sys::arbitrary::{self, Arbitrary};
 use libfuzzer_sys::fuzz_target;
@@ -66,27 +67,58 @@ fuzz_target!(|cell: Cell| {
     if cell.paper {
         (config.pace.mode, config.vote.mode) = (PaceMode::Paper, VoteMode::Paper);
     }
-    config.tracks.mode = if cell.tracks { TracksMode::On } else { TracksMode::Off };
+    config.tracks.mode = if cell.tracks {
+        TracksMode::On
+    } else {
+        TracksMode::Off
+    };
     let mut now = Timestamp(1_732_154_400_000_000);
     let landmarks = (0..cell.landmarks % 8).map(landmark).collect();
     let mut aggregator = Aggregator::new(NodeName::from_static("edge"), 1, config, landmarks, now);
     let mut epoch = 1;
     for (seq, step) in (1..).zip(cell.steps) {
         match step {
-            Step::Report { votes, vehicle, age_ms, pose, view, objects, seen } => {
+            Step::Report {
+                votes,
+                vehicle,
+                age_ms,
+                pose,
+                view,
+                objects,
+                seen,
+            } => {
                 let report = ObjectReport {
-                    pose: pose.map(|[x, y, heading]| WirePose::new(x.into(), y.into(), f64::from(heading) / 100.0)),
+                    pose: pose.map(|[x, y, heading]| {
+                        WirePose::new(x.into(), y.into(), f64::from(heading) / 100.0)
+                    }),
                     view: view.map(|(range, angle)| FieldOfView {
                         range_m: range.into(),
                         angle_rad: f64::from(angle) / 40.0,
                     }),
                     objects: objects.iter().map(object).collect(),
-                    seen: Some(seen.into_iter().map(|id| format!("l{}", id % 9).into()).collect()),
-                    ..ObjectReport::new(name(vehicle % 6), seq, now.shifted(-1000 * i64::from(age_ms)))
+                    seen: Some(
+                        seen.into_iter()
+                            .map(|id| format!("l{}", id % 9).into())
+                            .collect(),
+                    ),
+                    ..ObjectReport::new(
+                        name(vehicle % 6),
+                        seq,
+                        now.shifted(-1000 * i64::from(age_ms)),
+                    )
                 };
                 assert_valid(&report);
-                let kind = if votes { ReportKind::VoteDetections } else { ReportKind::Detections };
-                aggregator.report(kind, &Arc::new(report), now).ok().flatten().iter().for_each(check);
+                let kind = if votes {
+                    ReportKind::VoteDetections
+                } else {
+                    ReportKind::Detections
+                };
+                aggregator
+                    .report(kind, &Arc::new(report), now)
+                    .ok()
+                    .flatten()
+                    .iter()
+                    .for_each(check);
             }
             Step::Wait { ms } => {
                 now = now + Duration::from_millis(ms.into());
@@ -95,7 +127,12 @@ fuzz_target!(|cell: Cell| {
             Step::StepDown => aggregator.step_down(),
             Step::Lead => {
                 epoch += 1;
-                aggregator.lead(Epoch::new(epoch, NodeName::from_static("edge")), 1, FirstRound::OnTime, now);
+                aggregator.lead(
+                    Epoch::new(epoch, NodeName::from_static("edge")),
+                    1,
+                    FirstRound::OnTime,
+                    now,
+                );
             }
         }
     }
@@ -129,12 +166,18 @@ fn landmark(index: u8) -> Landmark {
 fn object(object: &Object) -> PerceivedObject {
     let unit = 10f64.powi(i32::from(object.scale % 8) - 3);
     // Up to the bounds of the wire format.
-    let [x_m, y_m] = object.at.map(|length| (f64::from(length) * unit).clamp(-1e8, 1e8));
+    let [x_m, y_m] = object
+        .at
+        .map(|length| (f64::from(length) * unit).clamp(-1e8, 1e8));
     let spread = |(xx, yy, correlation): (u16, u16, i8)| {
         let (xx, yy) = (f64::from(xx) * unit * unit, f64::from(yy) * unit * unit);
         [xx, f64::from(correlation) / 128.0 * (xx * yy).sqrt(), yy]
     };
-    let scores: BTreeMap<_, _> = object.scores.iter().map(|&(l, score)| (label(l), f64::from(score) / 255.0)).collect();
+    let scores: BTreeMap<_, _> = object
+        .scores
+        .iter()
+        .map(|&(l, score)| (label(l), f64::from(score) / 255.0))
+        .collect();
     PerceivedObject {
         covariance_m2: object.spread.map(spread),
         landmark: object.landmark.map(|id| format!("l{}", id % 9).into()),
@@ -142,7 +185,12 @@ fn object(object: &Object) -> PerceivedObject {
         heading_rad: object.heading.map(|heading| f64::from(heading) / 20.0),
         size_m: None,
         scores,
-        ..PerceivedObject::new(label(object.label), f64::from(object.confidence) / 255.0, x_m, y_m)
+        ..PerceivedObject::new(
+            label(object.label),
+            f64::from(object.confidence) / 255.0,
+            x_m,
+            y_m,
+        )
     }
 }
 

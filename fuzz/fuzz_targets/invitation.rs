@@ -11,12 +11,16 @@ use libfuzzer_sys::fuzz_target;
 const REQUEST: [&str; 2] = [r#"{"node":"gauss","secret":"00","request":""#, "\"}\n"];
 
 fuzz_target!(|input: &[u8]| {
-    let Some((kind, bytes)) = input.split_first() else { return };
+    let Some((kind, bytes)) = input.split_first() else {
+        return;
+    };
     match kind % 4 {
         0 => drop(read_request(bytes)),
         1 => {
             let pem = String::from_utf8_lossy(bytes).replace('\n', "\\n");
-            drop(read_request([REQUEST[0], &pem, REQUEST[1]].concat().as_bytes()));
+            drop(read_request(
+                [REQUEST[0], &pem, REQUEST[1]].concat().as_bytes(),
+            ));
         }
         2 => drop(std::str::from_utf8(bytes).map(str::parse::<Token>)),
         _ => assert!(token_is_read_as_written(bytes)),

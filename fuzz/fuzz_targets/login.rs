@@ -7,6 +7,10 @@ use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|sent: &[u8]| {
     if let Some(length) = read_connect_packet(sent) {
-        assert_eq!(read_connect_packet(&sent[..length]), Some(length), "nothing beyond the packet is read");
+        assert_eq!(
+            read_connect_packet(&sent[..length]),
+            Some(length),
+            "nothing beyond the packet is read"
+        );
     }
 });

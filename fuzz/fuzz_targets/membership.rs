@@ -42,15 +42,25 @@ fuzz_target!(|input: (u8, Vec<Step>)| {
     let (cell, steps) = input;
     let proves = cell & 1 == 1;
     // A meeting costs as much as many other steps.
-    let mut listener = if cell & 0b1110 == 0 { Listener::meet(proves) } else { Listener::alone(proves) };
+    let mut listener = if cell & 0b1110 == 0 {
+        Listener::meet(proves)
+    } else {
+        Listener::alone(proves)
+    };
     for step in steps {
         match step {
             Step::Datagram(frame) => listener.hear(&frame),
             Step::Sealed { kind, body } => listener.hear_sealed(kind, &body),
             Step::Greeting { wants_session } => listener.hear_greeting(wants_session),
             Step::Challenge { edits } => listener.hear_challenge(&edits),
-            Step::Proof { message, attestation } => listener.hear_proof(&message, &attestation),
-            Step::Accept { message, attestation } => listener.hear_accept(&message, &attestation),
+            Step::Proof {
+                message,
+                attestation,
+            } => listener.hear_proof(&message, &attestation),
+            Step::Accept {
+                message,
+                attestation,
+            } => listener.hear_accept(&message, &attestation),
             Step::Wait { ms } => listener.wait(ms.into()),
         }
     }

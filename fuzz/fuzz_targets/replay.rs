@@ -13,7 +13,10 @@ fuzz_target!(|text: &[u8]| {
 
 fn replay(text: &[u8]) -> (Vec<FusedLine>, Summary) {
     let mut replay = Replay::new(ReplayConfig::default());
-    let mut fused: Vec<_> = text.split(|byte| *byte == b'\n').flat_map(|line| replay.line(line)).collect();
+    let mut fused: Vec<_> = text
+        .split(|byte| *byte == b'\n')
+        .flat_map(|line| replay.line(line))
+        .collect();
     let (last, summary) = replay.finish();
     fused.extend(last);
     (fused, summary)

@@ -9,7 +9,11 @@ fuzz_target!(|text: &str| {
     if let Ok(testbed) = Testbed::from_json(text) {
         for scene in &testbed.scenes {
             drop(scene.landmarks(&testbed.placard));
-            for (cav, spot) in scene.cavs.iter().flat_map(|cav| scene.spots.iter().map(move |spot| (cav, spot))) {
+            for (cav, spot) in scene
+                .cavs
+                .iter()
+                .flat_map(|cav| scene.spots.iter().map(move |spot| (cav, spot)))
+            {
                 let _ = testbed.sighting(scene, cav, spot);
             }
         }

@@ -20,30 +20,48 @@ use ecod_lab::eval::tracks::TrackTruth;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|input: &[u8]| {
-    let Some((kind, bytes)) = input.split_first() else { return };
+    let Some((kind, bytes)) = input.split_first() else {
+        return;
+    };
     let text = std::str::from_utf8(bytes).unwrap_or_default();
     match kind % 7 {
         0 => {
             if let Ok((_, stated)) = read_pose(bytes, Timestamp(0), 0)
                 && let Ok(pose) = stated.in_map(Some(&ORIGIN))
             {
-                assert!(pose.position.x.is_finite() && pose.position.y.is_finite() && pose.heading_rad.is_finite());
+                assert!(
+                    pose.position.x.is_finite()
+                        && pose.position.y.is_finite()
+                        && pose.heading_rad.is_finite()
+                );
             }
         }
         1 => {
             let detections = parse_detections(text).unwrap_or_default();
-            assert!(detections.iter().all(|detection| detection.bounding_box.is_valid()));
+            assert!(
+                detections
+                    .iter()
+                    .all(|detection| detection.bounding_box.is_valid())
+            );
         }
         2 => assert!(SIGNING.rejects_forgery("ecod/lot-1/detections/euclid", bytes)),
         3 => read_saved(bytes),
-        4 => drop((Truth::parse(text), TrackTruth::is_in(text), TrackTruth::parse(text))),
+        4 => drop((
+            Truth::parse(text),
+            TrackTruth::is_in(text),
+            TrackTruth::parse(text),
+        )),
         5 => assert!(splits_as_appended(bytes)),
         _ => drop(CertificateSubject::of(bytes)),
     }
 });
 
-const ORIGIN: GeographicOrigin =
-    GeographicOrigin { latitude_deg: 52.2, longitude_deg: 21.0, height_m: 113.0, rotation_deg: 30.0 };
+const ORIGIN: GeographicOrigin = GeographicOrigin {
+    latitude_deg: 52.2,
+    longitude_deg: 21.0,
+    height_m: 113.0,
+    rotation_deg: 30.0,
+};
 
 /// Of a cell that signs, by 64 hexadecimal digits, which need no stretching.
 static SIGNING: LazyLock<Security> = LazyLock::new(|| {

@@ -12,15 +12,23 @@ const HANDSHAKE: &[u8] = b"ET / HTTP/1.1\r\nHost: 127.0.0.1:1883\r\nConnection: 
 Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Protocol: mqtt\r\n\r\n";
 
 fuzz_target!(|input: &[u8]| {
-    let Some((kind, bytes)) = input.split_first() else { return };
+    let Some((kind, bytes)) = input.split_first() else {
+        return;
+    };
     match kind % 3 {
         0 => drop(read_websocket(bytes.to_vec())),
         1 => {
-            let content = read_websocket([HANDSHAKE, bytes].concat()).expect("the handshake is right");
-            assert!(content.len() <= bytes.len(), "no client says more than it sends");
+            let content =
+                read_websocket([HANDSHAKE, bytes].concat()).expect("the handshake is right");
+            assert!(
+                content.len() <= bytes.len(),
+                "no client says more than it sends"
+            );
         }
         _ => {
-            let frames = bytes.chunks(1 + usize::from(kind / 3)).flat_map(|part| frame(part, *kind));
+            let frames = bytes
+                .chunks(1 + usize::from(kind / 3))
+                .flat_map(|part| frame(part, *kind));
             let content = read_websocket(HANDSHAKE.iter().copied().chain(frames).collect());
             assert_eq!(content.as_deref(), Some(bytes), "it comes as it was sent");
         }
@@ -30,5 +38,8 @@ fuzz_target!(|input: &[u8]| {
 /// A whole binary message of at most 125 bytes, masked.
 fn frame(part: &[u8], mask: u8) -> Vec<u8> {
     let masked = part.iter().map(|byte| byte ^ mask);
-    [0x82, 0x80 | part.len() as u8, mask, mask, mask, mask].into_iter().chain(masked).collect()
+    [0x82, 0x80 | part.len() as u8, mask, mask, mask, mask]
+        .into_iter()
+        .chain(masked)
+        .collect()
 }

@@ -14,12 +14,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
-use ecod_client::{Cell, Error, ForeignMessage, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings};
+use ecod_client::{
+    Cell, Error, ForeignMessage, Frame, GlobalMap, Label, NodeName, ObjectReport, Settings,
+};
 
 use self::sightings::Sightings;
 use self::stations::StationPlaces;
 use crate::carrying::{Carry, Failures, RefusalCounts, is_within, lock, until_one_ends};
-use crate::cpm::{self, CpmCell, CpmError, ObjectIds, RECEIVED_PART, ReceivedCpm, Segments, StationIds};
+use crate::cpm::{
+    self, CpmCell, CpmError, ObjectIds, RECEIVED_PART, ReceivedCpm, Segments, StationIds,
+};
 
 /// Level of the map's topic below `cpm`.
 const MAP_LEVEL: &str = "global";
@@ -81,7 +85,10 @@ impl CpmBridge {
     pub fn connect(settings: Settings) -> Result<Self, Error> {
         let invalid = |error: &dyn std::fmt::Display| Error::Invalid(error.to_string());
         let name = NodeName::new(&settings.cell).map_err(|error| invalid(&error))?;
-        let cell = Cell::connect(Settings { part: "cpm".to_owned(), ..settings.clone() })?;
+        let cell = Cell::connect(Settings {
+            part: "cpm".to_owned(),
+            ..settings.clone()
+        })?;
         let described = described(&cell)?.ok_or_else(|| {
             Error::Invalid(format!(
                 "the description of the cell {name} has no [origin], and a CPM needs a reference position on Earth: add \
@@ -90,8 +97,20 @@ impl CpmBridge {
         })?;
         let described = Mutex::new((Instant::now(), Arc::new(described)));
         let numbers = Mutex::new(StationIds::new(name));
-        let (sightings, refusals, failures) = (Mutex::default(), RefusalCounts::default(), Failures::default());
-        Ok(Self { cell, settings, described, numbers, sightings, refusals, failures })
+        let (sightings, refusals, failures) = (
+            Mutex::default(),
+            RefusalCounts::default(),
+            Failures::default(),
+        );
+        Ok(Self {
+            cell,
+            settings,
+            described,
+            numbers,
+            sightings,
+            refusals,
+            failures,
+        })
     }
 
     /// Carries messages until the connection is closed.
@@ -102,8 +121,11 @@ impl CpmBridge {
     /// # Panics
     /// When one of its threads did.
     pub fn run(&self) -> Result<(), Error> {
-        let carry: Vec<Carry<'_, Error>> =
-            vec![Box::new(|| self.send_maps()), Box::new(|| self.send_reports()), Box::new(|| self.take_received())];
+        let carry: Vec<Carry<'_, Error>> = vec![
+            Box::new(|| self.send_maps()),
+            Box::new(|| self.send_reports()),
+            Box::new(|| self.take_received()),
+        ];
         until_one_ends(carry, || self.cell.close())
     }
 
@@ -125,7 +147,9 @@ impl CpmBridge {
             let Some(number) = number else { continue };
             let (described, now) = (self.described(), Instant::now());
             let sightings = lock(&self.sightings);
-            let encoded = cpm::encode_map(map, &described, number, &mut ids, |at| sightings.is_sighted(at, now));
+            let encoded = cpm::encode_map(map, &described, number, &mut ids, |at| {
+                sightings.is_sighted(at, now)
+            });
             drop(sightings);
             self.send(MAP_LEVEL, encoded)?;
         }
@@ -138,7 +162,9 @@ impl CpmBridge {
             lock(&self.sightings).observe(report, Instant::now());
             if report.node.as_str() == MAP_LEVEL {
                 if self.failures.begins("reports of global") {
-                    log::warn!("no reports of the node {MAP_LEVEL} are sent: cpm/{MAP_LEVEL} is the map's topic");
+                    log::warn!(
+                        "no reports of the node {MAP_LEVEL} are sent: cpm/{MAP_LEVEL} is the map's topic"
+                    );
                 }
                 continue;
             }
@@ -171,8 +197,11 @@ impl CpmBridge {
     }
 
     fn take_received(&self) -> Result<(), Error> {
-        let mut stations =
-            Stations { settings: &self.settings, places: StationPlaces::default(), connected: BTreeMap::new() };
+        let mut stations = Stations {
+            settings: &self.settings,
+            places: StationPlaces::default(),
+            connected: BTreeMap::new(),
+        };
         for message in self.cell.received_cpms() {
             let message: &ForeignMessage = &*message?;
             if let Err(refusal) = self.take(&mut stations, message) {
@@ -182,10 +211,18 @@ impl CpmBridge {
         Ok(())
     }
 
-    fn take(&self, stations: &mut Stations<'_>, message: &ForeignMessage) -> Result<(), CpmRefusal> {
+    fn take(
+        &self,
+        stations: &mut Stations<'_>,
+        message: &ForeignMessage,
+    ) -> Result<(), CpmRefusal> {
         let received = cpm::decode(&message.payload, &self.described().origin)?;
         if received.left_out > 0 {
-            log::debug!("cpm/received/{}: {} objects without a usable place", message.receiver, received.left_out);
+            log::debug!(
+                "cpm/received/{}: {} objects without a usable place",
+                message.receiver,
+                received.left_out
+            );
         }
         if lock(&self.numbers).contains(received.station_id, Instant::now()) {
             return Err(CpmRefusal::Own);
@@ -219,7 +256,8 @@ impl CpmBridge {
     /// Counts a message that became no report.
     fn note(&self, receiver: &NodeName, refusal: CpmRefusal) {
         let rest = (NodeName::from_static(OTHER_RECEIVERS), refusal);
-        if let Some(((receiver, _), count)) = self.refusals.note((receiver.clone(), refusal), rest) {
+        if let Some(((receiver, _), count)) = self.refusals.note((receiver.clone(), refusal), rest)
+        {
             log::warn!("no report from cpm/received/{receiver}: {refusal}; {count} so far");
         }
     }
@@ -227,15 +265,27 @@ impl CpmBridge {
 
 /// The cell by its description; `None` without an origin.
 fn described(cell: &Cell) -> Result<Option<CpmCell>, Error> {
-    let Some(origin) = cell.origin()? else { return Ok(None) };
-    Ok(Some(CpmCell { origin, vacancy_signs: vacancy_signs(&cell.description()?.text) }))
+    let Some(origin) = cell.origin()? else {
+        return Ok(None);
+    };
+    Ok(Some(CpmCell {
+        origin,
+        vacancy_signs: vacancy_signs(&cell.description()?.text),
+    }))
 }
 
 /// Labels of the vacancy signs at the known locations of a description.
 fn vacancy_signs(description: &str) -> BTreeSet<Label> {
     let settings: toml::Table = description.parse().unwrap_or_default();
-    let landmarks = settings.get("landmarks").and_then(toml::Value::as_array).into_iter().flatten();
-    landmarks.filter_map(|place| place.get("vacancy")?.get("label")?.as_str()).map(Label::new).collect()
+    let landmarks = settings
+        .get("landmarks")
+        .and_then(toml::Value::as_array)
+        .into_iter()
+        .flatten();
+    landmarks
+        .filter_map(|place| place.get("vacancy")?.get("label")?.as_str())
+        .map(Label::new)
+        .collect()
 }
 
 /// Connections in which stations report.
@@ -262,20 +312,35 @@ impl Stations<'_> {
         let station = match self.connected.entry(number) {
             Entry::Occupied(station) => station.into_mut(),
             Entry::Vacant(place) => {
-                let settings = Settings { part: format!("{RECEIVED_PART}{number}"), ..self.settings.clone() };
+                let settings = Settings {
+                    part: format!("{RECEIVED_PART}{number}"),
+                    ..self.settings.clone()
+                };
                 let cell = Cell::connect(settings).map_err(|error| {
                     log::debug!("{RECEIVED_PART}{number}: {error}");
                     CpmRefusal::NotConnected
                 })?;
-                place.insert(Station { cell, segments: Segments::default() })
+                place.insert(Station {
+                    cell,
+                    segments: Segments::default(),
+                })
             }
         };
-        let Some(whole) = station.segments.join(received)? else { return Ok(()) };
+        let Some(whole) = station.segments.join(received)? else {
+            return Ok(());
+        };
         if !self.places.take_room(number, now) {
             return Err(CpmRefusal::TooOften);
         }
-        let frame = Frame { captured_at: capture_time(&whole), ..Frame::new(whole.objects) };
-        station.cell.report(frame).map(drop).map_err(|_| CpmRefusal::Report)
+        let frame = Frame {
+            captured_at: capture_time(&whole),
+            ..Frame::new(whole.objects)
+        };
+        station
+            .cell
+            .report(frame)
+            .map(drop)
+            .map_err(|_| CpmRefusal::Report)
     }
 }
 

@@ -12,7 +12,10 @@ pub(crate) type Carry<'a, E> = Box<dyn Fn() -> Result<(), E> + Send + 'a>;
 
 /// Runs all at a time until one ends, which closes the others. A panic goes on here, so that the program does not end as if
 /// all were well.
-pub(crate) fn until_one_ends<E: Send>(carry: Vec<Carry<'_, E>>, close: impl Fn() + Sync) -> Result<(), E> {
+pub(crate) fn until_one_ends<E: Send>(
+    carry: Vec<Carry<'_, E>>,
+    close: impl Fn() + Sync,
+) -> Result<(), E> {
     let close = &close;
     thread::scope(|scope| {
         let begin = |carry: Carry<'_, E>| {
@@ -20,8 +23,13 @@ pub(crate) fn until_one_ends<E: Send>(carry: Vec<Carry<'_, E>>, close: impl Fn()
             close();
             ended.unwrap_or_else(|panic| resume_unwind(panic))
         };
-        let threads: Vec<_> = carry.into_iter().map(|carry| scope.spawn(move || begin(carry))).collect();
-        let ended = threads.into_iter().map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
+        let threads: Vec<_> = carry
+            .into_iter()
+            .map(|carry| scope.spawn(move || begin(carry)))
+            .collect();
+        let ended = threads
+            .into_iter()
+            .map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)));
         ended.fold(Ok(()), Result::and)
     })
 }
@@ -104,17 +112,34 @@ mod tests {
         assert!(catch_unwind(AssertUnwindSafe(begin)).is_err());
         is_closed.store(false, Ordering::Relaxed);
         let refuse = || Err("refused");
-        assert_eq!(until_one_ends(vec![Box::new(wait), Box::new(wait), Box::new(refuse)], close), Err("refused"));
+        assert_eq!(
+            until_one_ends(
+                vec![Box::new(wait), Box::new(wait), Box::new(refuse)],
+                close
+            ),
+            Err("refused")
+        );
     }
 
     #[test]
     fn all_refusals_are_counted_and_the_powers_of_ten_of_each_kind_are_told() {
         let refusals = RefusalCounts::default();
-        let told: Vec<_> = (0..1000).chain(0..1000).filter_map(|kind| refusals.note(kind, 9999)).collect();
+        let told: Vec<_> = (0..1000)
+            .chain(0..1000)
+            .filter_map(|kind| refusals.note(kind, 9999))
+            .collect();
         let first = (0..256).map(|kind| (kind, 1));
-        assert_eq!(told, first.chain([1, 10, 100, 1000].map(|count| (9999, count))).collect::<Vec<_>>());
+        assert_eq!(
+            told,
+            first
+                .chain([1, 10, 100, 1000].map(|count| (9999, count)))
+                .collect::<Vec<_>>()
+        );
         let counts = refusals.counts();
-        assert_eq!((counts.values().sum::<u64>(), counts.len(), counts[&9999]), (2000, 257, 1488));
+        assert_eq!(
+            (counts.values().sum::<u64>(), counts.len(), counts[&9999]),
+            (2000, 257, 1488)
+        );
     }
 
     #[test]

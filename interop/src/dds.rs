@@ -26,16 +26,16 @@ use rustdds::bytes::Bytes;
 use rustdds::no_key::{DataReader, DataWriter, SerializerAdapter};
 use rustdds::policy::{History, Reliability};
 use rustdds::{
-    DomainParticipant, DomainParticipantBuilder, QosPolicies, QosPolicyBuilder, RepresentationIdentifier, Topic,
-    TopicKind,
+    DomainParticipant, DomainParticipantBuilder, QosPolicies, QosPolicyBuilder,
+    RepresentationIdentifier, Topic, TopicKind,
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::carrying::{Carry, RefusalCounts, is_within, lock, until_one_ends};
 use crate::ros2::{
-    CameraInfo, Definition, Detection2DArray, Detection3DArray, PoseStamped, RosMessage, RosSink, encode, put_map,
-    put_report,
+    CameraInfo, Definition, Detection2DArray, Detection3DArray, PoseStamped, RosMessage, RosSink,
+    encode, put_map, put_report,
 };
 pub use detections::{InputRefusal, RosCamera};
 use detections::{RefusedInput, place_in_pictures, pose_in_map};
@@ -107,7 +107,9 @@ pub enum RosBridgeError {
     #[error("network {0}: no address of this machine; `ip address` shows them")]
     Network(IpAddr),
     /// A topic below `/ecod`, which a bridge publishes. As reports, what a cell says would confirm itself.
-    #[error("{0} is no detector's topic: below /ecod are those of bridges, by which a cell would confirm itself")]
+    #[error(
+        "{0} is no detector's topic: below /ecod are those of bridges, by which a cell would confirm itself"
+    )]
     OwnTopic(String),
     /// No part in the cell.
     #[error(transparent)]
@@ -158,16 +160,26 @@ impl RosBridge {
     /// # Errors
     /// [`RosBridgeError`] if either is not possible, or a topic to be taken is one of a bridge.
     pub fn connect(settings: Settings, ros: RosSettings) -> Result<Self, RosBridgeError> {
-        if let Some(own) = ros.taken().find(|topic| topic.trim_start_matches('/').starts_with("ecod/")) {
+        if let Some(own) = ros
+            .taken()
+            .find(|topic| topic.trim_start_matches('/').starts_with("ecod/"))
+        {
             return Err(RosBridgeError::OwnTopic(own.clone()));
         }
         if ros.domain > MAX_DOMAIN {
             return Err(RosBridgeError::Domain(ros.domain));
         }
-        if let Some(other) = ros.networks.iter().find(|address| UdpSocket::bind((**address, 0)).is_err()) {
+        if let Some(other) = ros
+            .networks
+            .iter()
+            .find(|address| UdpSocket::bind((**address, 0)).is_err())
+        {
             return Err(RosBridgeError::Network(*other));
         }
-        let cell = Cell::connect(Settings { part: PART.to_owned(), ..settings })?;
+        let cell = Cell::connect(Settings {
+            part: PART.to_owned(),
+            ..settings
+        })?;
         let mut participant = DomainParticipantBuilder::new(ros.domain);
         if !ros.networks.is_empty() {
             participant = participant.with_only_networks(ros.networks);
@@ -192,8 +204,10 @@ impl RosBridge {
     /// # Errors
     /// [`RosBridgeError`] when the node's broker refuses the bridge, or DDS a topic.
     pub fn run(&self) -> Result<(), RosBridgeError> {
-        let mut carry: Vec<Carry<'_, RosBridgeError>> =
-            vec![Box::new(|| self.send_maps()), Box::new(|| self.send_reports())];
+        let mut carry: Vec<Carry<'_, RosBridgeError>> = vec![
+            Box::new(|| self.send_maps()),
+            Box::new(|| self.send_reports()),
+        ];
         if self.input.is_some() {
             carry.push(Box::new(|| self.take_detections()));
         }
@@ -212,7 +226,10 @@ impl RosBridge {
     }
 
     fn send_maps(&self) -> Result<(), RosBridgeError> {
-        let mut topics = LiveTopics { participant: &self.participant, topics: BTreeMap::new() };
+        let mut topics = LiveTopics {
+            participant: &self.participant,
+            topics: BTreeMap::new(),
+        };
         for map in self.cell.maps() {
             let map: &GlobalMap = &*map?;
             put_map(map, &mut topics)?;
@@ -221,7 +238,10 @@ impl RosBridge {
     }
 
     fn send_reports(&self) -> Result<(), RosBridgeError> {
-        let mut topics = LiveTopics { participant: &self.participant, topics: BTreeMap::new() };
+        let mut topics = LiveTopics {
+            participant: &self.participant,
+            topics: BTreeMap::new(),
+        };
         for report in self.cell.reports() {
             let report: &ObjectReport = &*report?;
             put_report(report, &mut topics)?;
@@ -230,7 +250,9 @@ impl RosBridge {
     }
 
     fn take_detections(&self) -> Result<(), RosBridgeError> {
-        let Some(closed) = lock(&self.closed).take() else { return Ok(()) };
+        let Some(closed) = lock(&self.closed).take() else {
+            return Ok(());
+        };
         let (over, patience) = oneshot::channel();
         thread::spawn(move || {
             thread::sleep(PATIENCE);
@@ -250,7 +272,10 @@ impl RosBridge {
         if let Some(topic) = &self.pose_topic {
             streams.push(self.read(topic, Taken::Pose)?);
         }
-        let (mut optics, mut poses) = (None, self.pose_topic.as_ref().map(|_| PoseHistory::default()));
+        let (mut optics, mut poses) = (
+            None,
+            self.pose_topic.as_ref().map(|_| PoseHistory::default()),
+        );
         for taken in block_on_stream(select_all(streams)) {
             let placed = match taken {
                 Taken::Patience => {
@@ -296,9 +321,16 @@ impl RosBridge {
     /// Takes a pose of the camera, if it is one of this time and later than those before.
     fn take_pose(&self, stamped: &PoseStamped, poses: &mut PoseHistory) {
         let taken = pose_in_map(stamped).and_then(|(at, pose)| {
-            let is_near = is_within(SystemTime::UNIX_EPOCH + Duration::from_micros(at.micros()), MAX_STAMP_DIFFERENCE);
+            let is_near = is_within(
+                SystemTime::UNIX_EPOCH + Duration::from_micros(at.micros()),
+                MAX_STAMP_DIFFERENCE,
+            );
             let is_taken = is_near && poses.push(at, pose);
-            if is_taken { Ok(()) } else { Err(InputRefusal::BadPoseTime.into()) }
+            if is_taken {
+                Ok(())
+            } else {
+                Err(InputRefusal::BadPoseTime.into())
+            }
         });
         if let Err(refusal) = taken {
             self.note(refusal);
@@ -314,11 +346,19 @@ impl RosBridge {
         // A reader that does not ask for more takes from reliable writers, too.
         let qos = qos(Reliability::BestEffort);
         let topic = ros_topic::<M>(&self.participant, name, &qos)?;
-        let subscriber = self.participant.create_subscriber(&qos).map_err(RosBridgeError::dds)?;
-        let reader: DataReader<M> =
-            subscriber.create_datareader_no_key_cdr(&topic, Some(qos)).map_err(RosBridgeError::dds)?;
+        let subscriber = self
+            .participant
+            .create_subscriber(&qos)
+            .map_err(RosBridgeError::dds)?;
+        let reader: DataReader<M> = subscriber
+            .create_datareader_no_key_cdr(&topic, Some(qos))
+            .map_err(RosBridgeError::dds)?;
         let heard = Arc::new(AtomicBool::new(false));
-        lock(&self.inputs).push(DetectorInput { topic: name.to_owned(), kind: M::NAME, heard: Arc::clone(&heard) });
+        lock(&self.inputs).push(DetectorInput {
+            topic: name.to_owned(),
+            kind: M::NAME,
+            heard: Arc::clone(&heard),
+        });
         let samples = reader.async_sample_stream().filter_map(move |sample| {
             heard.store(true, Ordering::Relaxed);
             let taken = match sample {
@@ -355,12 +395,17 @@ impl RosBridge {
 
 /// A time, for the log.
 fn seconds(time: SystemTime) -> String {
-    let since_1970 = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let since_1970 = time
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .unwrap_or_default();
     format!("{:.3} s since 1970", since_1970.as_secs_f64())
 }
 
 fn qos(reliability: Reliability) -> QosPolicies {
-    QosPolicyBuilder::new().reliability(reliability).history(History::KeepLast { depth: DEPTH }).build()
+    QosPolicyBuilder::new()
+        .reliability(reliability)
+        .history(History::KeepLast { depth: DEPTH })
+        .build()
 }
 
 /// The DDS topic of a topic of ROS, with the names that ROS gives to both topic and type.
@@ -369,9 +414,14 @@ fn ros_topic<M: RosMessage>(
     name: &str,
     qos: &QosPolicies,
 ) -> Result<Topic, RosBridgeError> {
-    let kind = M::NAME.replace('/', "::").replace("::msg::", "::msg::dds_::") + "_";
+    let kind = M::NAME
+        .replace('/', "::")
+        .replace("::msg::", "::msg::dds_::")
+        + "_";
     let name = format!("rt/{}", name.trim_start_matches('/'));
-    participant.create_topic(name, kind, qos, TopicKind::NoKey).map_err(RosBridgeError::dds)
+    participant
+        .create_topic(name, kind, qos, TopicKind::NoKey)
+        .map_err(RosBridgeError::dds)
 }
 
 /// Topics of a domain that messages are put on, each announced with its first message.
@@ -404,17 +454,38 @@ impl SerializerAdapter<Encoded> for Encoded {
 impl RosSink for LiveTopics<'_> {
     type Error = RosBridgeError;
 
-    fn put<M: Serialize + Definition>(&mut self, name: &str, message: &M) -> Result<(), RosBridgeError> {
+    fn put<M: Serialize + Definition>(
+        &mut self,
+        name: &str,
+        message: &M,
+    ) -> Result<(), RosBridgeError> {
         let now = Instant::now();
         if !self.topics.contains_key(name) {
-            self.topics.retain(|_, topic| now.duration_since(topic.said_at) < SILENCE);
-            let qos = qos(Reliability::Reliable { max_blocking_time: rustdds::Duration::ZERO });
+            self.topics
+                .retain(|_, topic| now.duration_since(topic.said_at) < SILENCE);
+            let qos = qos(Reliability::Reliable {
+                max_blocking_time: rustdds::Duration::ZERO,
+            });
             let topic = ros_topic::<M>(self.participant, name, &qos)?;
-            let publisher = self.participant.create_publisher(&qos).map_err(RosBridgeError::dds)?;
-            let writer = publisher.create_datawriter_no_key(&topic, Some(qos)).map_err(RosBridgeError::dds)?;
-            self.topics.insert(name.to_owned(), LiveTopic { writer, said_at: now, is_failing: false });
+            let publisher = self
+                .participant
+                .create_publisher(&qos)
+                .map_err(RosBridgeError::dds)?;
+            let writer = publisher
+                .create_datawriter_no_key(&topic, Some(qos))
+                .map_err(RosBridgeError::dds)?;
+            self.topics.insert(
+                name.to_owned(),
+                LiveTopic {
+                    writer,
+                    said_at: now,
+                    is_failing: false,
+                },
+            );
         }
-        let Some(topic) = self.topics.get_mut(name) else { return Ok(()) };
+        let Some(topic) = self.topics.get_mut(name) else {
+            return Ok(());
+        };
         topic.said_at = now;
         let encoded = Encoded(encode(message).map_err(RosBridgeError::dds)?);
         let sent = topic.writer.write(encoded, None);

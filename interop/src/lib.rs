@@ -4,7 +4,12 @@
 //! stations. `ros2` writes logs for ROS; `dds` carries messages between a cell and ROS. `docs/interoperability.md` and
 //! `docs/ros2.md` have the tables of what is mapped, and of what is lost.
 
-#![deny(clippy::unwrap_used, clippy::expect_used, clippy::indexing_slicing, clippy::panic)]
+#![deny(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    clippy::panic
+)]
 
 pub mod bridge;
 mod carrying;

@@ -67,7 +67,12 @@ struct RosOptions {
     #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose, group = "camera_pose")]
     pose: Option<Pose>,
     /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x ahead.
-    #[arg(long, value_name = "TOPIC", group = "camera_pose", requires = "detections")]
+    #[arg(
+        long,
+        value_name = "TOPIC",
+        group = "camera_pose",
+        requires = "detections"
+    )]
     pose_topic: Option<String>,
     /// Height of the camera above the ground in metres; boxes are then also ranged by the ground.
     #[arg(long, value_parser = height)]
@@ -88,20 +93,39 @@ impl RosOptions {
     fn settings(self) -> Result<(Settings, RosSettings), String> {
         let mut camera = RosCamera {
             pose: self.pose,
-            mount: Mount { height_m: self.height_m, pitch_rad: self.pitch_deg.to_radians(), ..Mount::default() },
+            mount: Mount {
+                height_m: self.height_m,
+                pitch_rad: self.pitch_deg.to_radians(),
+                ..Mount::default()
+            },
             labels: self.label.into_iter().collect(),
             ..RosCamera::default()
         };
         if let Some(file) = &self.projection {
-            let text = std::fs::read_to_string(file).map_err(|error| format!("{}: {error}", file.display()))?;
-            camera.projection = toml::from_str(&text).map_err(|error| format!("{}: {error}", file.display()))?;
-            camera.projection.validate().map_err(|error| format!("{}: {error}", file.display()))?;
+            let text = std::fs::read_to_string(file)
+                .map_err(|error| format!("{}: {error}", file.display()))?;
+            camera.projection =
+                toml::from_str(&text).map_err(|error| format!("{}: {error}", file.display()))?;
+            camera
+                .projection
+                .validate()
+                .map_err(|error| format!("{}: {error}", file.display()))?;
         }
         let in_pictures = self.detections_2d.zip(self.camera_info);
-        let in_pictures = in_pictures.map(|(topic, optics)| DetectorTopics::InPictures(topic, optics));
-        let input = self.detections_3d.map(DetectorTopics::InSpace).or(in_pictures);
+        let in_pictures =
+            in_pictures.map(|(topic, optics)| DetectorTopics::InPictures(topic, optics));
+        let input = self
+            .detections_3d
+            .map(DetectorTopics::InSpace)
+            .or(in_pictures);
         let pose_topic = self.pose_topic;
-        let ros = RosSettings { domain: self.domain, networks: self.network, input, pose_topic, camera };
+        let ros = RosSettings {
+            domain: self.domain,
+            networks: self.network,
+            input,
+            pose_topic,
+            camera,
+        };
         Ok((self.connection.settings(), ros))
     }
 }
@@ -109,22 +133,36 @@ impl RosOptions {
 /// A number of a domain; of an empty variable the default one.
 #[cfg(feature = "dds")]
 fn domain(text: &str) -> Result<u16, String> {
-    if text.is_empty() { Ok(0) } else { text.parse().map_err(|_| "must be a number from 0 to 232".to_owned()) }
+    if text.is_empty() {
+        Ok(0)
+    } else {
+        text.parse()
+            .map_err(|_| "must be a number from 0 to 232".to_owned())
+    }
 }
 
 #[cfg(feature = "dds")]
 fn finite(text: &str) -> Result<f64, String> {
-    text.parse().ok().filter(|number: &f64| number.is_finite()).ok_or_else(|| "must be a number".to_owned())
+    text.parse()
+        .ok()
+        .filter(|number: &f64| number.is_finite())
+        .ok_or_else(|| "must be a number".to_owned())
 }
 
 #[cfg(feature = "dds")]
 fn height(text: &str) -> Result<f64, String> {
-    finite(text).ok().filter(|height_m| *height_m > 0.0).ok_or_else(|| "must be metres above the ground".to_owned())
+    finite(text)
+        .ok()
+        .filter(|height_m| *height_m > 0.0)
+        .ok_or_else(|| "must be metres above the ground".to_owned())
 }
 
 #[cfg(feature = "dds")]
 fn pose(text: &str) -> Result<Pose, String> {
-    let numbers: Option<Vec<f64>> = text.split(',').map(|part| finite(part.trim()).ok()).collect();
+    let numbers: Option<Vec<f64>> = text
+        .split(',')
+        .map(|part| finite(part.trim()).ok())
+        .collect();
     let Some(&[x_m, y_m, heading_deg]) = numbers.as_deref() else {
         return Err("must be three numbers, such as 1.5,-2,90".to_owned());
     };
@@ -133,7 +171,9 @@ fn pose(text: &str) -> Result<Pose, String> {
 
 #[cfg(feature = "dds")]
 fn class_label(text: &str) -> Result<(String, String), String> {
-    let (class, label) = text.split_once('=').ok_or("must be CLASS=LABEL, such as 0=person")?;
+    let (class, label) = text
+        .split_once('=')
+        .ok_or("must be CLASS=LABEL, such as 0=person")?;
     Ok((class.to_owned(), label.to_owned()))
 }
 
@@ -175,16 +215,21 @@ impl Connection {
 }
 
 fn main() -> ExitCode {
-    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or("info,rustdds=error")).init();
+    env_logger::Builder::from_env(
+        env_logger::Env::default().default_filter_or("info,rustdds=error"),
+    )
+    .init();
     let ended = match Cli::parse().command {
-        Command::Cpm(connection) => {
-            CpmBridge::connect(connection.settings()).and_then(|bridge| bridge.run()).map_err(|error| error.to_string())
-        }
+        Command::Cpm(connection) => CpmBridge::connect(connection.settings())
+            .and_then(|bridge| bridge.run())
+            .map_err(|error| error.to_string()),
         #[cfg(feature = "ros2")]
         Command::Ros2 { log, output } => convert(&log, &output),
         #[cfg(feature = "dds")]
         Command::Ros2Live(options) => options.settings().and_then(|(settings, ros)| {
-            RosBridge::connect(settings, ros).and_then(|bridge| bridge.run()).map_err(|error| error.to_string())
+            RosBridge::connect(settings, ros)
+                .and_then(|bridge| bridge.run())
+                .map_err(|error| error.to_string())
         }),
     };
     match ended {
@@ -206,20 +251,34 @@ fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String
         for log in &logs {
             let at_log = |error: &dyn Display| format!("{}: {error}", log.display());
             let file = std::fs::File::open(log).map_err(|error| at_log(&error))?;
-            converted.add(std::io::BufReader::new(file)).map_err(|error| at_log(&error))?;
+            converted
+                .add(std::io::BufReader::new(file))
+                .map_err(|error| at_log(&error))?;
         }
-        converted.finish().map_err(|error| format!("{}: {error}", log.display()))
+        converted
+            .finish()
+            .map_err(|error| format!("{}: {error}", log.display()))
     };
     let done = write().map_err(|error| {
         // A part of a file, and in the way of the next try.
         let removed = std::fs::remove_file(output).err();
-        let left = removed.map(|error| format!("; {} is left there: {error}", output.display())).unwrap_or_default();
+        let left = removed
+            .map(|error| format!("; {} is left there: {error}", output.display()))
+            .unwrap_or_default();
         format!("{error}{left}")
     })?;
-    let Conversion { written, passed_over, unusable, cut } = done;
+    let Conversion {
+        written,
+        passed_over,
+        unusable,
+        cut,
+    } = done;
     log::info!("{written} messages written, {passed_over} of other kinds, {unusable} unusable");
     if cut > 0 {
-        log::warn!("{cut} of {} logs end before their last messages; what is before that is written", logs.len());
+        log::warn!(
+            "{cut} of {} logs end before their last messages; what is before that is written",
+            logs.len()
+        );
     }
     Ok(())
 }
@@ -230,9 +289,18 @@ fn logs(path: &std::path::Path) -> Result<Vec<PathBuf>, String> {
     if !path.is_dir() {
         return Ok(vec![path.to_owned()]);
     }
-    let entries = std::fs::read_dir(path).map_err(|error| format!("{}: {error}", path.display()))?;
+    let entries =
+        std::fs::read_dir(path).map_err(|error| format!("{}: {error}", path.display()))?;
     let is_log = |file: &PathBuf| file.extension().is_some_and(|ending| ending == "mcap");
-    let mut logs: Vec<_> = entries.filter_map(Result::ok).map(|entry| entry.path()).filter(is_log).collect();
+    let mut logs: Vec<_> = entries
+        .filter_map(Result::ok)
+        .map(|entry| entry.path())
+        .filter(is_log)
+        .collect();
     logs.sort();
-    if logs.is_empty() { Err(format!("{}: there is no .mcap file", path.display())) } else { Ok(logs) }
+    if logs.is_empty() {
+        Err(format!("{}: there is no .mcap file", path.display()))
+    } else {
+        Ok(logs)
+    }
 }

@@ -55,8 +55,15 @@ impl<'a> CellObject<'a> {
     /// Objects of a map and what stands at its known locations, each with its id.
     #[cfg(feature = "ros2")]
     pub(crate) fn all_of(map: &'a ecod::wire::GlobalMap) -> impl Iterator<Item = (Self, String)> {
-        let objects = map.objects.iter().map(|object| (object.into(), object.id.to_string()));
-        objects.chain(map.landmarks.iter().filter_map(|place| Some((Self::at(place)?, place.id.to_string()))))
+        let objects = map
+            .objects
+            .iter()
+            .map(|object| (object.into(), object.id.to_string()));
+        objects.chain(
+            map.landmarks
+                .iter()
+                .filter_map(|place| Some((Self::at(place)?, place.id.to_string()))),
+        )
     }
 
     /// What stands at a known location; `None` if nothing does.

@@ -39,7 +39,11 @@ pub(crate) trait RosSink {
     type Error;
 
     /// Takes a message.
-    fn put<M: Serialize + Definition>(&mut self, topic: &str, message: &M) -> Result<(), Self::Error>;
+    fn put<M: Serialize + Definition>(
+        &mut self,
+        topic: &str,
+        message: &M,
+    ) -> Result<(), Self::Error>;
 }
 
 /// Puts the messages of a map.
@@ -51,19 +55,36 @@ pub(crate) fn put_map<S: RosSink>(map: &GlobalMap, sink: &mut S) -> Result<(), S
 /// Puts the messages of a vehicle's report.
 pub(crate) fn put_report<S: RosSink>(report: &ObjectReport, sink: &mut S) -> Result<(), S::Error> {
     let node = ros_name(&report.node);
-    sink.put(&format!("/ecod/{node}/detections"), &Detection3DArray::of_report(report))?;
-    let Some(pose) = report.pose else { return Ok(()) };
-    let transforms = TFMessage::of_pose(Header::in_map(report.captured_at_us), format!("{node}_camera"), pose);
+    sink.put(
+        &format!("/ecod/{node}/detections"),
+        &Detection3DArray::of_report(report),
+    )?;
+    let Some(pose) = report.pose else {
+        return Ok(());
+    };
+    let transforms = TFMessage::of_pose(
+        Header::in_map(report.captured_at_us),
+        format!("{node}_camera"),
+        pose,
+    );
     sink.put("/tf", &transforms)
 }
 
 /// A node's name as names in ROS allow it: letters and digits with single `_` between them, no digit first. A `_` in front would
 /// hide the topic, and `map` is the cell's.
 fn ros_name(node: &NodeName) -> String {
-    let words: Vec<_> = node.as_str().split(['-', '_']).filter(|word| !word.is_empty()).collect();
+    let words: Vec<_> = node
+        .as_str()
+        .split(['-', '_'])
+        .filter(|word| !word.is_empty())
+        .collect();
     let name = words.join("_");
     let is_free = name != "map" && name.starts_with(|first: char| first.is_ascii_alphabetic());
-    if is_free { name } else { format!("node_{name}") }
+    if is_free {
+        name
+    } else {
+        format!("node_{name}")
+    }
 }
 
 #[cfg(test)]
@@ -84,7 +105,14 @@ mod tests {
     fn a_ghost_is_unlikely_in_ros_and_places_are_drawn() {
         let ghost = FusedObject {
             scores: [("car".into(), 0.75), ("truck".into(), 0.25)].into(),
-            ..FusedObject::new(uuid::Uuid::from_u128(1), "car", 0.04, 12.0, 0.0, Covariance::isotropic(0.04))
+            ..FusedObject::new(
+                uuid::Uuid::from_u128(1),
+                "car",
+                0.04,
+                12.0,
+                0.0,
+                Covariance::isotropic(0.04),
+            )
         };
         let place = LandmarkState {
             id: "slot-1".into(),
@@ -97,31 +125,68 @@ mod tests {
             readings: Vec::new(),
         };
         let epoch = Epoch::new(7, NodeName::from_static("edge"));
-        let map = GlobalMap { landmarks: vec![place], objects: vec![ghost], ..GlobalMap::new(&epoch, 1, NOW) };
+        let map = GlobalMap {
+            landmarks: vec![place],
+            objects: vec![ghost],
+            ..GlobalMap::new(&epoch, 1, NOW)
+        };
         let scores = |detections: Detection3DArray| -> Vec<_> {
             assert_eq!(detections.header.stamp, RosTime::of(NOW));
-            let results = detections.detections.into_iter().flat_map(|detection| detection.results);
-            results.map(|result| (result.hypothesis.class_id, (1000.0 * result.hypothesis.score).round())).collect()
+            let results = detections
+                .detections
+                .into_iter()
+                .flat_map(|detection| detection.results);
+            results
+                .map(|result| {
+                    (
+                        result.hypothesis.class_id,
+                        (1000.0 * result.hypothesis.score).round(),
+                    )
+                })
+                .collect()
         };
         let of_map = scores(Detection3DArray::of_map(&map));
-        assert_eq!(of_map, [("car".into(), 30.0), ("truck".into(), 10.0), ("van".into(), 900.0)]);
+        assert_eq!(
+            of_map,
+            [
+                ("car".into(), 30.0),
+                ("truck".into(), 10.0),
+                ("van".into(), 900.0)
+            ]
+        );
         let seen = PerceivedObject {
             scores: [("car".into(), 0.6), ("truck".into(), 0.3)].into(),
             ..PerceivedObject::new("car", 0.6, 1.0, 2.0)
         };
-        let report = ObjectReport { objects: vec![seen], ..ObjectReport::new(NodeName::from_static("euclid"), 1, NOW) };
+        let report = ObjectReport {
+            objects: vec![seen],
+            ..ObjectReport::new(NodeName::from_static("euclid"), 1, NOW)
+        };
         let of_report = scores(Detection3DArray::of_report(&report));
-        assert_eq!(of_report, [("car".into(), 600.0), ("truck".into(), 300.0)], "a detector's own confidences");
+        assert_eq!(
+            of_report,
+            [("car".into(), 600.0), ("truck".into(), 300.0)],
+            "a detector's own confidences"
+        );
         let drawn = serde_json::to_value(MarkerArray::of_map(&map)).unwrap();
-        let opacity: Vec<_> = (1..5).map(|marker| drawn["markers"][marker]["color"]["a"].as_f64().unwrap()).collect();
-        assert!(opacity[..2].iter().all(|a| *a < 0.05) && opacity[2..].iter().all(|a| *a > 0.8), "{drawn}");
+        let opacity: Vec<_> = (1..5)
+            .map(|marker| drawn["markers"][marker]["color"]["a"].as_f64().unwrap())
+            .collect();
+        assert!(
+            opacity[..2].iter().all(|a| *a < 0.05) && opacity[2..].iter().all(|a| *a > 0.8),
+            "{drawn}"
+        );
     }
 
     #[test]
     fn names_are_as_ros_allows_them() {
-        for (name, expected) in
-            [("lot-1", "lot_1"), ("edge--ros2", "edge_ros2"), ("_x-", "x"), ("7", "node_7"), ("map", "node_map")]
-        {
+        for (name, expected) in [
+            ("lot-1", "lot_1"),
+            ("edge--ros2", "edge_ros2"),
+            ("_x-", "x"),
+            ("7", "node_7"),
+            ("map", "node_map"),
+        ] {
             assert_eq!(ros_name(&NodeName::from_static(name)), expected);
         }
     }

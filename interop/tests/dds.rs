@@ -36,8 +36,17 @@ fn exchange(kind: &str, ros: RosSettings, (label, x_m, y_m): (&str, f64, f64)) {
     let runtime = Runtime::new().unwrap();
     let handle = runtime.block_on(node::start(config)).unwrap();
     let broker = handle.listens_at().unwrap().to_string();
-    let settings = Settings { broker, cell: "lot-1".into(), node: "edge".into(), ..Settings::default() };
-    let vehicle = Settings { node: "euclid-2".into(), part: String::new(), ..settings.clone() };
+    let settings = Settings {
+        broker,
+        cell: "lot-1".into(),
+        node: "edge".into(),
+        ..Settings::default()
+    };
+    let vehicle = Settings {
+        node: "euclid-2".into(),
+        part: String::new(),
+        ..settings.clone()
+    };
     let vehicle = Cell::connect(vehicle).unwrap();
     let bridge = RosBridge::connect(settings, ros).unwrap();
     let is_done = AtomicBool::new(false);
@@ -47,18 +56,37 @@ fn exchange(kind: &str, ros: RosSettings, (label, x_m, y_m): (&str, f64, f64)) {
             while !is_done.load(Ordering::Relaxed) {
                 let car = PerceivedObject::new("car", 0.9, 30.0, 40.0);
                 let pose = Some(WirePose::new(31.0, 36.0, 1.57));
-                vehicle.report(Frame { pose, ..Frame::new(vec![car]) }).unwrap();
+                vehicle
+                    .report(Frame {
+                        pose,
+                        ..Frame::new(vec![car])
+                    })
+                    .unwrap();
                 thread::sleep(Duration::from_millis(100));
             }
         });
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../packaging/check-dds.py");
         let place = [x_m, y_m].map(|metres| metres.to_string());
-        let run = Command::new(python).arg(script).args([kind, label]).args(place).output().unwrap();
+        let run = Command::new(python)
+            .arg(script)
+            .args([kind, label])
+            .args(place)
+            .output()
+            .unwrap();
         is_done.store(true, Ordering::Relaxed);
         bridge.close();
         carried.join().unwrap().unwrap();
-        assert!(run.status.success(), "{}{:?}", String::from_utf8_lossy(&run.stderr), bridge.refusals());
-        assert!(bridge.refusals().is_empty() || ["pictures", "driving"].contains(&kind), "{:?}", bridge.refusals());
+        assert!(
+            run.status.success(),
+            "{}{:?}",
+            String::from_utf8_lossy(&run.stderr),
+            bridge.refusals()
+        );
+        assert!(
+            bridge.refusals().is_empty() || ["pictures", "driving"].contains(&kind),
+            "{:?}",
+            bridge.refusals()
+        );
         print!("{}", String::from_utf8_lossy(&run.stdout));
     });
     runtime.block_on(handle.stop());
@@ -67,25 +95,53 @@ fn exchange(kind: &str, ros: RosSettings, (label, x_m, y_m): (&str, f64, f64)) {
 /// A camera 5 m east and 1 m north of the origin that looks north, of a detector whose class 2 are posts.
 fn camera() -> RosCamera {
     let labels = [("2".to_owned(), "post".to_owned())].into();
-    let post = ObjectSize { height_m: 1.5, ..ObjectSize::square(0.2) };
-    let sizes = ObjectSizes { labels: [("post".into(), post)].into(), ..ObjectSizes::default() };
-    let projection = ProjectionConfig { sizes, ..RosCamera::default().projection };
+    let post = ObjectSize {
+        height_m: 1.5,
+        ..ObjectSize::square(0.2)
+    };
+    let sizes = ObjectSizes {
+        labels: [("post".into(), post)].into(),
+        ..ObjectSizes::default()
+    };
+    let projection = ProjectionConfig {
+        sizes,
+        ..RosCamera::default().projection
+    };
     let pose = Some(Pose::new(5.0, 1.0, 90f64.to_radians()));
-    RosCamera { pose, mount: Mount { height_m: Some(0.75), ..Mount::default() }, projection, labels }
+    RosCamera {
+        pose,
+        mount: Mount {
+            height_m: Some(0.75),
+            ..Mount::default()
+        },
+        projection,
+        labels,
+    }
 }
 
 #[test]
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
 fn detections_in_the_map_become_objects_there() {
     let input = DetectorTopics::InSpace("/detections".to_owned());
-    exchange("map", RosSettings { input: Some(input), ..RosSettings::default() }, ("truck", 12.0, -5.0));
+    exchange(
+        "map",
+        RosSettings {
+            input: Some(input),
+            ..RosSettings::default()
+        },
+        ("truck", 12.0, -5.0),
+    );
 }
 
 #[test]
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
 fn detections_before_a_camera_are_placed_by_its_pose() {
     let input = DetectorTopics::InSpace("detections".to_owned());
-    let ros = RosSettings { input: Some(input), camera: camera(), ..RosSettings::default() };
+    let ros = RosSettings {
+        input: Some(input),
+        camera: camera(),
+        ..RosSettings::default()
+    };
     exchange("optical", ros, ("truck", 7.0, 11.0));
 }
 
@@ -93,8 +149,16 @@ fn detections_before_a_camera_are_placed_by_its_pose() {
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
 fn detections_before_a_camera_that_moves_are_placed_by_its_poses() {
     let input = Some(DetectorTopics::InSpace("/detections".to_owned()));
-    let camera = RosCamera { pose: None, ..camera() };
-    let ros = RosSettings { input, pose_topic: Some("/camera_pose".to_owned()), camera, ..RosSettings::default() };
+    let camera = RosCamera {
+        pose: None,
+        ..camera()
+    };
+    let ros = RosSettings {
+        input,
+        pose_topic: Some("/camera_pose".to_owned()),
+        camera,
+        ..RosSettings::default()
+    };
     exchange("driving", ros, ("truck", 7.0, 11.0));
 }
 
@@ -102,7 +166,11 @@ fn detections_before_a_camera_that_moves_are_placed_by_its_poses() {
 #[ignore = "needs a network of its own and Python packages: `make dds-check`"]
 fn boxes_in_pictures_are_placed_by_the_optics_and_the_ground() {
     let input = DetectorTopics::InPictures("/detections".to_owned(), "/camera_info".to_owned());
-    let ros = RosSettings { input: Some(input), camera: camera(), ..RosSettings::default() };
+    let ros = RosSettings {
+        input: Some(input),
+        camera: camera(),
+        ..RosSettings::default()
+    };
     exchange("pictures", ros, ("post", 7.0, 11.0));
 }
 
@@ -110,13 +178,32 @@ fn boxes_in_pictures_are_placed_by_the_optics_and_the_ground() {
 fn topics_of_the_bridge_itself_are_no_detectors() {
     let optics = || "/camera_info".to_owned();
     let inputs = [
-        (Some(DetectorTopics::InSpace("/ecod/map/detections".to_owned())), None),
-        (Some(DetectorTopics::InPictures("ecod/euclid/detections".to_owned(), optics())), None),
-        (Some(DetectorTopics::InSpace("/detections".to_owned())), Some("/ecod/pose".to_owned())),
+        (
+            Some(DetectorTopics::InSpace("/ecod/map/detections".to_owned())),
+            None,
+        ),
+        (
+            Some(DetectorTopics::InPictures(
+                "ecod/euclid/detections".to_owned(),
+                optics(),
+            )),
+            None,
+        ),
+        (
+            Some(DetectorTopics::InSpace("/detections".to_owned())),
+            Some("/ecod/pose".to_owned()),
+        ),
     ];
     for (input, pose_topic) in inputs {
-        let ros = RosSettings { input, pose_topic, ..RosSettings::default() };
+        let ros = RosSettings {
+            input,
+            pose_topic,
+            ..RosSettings::default()
+        };
         let refused = RosBridge::connect(Settings::default(), ros).err();
-        assert!(matches!(refused, Some(RosBridgeError::OwnTopic(_))), "{refused:?}");
+        assert!(
+            matches!(refused, Some(RosBridgeError::OwnTopic(_))),
+            "{refused:?}"
+        );
     }
 }

@@ -27,7 +27,12 @@ use figures::Figures;
 
 #[tokio::main(flavor = "multi_thread", worker_threads = 2)]
 async fn main() {
-    let number = |key, default| std::env::var(key).ok().and_then(|text| text.parse().ok()).unwrap_or(default);
+    let number = |key, default| {
+        std::env::var(key)
+            .ok()
+            .and_then(|text| text.parse().ok())
+            .unwrap_or(default)
+    };
     let (nodes, seconds): (u64, u64) = (number("NODES", 32), number("SECONDS", 10));
     let downs = Arc::<AtomicU64>::default();
     let (mut seeds, mut counters, mut members) = (Vec::new(), Vec::new(), Vec::new());
@@ -46,17 +51,26 @@ async fn main() {
                 key: Some(Secret::new("5e".repeat(32))),
                 bind: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))),
                 seeds: seeds.clone(),
-                multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
+                multicast: MulticastConfig {
+                    enabled: false,
+                    ..MulticastConfig::default()
+                },
                 ..MembershipConfig::default()
             },
             events: Arc::new(move |event| {
-                seen.fetch_add(u64::from(matches!(event, MembershipEvent::Down { .. })), Ordering::Relaxed);
+                seen.fetch_add(
+                    u64::from(matches!(event, MembershipEvent::Down { .. })),
+                    Ordering::Relaxed,
+                );
             }),
             members: sender,
             counters: Arc::clone(&counted),
         };
-        let (actor, _) = Actor::spawn(None, Membership, arguments).await.expect("a free port of loopback is there");
-        let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000).expect("the actor answers");
+        let (actor, _) = Actor::spawn(None, Membership, arguments)
+            .await
+            .expect("a free port of loopback is there");
+        let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000)
+            .expect("the actor answers");
         if seeds.is_empty() {
             seeds.push(address.to_string());
         }
@@ -68,29 +82,51 @@ async fn main() {
         let complete = |members: &Vec<Member>| members.len() as u64 == nodes - 1;
         members.wait_for(complete).await.expect("the actor runs");
     }
-    println!("{nodes} nodes all met {} ms after the last had started", started.elapsed().as_millis());
+    println!(
+        "{nodes} nodes all met {} ms after the last had started",
+        started.elapsed().as_millis()
+    );
     tokio::time::sleep(Duration::from_secs(5)).await;
-    let sum = |event| counters.iter().map(|counters| counters.get(event)).sum::<u64>();
+    let sum = |event| {
+        counters
+            .iter()
+            .map(|counters| counters.get(event))
+            .sum::<u64>()
+    };
     let counts = || [sum(FrameEvent::Sent), sum(FrameEvent::Received)];
     let (before, processor, down) = (counts(), processor_time(), downs.load(Ordering::Relaxed));
     tokio::time::sleep(Duration::from_secs(seconds)).await;
     let per_node = |n: f64| n / (nodes * seconds) as f64;
     let [sent, received] = std::array::from_fn(|at| per_node((counts()[at] - before[at]) as f64));
     let percent = 100.0 * per_node((processor_time() - processor).as_secs_f64());
-    println!("per node: {sent:.1} packets/s sent, {received:.1} received, {percent:.2} % of a core");
+    println!(
+        "per node: {sent:.1} packets/s sent, {received:.1} received, {percent:.2} % of a core"
+    );
     let mut figures = Figures::new("membership");
     figures.insert("nodes", nodes.into());
     figures.insert("received_per_s", received.into());
     figures.goal("sent_per_s", sent, 60.0, " packets/s");
     figures.goal("processor_percent", percent, 1.5, " %");
-    figures.goal("given_up_by_mistake", (downs.load(Ordering::Relaxed) - down) as f64, 0.0, "");
+    figures.goal(
+        "given_up_by_mistake",
+        (downs.load(Ordering::Relaxed) - down) as f64,
+        0.0,
+        "",
+    );
     figures.save();
 }
 
 /// User and system time of this process, by Linux's clock ticks of 10 ms.
 fn processor_time() -> Duration {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    let fields = stat.rsplit_once(')').map_or("", |(_, fields)| fields).split_whitespace();
-    let ticks: u64 = fields.skip(11).take(2).filter_map(|ticks| ticks.parse::<u64>().ok()).sum();
+    let fields = stat
+        .rsplit_once(')')
+        .map_or("", |(_, fields)| fields)
+        .split_whitespace();
+    let ticks: u64 = fields
+        .skip(11)
+        .take(2)
+        .filter_map(|ticks| ticks.parse::<u64>().ok())
+        .sum();
     Duration::from_millis(ticks * 10)
 }

@@ -17,7 +17,8 @@ use ecod_actors::platform::clock;
 use ecod_actors::telemetry::counters::Counters;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::mqtt::{
-    BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, MqttVersion, Security, SubscriptionRole,
+    BrokerAddress, Delivery, Incoming, LinkState, MqttConfig, MqttVersion, Security,
+    SubscriptionRole,
 };
 use ecod_lab::bench::two_hop::{self, TwoHopLoad};
 use hdrhistogram::Histogram;
@@ -31,22 +32,45 @@ use figures::Figures;
 async fn main() -> anyhow::Result<()> {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     let address = BrokerAddress::from(broker.start(([127, 0, 0, 1], 0).into())?);
-    let load = TwoHopLoad { messages: 1000, interval: Duration::from_millis(10), payload_bytes: 1100 };
+    let load = TwoHopLoad {
+        messages: 1000,
+        interval: Duration::from_millis(10),
+        payload_bytes: 1100,
+    };
     let mut figures = Figures::new("mqtt");
     println!("{:<28} {:>8} {:>8} {:>6}", "path", "p50 µs", "p99 µs", "n");
-    take(&mut figures, "two_hops", &two_hop::raw(&address, load).await?);
-    for (name, version) in [("gateways_mqtt_3_1_1", MqttVersion::V311), ("gateways_mqtt_5", MqttVersion::V5)] {
-        take(&mut figures, name, &through_gateways(&address, version, load).await?);
+    take(
+        &mut figures,
+        "two_hops",
+        &two_hop::raw(&address, load).await?,
+    );
+    for (name, version) in [
+        ("gateways_mqtt_3_1_1", MqttVersion::V311),
+        ("gateways_mqtt_5", MqttVersion::V5),
+    ] {
+        take(
+            &mut figures,
+            name,
+            &through_gateways(&address, version, load).await?,
+        );
     }
-    take(&mut figures, "two_hops_again", &two_hop::raw(&address, load).await?);
+    take(
+        &mut figures,
+        "two_hops_again",
+        &two_hop::raw(&address, load).await?,
+    );
     figures.save();
     Ok(())
 }
 
 fn take(figures: &mut Figures, path: &str, histogram: &Histogram<u64>) {
-    let [p50, p99] = [0.5, 0.99].map(|quantile| histogram.value_at_quantile(quantile) as f64 / 1000.0);
+    let [p50, p99] =
+        [0.5, 0.99].map(|quantile| histogram.value_at_quantile(quantile) as f64 / 1000.0);
     println!("{path:<28} {p50:>8.0} {p99:>8.0} {:>6}", histogram.len());
-    figures.insert(path, serde_json::json!({ "p50_us": p50, "p99_us": p99, "n": histogram.len() }));
+    figures.insert(
+        path,
+        serde_json::json!({ "p50_us": p50, "p99_us": p99, "n": histogram.len() }),
+    );
 }
 
 /// Times from a report's publication to the arrival of the map that answers it, in nanoseconds.
@@ -74,7 +98,13 @@ async fn through_gateways(
         for seq in 0..load.messages {
             ticks.tick().await;
             let report = Arc::new(report(seq.into()));
-            if publisher.cast(GatewayMessage::PublishReport { kind: ReportKind::Detections, report }).is_err() {
+            if publisher
+                .cast(GatewayMessage::PublishReport {
+                    kind: ReportKind::Detections,
+                    report,
+                })
+                .is_err()
+            {
                 return;
             }
         }
@@ -82,7 +112,9 @@ async fn through_gateways(
     let mut histogram = two_hop::latencies();
     let mut back = 0;
     while back < load.messages {
-        let delivery = tokio::time::timeout(Duration::from_secs(5), maps.recv()).await?.context("gateway ended")?;
+        let delivery = tokio::time::timeout(Duration::from_secs(5), maps.recv())
+            .await?
+            .context("gateway ended")?;
         if let Incoming::Map(map) = delivery.message {
             back += 1;
             if map.round >= u64::from(load.messages / 10) {
@@ -105,12 +137,20 @@ async fn join(
     broker: &BrokerAddress,
 ) -> anyhow::Result<(ActorRef<GatewayMessage>, mpsc::UnboundedReceiver<Delivery>)> {
     let (sender, mut deliveries) = mpsc::unbounded_channel();
-    let status = NodeStatus::starting(NodeName::new(name)?, Uuid::new_v4(), Role::Auto, env!("CARGO_PKG_VERSION"));
+    let status = NodeStatus::starting(
+        NodeName::new(name)?,
+        Uuid::new_v4(),
+        Role::Auto,
+        env!("CARGO_PKG_VERSION"),
+    );
     let arguments = GatewayArguments {
         cell: NodeName::new("bench")?,
         role,
         status,
-        mqtt: MqttConfig { version, ..MqttConfig::default() },
+        mqtt: MqttConfig {
+            version,
+            ..MqttConfig::default()
+        },
         security: Security::default(),
         clock: Default::default(),
         counters: Arc::new(Counters::default()),
@@ -119,9 +159,17 @@ async fn join(
         looks_on: false,
     };
     let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
-    gateway.cast(GatewayMessage::SetBrokers { addresses: vec![broker.clone()] })?;
+    gateway.cast(GatewayMessage::SetBrokers {
+        addresses: vec![broker.clone()],
+    })?;
     while let Some(delivery) = deliveries.recv().await {
-        if matches!(delivery.message, Incoming::Link { state: LinkState::Up, .. }) {
+        if matches!(
+            delivery.message,
+            Incoming::Link {
+                state: LinkState::Up,
+                ..
+            }
+        ) {
             break;
         }
     }
@@ -137,12 +185,19 @@ fn report(seq: u64) -> ObjectReport {
     };
     ObjectReport {
         objects: (0..10).map(object).collect(),
-        ..ObjectReport::new(NodeName::new("euclid").expect("a valid name"), seq, clock::now())
+        ..ObjectReport::new(
+            NodeName::new("euclid").expect("a valid name"),
+            seq,
+            clock::now(),
+        )
     }
 }
 
 fn answer_to(report: &ObjectReport) -> GlobalMap {
     let epoch = Epoch::new(1, NodeName::from_static("edge"));
     let oldest_capture_us = Some(report.captured_at_us);
-    GlobalMap { oldest_capture_us, ..GlobalMap::new(&epoch, report.seq, Timestamp::default()) }
+    GlobalMap {
+        oldest_capture_us,
+        ..GlobalMap::new(&epoch, report.seq, Timestamp::default())
+    }
 }

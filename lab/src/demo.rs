@@ -77,20 +77,44 @@ impl Demo<'_> {
     ///
     /// # Errors
     /// When a node does not start or ends early, `progress` fails, or a file cannot be written; all nodes are stopped in any case.
-    pub async fn run(&self, progress: impl Fn(Progress) -> anyhow::Result<()>) -> anyhow::Result<DemoResult> {
+    pub async fn run(
+        &self,
+        progress: impl Fn(Progress) -> anyhow::Result<()>,
+    ) -> anyhow::Result<DemoResult> {
         let stage = Stage::new(self.program, self.directory, self.scene.cavs.len() + 1)?;
         // Before any node runs: the renderer needs the processor.
         let frames = self.directory.join("frames");
-        let render = |cav: &Cav| frames::render(self.testbed, self.scene, cav, 1, &frames.join(cav.name.as_str()));
-        let sources = self.scene.cavs.iter().map(render).collect::<anyhow::Result<Vec<_>>>()?;
+        let render = |cav: &Cav| {
+            frames::render(
+                self.testbed,
+                self.scene,
+                cav,
+                1,
+                &frames.join(cav.name.as_str()),
+            )
+        };
+        let sources = self
+            .scene
+            .cavs
+            .iter()
+            .map(render)
+            .collect::<anyhow::Result<Vec<_>>>()?;
         let mut configs = vec![setup::edge(self.testbed, self.scene)];
         for (cav, source) in self.scene.cavs.iter().zip(sources) {
             configs.push(setup::cav(self.testbed, self.scene, cav, source));
         }
         let observer = setup::unused_name(self.scene, "observer");
-        let played = stage.play(configs, self.dashboard, observer, self.duration, progress).await;
-        fs::remove_dir_all(&frames).with_context(|| format!("cannot remove {}", frames.display()))?;
-        let Played { reports, from, until, .. } = played?;
+        let played = stage
+            .play(configs, self.dashboard, observer, self.duration, progress)
+            .await;
+        fs::remove_dir_all(&frames)
+            .with_context(|| format!("cannot remove {}", frames.display()))?;
+        let Played {
+            reports,
+            from,
+            until,
+            ..
+        } = played?;
         self.evaluate(&stage, reports, from, until)
     }
 
@@ -108,7 +132,11 @@ impl Demo<'_> {
             let mut log = stage.map_log(&cav.name)?;
             log.retain(|line| within(line.map.fused_at_us));
             for line in &log {
-                ages.extend(line.map.oldest_capture_us.map(|capture| line.received_at.since(capture)));
+                ages.extend(
+                    line.map
+                        .oldest_capture_us
+                        .map(|capture| line.received_at.since(capture)),
+                );
                 let epoch = Epoch::new(line.map.epoch, line.map.aggregator.clone());
                 maps.insert((epoch, line.map.round), GlobalMap::clone(&line.map));
             }
@@ -116,10 +144,17 @@ impl Demo<'_> {
         }
         let received: usize = logs.iter().map(Vec::len).sum();
         let mut fused = SpotScore::default();
-        maps.values().for_each(|map| fused.judge(self.testbed, self.scene, map));
+        maps.values()
+            .for_each(|map| fused.judge(self.testbed, self.scene, map));
         ages.sort();
         Ok(DemoResult {
-            result: SceneResult::new(self.testbed, self.scene, maps.len() as u64, &fused, &self.alone(&reports, from)),
+            result: SceneResult::new(
+                self.testbed,
+                self.scene,
+                maps.len() as u64,
+                &fused,
+                &self.alone(&reports, from),
+            ),
             missed: (maps.len() * self.scene.cavs.len()).saturating_sub(received),
             maps: maps.len(),
             median_age: ages.get(ages.len() / 2).copied().unwrap_or_default(),
@@ -128,7 +163,8 @@ impl Demo<'_> {
             from,
             terms: judged_terms(logs.iter().map(Vec::as_slice), |maps| {
                 let mut score = SpotScore::default();
-                maps.iter().for_each(|map| score.judge(self.testbed, self.scene, map));
+                maps.iter()
+                    .for_each(|map| score.judge(self.testbed, self.scene, map));
                 score.accuracy_pct()
             }),
         })
@@ -138,11 +174,26 @@ impl Demo<'_> {
     fn alone(&self, reports: &[ObservedReport], from: Timestamp) -> BTreeMap<NodeName, SpotScore> {
         let alone = |cav: &Cav| {
             let landmarks = self.scene.landmarks(&self.testbed.placard);
-            let start = reports.first().map_or(from, |observed| observed.received_at);
-            let mut aggregator = Aggregator::new(cav.name.clone(), 1, setup::fusion(self.testbed), landmarks, start);
+            let start = reports
+                .first()
+                .map_or(from, |observed| observed.received_at);
+            let mut aggregator = Aggregator::new(
+                cav.name.clone(),
+                1,
+                setup::fusion(self.testbed),
+                landmarks,
+                start,
+            );
             let mut score = SpotScore::default();
-            for observed in reports.iter().filter(|observed| observed.report.node == cav.name) {
-                let fused = aggregator.report(ReportKind::Detections, &observed.report, observed.received_at);
+            for observed in reports
+                .iter()
+                .filter(|observed| observed.report.node == cav.name)
+            {
+                let fused = aggregator.report(
+                    ReportKind::Detections,
+                    &observed.report,
+                    observed.received_at,
+                );
                 if let Ok(Some(Fused { map: Some(map), .. })) = fused
                     && map.fused_at_us >= from
                 {

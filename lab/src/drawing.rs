@@ -17,7 +17,12 @@ pub(crate) fn page(width: f64, height: f64, font_px: u32) -> Document {
         .set("font-family", FONT)
         .set("font-size", font_px)
         .set("fill", INK)
-        .add(Rectangle::new().set("width", "100%").set("height", "100%").set("fill", "white"))
+        .add(
+            Rectangle::new()
+                .set("width", "100%")
+                .set("height", "100%")
+                .set("fill", "white"),
+        )
 }
 
 /// Tenths of a pixel are enough and keep the file small.

@@ -132,15 +132,34 @@ impl Scores {
     /// The shares of a summary's row in percent: accuracy, coverage, accuracy where labelled, that of all lines, and of
     /// the majority.
     pub fn shares_pct(&self) -> [Option<f64>; 5] {
-        let Self { accuracy_pct, coverage_pct, labelled_accuracy_pct, rounds, majority_accuracy_pct, .. } = self;
-        [*accuracy_pct, *coverage_pct, *labelled_accuracy_pct, rounds.accuracy_pct, *majority_accuracy_pct]
+        let Self {
+            accuracy_pct,
+            coverage_pct,
+            labelled_accuracy_pct,
+            rounds,
+            majority_accuracy_pct,
+            ..
+        } = self;
+        [
+            *accuracy_pct,
+            *coverage_pct,
+            *labelled_accuracy_pct,
+            rounds.accuracy_pct,
+            *majority_accuracy_pct,
+        ]
     }
 }
 
 impl Evaluation {
     /// Nothing read yet.
     pub fn new(truth: Truth) -> Self {
-        Self { truth, cell: None, synonyms: BTreeMap::new(), pace: Tally::default(), vote: Tally::default() }
+        Self {
+            truth,
+            cell: None,
+            synonyms: BTreeMap::new(),
+            pace: Tally::default(),
+            vote: Tally::default(),
+        }
     }
 
     /// Names the location of objects whose report does not, and translates synonyms, as a node of the cell would.
@@ -161,11 +180,17 @@ impl Evaluation {
     pub fn fused(&mut self, line: &FusedLine) {
         match line {
             FusedLine::Map(map) => {
-                let entries = map.landmarks.iter().map(|state| (&state.id, state.label.as_ref()));
+                let entries = map
+                    .landmarks
+                    .iter()
+                    .map(|state| (&state.id, state.label.as_ref()));
                 self.pace.judge(&self.truth, map.fused_at_us, entries);
             }
             FusedLine::Verdicts(verdicts) => {
-                let entries = verdicts.verdicts.iter().map(|verdict| (&verdict.landmark, verdict.label.as_ref()));
+                let entries = verdicts
+                    .verdicts
+                    .iter()
+                    .map(|verdict| (&verdict.landmark, verdict.label.as_ref()));
                 self.vote.judge(&self.truth, verdicts.fused_at_us, entries);
             }
         }
@@ -178,19 +203,38 @@ impl Evaluation {
             ReportKind::VoteDetections => (&mut self.vote.votes, Some(&self.synonyms)),
         };
         for object in &report.objects {
-            let place = self.cell.as_ref().and_then(|(landmarks, gate)| votes::place(object, landmarks, gate));
-            let Some(id) = object.landmark.as_ref().or(place.map(|landmark| &landmark.id)) else { continue };
+            let place = self
+                .cell
+                .as_ref()
+                .and_then(|(landmarks, gate)| votes::place(object, landmarks, gate));
+            let Some(id) = object
+                .landmark
+                .as_ref()
+                .or(place.map(|landmark| &landmark.id))
+            else {
+                continue;
+            };
             let synonym = place.and_then(|place| place.synonym(&object.label));
-            let label = synonym.or_else(|| synonyms?.get(&object.label)).unwrap_or(&object.label);
+            let label = synonym
+                .or_else(|| synonyms?.get(&object.label))
+                .unwrap_or(&object.label);
             if let Some((span, truth)) = self.truth.at(id, report.captured_at_us) {
-                votes.count(&report.node, (id.clone(), span), label, self.truth.accepts(truth, Some(label)));
+                votes.count(
+                    &report.node,
+                    (id.clone(), span),
+                    label,
+                    self.truth.accepts(truth, Some(label)),
+                );
             }
         }
     }
 
     /// The figures so far.
     pub fn result(&self) -> EvalResult {
-        EvalResult { pace: self.pace.scores(&self.truth), vote: self.vote.scores(&self.truth) }
+        EvalResult {
+            pace: self.pace.scores(&self.truth),
+            vote: self.vote.scores(&self.truth),
+        }
     }
 }
 
@@ -203,7 +247,9 @@ impl Tally {
     ) {
         self.lines += 1;
         for (id, label) in entries {
-            let Some((number, span)) = truth.at(id, at) else { continue };
+            let Some((number, span)) = truth.at(id, at) else {
+                continue;
+            };
             self.rounds.entries += 1;
             self.rounds.right += u64::from(truth.accepts(span, label));
             let last = self.last.entry((id.clone(), number)).or_default();
@@ -223,7 +269,10 @@ impl Tally {
         let mut classes: BTreeMap<Option<Label>, (u64, u64)> = BTreeMap::new();
         let mut confusion: BTreeMap<(Option<Label>, Option<Label>), u64> = BTreeMap::new();
         for (id, number, span) in truth.spans() {
-            let said = self.last.get(&(id.clone(), number)).and_then(|last| last.said(truth, span));
+            let said = self
+                .last
+                .get(&(id.clone(), number))
+                .and_then(|last| last.said(truth, span));
             let is_right = u64::from(truth.accepts(span, said));
             items += 1;
             right += is_right;
@@ -237,19 +286,30 @@ impl Tally {
             }
             let of_class = classes.entry(span.name().cloned()).or_default();
             *of_class = (of_class.0 + 1, of_class.1 + is_right);
-            *confusion.entry((span.name().cloned(), said.cloned())).or_default() += 1;
+            *confusion
+                .entry((span.name().cloned(), said.cloned()))
+                .or_default() += 1;
         }
         let entry = |((truth, said), count)| ConfusionCell { truth, said, count };
-        let recalls = classes.values().map(|&(items, right)| right as f64 / items as f64);
+        let recalls = classes
+            .values()
+            .map(|&(items, right)| right as f64 / items as f64);
         let mean_recall_pct = percent(recalls.sum(), classes.len() as u64);
-        let of_class = |(truth, (items, right))| ClassRecall { truth, items, recall_pct: percent(right as f64, items) };
+        let of_class = |(truth, (items, right))| ClassRecall {
+            truth,
+            items,
+            recall_pct: percent(right as f64, items),
+        };
         Some(Scores {
             lines: self.lines,
             items,
             accuracy_pct: percent(right as f64, items),
             coverage_pct: percent(covered as f64, standing),
             labelled_accuracy_pct: percent(labelled_right as f64, labelled),
-            rounds: RoundScores { accuracy_pct: percent(self.rounds.right as f64, self.rounds.entries), ..self.rounds },
+            rounds: RoundScores {
+                accuracy_pct: percent(self.rounds.right as f64, self.rounds.entries),
+                ..self.rounds
+            },
             majority_accuracy_pct: self.votes.majority_accuracy_pct(truth),
             vehicles: self.votes.vehicles(truth),
             mean_recall_pct,
@@ -261,7 +321,11 @@ impl Tally {
 
 impl Last {
     fn said(&self, truth: &Truth, span: &LabelSpan) -> Option<&Label> {
-        if truth.accepts(span, None) { self.entry.as_ref() } else { self.labelled.as_ref() }
+        if truth.accepts(span, None) {
+            self.entry.as_ref()
+        } else {
+            self.labelled.as_ref()
+        }
     }
 }
 

@@ -34,13 +34,28 @@ impl NodeProcess {
     /// # Errors
     /// When a file cannot be written or the program cannot be run.
     pub fn start(program: &Path, config: &NodeConfig, directory: &Path) -> anyhow::Result<Self> {
-        let name = config.name.as_ref().map_or_else(|| "node".to_owned(), ToString::to_string);
-        let (file, log) = (directory.join(format!("{name}.toml")), directory.join(format!("{name}.log")));
-        let text = toml::to_string(config).context("the configuration cannot be written as TOML")?;
+        let name = config
+            .name
+            .as_ref()
+            .map_or_else(|| "node".to_owned(), ToString::to_string);
+        let (file, log) = (
+            directory.join(format!("{name}.toml")),
+            directory.join(format!("{name}.log")),
+        );
+        let text =
+            toml::to_string(config).context("the configuration cannot be written as TOML")?;
         fs::write(&file, text).with_context(|| format!("cannot write {}", file.display()))?;
         File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
         let child = spawn(program, &file, &log)?;
-        Ok(Self { name, program: program.into(), file, log, child, starts: 1, killed: false })
+        Ok(Self {
+            name,
+            program: program.into(),
+            file,
+            log,
+            child,
+            starts: 1,
+            killed: false,
+        })
     }
 
     /// Starts the node again, with its configuration; the log goes on.
@@ -60,7 +75,10 @@ impl NodeProcess {
     /// When the operating system refuses.
     pub async fn kill(&mut self) -> anyhow::Result<()> {
         self.killed = true;
-        self.child.kill().await.with_context(|| format!("cannot kill node {}", self.name))
+        self.child
+            .kill()
+            .await
+            .with_context(|| format!("cannot kill node {}", self.name))
     }
 
     /// True if it was killed and not started again.
@@ -98,8 +116,13 @@ impl NodeProcess {
             // The last line may not be whole.
             let whole = log.rsplit_once('\n').map_or("", |(whole, _)| whole);
             let mut lines = whole.lines().filter(|line| line.contains(message));
-            if let Some((_, address)) = lines.next_back().and_then(|line| line.rsplit_once("address=")) {
-                return address.parse().with_context(|| format!("no address of node {}: {address}", self.name));
+            if let Some((_, address)) = lines
+                .next_back()
+                .and_then(|line| line.rsplit_once("address="))
+            {
+                return address
+                    .parse()
+                    .with_context(|| format!("no address of node {}: {address}", self.name));
             }
             self.check()?;
             tokio::time::sleep(Duration::from_millis(20)).await;
@@ -113,11 +136,18 @@ impl NodeProcess {
 
     /// Asks the node to stop, and makes it stop when it does not.
     pub async fn stop(&mut self) {
-        let pid = self.child.id().and_then(|pid| i32::try_from(pid).ok()).map(Pid::from_raw);
+        let pid = self
+            .child
+            .id()
+            .and_then(|pid| i32::try_from(pid).ok())
+            .map(Pid::from_raw);
         if let Some(Err(error)) = pid.map(|pid| kill(pid, Signal::SIGTERM)) {
             tracing::warn!(node = self.name, %error, "node not asked to stop");
         }
-        if tokio::time::timeout(STOP_TIMEOUT, self.child.wait()).await.is_err() {
+        if tokio::time::timeout(STOP_TIMEOUT, self.child.wait())
+            .await
+            .is_err()
+        {
             tracing::warn!(node = self.name, "node did not stop in time");
             if let Err(error) = self.child.kill().await {
                 tracing::warn!(node = self.name, %error, "node not killed");
@@ -140,8 +170,16 @@ pub fn node_program() -> anyhow::Result<PathBuf> {
 /// When there is none.
 pub fn node_beside(program: &Path) -> anyhow::Result<PathBuf> {
     let node = program.with_file_name("ecod-node");
-    let profile = if cfg!(debug_assertions) { "" } else { " --release" };
-    ensure!(node.is_file(), "there is no {}: build it by `cargo build{profile} --bin ecod-node`", node.display());
+    let profile = if cfg!(debug_assertions) {
+        ""
+    } else {
+        " --release"
+    };
+    ensure!(
+        node.is_file(),
+        "there is no {}: build it by `cargo build{profile} --bin ecod-node`",
+        node.display()
+    );
     Ok(node)
 }
 
@@ -162,7 +200,9 @@ pub fn free_address() -> anyhow::Result<SocketAddr> {
         let port = first + (start + GIVEN.fetch_add(1, Ordering::Relaxed)) % (last - first + 1);
         SocketAddr::from((Ipv4Addr::LOCALHOST, port as u16))
     });
-    let is_free = |address: &SocketAddr| TcpListener::bind(address).is_ok() && UdpSocket::bind(address).is_ok();
+    let is_free = |address: &SocketAddr| {
+        TcpListener::bind(address).is_ok() && UdpSocket::bind(address).is_ok()
+    };
     ports.find(is_free).context("no free port on loopback")
 }
 
@@ -171,7 +211,9 @@ fn spawn(program: &Path, file: &Path, log: &Path) -> anyhow::Result<Child> {
     let output = output.with_context(|| format!("cannot write {}", log.display()))?;
     let mut command = Command::new(program);
     // The node is what its file says, whatever the environment says to others.
-    for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+    for (key, _) in
+        std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
+    {
         command.env_remove(key);
     }
     command
@@ -193,7 +235,12 @@ mod tests {
 
     #[test]
     fn a_program_without_a_node_beside_it_says_how_to_get_one() {
-        let error = node_beside(Path::new("/no/such/ecod-lab")).unwrap_err().to_string();
-        assert!(error.contains("/no/such/ecod-node") && error.contains("--bin ecod-node`"), "{error}");
+        let error = node_beside(Path::new("/no/such/ecod-lab"))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("/no/such/ecod-node") && error.contains("--bin ecod-node`"),
+            "{error}"
+        );
     }
 }

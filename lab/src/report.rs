@@ -31,7 +31,10 @@ impl Section for Locations {
         // Each file may have been written under another configuration.
         let landmarks: Vec<_> = identity.landmarks.iter().map(Landmark::from).collect();
         let gate = identity.fusion.pace.gate();
-        let evaluation = self.0.clone().with_landmarks(LandmarkIndex::new(landmarks, gate.radius_m), gate);
+        let evaluation = self
+            .0
+            .clone()
+            .with_landmarks(LandmarkIndex::new(landmarks, gate.radius_m), gate);
         self.0 = evaluation.with_synonyms(identity.fusion.vote.synonyms.clone());
     }
 
@@ -45,25 +48,54 @@ impl Section for Locations {
 
     fn html(&self) -> String {
         let result = self.0.result();
-        let percent = |share: Option<f64>| share.map_or("-".to_owned(), |share| format!("{share:.1}"));
+        let percent =
+            |share: Option<f64>| share.map_or("-".to_owned(), |share| format!("{share:.1}"));
         let row = |name: &str, scores: &Scores| {
-            let cells = [name.to_owned(), scores.lines.to_string(), scores.items.to_string()];
-            cells.into_iter().chain(scores.shares_pct().map(percent)).collect::<Vec<_>>()
+            let cells = [
+                name.to_owned(),
+                scores.lines.to_string(),
+                scores.items.to_string(),
+            ];
+            cells
+                .into_iter()
+                .chain(scores.shares_pct().map(percent))
+                .collect::<Vec<_>>()
         };
         let judged = [("PACE", &result.pace), ("VOTE", &result.vote)];
-        let rows: Vec<_> = judged.iter().filter_map(|(name, scores)| Some(row(name, scores.as_ref()?))).collect();
-        let head = ["", "rounds", "items", "accuracy %", "coverage %", "labelled %", "all rounds %", "majority %"];
+        let rows: Vec<_> = judged
+            .iter()
+            .filter_map(|(name, scores)| Some(row(name, scores.as_ref()?)))
+            .collect();
+        let head = [
+            "",
+            "rounds",
+            "items",
+            "accuracy %",
+            "coverage %",
+            "labelled %",
+            "all rounds %",
+            "majority %",
+        ];
         let mut text = table(&head, &rows);
-        for (name, scores) in judged.iter().filter_map(|(name, scores)| Some((name, scores.as_ref()?))) {
+        for (name, scores) in judged
+            .iter()
+            .filter_map(|(name, scores)| Some((name, scores.as_ref()?)))
+        {
             let alone: Vec<_> = scores.vehicles.iter().collect();
-            let shares: Vec<_> =
-                alone.iter().filter_map(|(node, alone)| Some((node.to_string(), alone.accuracy_pct?))).collect();
+            let shares: Vec<_> = alone
+                .iter()
+                .filter_map(|(node, alone)| Some((node.to_string(), alone.accuracy_pct?)))
+                .collect();
             if !shares.is_empty() {
                 let title = format!("{name}: accuracy of every vehicle alone");
                 text += &format!("<h3>{title}</h3>\n{}", drawing(&bars(&title, &shares)));
             }
         }
-        section("Accuracy", "Judged by the truth that was given; an item is a location while its truth stays.", &text)
+        section(
+            "Accuracy",
+            "Judged by the truth that was given; an item is a location while its truth stays.",
+            &text,
+        )
     }
 }
 
@@ -86,10 +118,14 @@ impl Section for Objects {
         let scores = self.0.clone().result();
         let tables = tables(&scores);
         let tables = tables.iter().filter_map(|rows| rows.split_first());
-        let tables = tables.map(|(head, rows)| table(&head.iter().map(String::as_str).collect::<Vec<_>>(), rows));
-        let warning = without_map(&scores).map_or_else(String::new, |warning| format!(" {warning}."));
-        let about =
-            format!("Objects of maps judged by where the true ones were, in {} frames.{warning}", scores.frames);
+        let tables = tables
+            .map(|(head, rows)| table(&head.iter().map(String::as_str).collect::<Vec<_>>(), rows));
+        let warning =
+            without_map(&scores).map_or_else(String::new, |warning| format!(" {warning}."));
+        let about = format!(
+            "Objects of maps judged by where the true ones were, in {} frames.{warning}",
+            scores.frames
+        );
         section("Accuracy of objects", &about, &tables.collect::<String>())
     }
 }

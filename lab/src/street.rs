@@ -99,8 +99,16 @@ impl Street {
 
     /// All cars and people at a time in seconds.
     pub fn truth(&self, at_s: f64) -> Vec<TrueObject> {
-        let labelled = (0u32..).zip(&self.bodies).filter_map(|(id, body)| Some((id, body, body.label.clone()?)));
-        labelled.map(|(id, body, label)| TrueObject { id, label, position: body.route.at(at_s).position }).collect()
+        let labelled = (0u32..)
+            .zip(&self.bodies)
+            .filter_map(|(id, body)| Some((id, body, body.label.clone()?)));
+        labelled
+            .map(|(id, body, label)| TrueObject {
+                id,
+                label,
+                position: body.route.at(at_s).position,
+            })
+            .collect()
     }
 
     /// Sides of the codes by label.
@@ -108,9 +116,15 @@ impl Street {
         let sizes = self.bodies.iter().filter_map(|body| {
             let placard = body.solids.iter().find(|solid| solid.is_placard)?;
             let all = (CODE_MODULES + 2 * QUIET_MODULES) as f64;
-            Some((body.label.clone()?, ObjectSize::square(placard.width_m * CODE_MODULES as f64 / all)))
+            Some((
+                body.label.clone()?,
+                ObjectSize::square(placard.width_m * CODE_MODULES as f64 / all),
+            ))
         });
-        ObjectSizes { default: None, labels: sizes.collect() }
+        ObjectSizes {
+            default: None,
+            labels: sizes.collect(),
+        }
     }
 }
 
@@ -118,13 +132,23 @@ impl StreetBody {
     /// Length and width around all parts, and the middle of that in the frame of the body.
     fn extent(&self) -> (Point2<f64>, [f64; 2]) {
         let ends = |middle: fn(&Solid) -> f64, size: fn(&Solid) -> f64| {
-            let low = self.solids.iter().map(|solid| middle(solid) - size(solid) / 2.0).fold(f64::INFINITY, f64::min);
-            let high = self.solids.iter().map(|solid| middle(solid) + size(solid) / 2.0);
+            let low = self
+                .solids
+                .iter()
+                .map(|solid| middle(solid) - size(solid) / 2.0)
+                .fold(f64::INFINITY, f64::min);
+            let high = self
+                .solids
+                .iter()
+                .map(|solid| middle(solid) + size(solid) / 2.0);
             (low, high.fold(f64::NEG_INFINITY, f64::max))
         };
         let (back, front) = ends(|solid| solid.forward_m, |solid| solid.length_m);
         let (right, left) = ends(|solid| solid.left_m, |solid| solid.width_m);
-        (Point2::new((back + front) / 2.0, (right + left) / 2.0), [front - back, left - right])
+        (
+            Point2::new((back + front) / 2.0, (right + left) / 2.0),
+            [front - back, left - right],
+        )
     }
 
     /// Corners of its extent on the ground, counter-clockwise.
@@ -136,6 +160,7 @@ impl StreetBody {
 
 /// Corners of a rectangle in the frame of a body, counter-clockwise from the front right one.
 fn corners(pose: &Pose, middle: Point2<f64>, length_m: f64, width_m: f64) -> [Point2<f64>; 4] {
-    [(0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5)]
-        .map(|(ahead, aside)| pose.transform(middle.x + ahead * length_m, middle.y + aside * width_m))
+    [(0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5)].map(|(ahead, aside)| {
+        pose.transform(middle.x + ahead * length_m, middle.y + aside * width_m)
+    })
 }

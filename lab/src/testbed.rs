@@ -58,15 +58,27 @@ impl Testbed {
     /// All cards that stand in a scene: of each spot its `EMPTY` placard, if it has one, and then its plate, if a
     /// vehicle is parked there.
     pub fn cards(&self, scene: &Scene) -> Vec<Card> {
-        scene.spots.iter().flat_map(|spot| [spot.empty_card(&self.placard), spot.plate_card()]).flatten().collect()
+        scene
+            .spots
+            .iter()
+            .flat_map(|spot| [spot.empty_card(&self.placard), spot.plate_card()])
+            .flatten()
+            .collect()
     }
 
     /// Sign that the vehicle's camera could read at a spot, by the geometry alone: the plate of an occupied spot, the
     /// `EMPTY` placard of a free one; `None` when it is outside the image, seen from behind, too small in it, or mostly
     /// hidden. A free spot without a placard can be seen to be free where its plate could be read.
     pub fn sighting(&self, scene: &Scene, cav: &Cav, spot: &Spot) -> Option<Sighting> {
-        let place = || Card { text: Label::default(), position: spot.occupied, facing_rad: spot.facing_rad };
-        let card = spot.plate_card().or_else(|| spot.empty_card(&self.placard)).unwrap_or_else(place);
+        let place = || Card {
+            text: Label::default(),
+            position: spot.occupied,
+            facing_rad: spot.facing_rad,
+        };
+        let card = spot
+            .plate_card()
+            .or_else(|| spot.empty_card(&self.placard))
+            .unwrap_or_else(place);
         Sighting::of(&card, &self.cards(scene), &cav.pose, self).filter(Sighting::is_legible)
     }
 }
@@ -113,7 +125,10 @@ pub struct Scene {
 impl Scene {
     /// The spots as the known locations of PACE.
     pub fn landmarks(&self, placard: &Placard) -> Vec<Landmark> {
-        self.spots.iter().map(|spot| spot.landmark(placard)).collect()
+        self.spots
+            .iter()
+            .map(|spot| spot.landmark(placard))
+            .collect()
     }
 }
 
@@ -139,18 +154,29 @@ impl Spot {
             id: self.id.clone(),
             position: self.occupied,
             facing_rad: Some(self.facing_rad),
-            vacancy: self.empty.map(|position| VacancySign { label: placard.empty_text.clone(), position }),
+            vacancy: self.empty.map(|position| VacancySign {
+                label: placard.empty_text.clone(),
+                position,
+            }),
             synonyms: Vec::new(),
         }
     }
 
     fn plate_card(&self) -> Option<Card> {
-        self.truth.clone().map(|text| Card { text, position: self.occupied, facing_rad: self.facing_rad })
+        self.truth.clone().map(|text| Card {
+            text,
+            position: self.occupied,
+            facing_rad: self.facing_rad,
+        })
     }
 
     fn empty_card(&self, placard: &Placard) -> Option<Card> {
         let text = placard.empty_text.clone();
-        self.empty.map(|position| Card { text, position, facing_rad: self.facing_rad })
+        self.empty.map(|position| Card {
+            text,
+            position,
+            facing_rad: self.facing_rad,
+        })
     }
 }
 

@@ -30,8 +30,12 @@ use links::TownLinks;
 use place::CellFrame;
 
 /// Where the town is.
-const TOWN: GeographicOrigin =
-    GeographicOrigin { latitude_deg: 48.137, longitude_deg: 11.575, height_m: 520.0, rotation_deg: 0.0 };
+const TOWN: GeographicOrigin = GeographicOrigin {
+    latitude_deg: 48.137,
+    longitude_deg: 11.575,
+    height_m: 520.0,
+    rotation_deg: 0.0,
+};
 
 /// Cells along each side.
 pub const CELLS_A_SIDE: usize = 3;
@@ -65,7 +69,13 @@ pub struct LinkConfig {
 
 impl Default for LinkConfig {
     fn default() -> Self {
-        Self { map_hz: 10.0, min_delay_s: 0.02, delay_s: 0.03, lost: 0.02, is_up: true }
+        Self {
+            map_hz: 10.0,
+            min_delay_s: 0.02,
+            delay_s: 0.03,
+            lost: 0.02,
+            is_up: true,
+        }
     }
 }
 
@@ -127,23 +137,35 @@ pub fn run(
     uniform: &mut dyn FnMut() -> f64,
 ) -> Result<TownResult, TrackTruthError> {
     let plan = TownPlan::new(traffic);
-    let config = FusionConfig { algorithms: Algorithms::Pace, ..FusionConfig::default() };
-    let Some(first) = recording.reports.first() else { return Err(TrackTruthError::Empty) };
+    let config = FusionConfig {
+        algorithms: Algorithms::Pace,
+        ..FusionConfig::default()
+    };
+    let Some(first) = recording.reports.first() else {
+        return Err(TrackTruthError::Empty);
+    };
     let start = first.received_at_us.unwrap_or(first.report.captured_at_us);
     let whole = NodeName::from_static("town");
     let mut single = TownCell::new(whole, CellFrame::new(&TOWN, TOWN, 0), config.clone(), start);
-    let mut cells: Vec<TownCell> =
-        plan.frames(uniform).map(|(name, frame)| TownCell::new(name, frame, config.clone(), start)).collect();
+    let mut cells: Vec<TownCell> = plan
+        .frames(uniform)
+        .map(|(name, frame)| TownCell::new(name, frame, config.clone(), start))
+        .collect();
     let mut links = TownLinks::new(link, uniform);
-    let numbers: BTreeMap<NodeName, usize> = CELLS.map(|number| (cell_name(number), number)).collect();
+    let numbers: BTreeMap<NodeName, usize> =
+        CELLS.map(|number| (cell_name(number), number)).collect();
     let mut vehicles: BTreeMap<NodeName, TownVehicle> = BTreeMap::new();
     for arrived in &recording.reports {
-        let now = arrived.received_at_us.unwrap_or(arrived.report.captured_at_us);
+        let now = arrived
+            .received_at_us
+            .unwrap_or(arrived.report.captured_at_us);
         single.close_until(now);
         advance(&mut cells, &mut links, now);
         single.report(&arrived.report, now);
         let node = arrived.report.node.clone();
-        let vehicle = vehicles.entry(node).or_insert_with(|| plan.vehicle(&arrived.report));
+        let vehicle = vehicles
+            .entry(node)
+            .or_insert_with(|| plan.vehicle(&arrived.report));
         let number = numbers[vehicle.drive(&arrived.report, now)];
         cells[number].report(&arrived.report, now);
         links.send_from(&mut cells, number, now);
@@ -152,11 +174,18 @@ pub fn run(
     Ok(TownResult {
         single: maps(std::slice::from_ref(&single))?,
         cells: maps(&cells)?,
-        identities: cells.iter().flat_map(TownCell::identities).collect::<BTreeSet<Uuid>>().len(),
-        hand_overs: cells.iter().map(TownCell::hand_overs).fold(HandOvers::default(), |all, cell| HandOvers {
-            begun: all.begun + cell.begun,
-            renamed: all.renamed + cell.renamed,
-        }),
+        identities: cells
+            .iter()
+            .flat_map(TownCell::identities)
+            .collect::<BTreeSet<Uuid>>()
+            .len(),
+        hand_overs: cells.iter().map(TownCell::hand_overs).fold(
+            HandOvers::default(),
+            |all, cell| HandOvers {
+                begun: all.begun + cell.begun,
+                renamed: all.renamed + cell.renamed,
+            },
+        ),
         received: cells.iter().map(|cell| cell.received).sum(),
         refused: cells.iter().map(|cell| cell.refused).sum(),
     })
@@ -165,8 +194,13 @@ pub fn run(
 /// Closes rounds and delivers maps that are due until `now`, in the order of time.
 fn advance(cells: &mut [TownCell], links: &mut TownLinks<'_>, now: Timestamp) {
     loop {
-        let rounds = cells.iter().enumerate().map(|(number, cell)| (cell.deadline(), number));
-        let Some((round_at, number)) = rounds.min() else { return };
+        let rounds = cells
+            .iter()
+            .enumerate()
+            .map(|(number, cell)| (cell.deadline(), number));
+        let Some((round_at, number)) = rounds.min() else {
+            return;
+        };
         let delivery = links.next_at().unwrap_or(Timestamp(u64::MAX));
         if round_at.min(delivery) > now {
             return;
@@ -190,13 +224,22 @@ struct TownPlan {
 impl TownPlan {
     fn new(traffic: &TrafficConfig) -> Self {
         let side_m = traffic.roads as f64 * traffic.block_m / CELLS_A_SIDE as f64;
-        Self { from_m: -traffic.block_m / 2.0, side_m }
+        Self {
+            from_m: -traffic.block_m / 2.0,
+            side_m,
+        }
     }
 
     /// Names and frames: each with a direction and a clock of its own, up to 2 s fast or slow.
-    fn frames<'a>(&'a self, uniform: &'a mut dyn FnMut() -> f64) -> impl Iterator<Item = (NodeName, CellFrame)> + 'a {
+    fn frames<'a>(
+        &'a self,
+        uniform: &'a mut dyn FnMut() -> f64,
+    ) -> impl Iterator<Item = (NodeName, CellFrame)> + 'a {
         CELLS.map(move |number| {
-            let origin = GeographicOrigin { rotation_deg: 360.0 * uniform(), ..self.middle(number) };
+            let origin = GeographicOrigin {
+                rotation_deg: 360.0 * uniform(),
+                ..self.middle(number)
+            };
             let clock_us = ((4.0 * uniform() - 2.0) * 1e6) as i64;
             (cell_name(number), CellFrame::new(&TOWN, origin, clock_us))
         })
@@ -212,16 +255,36 @@ impl TownPlan {
         let here = self.index(place.x) + CELLS_A_SIDE * self.index(place.y);
         // Circles that have the corners in them.
         let radius_m = 0.75 * self.side_m;
-        let known = |number| KnownCell { name: cell_name(number), origin: self.middle(number), radius_m };
-        TownVehicle { choice: CellChoice::new(CELLS.map(known).collect(), cell_name(here)), joined_at: None }
+        let known = |number| KnownCell {
+            name: cell_name(number),
+            origin: self.middle(number),
+            radius_m,
+        };
+        TownVehicle {
+            choice: CellChoice::new(CELLS.map(known).collect(), cell_name(here)),
+            joined_at: None,
+        }
     }
 
     /// Place on Earth of the middle of a cell; its frame looks east.
     fn middle(&self, number: usize) -> GeographicOrigin {
         let middle = |place: usize| self.from_m + (place as f64 + 0.5) * self.side_m;
-        let place = TOWN.to_wgs84(middle(number % CELLS_A_SIDE), middle(number / CELLS_A_SIDE), 0.0);
-        let GeographicPosition { latitude_deg, longitude_deg, height_m } = place;
-        GeographicOrigin { latitude_deg, longitude_deg, height_m, rotation_deg: 0.0 }
+        let place = TOWN.to_wgs84(
+            middle(number % CELLS_A_SIDE),
+            middle(number / CELLS_A_SIDE),
+            0.0,
+        );
+        let GeographicPosition {
+            latitude_deg,
+            longitude_deg,
+            height_m,
+        } = place;
+        GeographicOrigin {
+            latitude_deg,
+            longitude_deg,
+            height_m,
+            rotation_deg: 0.0,
+        }
     }
 
     /// Distance to the next border between cells, metres.
@@ -235,7 +298,8 @@ impl TownPlan {
     }
 
     fn is_in_middle(&self, place: &Point2<f64>) -> bool {
-        let middles = (0..CELLS_A_SIDE).map(|number| self.from_m + (number as f64 + 0.5) * self.side_m);
+        let middles =
+            (0..CELLS_A_SIDE).map(|number| self.from_m + (number as f64 + 0.5) * self.side_m);
         distance_m(place, middles) < BORDER_M && !self.is_at_border(place)
     }
 }
@@ -251,12 +315,18 @@ impl TownVehicle {
     /// The cell to which it reports from where it is at `now`.
     fn drive(&mut self, report: &ObjectReport, now: Timestamp) -> &NodeName {
         let place = place_of(report);
-        match self.choice.observe(Some(&TOWN.to_wgs84(place.x, place.y, 0.0)), now) {
+        match self
+            .choice
+            .observe(Some(&TOWN.to_wgs84(place.x, place.y, 0.0)), now)
+        {
             Some(CellMove::Join(cell)) => self.joined_at = Some((cell, now)),
             Some(CellMove::GiveUp(_)) => self.joined_at = None,
             None => {}
         }
-        if let Some((cell, _)) = self.joined_at.take_if(|(_, at)| now.since(*at) >= JOIN_TIME) {
+        if let Some((cell, _)) = self
+            .joined_at
+            .take_if(|(_, at)| now.since(*at) >= JOIN_TIME)
+        {
             self.choice.enter(&cell);
         }
         self.choice.present()
@@ -265,7 +335,9 @@ impl TownVehicle {
 
 /// Place in the town's frame of whoever reports, metres.
 fn place_of(report: &ObjectReport) -> Point2<f64> {
-    report.pose.map_or(Point2::origin(), |pose| Point2::new(pose.x_m, pose.y_m))
+    report
+        .pose
+        .map_or(Point2::origin(), |pose| Point2::new(pose.x_m, pose.y_m))
 }
 
 /// Distance of a place to the next of lines along both axes.
@@ -280,20 +352,36 @@ fn cell_name(number: usize) -> NodeName {
 }
 
 /// Judges the maps of cells together.
-fn judge(plan: &TownPlan, truth: &TrafficTruth, cells: &[TownCell]) -> Result<TownScores, TrackTruthError> {
+fn judge(
+    plan: &TownPlan,
+    truth: &TrafficTruth,
+    cells: &[TownCell],
+) -> Result<TownScores, TrackTruthError> {
     let part = |is_part: &dyn Fn(&Point2<f64>) -> bool| -> Result<TrackScores, TrackTruthError> {
         let frames = truth.frames.iter().map(|frame| {
-            let here = frame.objects.iter().filter(|object| is_part(&Point2::new(object.x_m, object.y_m)));
-            TruthFrame { t_us: frame.t_us, objects: here.cloned().collect() }
+            let here = frame
+                .objects
+                .iter()
+                .filter(|object| is_part(&Point2::new(object.x_m, object.y_m)));
+            TruthFrame {
+                t_us: frame.t_us,
+                objects: here.cloned().collect(),
+            }
         });
-        let part = TrafficTruth { frames: frames.collect() };
+        let part = TrafficTruth {
+            frames: frames.collect(),
+        };
         let text = serde_json::to_string(&part).unwrap_or_default();
         let mut judge = TrackEvaluation::new(TrackTruth::parse(&text)?);
         let mut ids = HashMap::new();
         for frame in &truth.frames {
             let moment = moment(cells, frame.t_us);
-            let said = moment.iter().filter(|object| is_part(&Point2::new(object.x_m, object.y_m)));
-            let said: Vec<SaidObject> = said.map(|object| SaidObject::of(object, &mut ids)).collect();
+            let said = moment
+                .iter()
+                .filter(|object| is_part(&Point2::new(object.x_m, object.y_m)));
+            let said: Vec<SaidObject> = said
+                .map(|object| SaidObject::of(object, &mut ids))
+                .collect();
             judge.said(frame.t_us, &said);
         }
         Ok(judge.result())

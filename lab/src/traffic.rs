@@ -137,20 +137,36 @@ struct Town {
 
 impl Town {
     fn new(config: &TrafficConfig, dice: &mut Dice<'_>) -> Self {
-        let roads = Roads { count: config.roads, block_m: config.block_m };
+        let roads = Roads {
+            count: config.roads,
+            block_m: config.block_m,
+        };
         let lanes = roads.lanes();
         let mut parked: Vec<TrafficBody> = Vec::new();
         while parked.len() < config.parked {
             let lane = lanes[dice.below(lanes.len())];
-            let (center, heading_rad) = roads.parking(lane, dice.between(0.0, roads.length_m(lane)));
-            if parked.iter().all(|other| (other.center - center).norm() > 6.0) || dice.chance(0.001) {
-                parked.push(TrafficBody { length_m: dice.between(3.8, 4.9), ..body("car", center, heading_rad) });
+            let (center, heading_rad) =
+                roads.parking(lane, dice.between(0.0, roads.length_m(lane)));
+            if parked
+                .iter()
+                .all(|other| (other.center - center).norm() > 6.0)
+                || dice.chance(0.001)
+            {
+                parked.push(TrafficBody {
+                    length_m: dice.between(3.8, 4.9),
+                    ..body("car", center, heading_rad)
+                });
             }
         }
         let mut walkers = walk::walkers(&roads, config.people, false, dice);
         walkers.extend(walk::walkers(&roads, config.bicycles, true, dice));
         let blocks = roads.blocks().len() as f64;
-        let lures = walk::walkers(&roads, (config.sensor.lures * blocks).round() as usize, false, dice);
+        let lures = walk::walkers(
+            &roads,
+            (config.sensor.lures * blocks).round() as usize,
+            false,
+            dice,
+        );
         let convoy = if config.convoy { config.observers } else { 0 };
         Self {
             buildings: roads.buildings(),
@@ -163,29 +179,67 @@ impl Town {
     }
 
     fn step(&mut self, step: u64, dice: &mut Dice<'_>) {
-        drive::drive(&self.roads, &mut self.vehicles, step as f64 * STEP_S, STEP_S);
-        self.walkers.iter_mut().for_each(|walker| walker.step(STEP_S, dice));
+        drive::drive(
+            &self.roads,
+            &mut self.vehicles,
+            step as f64 * STEP_S,
+            STEP_S,
+        );
+        self.walkers
+            .iter_mut()
+            .for_each(|walker| walker.step(STEP_S, dice));
     }
 
     /// Everything that can be seen, vehicles first; a body keeps its place in the list.
     fn bodies(&self) -> Vec<TrafficBody> {
         let vehicles = self.vehicles.iter().map(|vehicle| {
             let (center, heading_rad) = self.roads.place(vehicle.path, vehicle.along_m);
-            let MovingVehicle { speed_mps, length_m, width_m, .. } = *vehicle;
-            TrafficBody { speed_mps, length_m, width_m, ..body("car", center, heading_rad) }
+            let MovingVehicle {
+                speed_mps,
+                length_m,
+                width_m,
+                ..
+            } = *vehicle;
+            TrafficBody {
+                speed_mps,
+                length_m,
+                width_m,
+                ..body("car", center, heading_rad)
+            }
         });
         let walkers = self.walkers.iter().map(|walker| {
             let (center, heading_rad) = walker.place();
-            let (label, length_m) = if walker.is_bicycle { ("bicycle", 1.8) } else { ("person", 0.5) };
+            let (label, length_m) = if walker.is_bicycle {
+                ("bicycle", 1.8)
+            } else {
+                ("person", 0.5)
+            };
             let speed_mps = walker.speed_mps();
-            TrafficBody { speed_mps, length_m, width_m: 0.6, is_opaque: false, ..body(label, center, heading_rad) }
+            TrafficBody {
+                speed_mps,
+                length_m,
+                width_m: 0.6,
+                is_opaque: false,
+                ..body(label, center, heading_rad)
+            }
         });
-        vehicles.chain(self.parked.iter().cloned()).chain(walkers).collect()
+        vehicles
+            .chain(self.parked.iter().cloned())
+            .chain(walkers)
+            .collect()
     }
 }
 
 fn body(label: &'static str, center: Point2<f64>, heading_rad: f64) -> TrafficBody {
-    TrafficBody { label, center, heading_rad, speed_mps: 0.0, length_m: 4.5, width_m: 1.8, is_opaque: true }
+    TrafficBody {
+        label,
+        center,
+        heading_rad,
+        speed_mps: 0.0,
+        length_m: 4.5,
+        width_m: 1.8,
+        is_opaque: true,
+    }
 }
 
 /// All observers and what has come of them.
@@ -216,12 +270,28 @@ impl<'a> Watch<'a> {
         let parked = town.vehicles.len();
         let period = (STEPS_PER_S / config.sensor.rate_hz).round() as usize;
         let mut watcher = |number| {
-            let due = if config.synchronous { 0 } else { dice.below(period) as u64 };
-            let clock_s = if config.synchronous { 0.0 } else { CLOCK_S * dice.normal() };
-            let late_s = if number % 2 == 1 { config.sensor.stamped_late_s } else { 0.0 };
+            let due = if config.synchronous {
+                0
+            } else {
+                dice.below(period) as u64
+            };
+            let clock_s = if config.synchronous {
+                0.0
+            } else {
+                CLOCK_S * dice.normal()
+            };
+            let late_s = if number % 2 == 1 {
+                config.sensor.stamped_late_s
+            } else {
+                0.0
+            };
             Watcher {
                 name: observer_name(number),
-                body: if number < config.observers { number } else { parked + number - config.observers },
+                body: if number < config.observers {
+                    number
+                } else {
+                    parked + number - config.observers
+                },
                 sensor: SimulatedSensor::new(bodies, dice),
                 due,
                 shutter: due,
@@ -229,8 +299,16 @@ impl<'a> Watch<'a> {
                 seq: 0,
             }
         };
-        let observers = (0..config.observers + config.standing).map(&mut watcher).collect();
-        Self { config, observers, seen_at: vec![None; bodies], arrived: Vec::new(), truth: TrafficTruth::default() }
+        let observers = (0..config.observers + config.standing)
+            .map(&mut watcher)
+            .collect();
+        Self {
+            config,
+            observers,
+            seen_at: vec![None; bodies],
+            arrived: Vec::new(),
+            truth: TrafficTruth::default(),
+        }
     }
 
     fn step(&mut self, step: u64, town: &Town, dice: &mut Dice<'_>) {
@@ -246,32 +324,66 @@ impl<'a> Watch<'a> {
             }
         }
         if is_frame {
-            self.truth.frames.push(TruthFrame { t_us: time_of(step), objects: self.known(step, &bodies) });
+            self.truth.frames.push(TruthFrame {
+                t_us: time_of(step),
+                objects: self.known(step, &bodies),
+            });
         }
     }
 
-    fn capture(&mut self, number: usize, step: u64, town: &Town, bodies: &[TrafficBody], dice: &mut Dice<'_>) {
+    fn capture(
+        &mut self,
+        number: usize,
+        step: u64,
+        town: &Town,
+        bodies: &[TrafficBody],
+        dice: &mut Dice<'_>,
+    ) {
         let config = self.config;
         let (position, heading_rad) = match bodies.get(self.observers[number].body) {
             Some(vehicle) if !config.fixed => (vehicle.center, vehicle.heading_rad),
             _ => town.roads.post(number),
         };
-        let pose = Pose { position, heading_rad };
+        let pose = Pose {
+            position,
+            heading_rad,
+        };
         let sights = sight::sights(position, bodies, &town.buildings, config.sensor.range_m);
-        for sight in sights.iter().filter(|sight| SimulatedSensor::sees(config, &pose, sight)) {
+        for sight in sights
+            .iter()
+            .filter(|sight| SimulatedSensor::sees(config, &pose, sight))
+        {
             self.seen_at[sight.body] = Some(step);
         }
-        let is_open = |lure: &&Point2<f64>| !town.buildings.iter().any(|building| building.hides(&pose.position, lure));
+        let is_open = |lure: &&Point2<f64>| {
+            !town
+                .buildings
+                .iter()
+                .any(|building| building.hides(&pose.position, lure))
+        };
         let lures: Vec<Point2<f64>> = town.lures.iter().filter(is_open).copied().collect();
-        let around = Surroundings { pose, bodies, sights: &sights, lures: &lures, at_s: step as f64 * STEP_S };
+        let around = Surroundings {
+            pose,
+            bodies,
+            sights: &sights,
+            lures: &lures,
+            at_s: step as f64 * STEP_S,
+        };
         let watcher = &mut self.observers[number];
         watcher.seq += 1;
         let stamp = time_of(step).shifted(watcher.clock_us);
         let moving = config.fixed.then_some(false);
-        let mut report = ObjectReport { moving, ..ObjectReport::new(watcher.name.clone(), watcher.seq, stamp) };
+        let mut report = ObjectReport {
+            moving,
+            ..ObjectReport::new(watcher.name.clone(), watcher.seq, stamp)
+        };
         watcher.sensor.observe(config, &around, &mut report, dice);
         watcher.due += (STEPS_PER_S / config.sensor.rate_hz).round() as u64;
-        watcher.shutter = if config.synchronous { watcher.due } else { watcher.due - 1 + dice.below(3) as u64 };
+        watcher.shutter = if config.synchronous {
+            watcher.due
+        } else {
+            watcher.due - 1 + dice.below(3) as u64
+        };
         let mut takes_s = MIN_LATENCY_S + dice.exponential(config.sensor.latency_s);
         if dice.chance(config.sensor.lost) {
             return;
@@ -285,15 +397,24 @@ impl<'a> Watch<'a> {
             let received = time_of(step) + Duration::from_secs_f64(takes_s);
             (received, Some(received))
         };
-        self.arrived.push((received, ArrivedReport { received_at_us, report }));
+        self.arrived.push((
+            received,
+            ArrivedReport {
+                received_at_us,
+                report,
+            },
+        ));
     }
 
     /// Objects that belong to the truth.
     fn known(&self, step: u64, bodies: &[TrafficBody]) -> Vec<TruthObject> {
         let memory = (self.config.memory_s * STEPS_PER_S) as u64;
         let are_known = self.config.said.poses && !self.config.fixed;
-        let is_observer = |id: usize| are_known && self.observers.iter().any(|watcher| watcher.body == id);
-        let is_known = |id: usize| is_observer(id) || self.seen_at[id].is_some_and(|seen| step - seen <= memory);
+        let is_observer =
+            |id: usize| are_known && self.observers.iter().any(|watcher| watcher.body == id);
+        let is_known = |id: usize| {
+            is_observer(id) || self.seen_at[id].is_some_and(|seen| step - seen <= memory)
+        };
         let round = |value: f64| (value * 1e3).round() / 1e3;
         let objects = bodies.iter().enumerate().filter(|(id, _)| is_known(*id));
         objects
@@ -308,7 +429,10 @@ impl<'a> Watch<'a> {
 
     fn finish(mut self) -> TrafficRecording {
         self.arrived.sort_by_key(|(received, _)| *received);
-        TrafficRecording { reports: self.arrived.into_iter().map(|(_, report)| report).collect(), truth: self.truth }
+        TrafficRecording {
+            reports: self.arrived.into_iter().map(|(_, report)| report).collect(),
+            truth: self.truth,
+        }
     }
 }
 

@@ -14,10 +14,26 @@ fn a_cell_of_its_own_is_measured_and_other_figures_stay() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("figures.json");
     std::fs::write(&file, r#"{"core":{"x":1}}"#).unwrap();
-    let output = bench(&["--cavs", "4", "--seconds", "4", "--up-to", "8", "--out", file.to_str().unwrap()]);
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let output = bench(&[
+        "--cavs",
+        "4",
+        "--seconds",
+        "4",
+        "--up-to",
+        "8",
+        "--out",
+        file.to_str().unwrap(),
+    ]);
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let text = String::from_utf8(output.stdout).unwrap();
-    assert!(text.contains("p99.9") && text.contains("vehicles_4_verdict_p50_ratio"), "{text}");
+    assert!(
+        text.contains("p99.9") && text.contains("vehicles_4_verdict_p50_ratio"),
+        "{text}"
+    );
 
     let figures: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     assert_eq!(figures["core"]["x"], 1);
@@ -28,14 +44,19 @@ fn a_cell_of_its_own_is_measured_and_other_figures_stay() {
             // Four passes of ten rounds, the first of each for warming up, at four vehicles.
             assert_eq!(measured[way]["n"], 4 * 9 * 4, "{measured}");
             assert_eq!(measured[way]["missing"], 0, "{measured}");
-            let [p50, p99] = ["p50_us", "p99_us"].map(|quantile| measured[way][quantile].as_f64().unwrap());
+            let [p50, p99] =
+                ["p50_us", "p99_us"].map(|quantile| measured[way][quantile].as_f64().unwrap());
             assert!(p50 > 10.0 && p99 >= p50, "{measured}");
         }
-        let ratio = measured["cell"]["p50_us"].as_f64().unwrap() / measured["bare"]["p50_us"].as_f64().unwrap();
+        let ratio = measured["cell"]["p50_us"].as_f64().unwrap()
+            / measured["bare"]["p50_us"].as_f64().unwrap();
         assert!((measured["p50_ratio"].as_f64().unwrap() - ratio).abs() < 1e-9);
     }
     let p50 = |answer: &str| measured[answer]["cell"]["p50_us"].as_f64().unwrap();
-    assert!(p50("verdict") >= p50("map"), "verdicts leave after the map: {measured}");
+    assert!(
+        p50("verdict") >= p50("map"),
+        "verdicts leave after the map: {measured}"
+    );
     for bytes in ["map_bytes", "verdict_bytes"] {
         assert!(measured[bytes].as_u64().unwrap() > 1000, "{measured}");
     }
@@ -48,7 +69,13 @@ fn a_cell_of_its_own_is_measured_and_other_figures_stay() {
     };
     assert!(text.contains(&expected), "{text}");
     assert_eq!(found["steps"][0]["vehicles"], 4);
-    assert!(found["steps"][0]["shares"]["aggregator"]["fusion"].as_f64().unwrap() > 0.0, "{found}");
+    assert!(
+        found["steps"][0]["shares"]["aggregator"]["fusion"]
+            .as_f64()
+            .unwrap()
+            > 0.0,
+        "{found}"
+    );
 }
 
 #[test]
@@ -56,13 +83,27 @@ fn costs_are_measured_without_and_with_recording() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("figures.json");
     let output = bench(&["--costs", "--seconds", "2", "--out", file.to_str().unwrap()]);
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    assert!(String::from_utf8_lossy(&output.stdout).contains("an aggregator with 32 vehicles"), "{output:?}");
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    assert!(
+        String::from_utf8_lossy(&output.stdout).contains("an aggregator with 32 vehicles"),
+        "{output:?}"
+    );
     let figures: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let costs = &figures["costs"]["costs"];
     assert!(costs["resident_mb"].as_f64().unwrap() > 1.0, "{costs}");
     let threads = &costs["recording_cpu_percent_by_thread"];
-    assert!(threads.as_object().unwrap().values().any(|percent| percent.as_f64().unwrap() > 0.0), "{costs}");
+    assert!(
+        threads
+            .as_object()
+            .unwrap()
+            .values()
+            .any(|percent| percent.as_f64().unwrap() > 0.0),
+        "{costs}"
+    );
 }
 
 #[test]
@@ -71,15 +112,30 @@ fn a_closed_cell_is_refused_in_words() {
     let file = directory.path().join("cell.toml");
     let tls = "name = \"euclid\"\n[tls]\nca = \"ca.pem\"\ncertificate = \"euclid.pem\"\nkey = \"euclid.key\"\n";
     std::fs::write(&file, tls).unwrap();
-    let output = bench(&["--connect", "127.0.0.1:8883", "--config", file.to_str().unwrap()]);
+    let output = bench(&[
+        "--connect",
+        "127.0.0.1:8883",
+        "--config",
+        file.to_str().unwrap(),
+    ]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&output.stderr).contains("one vehicle only"), "{output:?}");
+    assert!(
+        String::from_utf8_lossy(&output.stderr).contains("one vehicle only"),
+        "{output:?}"
+    );
 }
 
 #[test]
 fn a_broker_that_is_not_there_is_named() {
-    let address = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
+    let address = std::net::TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .to_string();
     let output = bench(&["--connect", &address, "--cavs", "1", "--seconds", "1"]);
     assert_eq!(output.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&output.stderr).contains(&address), "{output:?}");
+    assert!(
+        String::from_utf8_lossy(&output.stderr).contains(&address),
+        "{output:?}"
+    );
 }

@@ -14,14 +14,24 @@ const SCENE: &str = "setup1-lot1";
 /// Waits until the vehicle has got a newer map that holds the plate.
 async fn plate_on_a_new_map(vehicle: &NodeHandle, plate: &str) {
     let mut newest = vehicle.newest_map();
-    let last = newest.borrow_and_update().as_ref().map(|received| received.map.round);
+    let last = newest
+        .borrow_and_update()
+        .as_ref()
+        .map(|received| received.map.round);
     let seen = newest.wait_for(|received| {
         received.as_ref().is_some_and(|received| {
             Some(received.map.round) != last
-                && received.map.landmarks.iter().any(|state| state.label.as_deref() == Some(plate))
+                && received
+                    .map
+                    .landmarks
+                    .iter()
+                    .any(|state| state.label.as_deref() == Some(plate))
         })
     });
-    timeout(PATIENCE, seen).await.expect("the plate never came back").expect("the follower lives on");
+    timeout(PATIENCE, seen)
+        .await
+        .expect("the plate never came back")
+        .expect("the follower lives on");
 }
 
 /// Waits until the vehicle has looked at more frames.
@@ -37,14 +47,19 @@ async fn more_frames(vehicle: &NodeHandle) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_plate_goes_from_pixels_to_the_map_though_detector_and_projector_are_killed() {
-    let file = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../examples/testbed/pace_setup1.json");
+    let file =
+        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../examples/testbed/pace_setup1.json");
     let testbed = Testbed::from_json(&std::fs::read_to_string(&file).unwrap()).unwrap();
     let scene = testbed.scene(SCENE).unwrap();
     let mut edge = setup::edge(&testbed, scene);
     edge.listen = Some("127.0.0.1:0".parse().unwrap());
     let edge = node::start(edge).await.unwrap();
 
-    let euclid = scene.cavs.iter().find(|cav| cav.name.as_str() == "euclid").unwrap();
+    let euclid = scene
+        .cavs
+        .iter()
+        .find(|cav| cav.name.as_str() == "euclid")
+        .unwrap();
     let directory = tempfile::tempdir().unwrap();
     let source = frames::render(&testbed, scene, euclid, 7, directory.path()).unwrap();
     let mut config = setup::cav(&testbed, scene, euclid, source);

@@ -28,13 +28,23 @@ fn an_output_that_cannot_be_written_is_told_of_before_the_run() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("file");
     std::fs::write(&file, "kept").unwrap();
-    for (command, out) in [("testbed", "/no/such/result.json"), ("demo", file.to_str().unwrap())] {
+    for (command, out) in [
+        ("testbed", "/no/such/result.json"),
+        ("demo", file.to_str().unwrap()),
+    ] {
         let started = Instant::now();
-        let output = ecod_lab().args([command, "--out", out, "--scenes"]).arg(scenes()).output().unwrap();
+        let output = ecod_lab()
+            .args([command, "--out", out, "--scenes"])
+            .arg(scenes())
+            .output()
+            .unwrap();
         let error = stderr(&output);
         assert_eq!(output.status.code(), Some(1), "{error}");
         assert!(error.contains(out) && output.stdout.is_empty(), "{error}");
-        assert!(started.elapsed() < Duration::from_secs(10), "{command} went to work first");
+        assert!(
+            started.elapsed() < Duration::from_secs(10),
+            "{command} went to work first"
+        );
     }
     assert_eq!(std::fs::read_to_string(file).unwrap(), "kept");
 }
@@ -42,15 +52,29 @@ fn an_output_that_cannot_be_written_is_told_of_before_the_run() {
 /// Four cameras, each before two of eight spots; `change` is applied to the file.
 fn result_of(change: impl Fn(&mut serde_json::Value)) -> serde_json::Value {
     let directory = tempfile::tempdir().unwrap();
-    let mut file: serde_json::Value = serde_json::from_slice(&std::fs::read(scenes()).unwrap()).unwrap();
+    let mut file: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(scenes()).unwrap()).unwrap();
     change(&mut file);
-    let (scenes, out) = (directory.path().join("scenes.json"), directory.path().join("result.json"));
+    let (scenes, out) = (
+        directory.path().join("scenes.json"),
+        directory.path().join("result.json"),
+    );
     std::fs::write(&scenes, file.to_string()).unwrap();
     let mut testbed = ecod_lab();
-    testbed.args(["testbed", "--scene", "setup1-lot2", "--verdicts", "3", "--scenes"]).arg(&scenes);
+    testbed
+        .args([
+            "testbed",
+            "--scene",
+            "setup1-lot2",
+            "--verdicts",
+            "3",
+            "--scenes",
+        ])
+        .arg(&scenes);
     let output = testbed.arg("--out").arg(&out).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
-    serde_json::from_slice::<serde_json::Value>(&std::fs::read(out).unwrap()).unwrap()["scenes"][0].clone()
+    serde_json::from_slice::<serde_json::Value>(&std::fs::read(out).unwrap()).unwrap()["scenes"][0]
+        .clone()
 }
 
 #[test]
@@ -60,7 +84,10 @@ fn scenes_may_differ_from_the_recorded_ones() {
             spot.as_object_mut().unwrap().remove("empty_placard");
         }
     });
-    assert_eq!(free_without_placards["pace_accuracy_pct"], 100.0, "{free_without_placards}");
+    assert_eq!(
+        free_without_placards["pace_accuracy_pct"], 100.0,
+        "{free_without_placards}"
+    );
     let slow = result_of(|file| {
         file["camera"]["capture_interval_s"] = 2.0.into();
         file["camera"]["submission_interval_s"] = 4.0.into();
@@ -72,7 +99,10 @@ fn scenes_may_differ_from_the_recorded_ones() {
             spot["truth"] = serde_json::Value::Null;
         }
     });
-    assert_eq!(without_cars["occupied_accuracy_pct"], 100.0, "{without_cars}");
+    assert_eq!(
+        without_cars["occupied_accuracy_pct"], 100.0,
+        "{without_cars}"
+    );
     assert_eq!(without_cars["always_empty_pct"], 100.0);
 }
 
@@ -85,7 +115,8 @@ fn working_in(directory: &Path) -> Vec<i32> {
         let line = std::fs::read(process.path().join("cmdline")).unwrap_or_default();
         String::from_utf8_lossy(&line).contains(directory)
     });
-    ours.filter_map(|process| process.file_name().to_str()?.parse().ok()).collect()
+    ours.filter_map(|process| process.file_name().to_str()?.parse().ok())
+        .collect()
 }
 
 fn until(what: &str, reached: impl Fn() -> bool) {
@@ -100,37 +131,76 @@ fn until(what: &str, reached: impl Fn() -> bool) {
 fn a_demo_that_is_killed_leaves_no_nodes_behind() {
     let directory = tempfile::tempdir().unwrap();
     let mut demo = ecod_lab();
-    demo.args(["demo", "--scene", "setup1-lot1", "--out"]).arg(directory.path());
-    let mut demo = demo.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-    until("five nodes and the demo run", || working_in(directory.path()).len() == 6);
-    kill(Pid::from_raw(i32::try_from(demo.id()).unwrap()), Signal::SIGKILL).unwrap();
+    demo.args(["demo", "--scene", "setup1-lot1", "--out"])
+        .arg(directory.path());
+    let mut demo = demo
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    until("five nodes and the demo run", || {
+        working_in(directory.path()).len() == 6
+    });
+    kill(
+        Pid::from_raw(i32::try_from(demo.id()).unwrap()),
+        Signal::SIGKILL,
+    )
+    .unwrap();
     demo.wait().unwrap();
-    until("all nodes have ended", || working_in(directory.path()).is_empty());
+    until("all nodes have ended", || {
+        working_in(directory.path()).is_empty()
+    });
 }
 
 #[test]
 fn in_the_street_the_cell_knows_more_than_any_camera_and_survives_its_edge() {
     let directory = tempfile::tempdir().unwrap();
     let mut demo = ecod_lab();
-    demo.args(["demo", "--scene", "street", "--seconds", "10", "--out"]).arg(directory.path());
+    demo.args(["demo", "--scene", "street", "--seconds", "10", "--out"])
+        .arg(directory.path());
     let output = demo.output().unwrap();
     let told = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success(), "{}{told}", stderr(&output));
     let result: serde_json::Value =
-        serde_json::from_slice(&std::fs::read(directory.path().join("result.json")).unwrap()).unwrap();
+        serde_json::from_slice(&std::fs::read(directory.path().join("result.json")).unwrap())
+            .unwrap();
     let street = &result["street"];
     let known = |how: &str| {
-        let nodes = street[how].as_object().unwrap().values().map(|share| share["known"].as_f64().unwrap());
+        let nodes = street[how]
+            .as_object()
+            .unwrap()
+            .values()
+            .map(|share| share["known"].as_f64().unwrap());
         nodes.collect::<Vec<_>>()
     };
     let (alone, with_cell) = (known("alone"), known("with_cell"));
     assert_eq!((alone.len(), with_cell.len()), (4, 4), "{told}");
     let best_alone = alone.into_iter().fold(0.0, f64::max);
-    assert!(with_cell.iter().all(|known| *known > best_alone + 1.0), "{told}");
-    assert!(street["took_over"].as_str().is_some_and(|leader| leader != "edge"), "nobody took over: {told}");
-    assert!(street["failover_gap_ms"].as_u64().is_none_or(|gap_ms| gap_ms < 5000), "{told}");
-    assert!(street["seen_only_by"]["galileo"].as_u64() > Some(0), "{told}");
+    assert!(
+        with_cell.iter().all(|known| *known > best_alone + 1.0),
+        "{told}"
+    );
+    assert!(
+        street["took_over"]
+            .as_str()
+            .is_some_and(|leader| leader != "edge"),
+        "nobody took over: {told}"
+    );
+    assert!(
+        street["failover_gap_ms"]
+            .as_u64()
+            .is_none_or(|gap_ms| gap_ms < 5000),
+        "{told}"
+    );
+    assert!(
+        street["seen_only_by"]["galileo"].as_u64() > Some(0),
+        "{told}"
+    );
     let film = std::fs::read_to_string(directory.path().join("street.svg")).unwrap();
-    assert!(film.len() < 2_000_000 && film.contains("seen only by galileo") && film.contains("edge is killed"));
+    assert!(
+        film.len() < 2_000_000
+            && film.contains("seen only by galileo")
+            && film.contains("edge is killed")
+    );
     roxmltree::Document::parse(&film).unwrap();
 }

@@ -14,7 +14,10 @@ fn example(name: &str) -> PathBuf {
 }
 
 fn ecod_lab(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_ecod-lab")).args(arguments).output().unwrap()
+    Command::new(env!("CARGO_BIN_EXE_ecod-lab"))
+        .args(arguments)
+        .output()
+        .unwrap()
 }
 
 fn said_by(output: &Output) -> String {
@@ -29,7 +32,10 @@ fn text(path: &Path) -> &str {
 fn replay(config: ReplayConfig, reports: &Path) -> (Vec<FusedLine>, Summary) {
     let mut replay = Replay::new(config);
     let lines = fs::read_to_string(reports).unwrap();
-    let mut output: Vec<_> = lines.lines().flat_map(|line| replay.line(line.as_bytes())).collect();
+    let mut output: Vec<_> = lines
+        .lines()
+        .flat_map(|line| replay.line(line.as_bytes()))
+        .collect();
     let (rest, summary) = replay.finish();
     output.extend(rest);
     (output, summary)
@@ -37,8 +43,14 @@ fn replay(config: ReplayConfig, reports: &Path) -> (Vec<FusedLine>, Summary) {
 
 /// Replays the example and returns the output.
 fn replay_lot(folder: &TempDir) -> PathBuf {
-    let (fused, _) = replay(cell(Some(&example("recordings/lot.toml"))).unwrap(), &example("recordings/lot.jsonl"));
-    let lines: Vec<_> = fused.iter().map(|line| serde_json::to_string(line).unwrap()).collect();
+    let (fused, _) = replay(
+        cell(Some(&example("recordings/lot.toml"))).unwrap(),
+        &example("recordings/lot.jsonl"),
+    );
+    let lines: Vec<_> = fused
+        .iter()
+        .map(|line| serde_json::to_string(line).unwrap())
+        .collect();
     let output = folder.path().join("out.jsonl");
     fs::write(&output, lines.join("\n")).unwrap();
     output
@@ -48,8 +60,11 @@ fn replay_lot(folder: &TempDir) -> PathBuf {
 fn a_replay_is_judged_beside_majority_and_every_vehicle() {
     let folder = TempDir::new().unwrap();
     let output = replay_lot(&folder);
-    let (truth, reports, config) =
-        (example("recordings/lot_truth.json"), example("recordings/lot.jsonl"), example("recordings/lot.toml"));
+    let (truth, reports, config) = (
+        example("recordings/lot_truth.json"),
+        example("recordings/lot.jsonl"),
+        example("recordings/lot.toml"),
+    );
     let result = folder.path().join("result.json");
     let run = ecod_lab(&[
         "eval",
@@ -67,41 +82,88 @@ fn a_replay_is_judged_beside_majority_and_every_vehicle() {
     assert!(run.status.success(), "{}", said_by(&run));
     let table = String::from_utf8(run.stdout).unwrap();
     assert!(
-        ["PACE", "VOTE", "majority %", "euclid", "truth", "recall %"].iter().all(|part| table.contains(part)),
+        ["PACE", "VOTE", "majority %", "euclid", "truth", "recall %"]
+            .iter()
+            .all(|part| table.contains(part)),
         "{table}"
     );
     let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
     for (algorithm, least) in [("pace", 100.0), ("vote", 75.0)] {
         let scores = &result[algorithm];
         assert_eq!(scores["items"].as_u64(), Some(8));
-        assert!(scores["accuracy_pct"].as_f64().unwrap() >= least, "{scores}");
+        assert!(
+            scores["accuracy_pct"].as_f64().unwrap() >= least,
+            "{scores}"
+        );
         assert_eq!(scores["vehicles"].as_object().unwrap().len(), 4);
-        assert!(scores["vehicles"]["euclid"]["accuracy_pct"].as_f64().unwrap() < 100.0);
+        assert!(
+            scores["vehicles"]["euclid"]["accuracy_pct"]
+                .as_f64()
+                .unwrap()
+                < 100.0
+        );
     }
 }
 
 #[test]
 fn objects_that_move_are_judged_by_where_they_were() {
     let folder = TempDir::new().unwrap();
-    let recorded = |name: &str| Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/eval_tracks")).join(name);
-    let (truth, maps, result) = (recorded("truth.json"), recorded("maps.jsonl"), folder.path().join("result.json"));
-    let run = ecod_lab(&["eval", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)]);
+    let recorded = |name: &str| {
+        Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/eval_tracks")).join(name)
+    };
+    let (truth, maps, result) = (
+        recorded("truth.json"),
+        recorded("maps.jsonl"),
+        folder.path().join("result.json"),
+    );
+    let run = ecod_lab(&[
+        "eval",
+        "--truth",
+        text(&truth),
+        "--input",
+        text(&maps),
+        "--out",
+        text(&result),
+    ]);
     assert!(run.status.success(), "{}", said_by(&run));
     let table = String::from_utf8(run.stdout).unwrap();
     assert!(
-        ["AP@0.5 %", "AP@4 %", "bicycle", "MODA %", "HOTA %", "switches", "fragments", "calibration error %"]
-            .iter()
-            .all(|p| table.contains(p)),
+        [
+            "AP@0.5 %",
+            "AP@4 %",
+            "bicycle",
+            "MODA %",
+            "HOTA %",
+            "switches",
+            "fragments",
+            "calibration error %"
+        ]
+        .iter()
+        .all(|p| table.contains(p)),
         "{table}"
     );
     let result: Value = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
     let ap_pct = result["tracks"]["ap_pct"].as_array().unwrap();
-    assert!(ap_pct.len() == 4 && ap_pct.iter().all(|ap| ap.as_f64().is_some_and(|ap| ap > 10.0)), "{result}");
+    assert!(
+        ap_pct.len() == 4
+            && ap_pct
+                .iter()
+                .all(|ap| ap.as_f64().is_some_and(|ap| ap > 10.0)),
+        "{result}"
+    );
     let broken = folder.path().join("broken.json");
-    fs::write(&broken, r#"{"frames": [{"t_us": 1, "objects": [{"id": 1, "label": "car", "x_m": 0}]}]}"#).unwrap();
+    fs::write(
+        &broken,
+        r#"{"frames": [{"t_us": 1, "objects": [{"id": 1, "label": "car", "x_m": 0}]}]}"#,
+    )
+    .unwrap();
     let run = ecod_lab(&["eval", "--truth", text(&broken), "--input", text(&maps)]);
     assert_eq!(run.status.code(), Some(2));
-    assert!(said_by(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"), "{}", said_by(&run));
+    assert!(
+        said_by(&run).contains("broken.json: at frames[0].objects[0]: missing field `y_m`"),
+        "{}",
+        said_by(&run)
+    );
 }
 
 /// Two cars in four frames of KITTI: the tracker loses one and calls the other by two names.
@@ -117,13 +179,20 @@ fn files_of_benchmarks_are_judged_by_name_line_and_field() {
         fs::write(&path, content).unwrap();
         path
     };
-    let truth = (0..4).map(|n| line(n, 1, 2.0, 10.0 + f64::from(n), "") + &line(n, 2, -8.0, 30.0, "")).collect();
-    let said = (0..4).map(|n| line(n, 5 + n / 2, 2.0, 10.0 + f64::from(n), "0.9")).collect();
+    let truth = (0..4)
+        .map(|n| line(n, 1, 2.0, 10.0 + f64::from(n), "") + &line(n, 2, -8.0, 30.0, ""))
+        .collect();
+    let said = (0..4)
+        .map(|n| line(n, 5 + n / 2, 2.0, 10.0 + f64::from(n), "0.9"))
+        .collect();
     let truth = write("truth/0001.txt", truth);
     write("truth/0002.txt", line(0, 1, 0.0, 5.0, ""));
     let said = write("said/0001.txt", said);
     let result = folder.path().join("result.json");
-    for (truth, input) in [(&truth, &said), (&folder.path().join("truth"), &folder.path().join("said"))] {
+    for (truth, input) in [
+        (&truth, &said),
+        (&folder.path().join("truth"), &folder.path().join("said")),
+    ] {
         let run = ecod_lab(&[
             "eval",
             "--format",
@@ -138,23 +207,48 @@ fn files_of_benchmarks_are_judged_by_name_line_and_field() {
         assert!(run.status.success(), "{}", said_by(&run));
         let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
         let (tracks, at) = (&result["tracks"], &result["tracks"]["at_default"]);
-        assert_eq!((tracks["frames"].as_u64(), tracks["objects"].as_u64()), (Some(4), Some(8)));
         assert_eq!(
-            (at["matches"].as_u64(), at["misses"].as_u64(), at["id_switches"].as_u64()),
+            (tracks["frames"].as_u64(), tracks["objects"].as_u64()),
+            (Some(4), Some(8))
+        );
+        assert_eq!(
+            (
+                at["matches"].as_u64(),
+                at["misses"].as_u64(),
+                at["id_switches"].as_u64()
+            ),
             (Some(4), Some(4), Some(1))
         );
         assert_eq!(at["mota_pct"].as_f64(), Some(37.5));
     }
-    let detections: String = (0..4).map(|n| format!("{n},2,0,0,9,9,8.5,1.5,1.6,3.9,-8.0,1.7,30.0,0,0\n")).collect();
+    let detections: String = (0..4)
+        .map(|n| format!("{n},2,0,0,9,9,8.5,1.5,1.6,3.9,-8.0,1.7,30.0,0,0\n"))
+        .collect();
     let run = |input: &Path| {
-        let flags =
-            ["eval", "--format", "kitti", "--truth", text(&truth), "--input", text(input), "--out", text(&result)];
+        let flags = [
+            "eval",
+            "--format",
+            "kitti",
+            "--truth",
+            text(&truth),
+            "--input",
+            text(input),
+            "--out",
+            text(&result),
+        ];
         ecod_lab(&flags)
     };
     assert!(run(&write("detections.txt", detections)).status.success());
-    let broken = run(&write("broken.txt", "0,2,0,0,9,9,8.5,1.5,1.6,3.9,x,1.7,30.0,0,0\n".into()));
+    let broken = run(&write(
+        "broken.txt",
+        "0,2,0,0,9,9,8.5,1.5,1.6,3.9,x,1.7,30.0,0,0\n".into(),
+    ));
     assert_eq!(broken.status.code(), Some(2));
-    assert!(said_by(&broken).contains("broken.txt: line 1: column 11 (x): \"x\" is no number"), "{}", said_by(&broken));
+    assert!(
+        said_by(&broken).contains("broken.txt: line 1: column 11 (x): \"x\" is no number"),
+        "{}",
+        said_by(&broken)
+    );
 }
 
 /// Two cameras detect a person; a replay of what they said has one.
@@ -170,25 +264,56 @@ fn detections_in_files_of_benchmarks_are_replayed_as_reports() {
     let left = file("left.txt", each("-1,0,0,9,9,0.9,3.1,4,0"));
     let right = file("right.txt", each("-1,0,0,9,9,0.8,2.9,4,0"));
     let truth = file("truth.txt", each("1,0,0,9,9,1,3,4,0"));
-    let [reports, maps, result] = ["reports.jsonl", "maps.jsonl", "result.json"].map(|name| folder.path().join(name));
+    let [reports, maps, result] =
+        ["reports.jsonl", "maps.jsonl", "result.json"].map(|name| folder.path().join(name));
     let right = format!("right={}", text(&right));
     let convert = |left: &str| {
         let vehicles = ["--vehicle", left, "--vehicle", &right];
-        ecod_lab(&[&["convert", "--format", "mot", "--output", text(&reports)][..], &vehicles].concat())
+        ecod_lab(
+            &[
+                &["convert", "--format", "mot", "--output", text(&reports)][..],
+                &vehicles,
+            ]
+            .concat(),
+        )
     };
     let run = convert(&format!("left={}", text(&left)));
     assert!(run.status.success(), "{}", said_by(&run));
     let (fused, summary) = replay(ReplayConfig::default(), &reports);
     assert_eq!((summary.lines, summary.used()), (60, 60));
-    let lines: Vec<_> = fused.iter().map(|line| serde_json::to_string(line).unwrap()).collect();
+    let lines: Vec<_> = fused
+        .iter()
+        .map(|line| serde_json::to_string(line).unwrap())
+        .collect();
     fs::write(&maps, lines.join("\n")).unwrap();
-    let flags = ["eval", "--format", "mot", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)];
+    let flags = [
+        "eval",
+        "--format",
+        "mot",
+        "--truth",
+        text(&truth),
+        "--input",
+        text(&maps),
+        "--out",
+        text(&result),
+    ];
     assert!(ecod_lab(&flags).status.success());
     let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
     let at = &result["tracks"]["at_best_f1"];
-    assert_eq!((at["false_alarms"].as_u64(), at["misses"].as_u64().map(|n| n < 10)), (Some(0), Some(true)), "{at}");
+    assert_eq!(
+        (
+            at["false_alarms"].as_u64(),
+            at["misses"].as_u64().map(|n| n < 10)
+        ),
+        (Some(0), Some(true)),
+        "{at}"
+    );
     let broken = convert(text(&left));
-    assert!(broken.status.code() == Some(2) && said_by(&broken).contains("is not NAME=FILE"), "{}", said_by(&broken));
+    assert!(
+        broken.status.code() == Some(2) && said_by(&broken).contains("is not NAME=FILE"),
+        "{}",
+        said_by(&broken)
+    );
 }
 
 /// Two vehicles, one of which detects nothing in the first sequence, and truth of one sequence more.
@@ -196,7 +321,11 @@ fn detections_in_files_of_benchmarks_are_replayed_as_reports() {
 fn sequences_have_the_numbers_of_their_names_and_maps_need_truth_of_just_these() {
     let folder = TempDir::new().unwrap();
     let path = |name: &str| folder.path().join(name);
-    let each = |place: &str| (1..=20).map(|frame| format!("{frame},1,0,0,9,9,0.9,{place},0\n")).collect::<String>();
+    let each = |place: &str| {
+        (1..=20)
+            .map(|frame| format!("{frame},1,0,0,9,9,0.9,{place},0\n"))
+            .collect::<String>()
+    };
     for (name, place) in [
         ("left/a.txt", "3,4"),
         ("left/b.txt", "5,6"),
@@ -212,45 +341,117 @@ fn sequences_have_the_numbers_of_their_names_and_maps_need_truth_of_just_these()
     }
     let [reports, maps, result] = ["reports.jsonl", "maps.jsonl", "result.json"].map(path);
     let [left, right] = ["left", "right"].map(|name| format!("{name}={}", text(&path(name))));
-    let flags = ["convert", "--format", "mot", "--vehicle", &left, "--vehicle", &right, "--output", text(&reports)];
+    let flags = [
+        "convert",
+        "--format",
+        "mot",
+        "--vehicle",
+        &left,
+        "--vehicle",
+        &right,
+        "--output",
+        text(&reports),
+    ];
     let run = ecod_lab(&flags);
     assert!(run.status.success(), "{}", said_by(&run));
     let lines = replay(ReplayConfig::default(), &reports).0;
-    fs::write(&maps, lines.iter().map(|line| serde_json::to_string(line).unwrap() + "\n").collect::<String>()).unwrap();
+    fs::write(
+        &maps,
+        lines
+            .iter()
+            .map(|line| serde_json::to_string(line).unwrap() + "\n")
+            .collect::<String>(),
+    )
+    .unwrap();
     let judge = |truth: &Path| {
-        let flags = ["eval", "--format", "mot", "--truth", text(truth), "--input", text(&maps), "--out", text(&result)];
+        let flags = [
+            "eval",
+            "--format",
+            "mot",
+            "--truth",
+            text(truth),
+            "--input",
+            text(&maps),
+            "--out",
+            text(&result),
+        ];
         ecod_lab(&flags)
     };
     let run = judge(&path("truth"));
     assert!(run.status.success(), "{}", said_by(&run));
     let judged: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
-    assert_eq!(judged["tracks"]["at_best_f1"]["false_alarms"].as_u64(), Some(0), "{judged}");
+    assert_eq!(
+        judged["tracks"]["at_best_f1"]["false_alarms"].as_u64(),
+        Some(0),
+        "{judged}"
+    );
     let over = text(&path("left/a.txt")).to_owned();
     for (flags, fault) in [
-        (["--vehicle", &left, "--vehicle", &left, "--output", text(&reports)], "names left twice"),
-        (["--vehicle", &left, "--vehicle", &right, "--output", &over], "a.txt is to be both read and written"),
+        (
+            [
+                "--vehicle",
+                &left,
+                "--vehicle",
+                &left,
+                "--output",
+                text(&reports),
+            ],
+            "names left twice",
+        ),
+        (
+            ["--vehicle", &left, "--vehicle", &right, "--output", &over],
+            "a.txt is to be both read and written",
+        ),
     ] {
         let run = ecod_lab(&[&["convert", "--format", "mot"][..], &flags].concat());
-        assert!(run.status.code() == Some(2) && said_by(&run).contains(fault), "{}", said_by(&run));
+        assert!(
+            run.status.code() == Some(2) && said_by(&run).contains(fault),
+            "{}",
+            said_by(&run)
+        );
     }
     let run = judge(&path("more"));
-    assert!(run.status.code() == Some(2) && said_by(&run).contains("has 3 sequences"), "{}", said_by(&run));
+    assert!(
+        run.status.code() == Some(2) && said_by(&run).contains("has 3 sequences"),
+        "{}",
+        said_by(&run)
+    );
 }
 
 #[test]
 fn a_truth_without_identities_judges_none() {
     let folder = TempDir::new().unwrap();
-    let (truth, maps, result) =
-        (folder.path().join("truth.txt"), folder.path().join("maps.txt"), folder.path().join("result.json"));
+    let (truth, maps, result) = (
+        folder.path().join("truth.txt"),
+        folder.path().join("maps.txt"),
+        folder.path().join("result.json"),
+    );
     fs::write(&truth, "1,-1,0,0,9,9,1,3,4,0\n2,-1,0,0,9,9,1,3,4,0\n").unwrap();
     fs::write(&maps, "1,4,0,0,9,9,1,3,4,0\n2,4,0,0,9,9,1,3,5,0\n").unwrap();
-    let run =
-        ecod_lab(&["eval", "--format", "mot", "--truth", text(&truth), "--input", text(&maps), "--out", text(&result)]);
+    let run = ecod_lab(&[
+        "eval",
+        "--format",
+        "mot",
+        "--truth",
+        text(&truth),
+        "--input",
+        text(&maps),
+        "--out",
+        text(&result),
+    ]);
     assert!(run.status.success(), "{}", said_by(&run));
     let result: Value = serde_json::from_slice(&fs::read(&result).unwrap()).unwrap();
     let at = &result["tracks"]["at_default"];
-    assert_eq!((at["moda_pct"].as_f64(), at["motp_m"].as_f64()), (Some(100.0), Some(0.5)));
-    assert!(["mota_pct", "idf1_pct", "hota_pct"].iter().all(|figure| at[figure].is_null()), "{at}");
+    assert_eq!(
+        (at["moda_pct"].as_f64(), at["motp_m"].as_f64()),
+        (Some(100.0), Some(0.5))
+    );
+    assert!(
+        ["mota_pct", "idf1_pct", "hota_pct"]
+            .iter()
+            .all(|figure| at[figure].is_null()),
+        "{at}"
+    );
 }
 
 #[test]
@@ -275,7 +476,13 @@ fn the_recorded_intersection_is_judged_right() {
     assert!(run.status.success(), "{}", said_by(&run));
     let result: Value = serde_json::from_slice(&fs::read(out).unwrap()).unwrap();
     let recording = &result["scenes"][0];
-    assert_eq!((recording["verdicts"].as_u64(), recording["vote_accuracy_pct"].as_f64()), (Some(9), Some(100.0)));
+    assert_eq!(
+        (
+            recording["verdicts"].as_u64(),
+            recording["vote_accuracy_pct"].as_f64()
+        ),
+        (Some(9), Some(100.0))
+    );
     assert_eq!(result["scenes"][1]["scenes"].as_u64(), Some(3));
     let (_, summary) = replay(ReplayConfig::default(), &reports);
     assert_eq!((summary.lines, summary.used()), (12, 12));
@@ -286,15 +493,35 @@ fn objects_of_unknown_size_and_vehicles_that_fall_silent_do_not_spoil_an_interse
     let folder = TempDir::new().unwrap();
     let recorded = fs::read_to_string(example("testbed/vote_recording.json")).unwrap();
     let mut silent: Value = serde_json::from_str(&recorded).unwrap();
-    silent["frames"]["euclid"].as_array_mut().unwrap().truncate(1);
-    let renamed = recorded.replace("mouse", "remote").replace("\"cup\"", "\"bottle\"");
+    silent["frames"]["euclid"]
+        .as_array_mut()
+        .unwrap()
+        .truncate(1);
+    let renamed = recorded
+        .replace("mouse", "remote")
+        .replace("\"cup\"", "\"bottle\"");
     for scene in [renamed, silent.to_string()] {
-        let (scenes, out) = (folder.path().join("scenes.json"), folder.path().join("result.json"));
+        let (scenes, out) = (
+            folder.path().join("scenes.json"),
+            folder.path().join("result.json"),
+        );
         fs::write(&scenes, scene).unwrap();
-        let run = ecod_lab(&["testbed", "--scenes", text(&scenes), "--scene", "recording", "--out", text(&out)]);
+        let run = ecod_lab(&[
+            "testbed",
+            "--scenes",
+            text(&scenes),
+            "--scene",
+            "recording",
+            "--out",
+            text(&out),
+        ]);
         assert!(run.status.success(), "{}", said_by(&run));
         let result: Value = serde_json::from_slice(&fs::read(&out).unwrap()).unwrap();
-        assert_eq!(result["scenes"][0]["vote_accuracy_pct"].as_f64(), Some(100.0), "{result}");
+        assert_eq!(
+            result["scenes"][0]["vote_accuracy_pct"].as_f64(),
+            Some(100.0),
+            "{result}"
+        );
     }
 }
 
@@ -306,9 +533,15 @@ fn what_cannot_be_judged_is_said() {
         fs::write(&path, content).unwrap();
         path
     };
-    let (recording, truth, empty) =
-        (file("in.jsonl", "{}\n"), file("truth.json", "{\"a\": {}}"), file("empty.jsonl", ""));
-    let frames = file("frames.json", r#"{"frames": [{"t_us": 9000000, "objects": []}]}"#);
+    let (recording, truth, empty) = (
+        file("in.jsonl", "{}\n"),
+        file("truth.json", "{\"a\": {}}"),
+        file("empty.jsonl", ""),
+    );
+    let frames = file(
+        "frames.json",
+        r#"{"frames": [{"t_us": 9000000, "objects": []}]}"#,
+    );
     let map = r#"{"schema": 1, "aggregator": "edge", "epoch": 1, "round": 1, "fused_at_us": 1, "landmarks": [], "objects": []}"#;
     let map = file("map.jsonl", map);
     let unsure = file(
@@ -326,10 +559,20 @@ fn what_cannot_be_judged_is_said() {
         (&lot, &empty, 1, "no map"),
         (&lot, &unsure, 1, "the first is line 1: objects[0]: "),
         (&frames, &map, 1, "no map of "),
-        (&lot, &recording, 1, "1 lines cannot be used, the first is line 1: it is neither a map nor verdicts"),
+        (
+            &lot,
+            &recording,
+            1,
+            "1 lines cannot be used, the first is line 1: it is neither a map nor verdicts",
+        ),
     ] {
         let run = ecod_lab(&["eval", "--truth", text(truth), "--input", text(input)]);
-        assert_eq!(run.status.code(), Some(code), "{truth:?}: {}", said_by(&run));
+        assert_eq!(
+            run.status.code(),
+            Some(code),
+            "{truth:?}: {}",
+            said_by(&run)
+        );
         assert!(said_by(&run).contains(part), "{truth:?}: {}", said_by(&run));
     }
 }

@@ -7,7 +7,9 @@ use std::ops::Range;
 use ecod::model::detection::{BoundingBox, Detection};
 use ecod::model::geometry::Pose;
 use ecod::perception::camera::Mount;
-use ecod::perception::projection::{ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging};
+use ecod::perception::projection::{
+    ObjectSize, ObjectSizes, Projection, ProjectionConfig, Ranging,
+};
 use ecod_lab::testbed::camera::TestbedCamera;
 use ecod_lab::testbed::{Cav, Spot, Testbed};
 use nalgebra::{Point2, Vector2};
@@ -29,20 +31,37 @@ const PAPER_FROM: f64 = 178.0;
 
 fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
     let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
-    Mount { height_m: Some(height_m), pitch_rad, roll_rad, ..Mount::default() }
+    Mount {
+        height_m: Some(height_m),
+        pitch_rad,
+        roll_rad,
+        ..Mount::default()
+    }
 }
 
 /// Posts of 0.25 m before a low camera, and as high as people otherwise; some pixels wide wherever they are.
 fn post(camera_m: f64) -> ObjectSize {
-    let (width_m, height_m) = if camera_m < 1.0 { (0.02, 0.25) } else { (0.1f64.max(0.05 * camera_m), 1.7) };
-    ObjectSize { width_m, height_m, length_m: Some(0.0), relative_sigma: 0.002 }
+    let (width_m, height_m) = if camera_m < 1.0 {
+        (0.02, 0.25)
+    } else {
+        (0.1f64.max(0.05 * camera_m), 1.7)
+    };
+    ObjectSize {
+        width_m,
+        height_m,
+        length_m: Some(0.0),
+        relative_sigma: 0.002,
+    }
 }
 
 /// A street with cards of the size of posts, and without any yet.
 fn street(camera_m: f64) -> Testbed {
-    let ObjectSize { width_m, height_m, .. } = post(camera_m);
+    let ObjectSize {
+        width_m, height_m, ..
+    } = post(camera_m);
     // The code is too small to be seen: dark pixels would cut a post.
-    let [width_in, height_in, code_in] = [width_m, height_m, width_m / 50.0].map(|metres| metres / 0.0254);
+    let [width_in, height_in, code_in] =
+        [width_m, height_m, width_m / 50.0].map(|metres| metres / 0.0254);
     Testbed::from_json(&format!(
         r#"{{"camera": {{"image_width": 480, "image_height": 300, "horizontal_fov_deg": 70, "vertical_fov_deg": 47.3}},
         "placard": {{"qr_width": {code_in}, "qr_with_quiet_zone": {width_in}, "card_width": {width_in},
@@ -65,17 +84,27 @@ fn boxes(testbed: &Testbed, places: &[Point2<f64>], mount: &Mount) -> Vec<Boundi
     };
     scene.spots = places.iter().enumerate().map(spot).collect();
     // The camera looks at the fronts.
-    let cav = Cav { pose: Pose::new(0.0, 0.0, HEADING_RAD), ..scene.cavs[0].clone() };
+    let cav = Cav {
+        pose: Pose::new(0.0, 0.0, HEADING_RAD),
+        ..scene.cavs[0].clone()
+    };
     let rendered = TestbedCamera::mounted(testbed, &scene, &cav, mount, 1).unwrap();
     let (mut gray, mut paper) = (Mat::default(), Mat::default());
     imgproc::cvt_color_def(rendered.still(), &mut gray, imgproc::COLOR_BGR2GRAY).unwrap();
     imgproc::threshold(&gray, &mut paper, PAPER_FROM, 255.0, imgproc::THRESH_BINARY).unwrap();
     let (mut labels, mut stats, mut middles) = (Mat::default(), Mat::default(), Mat::default());
-    let count = imgproc::connected_components_with_stats_def(&paper, &mut labels, &mut stats, &mut middles).unwrap();
+    let count =
+        imgproc::connected_components_with_stats_def(&paper, &mut labels, &mut stats, &mut middles)
+            .unwrap();
     let found = (1..count).map(|row| {
         let [left, upper, width, height] =
             [0, 1, 2, 3].map(|column| f64::from(*stats.at_2d::<i32>(row, column).unwrap()));
-        BoundingBox { x_min: left, y_min: upper, x_max: left + width, y_max: upper + height }
+        BoundingBox {
+            x_min: left,
+            y_min: upper,
+            x_max: left + width,
+            y_max: upper + height,
+        }
     });
     found.filter(|bounds| bounds.height() >= 10.0).collect()
 }
@@ -95,7 +124,9 @@ impl Dice {
         let camera = Pose::new(0.0, 0.0, HEADING_RAD);
         let place = |bearing_deg: f64| {
             let range_m = camera_m * self.0.random_range(ranges.clone());
-            let (sin, cos) = (bearing_deg + self.0.random_range(-3.0..3.0)).to_radians().sin_cos();
+            let (sin, cos) = (bearing_deg + self.0.random_range(-3.0..3.0))
+                .to_radians()
+                .sin_cos();
             camera.transform(range_m * cos, range_m * sin)
         };
         [-25.0, -15.0, -5.0, 5.0, 15.0, 25.0].map(place).to_vec()
@@ -113,14 +144,23 @@ fn errors(
 ) -> Vec<(f64, f64)> {
     let pose = Pose::new(0.0, 0.0, HEADING_RAD);
     let placed = found.iter().filter_map(|bounding_box| {
-        let mut detection =
-            Detection { label: "post".into(), confidence: 0.9, bounding_box: *bounding_box, corners: None };
+        let mut detection = Detection {
+            label: "post".into(),
+            confidence: 0.9,
+            bounding_box: *bounding_box,
+            corners: None,
+        };
         let cut = projection.cut(&detection);
         if cut.lower || cut.side {
             return None;
         }
         let bounds = &mut detection.bounding_box;
-        for edge in [&mut bounds.x_min, &mut bounds.y_min, &mut bounds.x_max, &mut bounds.y_max] {
+        for edge in [
+            &mut bounds.x_min,
+            &mut bounds.y_min,
+            &mut bounds.x_max,
+            &mut bounds.y_max,
+        ] {
             *edge += noise_px();
         }
         let placed = projection.place(&detection, cut, None, believed).ok()?;
@@ -128,10 +168,16 @@ fn errors(
         // Bearings tell which post it is.
         let bearing_rad = |at: &Point2<f64>| pose.range_bearing(at).1;
         let own = bearing_rad(&Point2::from(position));
-        let post =
-            places.iter().min_by(|a, b| (bearing_rad(a) - own).abs().total_cmp(&(bearing_rad(b) - own).abs()))?;
+        let post = places.iter().min_by(|a, b| {
+            (bearing_rad(a) - own)
+                .abs()
+                .total_cmp(&(bearing_rad(b) - own).abs())
+        })?;
         let off = position - post.coords;
-        Some((off.norm() / post.coords.norm(), placed.covariance()?.mahalanobis_squared(&off, 0.0)))
+        Some((
+            off.norm() / post.coords.norm(),
+            placed.covariance()?.mahalanobis_squared(&off, 0.0),
+        ))
     });
     placed.collect()
 }
@@ -144,7 +190,10 @@ fn config(
     pixel_sigma_px: f64,
     Unknown { tilt_rad, height }: Unknown,
 ) -> ProjectionConfig {
-    let sizes = ObjectSizes { labels: [("post".into(), post(camera_m))].into(), ..ObjectSizes::default() };
+    let sizes = ObjectSizes {
+        labels: [("post".into(), post(camera_m))].into(),
+        ..ObjectSizes::default()
+    };
     ProjectionConfig {
         ranging,
         sizes,
@@ -163,8 +212,14 @@ struct Unknown {
     height: f64,
 }
 
-const EXACT: Unknown = Unknown { tilt_rad: 1e-4, height: 1e-4 };
-const A_DEGREE: Unknown = Unknown { tilt_rad: std::f64::consts::PI / 180.0, height: 0.02 };
+const EXACT: Unknown = Unknown {
+    tilt_rad: 1e-4,
+    height: 1e-4,
+};
+const A_DEGREE: Unknown = Unknown {
+    tilt_rad: std::f64::consts::PI / 180.0,
+    height: 0.02,
+};
 
 #[test]
 fn posts_in_rendered_frames_are_placed_within_two_percent_of_the_range() {
@@ -172,7 +227,11 @@ fn posts_in_rendered_frames_are_placed_within_two_percent_of_the_range() {
     for camera_m in HEIGHTS_M {
         let testbed = street(camera_m);
         let mut all = [Vec::new(), Vec::new()];
-        for (pitch_deg, roll_deg, ranges) in [(0.0, 5.0, 3.5..6.0), (20.0, 0.0, 1.5..5.0), (45.0, -5.0, 1.0..2.2)] {
+        for (pitch_deg, roll_deg, ranges) in [
+            (0.0, 5.0, 3.5..6.0),
+            (20.0, 0.0, 1.5..5.0),
+            (45.0, -5.0, 1.0..2.2),
+        ] {
             let mount = mount(camera_m, pitch_deg, roll_deg);
             let places = dice.places(camera_m, ranges);
             let found = boxes(&testbed, &places, &mount);
@@ -180,17 +239,30 @@ fn posts_in_rendered_frames_are_placed_within_two_percent_of_the_range() {
                 let config = config(camera_m, ranging, EDGE_SIGMA_PX, EXACT);
                 let projection = Projection::new(config, testbed.camera.intrinsics, mount);
                 all.extend(
-                    errors(&found, &places, &projection, &Pose::new(0.0, 0.0, HEADING_RAD), || 0.0)
-                        .iter()
-                        .map(|(error, _)| *error),
+                    errors(
+                        &found,
+                        &places,
+                        &projection,
+                        &Pose::new(0.0, 0.0, HEADING_RAD),
+                        || 0.0,
+                    )
+                    .iter()
+                    .map(|(error, _)| *error),
                 );
             }
         }
         for (ranging, mut errors) in RANGINGS.into_iter().zip(all) {
             errors.sort_by(f64::total_cmp);
             let median = errors[errors.len() / 2];
-            println!("{ranging:?}, {camera_m} m: {:.2} % of {} posts", 100.0 * median, errors.len());
-            assert!(errors.len() >= 15 && median <= 0.02, "{ranging:?}, {camera_m} m: {errors:?}");
+            println!(
+                "{ranging:?}, {camera_m} m: {:.2} % of {} posts",
+                100.0 * median,
+                errors.len()
+            );
+            assert!(
+                errors.len() >= 15 && median <= 0.02,
+                "{ranging:?}, {camera_m} m: {errors:?}"
+            );
         }
     }
 }
@@ -238,7 +310,11 @@ fn shares(
     dice: &mut Dice,
 ) -> [(f64, usize); 2] {
     let camera_m = real.height_m.unwrap();
-    let ProjectionConfig { position_sigma_m, heading_sigma_rad, .. } = ProjectionConfig::default();
+    let ProjectionConfig {
+        position_sigma_m,
+        heading_sigma_rad,
+        ..
+    } = ProjectionConfig::default();
     let (mut covered, mut all) = ([0, 0], [0, 0]);
     for _ in 0..MOUNTS {
         for (found, places) in frames {
@@ -249,14 +325,27 @@ fn shares(
                 roll_rad: real.roll_rad + off(unknown.tilt_rad),
                 ..*real
             };
-            let believed =
-                Pose::new(off(position_sigma_m), off(position_sigma_m), HEADING_RAD + off(heading_sigma_rad));
+            let believed = Pose::new(
+                off(position_sigma_m),
+                off(position_sigma_m),
+                HEADING_RAD + off(heading_sigma_rad),
+            );
             for (index, ranging) in RANGINGS.into_iter().enumerate() {
-                let config = config(camera_m, ranging, DETECTOR_SIGMA_PX.hypot(EDGE_SIGMA_PX), unknown);
+                let config = config(
+                    camera_m,
+                    ranging,
+                    DETECTOR_SIGMA_PX.hypot(EDGE_SIGMA_PX),
+                    unknown,
+                );
                 let projection = Projection::new(config, testbed.camera.intrinsics, stated);
-                let errors = errors(found, places, &projection, &believed, || DETECTOR_SIGMA_PX * dice.normal());
+                let errors = errors(found, places, &projection, &believed, || {
+                    DETECTOR_SIGMA_PX * dice.normal()
+                });
                 all[index] += errors.len();
-                covered[index] += errors.iter().filter(|(_, squared)| *squared <= CHI_SQUARED_95).count();
+                covered[index] += errors
+                    .iter()
+                    .filter(|(_, squared)| *squared <= CHI_SQUARED_95)
+                    .count();
             }
         }
     }
@@ -264,8 +353,13 @@ fn shares(
 }
 
 /// Pitches and rolls in degrees, and ranges in heights of the camera.
-const TILTS: [(f64, f64, Range<f64>); 5] =
-    [(0.0, 0.0, 3.0..6.0), (10.0, 5.0, 2.0..5.0), (20.0, 0.0, 1.7..4.0), (32.0, -5.0, 1.3..3.0), (45.0, 0.0, 1.0..2.2)];
+const TILTS: [(f64, f64, Range<f64>); 5] = [
+    (0.0, 0.0, 3.0..6.0),
+    (10.0, 5.0, 2.0..5.0),
+    (20.0, 0.0, 1.7..4.0),
+    (32.0, -5.0, 1.3..3.0),
+    (45.0, 0.0, 1.0..2.2),
+];
 /// Frames of each camera, and mounts that are stated for each frame, with errors of their own.
 const FRAMES: usize = 2;
 const MOUNTS: usize = 200;

@@ -12,16 +12,44 @@ fn what_drives_from_cell_to_cell_keeps_its_identity() {
     let mut rng = ChaCha8Rng::seed_from_u64(4001);
     let recording = generate(&traffic, &mut || rng.random());
     let mut town = |link| run(&traffic, &recording, link, &mut || rng.random()).unwrap();
-    let alone = town(LinkConfig { is_up: false, ..LinkConfig::default() });
-    let linked = town(LinkConfig { map_hz: 2.0, ..LinkConfig::default() });
+    let alone = town(LinkConfig {
+        is_up: false,
+        ..LinkConfig::default()
+    });
+    let linked = town(LinkConfig {
+        map_hz: 2.0,
+        ..LinkConfig::default()
+    });
     let idf1 = |scores: &ecod_lab::town::TownScores| scores.all.at_best_f1.idf1_pct.unwrap();
-    let [whole, linked_idf1, alone_idf1] = [idf1(&linked.single), idf1(&linked.cells), idf1(&alone.cells)];
-    assert!(linked_idf1 > whole - 2.0, "IDF1 of nine cells {linked_idf1}, of one aggregator {whole}");
-    assert!(alone_idf1 < whole - 4.0, "without neighbours nothing is handed over: {alone_idf1} of {whole}");
-    let [border, middle] = [&linked.cells.border, &linked.cells.middle].map(|part| part.at_best_f1.hota_pct.unwrap());
-    assert!(border > middle - 3.0, "HOTA at borders {border}, in the middle {middle}");
-    let TownResult { hand_overs, received, refused, .. } = linked;
+    let [whole, linked_idf1, alone_idf1] = [
+        idf1(&linked.single),
+        idf1(&linked.cells),
+        idf1(&alone.cells),
+    ];
+    assert!(
+        linked_idf1 > whole - 2.0,
+        "IDF1 of nine cells {linked_idf1}, of one aggregator {whole}"
+    );
+    assert!(
+        alone_idf1 < whole - 4.0,
+        "without neighbours nothing is handed over: {alone_idf1} of {whole}"
+    );
+    let [border, middle] =
+        [&linked.cells.border, &linked.cells.middle].map(|part| part.at_best_f1.hota_pct.unwrap());
+    assert!(
+        border > middle - 3.0,
+        "HOTA at borders {border}, in the middle {middle}"
+    );
+    let TownResult {
+        hand_overs,
+        received,
+        refused,
+        ..
+    } = linked;
     assert!(hand_overs.begun > 20, "{hand_overs:?}");
     // The first second of each link, what comes twice, and what is overtaken.
-    assert!(refused * 5 < received, "{refused} of {received} maps refused");
+    assert!(
+        refused * 5 < received,
+        "{refused} of {received} maps refused"
+    );
 }

@@ -35,27 +35,61 @@ fn fuse_by(
     recording: &TrafficRecording,
     mut each: impl FnMut(Option<&ObjectReport>, Option<&GlobalMap>),
 ) {
-    let config = FusionConfig { algorithms: Algorithms::Pace, ..config };
-    let time = |n: usize| recording.reports[n].received_at_us.unwrap_or(recording.reports[n].report.captured_at_us);
-    let mut cell = Aggregator::new(NodeName::from_static("edge"), 1, config, Vec::new(), time(0));
+    let config = FusionConfig {
+        algorithms: Algorithms::Pace,
+        ..config
+    };
+    let time = |n: usize| {
+        recording.reports[n]
+            .received_at_us
+            .unwrap_or(recording.reports[n].report.captured_at_us)
+    };
+    let mut cell = Aggregator::new(
+        NodeName::from_static("edge"),
+        1,
+        config,
+        Vec::new(),
+        time(0),
+    );
     for (n, arrived) in recording.reports.iter().enumerate() {
         while cell.deadline() <= time(n) {
-            each(None, cell.tick(cell.deadline()).and_then(|fused| fused.map).as_ref());
+            each(
+                None,
+                cell.tick(cell.deadline())
+                    .and_then(|fused| fused.map)
+                    .as_ref(),
+            );
         }
         each(Some(&arrived.report), None);
-        let fused = cell.report(ReportKind::Detections, &Arc::new(arrived.report.clone()), time(n)).unwrap_or_default();
+        let fused = cell
+            .report(
+                ReportKind::Detections,
+                &Arc::new(arrived.report.clone()),
+                time(n),
+            )
+            .unwrap_or_default();
         each(None, fused.and_then(|fused| fused.map).as_ref());
     }
 }
 
 #[test]
 fn traffic_is_tracked_better_than_late_fusion_does_it() {
-    let town = TrafficConfig { observers: 8, duration_s: 12.0, ..TrafficConfig::default() };
-    let two = TrafficConfig { duration_s: 12.0, ..TrafficConfig::two_vehicle_recording() };
+    let town = TrafficConfig {
+        observers: 8,
+        duration_s: 12.0,
+        ..TrafficConfig::default()
+    };
+    let two = TrafficConfig {
+        duration_s: 12.0,
+        ..TrafficConfig::two_vehicle_recording()
+    };
     for (config, floor) in [(town, FLOOR_TOWN), (two, FLOOR_TWO)] {
         let recording = recording_of(&config);
         let truth = TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap();
-        let (mut ours, mut late) = (TrackEvaluation::new(truth.clone()), TrackEvaluation::new(truth));
+        let (mut ours, mut late) = (
+            TrackEvaluation::new(truth.clone()),
+            TrackEvaluation::new(truth),
+        );
         let (mut latest, mut tracker) = (LatestReports::default(), NearestTracker::default());
         fuse(&recording, |report, map| {
             report.into_iter().for_each(|report| latest.report(report));
@@ -67,7 +101,10 @@ fn traffic_is_tracked_better_than_late_fusion_does_it() {
         });
         let figures = [ours, late].map(|judge| {
             let scores = judge.result();
-            [scores.ap_pct[2].unwrap(), scores.at_best_f1.moda_pct.unwrap()]
+            [
+                scores.ap_pct[2].unwrap(),
+                scores.at_best_f1.moda_pct.unwrap(),
+            ]
         });
         let [ours, late] = figures;
         for figure in 0..2 {
@@ -87,26 +124,47 @@ const FLOOR_TWO: [f64; 2] = [88.0, 76.0];
 /// Of cars that drive, over the second half: mean error of velocity in metres per second, share of those whose heading
 /// is not known to 0.15 rad, and mean error of length in metres, where it is known.
 fn errors(said: SaidConfig) -> [f64; 3] {
-    let recording = recording_of(&TrafficConfig { observers: 6, duration_s: 8.0, said, ..TrafficConfig::default() });
+    let recording = recording_of(&TrafficConfig {
+        observers: 6,
+        duration_s: 8.0,
+        said,
+        ..TrafficConfig::default()
+    });
     let frames = &recording.truth.frames;
     let mut sums = [(0.0, 0.0); 3];
     fuse(&recording, |_, map| {
         let Some(map) = map else { return };
-        let Some(place) = frames.iter().position(|frame| frame.t_us >= map.fused_at_us).filter(|n| *n > 40) else {
+        let Some(place) = frames
+            .iter()
+            .position(|frame| frame.t_us >= map.fused_at_us)
+            .filter(|n| *n > 40)
+        else {
             return;
         };
-        let objects = || map.objects.iter().filter(|object| object.confidence > 0.5 && object.label == "car");
+        let objects = || {
+            map.objects
+                .iter()
+                .filter(|object| object.confidence > 0.5 && object.label == "car")
+        };
         for (x_m, y_m, velocity) in driving(&frames[place - 1], &frames[place]) {
             let distance = |object: &&FusedObject| (object.x_m - x_m).hypot(object.y_m - y_m);
-            let Some(object) = objects().min_by(|a, b| distance(a).total_cmp(&distance(b))) else { continue };
+            let Some(object) = objects().min_by(|a, b| distance(a).total_cmp(&distance(b))) else {
+                continue;
+            };
             if distance(&object) > 1.5 {
                 continue;
             }
             let [x, y] = object.velocity_mps.unwrap_or_default();
-            let turn = object.heading_rad.map(|heading| heading - velocity[1].atan2(velocity[0]));
+            let turn = object
+                .heading_rad
+                .map(|heading| heading - velocity[1].atan2(velocity[0]));
             let is_turned = turn.is_none_or(|turn| turn.sin().atan2(turn.cos()).abs() > 0.15);
             let length = object.size_m.map(|[length, _]| (length - 4.5).abs());
-            let off = [Some((x - velocity[0]).hypot(y - velocity[1])), Some(f64::from(u8::from(is_turned))), length];
+            let off = [
+                Some((x - velocity[0]).hypot(y - velocity[1])),
+                Some(f64::from(u8::from(is_turned))),
+                length,
+            ];
             for ((sum, count), off) in sums.iter_mut().zip(off) {
                 *sum += off.unwrap_or_default();
                 *count += f64::from(u8::from(off.is_some()));
@@ -122,7 +180,14 @@ fn driving(before: &TruthFrame, now: &TruthFrame) -> Vec<(f64, f64, [f64; 2])> {
     let cars = now.objects.iter().filter(|object| object.label == "car");
     let moved = cars.filter_map(|car| {
         let earlier = before.objects.iter().find(|object| object.id == car.id)?;
-        Some((car.x_m, car.y_m, [(car.x_m - earlier.x_m) / dt_s, (car.y_m - earlier.y_m) / dt_s]))
+        Some((
+            car.x_m,
+            car.y_m,
+            [
+                (car.x_m - earlier.x_m) / dt_s,
+                (car.y_m - earlier.y_m) / dt_s,
+            ],
+        ))
     });
     moved.filter(|(_, _, [x, y])| x.hypot(*y) > 2.0).collect()
 }
@@ -130,12 +195,30 @@ fn driving(before: &TruthFrame, now: &TruthFrame) -> Vec<(f64, f64, [f64; 2])> {
 #[test]
 fn velocities_headings_and_sizes_that_are_said_make_maps_better() {
     let plain = errors(SaidConfig::default());
-    let rich =
-        SaidConfig { velocities_mps: Some(0.6), headings_rad: Some(0.1), sizes_m: Some(0.3), ..SaidConfig::default() };
+    let rich = SaidConfig {
+        velocities_mps: Some(0.6),
+        headings_rad: Some(0.1),
+        sizes_m: Some(0.3),
+        ..SaidConfig::default()
+    };
     let rich = errors(rich);
-    assert!(rich[0] < 0.95 * plain[0], "velocities are off by {} and {} m/s", rich[0], plain[0]);
-    assert!(rich[1] < 0.5 * plain[1], "{} and {} of the headings are not known", rich[1], plain[1]);
-    assert!(plain[2].is_nan() && rich[2] < 1.0, "lengths are off by {} m", rich[2]);
+    assert!(
+        rich[0] < 0.95 * plain[0],
+        "velocities are off by {} and {} m/s",
+        rich[0],
+        plain[0]
+    );
+    assert!(
+        rich[1] < 0.5 * plain[1],
+        "{} and {} of the headings are not known",
+        rich[1],
+        plain[1]
+    );
+    assert!(
+        plain[2].is_nan() && rich[2] < 1.0,
+        "lengths are off by {} m",
+        rich[2]
+    );
 }
 
 /// Average precision and greatest MODA at 0.5, 1 and 2 m in percent, of each: aggregators with and without `align`, late
@@ -150,13 +233,21 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 4] {
     };
     let mut alone: BTreeMap<NodeName, (TrackEvaluation, NearestTracker)> = BTreeMap::new();
     for ArrivedReport { report, .. } in &recording.reports {
-        let (judge, tracker) = alone
-            .entry(report.node.clone())
-            .or_insert_with(|| (TrackEvaluation::new(truth.clone()), NearestTracker::default()));
-        judge.said(report.captured_at_us, &tracker.track(report.captured_at_us, &found(report)));
+        let (judge, tracker) = alone.entry(report.node.clone()).or_insert_with(|| {
+            (
+                TrackEvaluation::new(truth.clone()),
+                NearestTracker::default(),
+            )
+        });
+        judge.said(
+            report.captured_at_us,
+            &tracker.track(report.captured_at_us, &found(report)),
+        );
     }
     let alone = alone.into_values().map(|(judge, _)| figures(judge));
-    let best = alone.reduce(|a, b| [0, 1, 2, 3, 4, 5].map(|figure| a[figure].max(b[figure]))).unwrap();
+    let best = alone
+        .reduce(|a, b| [0, 1, 2, 3, 4, 5].map(|figure| a[figure].max(b[figure])))
+        .unwrap();
     let mut late = TrackEvaluation::new(truth.clone());
     let (mut latest, mut tracker) = (LatestReports::default(), NearestTracker::default());
     let ours = [true, false].map(|align| {
@@ -164,7 +255,10 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 4] {
         config.tracks.align = align;
         let mut ours = TrackEvaluation::new(truth.clone());
         fuse_by(config, recording, |report, map| {
-            report.into_iter().filter(|_| align).for_each(|report| latest.report(report));
+            report
+                .into_iter()
+                .filter(|_| align)
+                .for_each(|report| latest.report(report));
             if let Some(map) = map {
                 ours.map(map);
                 let at = map.fused_at_us;
@@ -182,15 +276,32 @@ fn aligned_or_not(recording: &TrafficRecording) -> [[f64; 6]; 4] {
 fn means(scene: impl Fn(u64) -> TrafficRecording) -> [[f64; 6]; 4] {
     let scenes = [0, 1, 2, 3].map(|number| aligned_or_not(&scene(SEED + number)));
     [0, 1, 2, 3].map(|method| {
-        [0, 1, 2, 3, 4, 5].map(|figure| scenes.iter().map(|scene| scene[method][figure]).sum::<f64>() / 4.0)
+        [0, 1, 2, 3, 4, 5].map(|figure| {
+            scenes
+                .iter()
+                .map(|scene| scene[method][figure])
+                .sum::<f64>()
+                / 4.0
+        })
     })
 }
 
 /// Two cameras on posts, whose positions are off by `pose_m` and as much again at 40 m by their headings.
 fn two_posts(seed: u64, pose_m: f64) -> TrafficRecording {
-    let sensor = SensorConfig { pose_m, pose_rad: pose_m / 40.0, lures: 0.1, ..SensorConfig::default() };
+    let sensor = SensorConfig {
+        pose_m,
+        pose_rad: pose_m / 40.0,
+        lures: 0.1,
+        ..SensorConfig::default()
+    };
     let recording = TrafficConfig::two_vehicle_recording();
-    let config = TrafficConfig { fixed: true, duration_s: 20.0, said: SaidConfig::default(), sensor, ..recording };
+    let config = TrafficConfig {
+        fixed: true,
+        duration_s: 20.0,
+        said: SaidConfig::default(),
+        sensor,
+        ..recording
+    };
     config.validate().unwrap();
     recording_by(seed, &config)
 }
@@ -198,8 +309,15 @@ fn two_posts(seed: u64, pose_m: f64) -> TrafficRecording {
 /// Two vehicles, one of which stamps its captures 100 ms late.
 fn stamped_late(seed: u64) -> TrafficRecording {
     let recording = TrafficConfig::two_vehicle_recording();
-    let sensor = SensorConfig { stamped_late_s: 0.1, ..recording.sensor.clone() };
-    let config = TrafficConfig { sensor, duration_s: 20.0, ..recording };
+    let sensor = SensorConfig {
+        stamped_late_s: 0.1,
+        ..recording.sensor.clone()
+    };
+    let config = TrafficConfig {
+        sensor,
+        duration_s: 20.0,
+        ..recording
+    };
     config.validate().unwrap();
     recording_by(seed, &config)
 }
@@ -220,7 +338,12 @@ fn assert_best(scene: &str, [aligned, unaligned, late, alone]: [[f64; 6]; 4]) {
 fn assert_better(scene: &str, figures: [[f64; 6]; 4]) {
     assert_best(scene, figures);
     let [aligned, unaligned, ..] = figures;
-    assert!(aligned[0] > unaligned[0], "{scene}: AP@0.5 is {} aligned, {} not", aligned[0], unaligned[0]);
+    assert!(
+        aligned[0] > unaligned[0],
+        "{scene}: AP@0.5 is {} aligned, {} not",
+        aligned[0],
+        unaligned[0]
+    );
 }
 
 #[test]
@@ -231,7 +354,10 @@ fn alignment_costs_cameras_whose_poses_are_right_nothing_and_they_are_better_tog
 #[test]
 fn alignment_makes_maps_of_cameras_on_posts_better() {
     for pose_m in [0.1, 0.35] {
-        assert_better(&format!("{pose_m} m"), means(|seed| two_posts(seed, pose_m)));
+        assert_better(
+            &format!("{pose_m} m"),
+            means(|seed| two_posts(seed, pose_m)),
+        );
     }
 }
 
@@ -245,9 +371,12 @@ fn calibration(config: &TrafficConfig) -> [f64; 2] {
     let mut sums = [0.0; 2];
     for seed in SEED..SEED + 4 {
         let recording = recording_by(seed, config);
-        let mut judge =
-            TrackEvaluation::new(TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap());
-        fuse(&recording, |_, map| map.into_iter().for_each(|map| judge.map(map)));
+        let mut judge = TrackEvaluation::new(
+            TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap(),
+        );
+        fuse(&recording, |_, map| {
+            map.into_iter().for_each(|map| judge.map(map))
+        });
         let scores = judge.result();
         let at = &scores.at_default;
         let f1 = 200.0 * at.matches as f64 / (2 * at.matches + at.false_alarms + at.misses) as f64;
@@ -259,12 +388,35 @@ fn calibration(config: &TrafficConfig) -> [f64; 2] {
 
 #[test]
 fn confidences_can_be_taken_at_their_word_whoever_looks_and_however_often() {
-    let town = TrafficConfig { duration_s: 15.0, ..TrafficConfig::default() };
-    let slow = SensorConfig { rate_hz: 2.0, ..SensorConfig::default() };
-    let towns = [1, 4].map(|observers| TrafficConfig { observers, ..town.clone() });
-    let slow = TrafficConfig { observers: 4, sensor: slow, ..town.clone() };
-    for config in towns.into_iter().chain([slow, TrafficConfig { fixed: true, observers: 4, ..town }]) {
+    let town = TrafficConfig {
+        duration_s: 15.0,
+        ..TrafficConfig::default()
+    };
+    let slow = SensorConfig {
+        rate_hz: 2.0,
+        ..SensorConfig::default()
+    };
+    let towns = [1, 4].map(|observers| TrafficConfig {
+        observers,
+        ..town.clone()
+    });
+    let slow = TrafficConfig {
+        observers: 4,
+        sensor: slow,
+        ..town.clone()
+    };
+    for config in towns.into_iter().chain([
+        slow,
+        TrafficConfig {
+            fixed: true,
+            observers: 4,
+            ..town
+        },
+    ]) {
         let [error, lost] = calibration(&config);
-        assert!(error < 5.0 && lost < 1.5, "{config:?}: calibration error {error} %, 0.5 loses {lost} of F1");
+        assert!(
+            error < 5.0 && lost < 1.5,
+            "{config:?}: calibration error {error} %, 0.5 loses {lost} of F1"
+        );
     }
 }

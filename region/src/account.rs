@@ -19,15 +19,27 @@ pub struct CellAccount {
 impl CellAccount {
     /// The account of a cell.
     pub fn new(cell: NodeName, origin: &GeographicOrigin) -> Self {
-        Self { cell, tile: Quadkey::of_cell(origin) }
+        Self {
+            cell,
+            tile: Quadkey::of_cell(origin),
+        }
     }
 
     /// MQTT filters of what the cell may publish.
     pub fn writes(&self) -> Vec<String> {
         let Self { cell, tile } = self;
         let (tile, cell) = (*tile, cell.clone());
-        let own = RegionTopicKind::ALL.map(|kind| RegionTopic { tile, cell: cell.clone(), kind }.path());
-        own.into_iter().chain([ReputationTopic::filter_of_cell(&cell)]).collect()
+        let own = RegionTopicKind::ALL.map(|kind| {
+            RegionTopic {
+                tile,
+                cell: cell.clone(),
+                kind,
+            }
+            .path()
+        });
+        own.into_iter()
+            .chain([ReputationTopic::filter_of_cell(&cell)])
+            .collect()
     }
 
     /// MQTT filters of what the cell may read: its own, maps and descriptions of the tiles around, and reputations.
@@ -38,7 +50,10 @@ impl CellAccount {
         let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
         let around = tile.with_neighbours().into_iter();
         let around = around.flat_map(|tile| kinds.map(|kind| RegionTopic::filter(tile, kind)));
-        let own = [RegionTopic::filter_of_cell(*tile, cell), ReputationTopic::filter_everywhere()];
+        let own = [
+            RegionTopic::filter_of_cell(*tile, cell),
+            ReputationTopic::filter_everywhere(),
+        ];
         own.into_iter().chain(around).collect()
     }
 
@@ -47,7 +62,10 @@ impl CellAccount {
     /// The password stands there as it is; docs/city.md says why.
     pub fn nats(&self, password: &str) -> String {
         let list = |filters: Vec<String>| {
-            let subjects: Vec<_> = filters.iter().map(|filter| format!("\"{}\"", subject(filter))).collect();
+            let subjects: Vec<_> = filters
+                .iter()
+                .map(|filter| format!("\"{}\"", subject(filter)))
+                .collect();
             subjects.join(", ")
         };
         let (writes, reads) = (list(self.writes()), list(self.reads()));
@@ -87,18 +105,33 @@ mod tests {
 
     #[test]
     fn a_cell_writes_below_its_own_tile_and_name_alone() {
-        let origin =
-            GeographicOrigin { latitude_deg: 48.8584, longitude_deg: 2.2945, height_m: 0.0, rotation_deg: 0.0 };
+        let origin = GeographicOrigin {
+            latitude_deg: 48.8584,
+            longitude_deg: 2.2945,
+            height_m: 0.0,
+            rotation_deg: 0.0,
+        };
         let account = CellAccount::new(NodeName::from_static("lot-1"), &origin);
         let own = "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0";
         let below = ["map", "cell", "status"].map(|kind| format!("{own}/lot-1/{kind}"));
-        assert_eq!(account.writes(), [&below[..], &["ecod/v1/rep/+/lot-1".to_owned()]].concat());
-        assert_eq!(account.reads().len(), 20, "its own, the reputations, two kinds of nine tiles");
+        assert_eq!(
+            account.writes(),
+            [&below[..], &["ecod/v1/rep/+/lot-1".to_owned()]].concat()
+        );
+        assert_eq!(
+            account.reads().len(),
+            20,
+            "its own, the reputations, two kinds of nine tiles"
+        );
         let nats = account.nats("secret");
         assert!(
             nats.contains("\"ecod.v1.geo.1.2.0.2.2.0.0.1.1.0.1.2.0.0.0.lot-1.status\", \"ecod.v1.rep.*.lot-1\""),
             "{nats}"
         );
-        assert!(account.mosquitto().contains(&format!("topic write {own}/lot-1/map\n")));
+        assert!(
+            account
+                .mosquitto()
+                .contains(&format!("topic write {own}/lot-1/map\n"))
+        );
     }
 }

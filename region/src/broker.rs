@@ -54,26 +54,42 @@ impl BrokerArguments {
     pub fn load(&self) -> anyhow::Result<BrokerLogin> {
         let password = self.password_file.as_deref().map(read_secret).transpose()?;
         let tls = self.ca.as_deref().map(trust).transpose()?;
-        Ok(BrokerLogin { address: self.broker.clone(), tls, login: self.user.clone().zip(password) })
+        Ok(BrokerLogin {
+            address: self.broker.clone(),
+            tls,
+            login: self.user.clone().zip(password),
+        })
     }
 }
 
 impl BrokerLogin {
     /// A plaintext connection without a login.
     pub fn anonymous(address: BrokerAddress) -> Self {
-        Self { address, tls: None, login: None }
+        Self {
+            address,
+            tls: None,
+            login: None,
+        }
     }
 
     /// A plaintext login by user and password.
     pub fn plain(address: BrokerAddress, user: &str, password: &str) -> Self {
-        Self { address, tls: None, login: Some((user.to_owned(), Secret::new(password))) }
+        Self {
+            address,
+            tls: None,
+            login: Some((user.to_owned(), Secret::new(password))),
+        }
     }
 
     /// Options of a connection. Its identity is random: who knows another's may end its connection.
     pub fn options(&self) -> MqttOptions {
         let host = self.address.host();
         // The name in the certificate has no brackets.
-        let host = if self.tls.is_some() { host.trim_matches(['[', ']']) } else { host };
+        let host = if self.tls.is_some() {
+            host.trim_matches(['[', ']'])
+        } else {
+            host
+        };
         let id = format!("ecod-region-{}", Uuid::new_v4().simple());
         let mut options = MqttOptions::new(id, host, self.address.port());
         options.set_keep_alive(KEEP_ALIVE);
@@ -82,7 +98,9 @@ impl BrokerLogin {
             options.set_credentials(user, password.reveal());
         }
         if let Some(tls) = &self.tls {
-            options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(Arc::clone(tls))));
+            options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(
+                Arc::clone(tls),
+            )));
         }
         options
     }
@@ -98,9 +116,14 @@ impl BrokerLogin {
 /// # Errors
 /// When it cannot be read or is empty.
 pub fn read_secret(path: &Path) -> anyhow::Result<Secret> {
-    let text = bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let text =
+        bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
     let line = text.lines().next().unwrap_or_default().trim();
-    ensure!(!line.is_empty(), "{} is empty: its first line is to be the secret", path.display());
+    ensure!(
+        !line.is_empty(),
+        "{} is empty: its first line is to be the secret",
+        path.display()
+    );
     Ok(Secret::new(line))
 }
 
@@ -108,10 +131,15 @@ fn trust(ca: &Path) -> anyhow::Result<Arc<ClientConfig>> {
     let named = || format!("cannot use the CAs of {}", ca.display());
     let mut roots = RootCertStore::empty();
     for certificate in CertificateDer::pem_file_iter(ca).with_context(named)? {
-        roots.add(certificate.with_context(named)?).with_context(named)?;
+        roots
+            .add(certificate.with_context(named)?)
+            .with_context(named)?;
     }
     ensure!(!roots.is_empty(), "{} has no certificate", ca.display());
     let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
-    Ok(Arc::new(builder.with_root_certificates(roots).with_no_client_auth()))
+    let builder =
+        ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions()?;
+    Ok(Arc::new(
+        builder.with_root_certificates(roots).with_no_client_auth(),
+    ))
 }

@@ -36,7 +36,11 @@ enum Command {
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     let is_service = matches!(cli.command, Command::Serve(_));
-    let _export = start_log(cli.log.log_format, is_service, if is_service { "info" } else { "warn" });
+    let _export = start_log(
+        cli.log.log_format,
+        is_service,
+        if is_service { "info" } else { "warn" },
+    );
     let outcome = match cli.command {
         Command::Serve(arguments) => serve::run(&arguments),
         Command::Export(arguments) => export::run(&arguments),
@@ -46,10 +50,15 @@ pub fn main() -> ExitCode {
 }
 
 /// Runs a future until it ends, or the process is asked to.
-fn run_until_stopped<T>(future: impl Future<Output = anyhow::Result<T>>) -> Result<Option<T>, Failure> {
+fn run_until_stopped<T>(
+    future: impl Future<Output = anyhow::Result<T>>,
+) -> Result<Option<T>, Failure> {
     let runtime = Runtime::new().context("cannot start threads")?;
     let outcome = runtime.block_on(async {
-        let [mut interrupted, mut terminated] = [signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?];
+        let [mut interrupted, mut terminated] = [
+            signal(SignalKind::interrupt())?,
+            signal(SignalKind::terminate())?,
+        ];
         tokio::select! {
             outcome = future => outcome.map(Some),
             _ = interrupted.recv() => Ok(None),

@@ -52,11 +52,18 @@ impl RegionPage {
         watched: Vec<Quadkey>,
         state: Arc<RegionState>,
     ) -> anyhow::Result<Self> {
-        let listener = TcpListener::bind(address).await.with_context(|| format!("cannot listen at {address}"))?;
+        let listener = TcpListener::bind(address)
+            .await
+            .with_context(|| format!("cannot listen at {address}"))?;
         let address = listener.local_addr()?;
         let access = PageAccess::new(token, address, &NodeName::from_static("region"));
         let api = Arc::new(RegionApi::new(state, Viewers::new(watched)));
-        Ok(Self { listener, address, api, access })
+        Ok(Self {
+            listener,
+            address,
+            api,
+            access,
+        })
     }
 
     /// The address, with the port that was given.
@@ -69,7 +76,9 @@ impl RegionPage {
         let router = routes::router(&self.api, self.access);
         let limit = ConnectionLimit::new(MAX_CONNECTIONS);
         tokio::join!(
-            accept(&self.listener, &limit, &router, || PageCounts::count(&self.api.counts.refused)),
+            accept(&self.listener, &limit, &router, || PageCounts::count(
+                &self.api.counts.refused
+            )),
             upkeep(&self.api)
         );
     }

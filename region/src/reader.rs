@@ -9,7 +9,8 @@ use ecod::model::time::Timestamp;
 use ecod::wire::{RegionTopic, RegionTopicKind};
 use ecod_actors::platform::clock;
 use rumqttc::{
-    AsyncClient, Event, EventLoop, NetworkOptions, Outgoing, Packet, QoS, SubscribeFilter, SubscribeReasonCode,
+    AsyncClient, Event, EventLoop, NetworkOptions, Outgoing, Packet, QoS, SubscribeFilter,
+    SubscribeReasonCode,
 };
 use tokio::sync::watch;
 
@@ -86,7 +87,11 @@ impl RegionState {
 }
 
 /// Reads without end; `seen` is told of every message. A connection that is lost is made anew.
-pub async fn read(login: &BrokerLogin, state: &Arc<RegionState>, mut seen: impl FnMut(&Reading<'_>)) {
+pub async fn read(
+    login: &BrokerLogin,
+    state: &Arc<RegionState>,
+    mut seen: impl FnMut(&Reading<'_>),
+) {
     let (client, mut events) = AsyncClient::new(login.options(), SEND_QUEUE);
     let mut network = NetworkOptions::new();
     network.set_connection_timeout(CONNECT_TIMEOUT_S);
@@ -103,7 +108,12 @@ pub async fn read(login: &BrokerLogin, state: &Arc<RegionState>, mut seen: impl 
 type Asked = Mutex<VecDeque<Vec<String>>>;
 
 /// Keeps the subscriptions as the tiles that are asked for.
-async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watch::Receiver<u64>, asked: &Asked) {
+async fn subscribe(
+    client: AsyncClient,
+    state: &RegionState,
+    mut logged_in: watch::Receiver<u64>,
+    asked: &Asked,
+) {
     let mut tiles = state.tiles.subscribe();
     let mut present = BTreeSet::new();
     loop {
@@ -125,8 +135,12 @@ async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watc
             continue;
         }
         let asked_tiles = tiles.borrow_and_update().clone();
-        let of_tiles = asked_tiles.iter().map(|tile| RegionTopic::filter_within(*tile));
-        let wanted: BTreeSet<_> = of_tiles.chain([RegionTopic::filter_everywhere(RegionTopicKind::Status)]).collect();
+        let of_tiles = asked_tiles
+            .iter()
+            .map(|tile| RegionTopic::filter_within(*tile));
+        let wanted: BTreeSet<_> = of_tiles
+            .chain([RegionTopic::filter_everywhere(RegionTopicKind::Status)])
+            .collect();
         let (new, old) = (&wanted - &present, &present - &wanted);
         for filter in old {
             // The next login subscribes anew if the connection has ended.
@@ -135,7 +149,9 @@ async fn subscribe(client: AsyncClient, state: &RegionState, mut logged_in: watc
         if !new.is_empty() {
             let filters: Vec<_> = new.into_iter().collect();
             lock(asked).push_back(filters.clone());
-            let filters = filters.into_iter().map(|filter| SubscribeFilter::new(filter, QoS::AtMostOnce));
+            let filters = filters
+                .into_iter()
+                .map(|filter| SubscribeFilter::new(filter, QoS::AtMostOnce));
             let _ = client.subscribe_many(filters).await;
         }
         present = wanted;
@@ -162,13 +178,22 @@ async fn poll(
                 wait = RETRY_MIN;
                 let mut link = lock(&state.link);
                 lock(&state.read).clear();
-                *link = BrokerLink { is_up: true, logins: link.logins + 1, trouble: None };
+                *link = BrokerLink {
+                    is_up: true,
+                    logins: link.logins + 1,
+                    trouble: None,
+                };
                 logins.send_replace(link.logins);
             }
             Ok(Event::Incoming(Packet::Publish(message))) => {
                 let at = clock::now();
                 let outcome = state.town().accept(&message.topic, &message.payload, at);
-                seen(&Reading { topic: &message.topic, payload: &message.payload, at, outcome });
+                seen(&Reading {
+                    topic: &message.topic,
+                    payload: &message.payload,
+                    at,
+                    outcome,
+                });
             }
             Ok(Event::Incoming(Packet::SubAck(answer))) => {
                 let filters = lock(asked).pop_front().unwrap_or_default();
@@ -176,7 +201,8 @@ async fn poll(
                 let refused = answers.filter(|(_, code)| *code == SubscribeReasonCode::Failure);
                 let refused: Vec<_> = refused.map(|(filter, _)| filter).collect();
                 if !refused.is_empty() {
-                    let trouble = format!("the broker lets this user not read {}", refused.join(", "));
+                    let trouble =
+                        format!("the broker lets this user not read {}", refused.join(", "));
                     tracing::warn!(broker = %login.address(), trouble);
                     lock(&state.link).trouble = Some(trouble);
                 }
@@ -191,7 +217,11 @@ async fn poll(
                     if link.is_up || link.trouble.is_none() {
                         tracing::warn!(broker = %login.address(), %error, "no connection to the region's broker");
                     }
-                    *link = BrokerLink { is_up: false, logins: link.logins, trouble: Some(trouble) };
+                    *link = BrokerLink {
+                        is_up: false,
+                        logins: link.logins,
+                        trouble: Some(trouble),
+                    };
                 }
                 tokio::time::sleep(wait).await;
                 wait = (2 * wait).min(RETRY_MAX);

@@ -16,8 +16,8 @@ use ecod::model::quadkey::{CELL_TILE_DIGITS, Quadkey};
 use ecod::model::time::Timestamp;
 use ecod::neighbours::{CellMapFilter, CoveredArea, MAX_AGE, MAX_MAP_HZ};
 use ecod::wire::{
-    CellDescription, CellMap, FusedObject, GlobalMap, Limits, NodeState, NodeStatus, Payload, RegionTopic,
-    RegionTopicKind, RejectReason, decode,
+    CellDescription, CellMap, FusedObject, GlobalMap, Limits, NodeState, NodeStatus, Payload,
+    RegionTopic, RegionTopicKind, RejectReason, decode,
 };
 use ecod_actors::platform::throttle::KeyedThrottle;
 pub use read_tiles::ReadTiles;
@@ -177,7 +177,12 @@ impl RegionTown {
     ///
     /// # Errors
     /// The reason why it does not count; it is counted.
-    pub fn accept(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, CellRefusal> {
+    pub fn accept(
+        &mut self,
+        path: &str,
+        payload: &[u8],
+        now: Timestamp,
+    ) -> Result<Accepted, CellRefusal> {
         self.counts.messages += 1;
         self.counts.bytes += payload.len() as u64;
         let accepted = self.take(path, payload, now);
@@ -187,12 +192,24 @@ impl RegionTown {
         accepted
     }
 
-    fn take(&mut self, path: &str, payload: &[u8], now: Timestamp) -> Result<Accepted, CellRefusal> {
-        let topic = RegionTopic::parse(path).filter(|topic| topic.tile.digits() == CELL_TILE_DIGITS);
+    fn take(
+        &mut self,
+        path: &str,
+        payload: &[u8],
+        now: Timestamp,
+    ) -> Result<Accepted, CellRefusal> {
+        let topic =
+            RegionTopic::parse(path).filter(|topic| topic.tile.digits() == CELL_TILE_DIGITS);
         let topic = topic.ok_or(RejectReason::UnknownTopic)?;
         let key = (topic.tile, topic.cell.clone());
         if !self.throttle.allow(&topic, now) {
-            self.lose(&key, CellLosses { throttled: 1, ..CellLosses::default() });
+            self.lose(
+                &key,
+                CellLosses {
+                    throttled: 1,
+                    ..CellLosses::default()
+                },
+            );
             return Err(CellRefusal::CellThrottled);
         }
         // A cell that clears what it retained has left for good.
@@ -255,9 +272,13 @@ impl RegionTown {
     pub fn forget_old_maps(&mut self, now: Timestamp) {
         self.filter.forget_silent(now);
         for cell in self.cells.values_mut() {
-            cell.map = cell.map.take().filter(|map| now.since(map.sent_at) <= KEPT_FOR);
+            cell.map = cell
+                .map
+                .take()
+                .filter(|map| now.since(map.sent_at) <= KEPT_FOR);
         }
-        self.cells.retain(|_, cell| cell.status.is_some() || cell.map.is_some());
+        self.cells
+            .retain(|_, cell| cell.status.is_some() || cell.map.is_some());
     }
 }
 
@@ -268,18 +289,39 @@ impl TownMap {
     /// The part of a map of a cell in `tile` that is shown, and the number of objects that are not.
     fn new(tile: Quadkey, message: CellMap, sent_at: Timestamp) -> (Self, CellLosses) {
         let CellMap { origin, map, .. } = message;
-        let GlobalMap { aggregator, epoch, round, fused_at_us: fused_at, mut objects, .. } = map;
+        let GlobalMap {
+            aggregator,
+            epoch,
+            round,
+            fused_at_us: fused_at,
+            mut objects,
+            ..
+        } = map;
         let (area, told) = (CoveredArea::of(tile), objects.len());
         objects.retain(|object| area.covers(&origin.to_wgs84(object.x_m, object.y_m, 0.0)));
         let covered = objects.len();
         objects.truncate(MAX_OBJECTS);
-        let losses =
-            CellLosses { throttled: 0, outside: (told - covered) as u64, too_many: (covered - objects.len()) as u64 };
+        let losses = CellLosses {
+            throttled: 0,
+            outside: (told - covered) as u64,
+            too_many: (covered - objects.len()) as u64,
+        };
         for object in &mut objects {
             (object.contributors, object.scores) = (Vec::new(), BTreeMap::new());
         }
         objects.shrink_to_fit();
-        (Self { origin, aggregator, epoch, round, objects, fused_at, sent_at }, losses)
+        (
+            Self {
+                origin,
+                aggregator,
+                epoch,
+                round,
+                objects,
+                fused_at,
+                sent_at,
+            },
+            losses,
+        )
     }
 }
 
@@ -298,7 +340,9 @@ impl RegionCell {
         match age {
             Some(age) if age <= MAX_AGE => CellState::Live,
             _ if self.status.as_ref().is_some_and(|status| !leads(status)) => CellState::Offline,
-            _ if read_since.is_some_and(|since| now.since(since.max(self.leads_since)) >= DUE_AFTER) => {
+            _ if read_since
+                .is_some_and(|since| now.since(since.max(self.leads_since)) >= DUE_AFTER) =>
+            {
                 CellState::Silent
             }
             _ => CellState::Told,
@@ -311,5 +355,12 @@ fn leads(status: &NodeStatus) -> bool {
 }
 
 fn read<T: Payload>(payload: &[u8]) -> Result<T, RejectReason> {
-    decode(payload, &Limits { map_bytes: MAX_MAP_BYTES, payload_bytes: MAX_STATUS_BYTES, ..Limits::default() })
+    decode(
+        payload,
+        &Limits {
+            map_bytes: MAX_MAP_BYTES,
+            payload_bytes: MAX_STATUS_BYTES,
+            ..Limits::default()
+        },
+    )
 }

@@ -32,18 +32,25 @@ impl LiveStream {
             Some(stream) if stream.last_stamp == stamp => return None,
             Some(stream)
                 if stamp > stream.last_stamp
-                    && delay_us.saturating_sub(stream.first_us).saturating_abs() <= tolerance_us =>
+                    && delay_us.saturating_sub(stream.first_us).saturating_abs()
+                        <= tolerance_us =>
             {
                 stream.least_us = stream.least_us.min(delay_us);
                 stream.messages += 1;
                 stream.last_stamp = stamp;
-                let is_live = stream.messages >= MIN_MESSAGES && received_at.since(stream.since) >= MIN_TIME;
+                let is_live =
+                    stream.messages >= MIN_MESSAGES && received_at.since(stream.since) >= MIN_TIME;
                 return is_live.then_some(stream.least_us);
             }
             _ => {}
         }
-        *candidate =
-            Some(Self { since: received_at, first_us: delay_us, least_us: delay_us, messages: 1, last_stamp: stamp });
+        *candidate = Some(Self {
+            since: received_at,
+            first_us: delay_us,
+            least_us: delay_us,
+            messages: 1,
+            last_stamp: stamp,
+        });
         None
     }
 }

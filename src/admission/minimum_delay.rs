@@ -25,7 +25,13 @@ impl MinimumDelay {
 
     /// An estimate without delays, over spans of this length.
     pub fn over(span: Duration, now: Timestamp) -> Self {
-        Self { span, span_start: now, current_us: i64::MAX, previous_us: i64::MAX, observed: 0 }
+        Self {
+            span,
+            span_start: now,
+            current_us: i64::MAX,
+            previous_us: i64::MAX,
+            observed: 0,
+        }
     }
 
     /// Takes the delay of one message in microseconds, which is negative if the sender's clock is ahead.

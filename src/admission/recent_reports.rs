@@ -19,7 +19,10 @@ const MAX_SENDERS: usize = 8192;
 impl RecentReports {
     /// Remembers a report; false if it came before.
     pub fn is_new(&mut self, kind: ReportKind, report: &ObjectReport) -> bool {
-        let (sender, mark) = ((report.node.clone(), kind), (report.captured_at_us, report.seq));
+        let (sender, mark) = (
+            (report.node.clone(), kind),
+            (report.captured_at_us, report.seq),
+        );
         if self.0.len() >= MAX_SENDERS && !self.0.contains_key(&sender) {
             self.0.clear();
         }
@@ -42,10 +45,14 @@ mod tests {
     #[test]
     fn what_comes_by_two_brokers_is_new_once() {
         let mut recent = RecentReports::default();
-        let report = |seq: u64| ObjectReport::new(NodeName::from_static("euclid"), seq, Timestamp(seq));
+        let report =
+            |seq: u64| ObjectReport::new(NodeName::from_static("euclid"), seq, Timestamp(seq));
         let by_two = [1, 2, 2, 1, 3, 4, 3, 4];
         let new = by_two.map(|seq| recent.is_new(ReportKind::Detections, &report(seq)));
         assert_eq!(new, [true, true, false, false, true, true, false, false]);
-        assert!(recent.is_new(ReportKind::VoteDetections, &report(4)), "another kind");
+        assert!(
+            recent.is_new(ReportKind::VoteDetections, &report(4)),
+            "another kind"
+        );
     }
 }

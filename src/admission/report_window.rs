@@ -74,7 +74,12 @@ pub struct ReportWindow {
 impl ReportWindow {
     /// An empty window on a clock that is the cell's time.
     pub fn new(config: WindowConfig) -> Self {
-        Self { config, cell_offset_us: 0, offset_before_us: None, vehicles: BTreeMap::new() }
+        Self {
+            config,
+            cell_offset_us: 0,
+            offset_before_us: None,
+            vehicles: BTreeMap::new(),
+        }
     }
 
     /// Goes on under other settings.
@@ -89,7 +94,11 @@ impl ReportWindow {
         if change.saturating_abs() > seconds(self.config.max_age_s) {
             self.offset_before_us = Some(self.cell_offset_us);
             for vehicle in self.vehicles.values_mut() {
-                vehicle.base = if vehicle.base == TimeBase::Cell { TimeBase::CellBefore } else { TimeBase::Own };
+                vehicle.base = if vehicle.base == TimeBase::Cell {
+                    TimeBase::CellBefore
+                } else {
+                    TimeBase::Own
+                };
             }
         }
         self.cell_offset_us = offset_us;
@@ -100,7 +109,11 @@ impl ReportWindow {
     /// # Errors
     /// [`RejectReason::FromTheFuture`] (also for a timestamp that no other report agrees with), [`RejectReason::Stale`],
     /// [`RejectReason::OutOfOrder`] for certain and possible duplicates, or [`RejectReason::TooManyVehicles`].
-    pub fn admit(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<Admitted, RejectReason> {
+    pub fn admit(
+        &mut self,
+        report: &ObjectReport,
+        received_at: Timestamp,
+    ) -> Result<Admitted, RejectReason> {
         let bounds = Bounds {
             max_age: seconds(self.config.max_age_s),
             max_offset: seconds(self.config.max_clock_offset_s),
@@ -129,16 +142,29 @@ impl ReportWindow {
 
     /// Time for which a sender's reports have been rejected for their time, and nothing else.
     pub fn untimely_for(&self, name: &NodeName, now: Timestamp) -> Duration {
-        let since = self.vehicles.get(name).and_then(|vehicle| vehicle.untimely_since);
+        let since = self
+            .vehicles
+            .get(name)
+            .and_then(|vehicle| vehicle.untimely_since);
         since.map_or(Duration::ZERO, |since| now.since(since))
     }
 
     /// The state of a sender; without faults if it is not known.
     pub(crate) fn sender(&self, name: &NodeName, now: Timestamp) -> SenderState {
-        let Some(vehicle) = self.vehicles.get(name) else { return SenderState::default() };
-        let misplaced = vehicle.misplaced_since.map_or(Duration::ZERO, |since| now.since(since));
-        let has_moved = vehicle.moved_at.is_some_and(|moved_at| now.since(moved_at) < MOVED_LATELY);
-        SenderState { misplaced, is_shared: vehicle.is_shared(), has_moved }
+        let Some(vehicle) = self.vehicles.get(name) else {
+            return SenderState::default();
+        };
+        let misplaced = vehicle
+            .misplaced_since
+            .map_or(Duration::ZERO, |since| now.since(since));
+        let has_moved = vehicle
+            .moved_at
+            .is_some_and(|moved_at| now.since(moved_at) < MOVED_LATELY);
+        SenderState {
+            misplaced,
+            is_shared: vehicle.is_shared(),
+            has_moved,
+        }
     }
 
     /// Notes if any object of a known sender's report has an effect where it is.
@@ -152,18 +178,29 @@ impl ReportWindow {
     pub fn timeliness(&self, now: Timestamp) -> Timeliness {
         // By vehicle: the parts of one must not speak for many.
         let mut vehicles = BTreeMap::new();
-        for (name, vehicle) in self.vehicles.iter().filter(|(_, vehicle)| now.since(vehicle.last_heard) < UNTIMELY_TIME)
+        for (name, vehicle) in self
+            .vehicles
+            .iter()
+            .filter(|(_, vehicle)| now.since(vehicle.last_heard) < UNTIMELY_TIME)
         {
-            let is_untimely = vehicle.untimely_since.is_some_and(|since| now.since(since) >= UNTIMELY_TIME);
+            let is_untimely = vehicle
+                .untimely_since
+                .is_some_and(|since| now.since(since) >= UNTIMELY_TIME);
             *vehicles.entry(name.vehicle()).or_insert(false) |= !is_untimely;
         }
         let timely = vehicles.values().filter(|is_timely| **is_timely).count();
-        Timeliness { timely, untimely: vehicles.len() - timely }
+        Timeliness {
+            timely,
+            untimely: vehicles.len() - timely,
+        }
     }
 
     /// The vehicles that were heard lately, once for each part.
     pub(crate) fn present(&self, now: Timestamp) -> impl Iterator<Item = NodeName> {
-        let present = self.vehicles.iter().filter(move |(_, vehicle)| now.since(vehicle.last_received) < RETENTION);
+        let present = self
+            .vehicles
+            .iter()
+            .filter(move |(_, vehicle)| now.since(vehicle.last_received) < RETENTION);
         present.map(|(name, _)| name.vehicle())
     }
 
@@ -173,9 +210,14 @@ impl ReportWindow {
             vehicles.len() >= self.config.max_vehicles || parts_beside(vehicles, name) >= MAX_PARTS
         };
         if is_full(&self.vehicles) {
-            self.vehicles.retain(|_, vehicle| now.since(vehicle.last_received) < RETENTION);
+            self.vehicles
+                .retain(|_, vehicle| now.since(vehicle.last_received) < RETENTION);
         }
-        if is_full(&self.vehicles) { Err(RejectReason::TooManyVehicles) } else { Ok(()) }
+        if is_full(&self.vehicles) {
+            Err(RejectReason::TooManyVehicles)
+        } else {
+            Ok(())
+        }
     }
 }
 

@@ -19,12 +19,18 @@ pub(super) fn agree(
         Some(label) => Some(label) == sign,
         None => !state.observers.is_empty(),
     };
-    if let Some(Decision { label, share, mass }) = verdict.and_then(decision).filter(|_| !is_known_empty) {
+    if let Some(Decision { label, share, mass }) =
+        verdict.and_then(decision).filter(|_| !is_known_empty)
+    {
         match &state.label {
             Some(known) if known == label => state.confidence = state.confidence.min(share),
             known => {
                 // Without PACE, few voters make nothing sure: Laplace's rule of succession for votes that all agree.
-                let sure = if known.is_some() { state.confidence } else { mass / (mass + 1.0) };
+                let sure = if known.is_some() {
+                    state.confidence
+                } else {
+                    mass / (mass + 1.0)
+                };
                 state.confidence = share.min(sure);
                 let by = readings.iter().find(|reading| reading.label == *label);
                 state.contributors = by.map(|reading| reading.nodes.clone()).unwrap_or_default();
@@ -33,7 +39,8 @@ pub(super) fn agree(
         }
     }
     // Where all read the place's label, the contributors say as much.
-    let is_unanimous = matches!(&readings[..], [reading] if Some(&reading.label) == state.label.as_ref());
+    let is_unanimous =
+        matches!(&readings[..], [reading] if Some(&reading.label) == state.label.as_ref());
     state.readings = if is_unanimous { Vec::new() } else { readings };
     state
 }
@@ -83,35 +90,83 @@ mod tests {
             label: Some(votes[0].0.into()),
             score,
             margin: score - next,
-            votes: votes.iter().map(|(label, score)| (Label::new(label), *score)).collect(),
+            votes: votes
+                .iter()
+                .map(|(label, score)| (Label::new(label), *score))
+                .collect(),
             contributors: Vec::new(),
         }
     }
 
     fn answer(state: LandmarkState, votes: &[(&str, f64)]) -> (Option<String>, f64) {
-        let readings = vec![LabelReading { label: "car".into(), nodes: vec![name("euclid")] }];
+        let readings = vec![LabelReading {
+            label: "car".into(),
+            nodes: vec![name("euclid")],
+        }];
         let empty = Label::new("EMPTY");
         let state = agree(state, Some(&verdict(votes)), readings, Some(&empty));
-        (state.label.map(|label| label.to_string()), (state.confidence * 100.0).round() / 100.0)
+        (
+            state.label.map(|label| label.to_string()),
+            (state.confidence * 100.0).round() / 100.0,
+        )
     }
 
     #[test]
     fn who_is_trusted_decides_what_is_there_and_pace_whether_anything_is() {
         let seen: &[&str] = &["euclid"];
-        assert_eq!(answer(state(Some("car"), 0.9, seen), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.9));
-        assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.9), ("van", 0.1)]).0, Some("car".into()));
-        assert_eq!(answer(state(Some("van"), 0.7, seen), &[("car", 1.05), ("van", 0.95)]), (Some("car".into()), 0.53));
-        assert_eq!(answer(state(None, 0.0, &[]), &[("car", 1.8), ("van", 0.2)]), (Some("car".into()), 0.67));
-        assert_eq!(answer(state(None, 0.0, seen), &[("car", 2.0)]), (None, 0.0), "seen empty");
-        assert_eq!(answer(state(Some("EMPTY"), 0.8, seen), &[("car", 2.0)]), (Some("EMPTY".into()), 0.8));
+        assert_eq!(
+            answer(state(Some("car"), 0.9, seen), &[("car", 1.8), ("van", 0.2)]),
+            (Some("car".into()), 0.9)
+        );
+        assert_eq!(
+            answer(state(Some("van"), 0.7, seen), &[("car", 1.9), ("van", 0.1)]).0,
+            Some("car".into())
+        );
+        assert_eq!(
+            answer(
+                state(Some("van"), 0.7, seen),
+                &[("car", 1.05), ("van", 0.95)]
+            ),
+            (Some("car".into()), 0.53)
+        );
+        assert_eq!(
+            answer(state(None, 0.0, &[]), &[("car", 1.8), ("van", 0.2)]),
+            (Some("car".into()), 0.67)
+        );
+        assert_eq!(
+            answer(state(None, 0.0, seen), &[("car", 2.0)]),
+            (None, 0.0),
+            "seen empty"
+        );
+        assert_eq!(
+            answer(state(Some("EMPTY"), 0.8, seen), &[("car", 2.0)]),
+            (Some("EMPTY".into()), 0.8)
+        );
     }
 
     #[test]
     fn the_answer_is_as_sure_as_the_less_sure_of_both() {
         let seen: &[&str] = &["euclid"];
-        assert_eq!(answer(state(Some("car"), 0.8, seen), &[("car", 1.0)]).1, 0.8);
-        assert_eq!(answer(state(Some("car"), 0.99, seen), &[("car", 1.5), ("van", 0.5)]).1, 0.75);
-        assert_eq!(answer(state(Some("van"), 0.6, seen), &[("car", 1.9), ("van", 0.1)]).1, 0.6);
-        assert_eq!(answer(state(None, 0.0, &[]), &[("car", 1.0)]).1, 0.5, "one voter alone");
+        assert_eq!(
+            answer(state(Some("car"), 0.8, seen), &[("car", 1.0)]).1,
+            0.8
+        );
+        assert_eq!(
+            answer(
+                state(Some("car"), 0.99, seen),
+                &[("car", 1.5), ("van", 0.5)]
+            )
+            .1,
+            0.75
+        );
+        assert_eq!(
+            answer(state(Some("van"), 0.6, seen), &[("car", 1.9), ("van", 0.1)]).1,
+            0.6
+        );
+        assert_eq!(
+            answer(state(None, 0.0, &[]), &[("car", 1.0)]).1,
+            0.5,
+            "one voter alone"
+        );
     }
 }

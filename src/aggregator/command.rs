@@ -88,16 +88,25 @@ impl Aggregator {
     pub fn command(&mut self, command: &Command, now: Timestamp) -> Option<Fused> {
         match command {
             Command::Tick => return self.tick(now),
-            Command::Lead { epoch, first_round, first } => self.lead(epoch.clone(), *first_round, *first, now),
+            Command::Lead {
+                epoch,
+                first_round,
+                first,
+            } => self.lead(epoch.clone(), *first_round, *first, now),
             Command::Hold => self.hold(),
             Command::StepDown => self.step_down(),
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
-            Command::TakeNeighbours { objects, stated_at } => self.take_neighbours(objects, *stated_at),
+            Command::TakeNeighbours { objects, stated_at } => {
+                self.take_neighbours(objects, *stated_at)
+            }
             Command::TakeForeign { reputations } => self.take_foreign(reputations),
             Command::Resume { reputations } => self.resume(reputations),
             Command::Configure { fusion, landmarks } => {
-                self.configure(FusionConfig::clone(fusion), landmarks.iter().map(Landmark::from).collect());
+                self.configure(
+                    FusionConfig::clone(fusion),
+                    landmarks.iter().map(Landmark::from).collect(),
+                );
             }
             Command::SetCellOffset { offset_us } => self.set_cell_offset(*offset_us),
         }

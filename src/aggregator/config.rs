@@ -77,11 +77,19 @@ impl FusionConfig {
     /// # Errors
     /// [`ConfigError`] naming the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        self.window.validate().map_err(|error| error.within("window"))?;
-        self.round.validate().map_err(|error| error.within("round"))?;
+        self.window
+            .validate()
+            .map_err(|error| error.within("window"))?;
+        self.round
+            .validate()
+            .map_err(|error| error.within("round"))?;
         self.pace.validate().map_err(|error| error.within("pace"))?;
-        self.tracks.validate().map_err(|error| error.within("tracks"))?;
+        self.tracks
+            .validate()
+            .map_err(|error| error.within("tracks"))?;
         self.vote.validate().map_err(|error| error.within("vote"))?;
-        self.reputation.validate().map_err(|error| error.within("reputation"))
+        self.reputation
+            .validate()
+            .map_err(|error| error.within("reputation"))
     }
 }

@@ -35,8 +35,17 @@ impl ForeignView {
     /// Tells votes and tracks, if anything or the trust in any cell has changed. A cell of which tracks know nothing is
     /// trusted as a newcomer is.
     pub(super) fn weigh(&mut self, vote: Option<&mut Vote>, tracks: Option<&mut Tracker>) {
-        let of_cell = |cell: &NodeName| tracks.as_ref().map_or(1.0, |tracks| tracks.trust_in_cell(cell));
-        let trust = self.reputations.cells().into_iter().map(|cell| (cell.clone(), of_cell(cell))).collect();
+        let of_cell = |cell: &NodeName| {
+            tracks
+                .as_ref()
+                .map_or(1.0, |tracks| tracks.trust_in_cell(cell))
+        };
+        let trust = self
+            .reputations
+            .cells()
+            .into_iter()
+            .map(|cell| (cell.clone(), of_cell(cell)))
+            .collect();
         if self.trust.as_ref() == Some(&trust) {
             return;
         }
@@ -50,12 +59,20 @@ impl ForeignView {
     }
 
     /// The votes beside the prior of published reputations, if they have changed since the last call.
-    pub(super) fn take_news(&mut self, prior_votes: f64) -> Option<BTreeMap<NodeName, ForeignVotes>> {
+    pub(super) fn take_news(
+        &mut self,
+        prior_votes: f64,
+    ) -> Option<BTreeMap<NodeName, ForeignVotes>> {
         std::mem::take(&mut self.is_news).then(|| self.votes_beside(prior_votes))
     }
 
     fn votes_beside(&self, prior_votes: f64) -> BTreeMap<NodeName, ForeignVotes> {
-        let trust = |cell: &NodeName| self.trust.as_ref().and_then(|trust| trust.get(cell).copied()).unwrap_or(1.0);
+        let trust = |cell: &NodeName| {
+            self.trust
+                .as_ref()
+                .and_then(|trust| trust.get(cell).copied())
+                .unwrap_or(1.0)
+        };
         self.reputations.votes(prior_votes, trust)
     }
 }
@@ -73,6 +90,9 @@ impl Aggregator {
 
     /// The vehicles that are present: those heard in the last ten seconds.
     pub fn present(&self, now: Timestamp) -> BTreeSet<NodeName> {
-        self.windows.iter().flat_map(|window| window.present(now)).collect()
+        self.windows
+            .iter()
+            .flat_map(|window| window.present(now))
+            .collect()
     }
 }

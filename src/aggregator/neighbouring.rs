@@ -44,14 +44,23 @@ impl NeighbourView {
         let mut shown: Vec<NeighbourObject> = Vec::new();
         for stated in &*self.objects {
             let age_s = stated.age_s + passed_s;
-            let is_hidden = age_s > MAX_AGE.as_secs_f64() || tracks.is_some_and(|tracks| tracks.hides(stated));
-            let is_told =
-                || shown.iter().any(|told| told.object.id == stated.object.id && is_near(told, stated, age_s));
+            let is_hidden =
+                age_s > MAX_AGE.as_secs_f64() || tracks.is_some_and(|tracks| tracks.hides(stated));
+            let is_told = || {
+                shown
+                    .iter()
+                    .any(|told| told.object.id == stated.object.id && is_near(told, stated, age_s))
+            };
             if !is_hidden && !known.contains(&stated.object.id) && !is_told() {
-                shown.push(NeighbourObject { age_s, ..stated.clone() });
+                shown.push(NeighbourObject {
+                    age_s,
+                    ..stated.clone()
+                });
             }
         }
-        shown.iter_mut().for_each(|stated| date_objects(std::slice::from_mut(&mut stated.object), cell_offset_us));
+        shown.iter_mut().for_each(|stated| {
+            date_objects(std::slice::from_mut(&mut stated.object), cell_offset_us)
+        });
         shown
     }
 }
@@ -59,7 +68,12 @@ impl NeighbourView {
 /// True if two statements can be of one object, by the lower speed and their ages; `age_s` is that of the second.
 fn is_near(told: &NeighbourObject, stated: &NeighbourObject, age_s: f64) -> bool {
     let [a, b] = [&told.object, &stated.object];
-    let speeds = [a, b].map(|object| object.velocity_mps.map_or(0.0, |[east, north]| east.hypot(north)));
+    let speeds = [a, b].map(|object| {
+        object
+            .velocity_mps
+            .map_or(0.0, |[east, north]| east.hypot(north))
+    });
     let speed_mps = f64::min(speeds[0], speeds[1]);
-    (a.x_m - b.x_m).hypot(a.y_m - b.y_m) <= SAME_PLACE_M + speed_mps * ((told.age_s - age_s).abs() + CLOCK_ERROR_S)
+    (a.x_m - b.x_m).hypot(a.y_m - b.y_m)
+        <= SAME_PLACE_M + speed_mps * ((told.age_s - age_s).abs() + CLOCK_ERROR_S)
 }

@@ -39,7 +39,11 @@ impl ReportDoubt {
     pub(super) fn of_ranges(report: &ObjectReport) -> Option<Self> {
         let camera = Pose::from(report.pose?).position;
         let range_m = |x_m, y_m| nalgebra::distance(&camera, &Point2::new(x_m, y_m));
-        let range_m = report.objects.iter().map(|object| range_m(object.x_m, object.y_m)).fold(0.0, f64::max);
+        let range_m = report
+            .objects
+            .iter()
+            .map(|object| range_m(object.x_m, object.y_m))
+            .fold(0.0, f64::max);
         (range_m > MAX_SEEN_RANGE_M).then_some(Self::FarObject { range_m })
     }
 }

@@ -83,7 +83,12 @@ struct Reporter {
 
 impl Reporter {
     fn new(now: Timestamp) -> Self {
-        Self { last_report: now, gaps: [Duration::ZERO; 2], is_awaited: false, due: false }
+        Self {
+            last_report: now,
+            gaps: [Duration::ZERO; 2],
+            is_awaited: false,
+            due: false,
+        }
     }
 
     fn note(&mut self, now: Timestamp) {
@@ -100,7 +105,8 @@ impl Reporter {
     fn begin_round(&mut self, now: Timestamp, period: Duration) -> bool {
         let (silent, interval) = (now.since(self.last_report), self.interval(period));
         let expected_within = interval.saturating_sub(silent);
-        self.is_awaited = silent < interval * LIVE_INTERVALS && expected_within <= period + period / DELAY_DIVISOR;
+        self.is_awaited = silent < interval * LIVE_INTERVALS
+            && expected_within <= period + period / DELAY_DIVISOR;
         self.is_awaited
     }
 }
@@ -184,7 +190,10 @@ impl RoundTrigger {
         } else {
             live.insert(node.clone(), Reporter::new(now));
         }
-        if was_last_due && !self.held && now.since(self.last_close) < self.config.period() / MAX_RATE {
+        if was_last_due
+            && !self.held
+            && now.since(self.last_close) < self.config.period() / MAX_RATE
+        {
             self.close(now);
             return true;
         }
@@ -207,17 +216,22 @@ impl RoundTrigger {
         let by_reports = self.config.close == RoundClose::WhenComplete && !self.held;
         (self.missing, self.due) = (0, 0);
         for live in &mut self.live {
-            live.retain(|_, vehicle| now.since(vehicle.last_report) < REMEMBERED.max(period * LIVE_INTERVALS));
+            live.retain(|_, vehicle| {
+                now.since(vehicle.last_report) < REMEMBERED.max(period * LIVE_INTERVALS)
+            });
             for vehicle in live.values_mut() {
                 self.missing += usize::from(vehicle.begin_round(now, period));
-                vehicle.due = by_reports && now.since(vehicle.last_report) > vehicle.interval(period) / DUE_DIVISOR;
+                vehicle.due = by_reports
+                    && now.since(vehicle.last_report) > vehicle.interval(period) / DUE_DIVISOR;
                 self.due += usize::from(vehicle.due);
             }
         }
         self.last_close = now;
         self.first_report = None;
         self.held = self.early < EARLY.len();
-        self.length = EARLY.get(self.early).map_or(period, |&length| length.min(period));
+        self.length = EARLY
+            .get(self.early)
+            .map_or(period, |&length| length.min(period));
         self.early += usize::from(self.held);
     }
 
@@ -249,7 +263,9 @@ impl RoundTrigger {
         }
         match self.first_report {
             Some(_) if self.missing == 0 => self.last_close + period / MAX_RATE,
-            Some(first) => end.max(first + period / DELAY_DIVISOR).min(end + period / DELAY_DIVISOR),
+            Some(first) => end
+                .max(first + period / DELAY_DIVISOR)
+                .min(end + period / DELAY_DIVISOR),
             None => end,
         }
     }
@@ -271,7 +287,13 @@ mod tests {
     }
 
     fn trigger(close: RoundClose) -> RoundTrigger {
-        RoundTrigger::new(RoundConfig { close, ..RoundConfig::default() }, at(0))
+        RoundTrigger::new(
+            RoundConfig {
+                close,
+                ..RoundConfig::default()
+            },
+            at(0),
+        )
     }
 
     #[test]
@@ -292,7 +314,10 @@ mod tests {
         rounds.report(Detections, &node("a"), at(10));
         rounds.report(VoteDetections, &node("a"), at(11));
         assert!(rounds.tick(at(20)));
-        assert!(!rounds.report(Detections, &node("a"), at(110)), "its vote is on the way");
+        assert!(
+            !rounds.report(Detections, &node("a"), at(110)),
+            "its vote is on the way"
+        );
         assert!(rounds.report(VoteDetections, &node("a"), at(111)));
     }
 
@@ -309,15 +334,18 @@ mod tests {
 
     #[test]
     fn who_connects_late_to_an_unplanned_leader_does_not_wait_for_a_period() {
-        for (first, expected) in
-            [(FirstRound::Overdue, [50, 75, 125, 225, 325]), (FirstRound::AfterConnects, [75, 100, 150, 250, 350])]
-        {
+        for (first, expected) in [
+            (FirstRound::Overdue, [50, 75, 125, 225, 325]),
+            (FirstRound::AfterConnects, [75, 100, 150, 250, 350]),
+        ] {
             for close in [RoundClose::WhenComplete, RoundClose::Periodic] {
                 let mut rounds = trigger(close);
                 rounds.start(first, at(50));
                 let closes = expected.map(|_| {
                     let deadline = rounds.deadline();
-                    assert!(!rounds.tick(deadline - Duration::from_millis(1)) && rounds.tick(deadline));
+                    assert!(
+                        !rounds.tick(deadline - Duration::from_millis(1)) && rounds.tick(deadline)
+                    );
                     deadline
                 });
                 assert_eq!(closes, expected.map(at), "{first:?}, {close:?}");
@@ -344,7 +372,10 @@ mod tests {
             rounds.report(Detections, &node("a"), at(round * 100));
             rounds.tick(at(round * 100 + 99));
         }
-        assert!(rounds.report(Detections, &node("a"), at(600)), "closes without the vehicle that left");
+        assert!(
+            rounds.report(Detections, &node("a"), at(600)),
+            "closes without the vehicle that left"
+        );
     }
 
     /// Two reports a second of each of seven cameras, which capture together.
@@ -360,8 +391,14 @@ mod tests {
             }
             assert!(between < 5, "{between} rounds before frame {frame}");
             let names = ["a", "b", "c", "d", "e", "f", "g"];
-            let closed: Vec<_> = names.iter().filter(|name| rounds.report(Detections, &node(name), capture)).collect();
-            assert!(frame < 4 || closed == [&"g"], "frame {frame}: a round after {closed:?}");
+            let closed: Vec<_> = names
+                .iter()
+                .filter(|name| rounds.report(Detections, &node(name), capture))
+                .collect();
+            assert!(
+                frame < 4 || closed == [&"g"],
+                "frame {frame}: a round after {closed:?}"
+            );
         }
     }
 
@@ -379,7 +416,11 @@ mod tests {
             }
             rounds.report(Detections, &node("a"), at(ms));
             let closed = rounds.report(Detections, &node("b"), at(ms + 1));
-            assert!(ms < 2000 || closed || ms - slow >= 900, "open at {ms}, {} after the slow one", ms - slow);
+            assert!(
+                ms < 2000 || closed || ms - slow >= 900,
+                "open at {ms}, {} after the slow one",
+                ms - slow
+            );
         }
     }
 
@@ -407,12 +448,21 @@ mod tests {
         rounds.report(Detections, &node("a"), at(100));
         assert!(rounds.tick(at(120)), "without b and c");
         assert!(!rounds.report(Detections, &node("b"), at(125)));
-        assert!(rounds.report(Detections, &node("c"), at(126)), "as soon as both are there");
+        assert!(
+            rounds.report(Detections, &node("c"), at(126)),
+            "as soon as both are there"
+        );
         for name in ["a", "b"] {
-            assert!(!rounds.report(Detections, &node(name), at(200)), "all are waited for again");
+            assert!(
+                !rounds.report(Detections, &node(name), at(200)),
+                "all are waited for again"
+            );
         }
         assert!(rounds.tick(at(226)), "without c");
-        assert!(!rounds.report(Detections, &node("c"), at(290)), "too late: it counts for the next");
+        assert!(
+            !rounds.report(Detections, &node("c"), at(290)),
+            "too late: it counts for the next"
+        );
     }
 
     #[test]
@@ -445,15 +495,22 @@ mod tests {
     #[test]
     fn one_fast_vehicle_does_not_drive_the_rate() {
         let mut rounds = trigger(RoundClose::WhenComplete);
-        let closed = (0..1000).filter(|ms| rounds.report(Detections, &node("a"), at(*ms))).count();
-        assert!((45..=50).contains(&closed), "{closed} rounds in a second at a period of 100 ms");
+        let closed = (0..1000)
+            .filter(|ms| rounds.report(Detections, &node("a"), at(*ms)))
+            .count();
+        assert!(
+            (45..=50).contains(&closed),
+            "{closed} rounds in a second at a period of 100 ms"
+        );
     }
 
     #[test]
     fn a_round_that_is_held_lasts_its_period() {
         let start = Timestamp(1_000_000);
         let mut rounds = RoundTrigger::new(RoundConfig::default(), start);
-        let (euclid, at) = (NodeName::from_static("euclid"), |ms: u64| Timestamp(1_000_000 + ms * 1000));
+        let (euclid, at) = (NodeName::from_static("euclid"), |ms: u64| {
+            Timestamp(1_000_000 + ms * 1000)
+        });
         assert!(!rounds.report(ReportKind::Detections, &euclid, at(5)));
         rounds.hold();
         assert!(!rounds.tick(at(99)));

@@ -19,12 +19,21 @@ fn at(ms: u64) -> Timestamp {
 
 fn landmarks() -> Vec<Landmark> {
     let ball = Point2::new(1.0, 0.0);
-    vec![Landmark { id: "ball".into(), position: ball, facing_rad: None, vacancy: None, synonyms: vec![] }]
+    vec![Landmark {
+        id: "ball".into(),
+        position: ball,
+        facing_rad: None,
+        vacancy: None,
+        synonyms: vec![],
+    }]
 }
 
 fn report(node: &str, label: &str, captured_ms: u64) -> Arc<ObjectReport> {
     Arc::new(ObjectReport {
-        objects: vec![PerceivedObject { landmark: Some("ball".into()), ..PerceivedObject::new(label, 0.9, 1.0, 0.0) }],
+        objects: vec![PerceivedObject {
+            landmark: Some("ball".into()),
+            ..PerceivedObject::new(label, 0.9, 1.0, 0.0)
+        }],
         ..ObjectReport::new(NodeName::new(node).unwrap(), captured_ms, at(captured_ms))
     })
 }
@@ -34,26 +43,54 @@ fn leader(config: FusionConfig) -> Aggregator {
 }
 
 fn shown(fused: &Fused) -> (Option<&str>, Option<&str>) {
-    let map = fused.map.as_ref().and_then(|map| map.landmarks[0].label.as_deref());
-    (map, fused.verdicts.as_ref().and_then(|verdicts| verdicts.verdicts[0].label.as_deref()))
+    let map = fused
+        .map
+        .as_ref()
+        .and_then(|map| map.landmarks[0].label.as_deref());
+    (
+        map,
+        fused
+            .verdicts
+            .as_ref()
+            .and_then(|verdicts| verdicts.verdicts[0].label.as_deref()),
+    )
 }
 
 #[test]
 fn a_round_is_closed_for_map_and_verdicts_together() {
-    let round = RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() };
-    let mut cell = leader(FusionConfig { round, ..FusionConfig::default() });
+    let round = RoundConfig {
+        close: RoundClose::Periodic,
+        ..RoundConfig::default()
+    };
+    let mut cell = leader(FusionConfig {
+        round,
+        ..FusionConfig::default()
+    });
     for round in 1..=3 {
         let now = at(round * 100);
         for kind in [Detections, VoteDetections] {
-            cell.report(kind, &report("euclid", "cup", round * 100 - 10), now - std::time::Duration::from_millis(5))
-                .unwrap();
+            cell.report(
+                kind,
+                &report("euclid", "cup", round * 100 - 10),
+                now - std::time::Duration::from_millis(5),
+            )
+            .unwrap();
         }
         let fused = cell.tick(now).unwrap();
         let (map, verdicts) = (fused.map.clone().unwrap(), fused.verdicts.clone().unwrap());
         assert_eq!((map.epoch, map.round, map.fused_at_us), (7, round, now));
-        assert_eq!((verdicts.epoch, verdicts.round, verdicts.fused_at_us), (7, round, now));
-        assert_eq!((verdicts.aggregator.as_str(), shown(&fused).1), ("edge", Some("cup")));
-        assert_eq!(verdicts.verdicts[0].contributors, [NodeName::from_static("euclid")]);
+        assert_eq!(
+            (verdicts.epoch, verdicts.round, verdicts.fused_at_us),
+            (7, round, now)
+        );
+        assert_eq!(
+            (verdicts.aggregator.as_str(), shown(&fused).1),
+            ("edge", Some("cup"))
+        );
+        assert_eq!(
+            verdicts.verdicts[0].contributors,
+            [NodeName::from_static("euclid")]
+        );
     }
 }
 
@@ -64,20 +101,36 @@ fn one_frame_may_go_out_as_both_kinds_but_each_only_once() {
     assert_eq!(cell.report(Detections, &frame, at(12)), Ok(None));
     assert_eq!(cell.report(VoteDetections, &frame, at(12)), Ok(None));
     for kind in [Detections, VoteDetections] {
-        assert_eq!(cell.report(kind, &frame, at(13)), Err(RejectReason::OutOfOrder));
+        assert_eq!(
+            cell.report(kind, &frame, at(13)),
+            Err(RejectReason::OutOfOrder)
+        );
     }
     let old = report("gauss", "cup", 10);
-    assert_eq!(cell.report(VoteDetections, &old, at(9000)), Err(RejectReason::Stale));
+    assert_eq!(
+        cell.report(VoteDetections, &old, at(9000)),
+        Err(RejectReason::Stale)
+    );
 }
 
 #[test]
 fn a_cell_refuses_reports_for_what_it_does_not_run() {
-    for (algorithms, kind, other) in
-        [(Algorithms::Pace, Detections, VoteDetections), (Algorithms::Vote, VoteDetections, Detections)]
-    {
-        let mut cell = leader(FusionConfig { algorithms, ..FusionConfig::default() });
-        assert_eq!(cell.report(kind, &report("euclid", "cup", 10), at(11)), Ok(None));
-        assert_eq!(cell.report(other, &report("euclid", "cup", 10), at(11)), Err(RejectReason::NotFused));
+    for (algorithms, kind, other) in [
+        (Algorithms::Pace, Detections, VoteDetections),
+        (Algorithms::Vote, VoteDetections, Detections),
+    ] {
+        let mut cell = leader(FusionConfig {
+            algorithms,
+            ..FusionConfig::default()
+        });
+        assert_eq!(
+            cell.report(kind, &report("euclid", "cup", 10), at(11)),
+            Ok(None)
+        );
+        assert_eq!(
+            cell.report(other, &report("euclid", "cup", 10), at(11)),
+            Err(RejectReason::NotFused)
+        );
         let fused = cell.tick(at(100)).unwrap();
         assert_eq!(fused.map.is_some(), algorithms.pace());
         assert_eq!(fused.verdicts.is_some(), algorithms.vote());
@@ -87,12 +140,17 @@ fn a_cell_refuses_reports_for_what_it_does_not_run() {
 #[test]
 fn where_both_run_verdicts_come_from_the_first_vote_on() {
     let mut cell = leader(FusionConfig::default());
-    cell.report(Detections, &report("euclid", "cup", 10), at(12)).unwrap();
+    cell.report(Detections, &report("euclid", "cup", 10), at(12))
+        .unwrap();
     let silent = cell.tick(at(100)).unwrap();
     assert!(silent.map.is_some() && silent.verdicts.is_none());
-    cell.report(VoteDetections, &report("euclid", "cup", 110), at(112)).unwrap();
+    cell.report(VoteDetections, &report("euclid", "cup", 110), at(112))
+        .unwrap();
     assert!(cell.tick(at(200)).unwrap().verdicts.is_some());
-    assert!(cell.tick(at(20_000)).unwrap().verdicts.is_some(), "silence is a verdict once there were votes");
+    assert!(
+        cell.tick(at(20_000)).unwrap().verdicts.is_some(),
+        "silence is a verdict once there were votes"
+    );
 }
 
 #[test]
@@ -100,19 +158,37 @@ fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
     let mut cell = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
     for step in 1..=20 {
         for kind in [Detections, VoteDetections] {
-            assert_eq!(cell.report(kind, &report("euclid", "cup", step * 50), at(step * 50)), Ok(None));
+            assert_eq!(
+                cell.report(kind, &report("euclid", "cup", step * 50), at(step * 50)),
+                Ok(None)
+            );
         }
         assert_eq!(cell.tick(at(step * 50 + 20)), None);
     }
     let epoch = Epoch::new(3, NodeName::from_static("gauss"));
     cell.lead(epoch.clone(), 88, FirstRound::Overdue, at(1030));
     let first = cell.tick(at(1030)).expect("due at once");
-    assert_eq!((first.epoch.clone(), first.round, shown(&first)), (epoch.clone(), 88, (Some("cup"), Some("cup"))));
+    assert_eq!(
+        (first.epoch.clone(), first.round, shown(&first)),
+        (epoch.clone(), 88, (Some("cup"), Some("cup")))
+    );
     cell.lead(epoch, 89, FirstRound::OnTime, at(1040));
     assert_eq!(cell.tick(at(1139)), None);
     assert_eq!(cell.tick(at(1140)).map(|fused| fused.round), Some(89));
-    cell.lead(Epoch::new(4, NodeName::from_static("gauss")), 90, FirstRound::AfterConnects, at(1140));
-    assert_eq!(cell.report(ReportKind::Detections, &report("euclid", "cup", 1150), at(1150)), Ok(None));
+    cell.lead(
+        Epoch::new(4, NodeName::from_static("gauss")),
+        90,
+        FirstRound::AfterConnects,
+        at(1140),
+    );
+    assert_eq!(
+        cell.report(
+            ReportKind::Detections,
+            &report("euclid", "cup", 1150),
+            at(1150)
+        ),
+        Ok(None)
+    );
     assert_eq!(cell.tick(at(1164)), None, "the others are still connecting");
     assert_eq!(cell.tick(at(1165)).map(|fused| fused.round), Some(90));
     cell.step_down();
@@ -121,29 +197,61 @@ fn a_standby_says_nothing_and_leads_at_once_with_what_it_knows() {
 
 #[test]
 fn paper_verdicts_come_by_packets_and_rounds_without_result_are_not_counted() {
-    let vote = VoteConfig { mode: VoteMode::Paper, ..VoteConfig::default() };
-    let config = FusionConfig { algorithms: Algorithms::Vote, vote, ..FusionConfig::default() };
+    let vote = VoteConfig {
+        mode: VoteMode::Paper,
+        ..VoteConfig::default()
+    };
+    let config = FusionConfig {
+        algorithms: Algorithms::Vote,
+        vote,
+        ..FusionConfig::default()
+    };
     let mut cell = leader(config);
     let rounds: Vec<_> = (1..=10)
         .filter_map(|frame| {
             let now = at(frame * 100);
-            cell.report(VoteDetections, &report("euclid", "cup", frame * 100), now).unwrap().or_else(|| cell.tick(now))
+            cell.report(VoteDetections, &report("euclid", "cup", frame * 100), now)
+                .unwrap()
+                .or_else(|| cell.tick(now))
         })
-        .map(|fused| (fused.round, fused.verdicts.unwrap().verdicts[0].votes["cup"]))
+        .map(|fused| {
+            (
+                fused.round,
+                fused.verdicts.unwrap().verdicts[0].votes["cup"],
+            )
+        })
         .collect();
-    assert_eq!(rounds.iter().map(|(round, _)| *round).collect::<Vec<_>>(), [1, 2]);
+    assert_eq!(
+        rounds.iter().map(|(round, _)| *round).collect::<Vec<_>>(),
+        [1, 2]
+    );
     assert!(rounds[1].1 > rounds[0].1, "the paper's scores are sums");
 }
 
 #[test]
 fn settled_votes_become_evidence_that_another_aggregator_adopts() {
-    let config = FusionConfig { round: RoundConfig { period_s: 0.5, ..RoundConfig::default() }, ..Default::default() };
+    let config = FusionConfig {
+        round: RoundConfig {
+            period_s: 0.5,
+            ..RoundConfig::default()
+        },
+        ..Default::default()
+    };
     let mut cell = leader(config.clone());
     let mut ledger = ReputationLedger::default();
     for step in 1..=60u64 {
         for (node, label) in [("euclid", "cup"), ("gauss", "cup"), ("liar", "dog")] {
-            let fused = cell.report(VoteDetections, &report(node, label, step * 500), at(step * 500)).unwrap();
-            for (fused, evidence) in fused.iter().flat_map(|f| f.evidence.iter().map(move |e| (f, e))) {
+            let fused = cell
+                .report(
+                    VoteDetections,
+                    &report(node, label, step * 500),
+                    at(step * 500),
+                )
+                .unwrap();
+            for (fused, evidence) in fused
+                .iter()
+                .flat_map(|f| f.evidence.iter().map(move |e| (f, e)))
+            {
                 ledger.record(fused.epoch.term, &fused.epoch.leader, evidence);
             }
         }
@@ -152,17 +260,31 @@ fn settled_votes_become_evidence_that_another_aggregator_adopts() {
     let mut other = leader(config);
     other.adopt(&ledger);
     let reputations = other.reputations();
-    assert!(reputations[&NodeName::from_static("euclid")].score > reputations[&NodeName::from_static("liar")].score);
+    assert!(
+        reputations[&NodeName::from_static("euclid")].score
+            > reputations[&NodeName::from_static("liar")].score
+    );
 }
 
 /// All that the cell settles of votes from `from_ms` to `until_ms` and of silence for three seconds, by vehicle.
-fn settled(cell: &mut Aggregator, nodes: &[&str], (from_ms, until_ms): (u64, u64)) -> BTreeMap<NodeName, usize> {
+fn settled(
+    cell: &mut Aggregator,
+    nodes: &[&str],
+    (from_ms, until_ms): (u64, u64),
+) -> BTreeMap<NodeName, usize> {
     let mut settled = BTreeMap::new();
     for step in (from_ms / 100)..(until_ms / 100 + 30) {
         let mut closed = Vec::new();
         if step < until_ms / 100 {
             for node in nodes {
-                closed.extend(cell.report(VoteDetections, &report(node, "cup", step * 100), at(step * 100)).unwrap());
+                closed.extend(
+                    cell.report(
+                        VoteDetections,
+                        &report(node, "cup", step * 100),
+                        at(step * 100),
+                    )
+                    .unwrap(),
+                );
             }
         }
         closed.extend(cell.tick(at(step * 100 + 50)));
@@ -181,14 +303,25 @@ fn votes_that_are_open_when_the_cell_splits_are_settled_on_one_side_only() {
         for node in ["euclid", "gauss"] {
             let vote = report(node, "cup", step * 100);
             edge.report(VoteDetections, &vote, at(step * 100)).unwrap();
-            standby.report(VoteDetections, &vote, at(step * 100)).unwrap();
+            standby
+                .report(VoteDetections, &vote, at(step * 100))
+                .unwrap();
         }
     }
-    standby.lead(Epoch::new(4, NodeName::from_static("standby")), 10, FirstRound::Overdue, at(950));
+    standby.lead(
+        Epoch::new(4, NodeName::from_static("standby")),
+        10,
+        FirstRound::Overdue,
+        at(950),
+    );
     // Neither vehicle reaches the standby again, and one of them the edge: each has voted for less than two seconds.
     let at_the_edge = settled(&mut edge, &["euclid"], (1000, 1500));
     let at_the_standby = settled(&mut standby, &[], (1000, 1500));
-    assert_eq!(at_the_edge.values().copied().collect::<Vec<_>>(), [1, 1], "{at_the_edge:?}");
+    assert_eq!(
+        at_the_edge.values().copied().collect::<Vec<_>>(),
+        [1, 1],
+        "{at_the_edge:?}"
+    );
     assert!(at_the_standby.is_empty(), "{at_the_standby:?}");
 }
 
@@ -197,9 +330,18 @@ fn what_is_said_to_a_new_leader_is_its_evidence() {
     let mut standby = Aggregator::new_standby(FusionConfig::default(), landmarks(), at(0));
     let before = settled(&mut standby, &["euclid", "gauss"], (100, 1000));
     assert!(before.is_empty());
-    standby.lead(Epoch::new(4, NodeName::from_static("standby")), 10, FirstRound::Overdue, at(5000));
+    standby.lead(
+        Epoch::new(4, NodeName::from_static("standby")),
+        10,
+        FirstRound::Overdue,
+        at(5000),
+    );
     let after = settled(&mut standby, &["euclid", "gauss"], (5000, 6000));
-    assert_eq!(after.values().copied().collect::<Vec<_>>(), [1, 1], "{after:?}");
+    assert_eq!(
+        after.values().copied().collect::<Vec<_>>(),
+        [1, 1],
+        "{after:?}"
+    );
 }
 
 #[test]
@@ -213,7 +355,16 @@ fn a_vehicle_that_is_rejected_for_its_time_deposes_nobody_by_sending_both_kinds(
         }
         last = cell.timeliness(at(n * 100 + 2));
     }
-    assert_eq!((last, last.is_usable()), (Timeliness { timely: 0, untimely: 1 }, true));
+    assert_eq!(
+        (last, last.is_usable()),
+        (
+            Timeliness {
+                timely: 0,
+                untimely: 1
+            },
+            true
+        )
+    );
 }
 
 #[test]
@@ -222,16 +373,31 @@ fn the_parts_of_a_vehicle_are_one_witness() {
     for (n, part) in (0..).zip(["euclid", "euclid--lidar", "euclid--radar", "gauss"]) {
         let label = if part == "gauss" { "car" } else { "cup" };
         for kind in [Detections, VoteDetections] {
-            cell.report(kind, &report(part, label, 10 + n), at(15 + n)).unwrap();
+            cell.report(kind, &report(part, label, 10 + n), at(15 + n))
+                .unwrap();
         }
     }
     let fused = cell.tick(at(100)).unwrap();
     let (map, verdicts) = (fused.map.unwrap(), fused.verdicts.unwrap());
     let verdict = &verdicts.verdicts[0];
-    assert_eq!(verdict.contributors, ["euclid", "gauss"].map(NodeName::from_static));
+    assert_eq!(
+        verdict.contributors,
+        ["euclid", "gauss"].map(NodeName::from_static)
+    );
     let votes: Vec<_> = verdict.votes.values().collect();
-    assert!((votes[0] - votes[1]).abs() < 1e-9, "three parts against one vehicle: {:?}", verdict.votes);
-    assert!(map.landmarks[0].observers.iter().all(|node| !node.as_str().contains("--")), "{:?}", map.landmarks);
+    assert!(
+        (votes[0] - votes[1]).abs() < 1e-9,
+        "three parts against one vehicle: {:?}",
+        verdict.votes
+    );
+    assert!(
+        map.landmarks[0]
+            .observers
+            .iter()
+            .all(|node| !node.as_str().contains("--")),
+        "{:?}",
+        map.landmarks
+    );
 }
 
 /// Frames of a slower camera are older than those of a faster one that came before, and it has sent fewer.
@@ -241,7 +407,8 @@ fn the_cameras_of_a_vehicle_may_overtake_one_another() {
     for n in 1..=5 {
         for (camera, captured_ms) in [("euclid", n * 100), ("euclid--rear", n * 100 - 40)] {
             for kind in [Detections, VoteDetections] {
-                let taken = cell.report(kind, &report(camera, "cup", captured_ms), at(n * 100 + 20));
+                let taken =
+                    cell.report(kind, &report(camera, "cup", captured_ms), at(n * 100 + 20));
                 assert!(taken.is_ok(), "{camera} {n}: {taken:?}");
             }
         }

@@ -25,7 +25,11 @@ impl AttributedDescription {
     /// True if it is of no other than revoked nodes. One that has it from many hears who passes it on, too: it goes back
     /// when a node that had it from its author does.
     pub fn is_of_revoked(&self, is_revoked: impl Fn(&str) -> bool) -> bool {
-        !self.authors.is_empty() && self.authors.iter().all(|certificate| is_revoked(certificate))
+        !self.authors.is_empty()
+            && self
+                .authors
+                .iter()
+                .all(|certificate| is_revoked(certificate))
     }
 }
 
@@ -46,13 +50,21 @@ const MAX_EARLIER: usize = 4;
 impl DescriptionHistory {
     /// A history that begins with this description.
     pub fn of(current: Option<Arc<CellDescription>>) -> Self {
-        let current = current.map(|description| AttributedDescription { description, authors: Vec::new() });
-        Self { current, earlier: Vec::new() }
+        let current = current.map(|description| AttributedDescription {
+            description,
+            authors: Vec::new(),
+        });
+        Self {
+            current,
+            earlier: Vec::new(),
+        }
     }
 
     /// Puts a description in the place of the present one.
     pub(super) fn replace(&mut self, next: AttributedDescription) {
-        let Some(before) = self.current.replace(next) else { return };
+        let Some(before) = self.current.replace(next) else {
+            return;
+        };
         self.earlier.retain(|held| held.authors != before.authors);
         self.earlier.push(before);
         if self.earlier.len() > MAX_EARLIER {

@@ -11,9 +11,17 @@ fn at(ms: u64) -> Timestamp {
 
 fn described(version: u64, text: &str) -> Arc<CellDescription> {
     let mut hash = [0; 32];
-    hash.iter_mut().zip(text.bytes()).for_each(|(hash, byte)| *hash = byte);
+    hash.iter_mut()
+        .zip(text.bytes())
+        .for_each(|(hash, byte)| *hash = byte);
     let (hash, set_by) = (ContentHash(hash), name("edge"));
-    Arc::new(CellDescription { schema: SCHEMA_VERSION, version, hash, set_by, text: text.into() })
+    Arc::new(CellDescription {
+        schema: SCHEMA_VERSION,
+        version,
+        hash,
+        set_by,
+        text: text.into(),
+    })
 }
 
 fn node(own: &str) -> DescriptionExchange {
@@ -21,7 +29,12 @@ fn node(own: &str) -> DescriptionExchange {
 }
 
 fn word(may_lead: bool, stamp: DescriptionStamp) -> DescriptionStatement {
-    DescriptionStatement { stamp, may_lead, may_describe: may_lead, certificate: None }
+    DescriptionStatement {
+        stamp,
+        may_lead,
+        may_describe: may_lead,
+        certificate: None,
+    }
 }
 
 fn adopts(effects: &[DescriptionEffect]) -> bool {
@@ -29,7 +42,9 @@ fn adopts(effects: &[DescriptionEffect]) -> bool {
 }
 
 fn publishes(effects: &[DescriptionEffect]) -> bool {
-    effects.iter().any(|effect| matches!(effect, Publish { .. }))
+    effects
+        .iter()
+        .any(|effect| matches!(effect, Publish { .. }))
 }
 
 #[test]
@@ -39,21 +54,40 @@ fn a_body_is_taken_on_a_candidates_word_alone_in_either_order() {
         let mut euclid = node("euclid");
         let taken: Vec<_> = if is_body_first {
             assert_eq!(euclid.take(Arc::clone(&new), at(0)), []);
-            assert_eq!(euclid.hear(&name("gauss"), word(false, new.stamp()), at(1)), [], "a vehicle that never leads");
+            assert_eq!(
+                euclid.hear(&name("gauss"), word(false, new.stamp()), at(1)),
+                [],
+                "a vehicle that never leads"
+            );
             euclid.hear(&name("edge"), word(true, new.stamp()), at(2))
         } else {
-            assert_eq!(euclid.hear(&name("edge"), word(true, new.stamp()), at(0)), []);
-            assert!(!adopts(&euclid.take(described(1, "forged"), at(1))), "nobody stated it");
+            assert_eq!(
+                euclid.hear(&name("edge"), word(true, new.stamp()), at(0)),
+                []
+            );
+            assert!(
+                !adopts(&euclid.take(described(1, "forged"), at(1))),
+                "nobody stated it"
+            );
             euclid.take(Arc::clone(&new), at(2))
         };
-        assert_eq!(taken, [Adopt { description: Arc::clone(&new), stated_by: name("edge") }]);
+        assert_eq!(
+            taken,
+            [Adopt {
+                description: Arc::clone(&new),
+                stated_by: name("edge")
+            }]
+        );
         assert_eq!(euclid.stamp(), new.stamp());
     }
 }
 
 /// Statement of a node that may lead and is no operator's.
 fn candidates(stamp: DescriptionStamp) -> DescriptionStatement {
-    DescriptionStatement { may_describe: false, ..word(true, stamp) }
+    DescriptionStatement {
+        may_describe: false,
+        ..word(true, stamp)
+    }
 }
 
 #[test]
@@ -63,23 +97,41 @@ fn one_candidate_that_is_no_operators_does_not_change_the_cell_and_two_pass_a_de
     let new = described(2, "new");
     euclid.take(Arc::clone(&new), at(0));
     euclid.lead(Some(&name("gauss")), at(1));
-    assert!(!adopts(&euclid.hear(&name("gauss"), candidates(new.stamp()), at(2))), "the leader alone");
-    assert!(!adopts(&euclid.hear(&name("gauss"), candidates(new.stamp()), at(3))), "the same again");
-    assert!(adopts(&euclid.hear(&name("turing"), candidates(new.stamp()), at(4))), "two who have it from its author");
+    assert!(
+        !adopts(&euclid.hear(&name("gauss"), candidates(new.stamp()), at(2))),
+        "the leader alone"
+    );
+    assert!(
+        !adopts(&euclid.hear(&name("gauss"), candidates(new.stamp()), at(3))),
+        "the same again"
+    );
+    assert!(
+        adopts(&euclid.hear(&name("turing"), candidates(new.stamp()), at(4))),
+        "two who have it from its author"
+    );
 }
 
 #[test]
 fn a_node_without_a_description_gets_it_from_its_leader_while_the_operators_node_is_away() {
     let (mut euclid, right) = (node("euclid"), described(6, "right"));
     euclid.take(Arc::clone(&right), at(0));
-    assert!(!adopts(&euclid.hear(&name("turing"), candidates(right.stamp()), at(1))));
+    assert!(!adopts(&euclid.hear(
+        &name("turing"),
+        candidates(right.stamp()),
+        at(1)
+    )));
     euclid.lead(Some(&name("turing")), at(2));
     assert!(adopts(&euclid.tick(at(3))));
 }
 
 #[test]
 fn all_agree_after_a_split_in_whatever_order_they_meet() {
-    let sides = [described(3, "a"), described(4, "b"), described(4, "c"), described(2, "z")];
+    let sides = [
+        described(3, "a"),
+        described(4, "b"),
+        described(4, "c"),
+        described(2, "z"),
+    ];
     let winner = described(4, "c").stamp();
     for turn in 0..sides.len() {
         let mut euclid = node("euclid");
@@ -94,35 +146,78 @@ fn all_agree_after_a_split_in_whatever_order_they_meet() {
 
 #[test]
 fn a_change_here_is_the_next_version_and_goes_out_at_once() {
-    let mut euclid = DescriptionExchange::new(name("euclid"), true, DescriptionHistory::of(Some(described(6, "old"))));
-    euclid.hear(&name("edge"), word(true, described(8, "unseen").stamp()), at(0));
+    let mut euclid = DescriptionExchange::new(
+        name("euclid"),
+        true,
+        DescriptionHistory::of(Some(described(6, "old"))),
+    );
+    euclid.hear(
+        &name("edge"),
+        word(true, described(8, "unseen").stamp()),
+        at(0),
+    );
     let effects = euclid.set("new".into(), ContentHash([7; 32]), at(1));
-    assert!(matches!(&effects[..], [Adopt { .. }, Publish { description }] if description.version == 9));
-    assert_eq!(euclid.set("new".into(), ContentHash([7; 32]), at(2)), [], "it is that already");
+    assert!(
+        matches!(&effects[..], [Adopt { .. }, Publish { description }] if description.version == 9)
+    );
+    assert_eq!(
+        euclid.set("new".into(), ContentHash([7; 32]), at(2)),
+        [],
+        "it is that already"
+    );
     let effects = euclid.set("new".into(), ContentHash([8; 32]), at(3));
-    assert_eq!(effects, [], "whoever set it: the hash is also of its setter");
+    assert_eq!(
+        effects,
+        [],
+        "whoever set it: the hash is also of its setter"
+    );
     let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(None));
-    assert_eq!(gauss.set("new".into(), ContentHash([7; 32]), at(1)), [], "it only follows");
+    assert_eq!(
+        gauss.set("new".into(), ContentHash([7; 32]), at(1)),
+        [],
+        "it only follows"
+    );
 }
 
 #[test]
 fn a_version_far_ahead_is_counted_and_changes_nothing() {
-    let mut euclid = DescriptionExchange::new(name("euclid"), true, DescriptionHistory::of(Some(described(6, "old"))));
+    let mut euclid = DescriptionExchange::new(
+        name("euclid"),
+        true,
+        DescriptionHistory::of(Some(described(6, "old"))),
+    );
     let far = described(6 + MAX_VERSION_STEP + 1, "far");
-    assert_eq!(euclid.hear(&name("edge"), word(true, far.stamp()), at(0)), [CountImplausible { from: name("edge") }]);
+    assert_eq!(
+        euclid.hear(&name("edge"), word(true, far.stamp()), at(0)),
+        [CountImplausible { from: name("edge") }]
+    );
     assert!(!adopts(&euclid.take(far, at(0))));
     euclid.set("new".into(), ContentHash([7; 32]), at(1));
     assert_eq!(euclid.stamp().version, 7);
-    let first = DescriptionStamp { version: MAX_FIRST_VERSION + 1, ..Default::default() };
-    assert_eq!(node("gauss").hear(&name("edge"), word(true, first), at(0)), [CountImplausible { from: name("edge") }]);
+    let first = DescriptionStamp {
+        version: MAX_FIRST_VERSION + 1,
+        ..Default::default()
+    };
+    assert_eq!(
+        node("gauss").hear(&name("edge"), word(true, first), at(0)),
+        [CountImplausible { from: name("edge") }]
+    );
 }
 
 #[test]
 fn a_version_that_is_set_can_be_taken_by_all_whatever_somebody_has_stated() {
     let held = described(6, "old");
-    let [mut euclid, mut gauss] = ["euclid", "gauss"]
-        .map(|own| DescriptionExchange::new(name(own), true, DescriptionHistory::of(Some(Arc::clone(&held)))));
-    let boast = DescriptionStamp { version: 6 + MAX_VERSION_STEP, hash: ContentHash::default() };
+    let [mut euclid, mut gauss] = ["euclid", "gauss"].map(|own| {
+        DescriptionExchange::new(
+            name(own),
+            true,
+            DescriptionHistory::of(Some(Arc::clone(&held))),
+        )
+    });
+    let boast = DescriptionStamp {
+        version: 6 + MAX_VERSION_STEP,
+        hash: ContentHash::default(),
+    };
     euclid.hear(&name("liar"), word(true, boast), at(0));
     euclid.set("new".into(), ContentHash([7; 32]), at(1));
     let set = Arc::clone(euclid.current().unwrap());
@@ -133,9 +228,17 @@ fn a_version_that_is_set_can_be_taken_by_all_whatever_somebody_has_stated() {
 #[test]
 fn who_was_away_for_long_takes_the_leaders() {
     let far = described(6 + 3 * MAX_VERSION_STEP, "far");
-    let mut euclid = DescriptionExchange::new(name("euclid"), true, DescriptionHistory::of(Some(described(6, "old"))));
+    let mut euclid = DescriptionExchange::new(
+        name("euclid"),
+        true,
+        DescriptionHistory::of(Some(described(6, "old"))),
+    );
     euclid.lead(Some(&name("edge")), at(0));
-    assert!(!adopts(&euclid.hear(&name("gauss"), word(true, far.stamp()), at(1))));
+    assert!(!adopts(&euclid.hear(
+        &name("gauss"),
+        word(true, far.stamp()),
+        at(1)
+    )));
     euclid.hear(&name("edge"), word(true, far.stamp()), at(2));
     assert!(adopts(&euclid.take(far, at(3))));
 }
@@ -158,42 +261,91 @@ fn ever_new_descriptions_are_adopted_one_a_second_and_the_latest_in_the_end() {
 #[test]
 fn the_leader_repeats_it_while_somebody_lacks_it_and_no_longer() {
     let held = described(3, "held");
-    let mut edge = DescriptionExchange::new(name("edge"), true, DescriptionHistory::of(Some(Arc::clone(&held))));
-    assert!(publishes(&edge.lead(Some(&name("edge")), at(0))), "its brokers may not have it");
+    let mut edge = DescriptionExchange::new(
+        name("edge"),
+        true,
+        DescriptionHistory::of(Some(Arc::clone(&held))),
+    );
+    assert!(
+        publishes(&edge.lead(Some(&name("edge")), at(0))),
+        "its brokers may not have it"
+    );
     assert!(!publishes(&edge.tick(at(1500))));
-    assert!(publishes(&edge.hear(&name("euclid"), word(false, DescriptionStamp::default()), at(1600))));
+    assert!(publishes(&edge.hear(
+        &name("euclid"),
+        word(false, DescriptionStamp::default()),
+        at(1600)
+    )));
     assert!(!publishes(&edge.tick(at(3500))), "not that often");
     assert!(publishes(&edge.tick(at(3600))));
     edge.hear(&name("euclid"), word(false, held.stamp()), at(3700));
     assert!(!publishes(&edge.tick(at(9000))));
-    assert!(publishes(&edge.take(described(2, "displaced"), at(9100))), "an earlier one took its place");
+    assert!(
+        publishes(&edge.take(described(2, "displaced"), at(9100))),
+        "an earlier one took its place"
+    );
 }
 
 #[test]
 fn a_node_that_never_has_it_costs_the_others_little() {
-    let mut edge = DescriptionExchange::new(name("edge"), true, DescriptionHistory::of(Some(described(3, "held"))));
+    let mut edge = DescriptionExchange::new(
+        name("edge"),
+        true,
+        DescriptionHistory::of(Some(described(3, "held"))),
+    );
     edge.lead(Some(&name("edge")), at(0));
-    let is_repeated =
-        |ms: &u64| publishes(&edge.hear(&name("liar"), word(false, DescriptionStamp::default()), at(*ms)));
+    let is_repeated = |ms: &u64| {
+        publishes(&edge.hear(
+            &name("liar"),
+            word(false, DescriptionStamp::default()),
+            at(*ms),
+        ))
+    };
     let times = (0..600_000).step_by(500).filter(is_repeated).count();
     assert!((15..=25).contains(&times), "{times} in ten minutes");
     edge.set("new".into(), ContentHash([7; 32]), at(600_000));
-    assert!(publishes(&edge.tick(at(601_000))), "a new one is repeated soon");
+    assert!(
+        publishes(&edge.tick(at(601_000))),
+        "a new one is repeated soon"
+    );
 }
 
 #[test]
 fn a_candidate_that_does_not_lead_tells_a_leader_that_is_behind() {
     let held = described(3, "held");
-    let mut euclid = DescriptionExchange::new(name("euclid"), true, DescriptionHistory::of(Some(Arc::clone(&held))));
-    assert!(!publishes(&euclid.lead(Some(&name("edge")), at(0))), "the leader has not said what it has");
-    assert!(publishes(&euclid.hear(&name("edge"), word(true, DescriptionStamp::default()), at(100))));
+    let mut euclid = DescriptionExchange::new(
+        name("euclid"),
+        true,
+        DescriptionHistory::of(Some(Arc::clone(&held))),
+    );
+    assert!(
+        !publishes(&euclid.lead(Some(&name("edge")), at(0))),
+        "the leader has not said what it has"
+    );
+    assert!(publishes(&euclid.hear(
+        &name("edge"),
+        word(true, DescriptionStamp::default()),
+        at(100)
+    )));
     euclid.hear(&name("edge"), word(true, held.stamp()), at(200));
-    euclid.hear(&name("gauss"), word(false, DescriptionStamp::default()), at(300));
-    assert!(!publishes(&euclid.tick(at(5000))), "the rest is the leader's");
-    let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(Some(held)));
+    euclid.hear(
+        &name("gauss"),
+        word(false, DescriptionStamp::default()),
+        at(300),
+    );
+    assert!(
+        !publishes(&euclid.tick(at(5000))),
+        "the rest is the leader's"
+    );
+    let mut gauss =
+        DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(Some(held)));
     gauss.lead(Some(&name("edge")), at(0));
     assert!(
-        !publishes(&gauss.hear(&name("edge"), word(true, DescriptionStamp::default()), at(100))),
+        !publishes(&gauss.hear(
+            &name("edge"),
+            word(true, DescriptionStamp::default()),
+            at(100)
+        )),
         "it never publishes"
     );
 }
@@ -211,7 +363,10 @@ fn bodies_that_nobody_states_take_bounded_room() {
 
 /// Word of a node with this certificate.
 fn certified(certificate: &str, stamp: DescriptionStamp) -> DescriptionStatement {
-    DescriptionStatement { certificate: Some(certificate.into()), ..word(true, stamp) }
+    DescriptionStatement {
+        certificate: Some(certificate.into()),
+        ..word(true, stamp)
+    }
 }
 
 const EMPTY: ContentHash = ContentHash([0xee; 32]);
@@ -219,30 +374,61 @@ const EMPTY: ContentHash = ContentHash([0xee; 32]);
 #[test]
 fn a_description_goes_with_the_certificate_of_the_candidate_that_made_it() {
     let right = described(6, "right");
-    let mut edge = DescriptionExchange::new(name("edge"), true, DescriptionHistory::of(Some(Arc::clone(&right))));
-    let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(Some(right)));
+    let mut edge = DescriptionExchange::new(
+        name("edge"),
+        true,
+        DescriptionHistory::of(Some(Arc::clone(&right))),
+    );
+    let mut gauss =
+        DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(Some(right)));
     edge.lead(Some(&name("edge")), at(0));
     // It sets one after the other, in the name of the edge. A vehicle has them from the edge.
     for (version, text) in [(7, "false"), (8, "worse")] {
         let forged = described(version, text);
-        edge.hear(&name("turing"), certified("turing's", forged.stamp()), at(version));
+        edge.hear(
+            &name("turing"),
+            certified("turing's", forged.stamp()),
+            at(version),
+        );
         assert!(adopts(&edge.take(Arc::clone(&forged), at(version))));
-        gauss.hear(&name("edge"), certified("edge's", forged.stamp()), at(version));
+        gauss.hear(
+            &name("edge"),
+            certified("edge's", forged.stamp()),
+            at(version),
+        );
         assert!(adopts(&gauss.take(forged, at(version))));
     }
-    assert_eq!(edge.revoke(|certificate| certificate == "euclid's", EMPTY, at(100)), [], "another's");
+    assert_eq!(
+        edge.revoke(|certificate| certificate == "euclid's", EMPTY, at(100)),
+        [],
+        "another's"
+    );
     // Saved descriptions count after a restart.
     let saved = serde_json::to_string(edge.history()).unwrap();
-    assert_eq!(serde_json::from_str::<CellDescription>(&saved).unwrap(), **edge.current().unwrap());
+    assert_eq!(
+        serde_json::from_str::<CellDescription>(&saved).unwrap(),
+        **edge.current().unwrap()
+    );
     edge = DescriptionExchange::new(name("edge"), true, serde_json::from_str(&saved).unwrap());
     edge.lead(Some(&name("edge")), at(200));
     let effects = edge.revoke(|certificate| certificate == "turing's", EMPTY, at(300));
     assert!(adopts(&effects) && publishes(&effects), "{effects:?}");
     let restored = Arc::clone(edge.current().unwrap());
     assert_eq!((restored.version, &*restored.text), (9, "right"));
-    gauss.hear(&name("edge"), certified("edge's", restored.stamp()), at(300));
-    assert!(adopts(&gauss.take(restored, at(300))), "also by nodes that have not read the list");
-    assert_eq!(edge.revoke(|certificate| certificate == "turing's", EMPTY, at(400)), [], "once");
+    gauss.hear(
+        &name("edge"),
+        certified("edge's", restored.stamp()),
+        at(300),
+    );
+    assert!(
+        adopts(&gauss.take(restored, at(300))),
+        "also by nodes that have not read the list"
+    );
+    assert_eq!(
+        edge.revoke(|certificate| certificate == "turing's", EMPTY, at(400)),
+        [],
+        "once"
+    );
 }
 
 #[test]
@@ -250,7 +436,11 @@ fn a_burst_of_descriptions_does_not_delay_the_right_one_after_the_revocation() {
     let mut gauss = DescriptionExchange::new(name("gauss"), false, DescriptionHistory::of(None));
     for version in 1..=MAX_ADOPTIONS as u64 {
         let forged = described(version, "false");
-        gauss.hear(&name("edge"), certified("edge's", forged.stamp()), at(version));
+        gauss.hear(
+            &name("edge"),
+            certified("edge's", forged.stamp()),
+            at(version),
+        );
         assert!(adopts(&gauss.take(forged, at(version))));
     }
     gauss.revoke(|certificate| certificate == "turing's", EMPTY, at(100));
@@ -263,23 +453,53 @@ fn a_burst_of_descriptions_does_not_delay_the_right_one_after_the_revocation() {
 fn without_an_earlier_description_the_nodes_own_settings_count_again() {
     let mut edge = node("edge");
     let forged = described(7, "false");
-    edge.hear(&name("turing"), certified("turing's", forged.stamp()), at(0));
+    edge.hear(
+        &name("turing"),
+        certified("turing's", forged.stamp()),
+        at(0),
+    );
     edge.take(Arc::clone(&forged), at(0));
     // A word that was on its way.
     let late = described(8, "late");
     edge.hear(&name("turing"), certified("turing's", late.stamp()), at(1));
-    assert!(adopts(&edge.revoke(|certificate| certificate == "turing's", EMPTY, at(2))));
-    assert!(!adopts(&edge.take(late, at(3))), "nobody states it any more");
+    assert!(adopts(&edge.revoke(
+        |certificate| certificate == "turing's",
+        EMPTY,
+        at(2)
+    )));
+    assert!(
+        !adopts(&edge.take(late, at(3))),
+        "nobody states it any more"
+    );
     let empty = edge.current().unwrap();
-    assert_eq!((empty.version, &*empty.text, empty.hash, empty.set_by.as_str()), (9, "", EMPTY, "edge"));
+    assert_eq!(
+        (
+            empty.version,
+            &*empty.text,
+            empty.hash,
+            empty.set_by.as_str()
+        ),
+        (9, "", EMPTY, "edge")
+    );
 }
 
 #[test]
 fn many_descriptions_of_one_certificate_displace_no_other_earlier_one() {
-    let mut edge = DescriptionExchange::new(name("edge"), true, DescriptionHistory::of(Some(described(1, "right"))));
+    let mut edge = DescriptionExchange::new(
+        name("edge"),
+        true,
+        DescriptionHistory::of(Some(described(1, "right"))),
+    );
     for version in 2..40 {
-        let (liar, forged) = (if version % 2 == 0 { "turing" } else { "euclid" }, described(version, "false"));
-        edge.hear(&name(liar), certified(liar, forged.stamp()), at(version * 10_000));
+        let (liar, forged) = (
+            if version % 2 == 0 { "turing" } else { "euclid" },
+            described(version, "false"),
+        );
+        edge.hear(
+            &name(liar),
+            certified(liar, forged.stamp()),
+            at(version * 10_000),
+        );
         assert!(adopts(&edge.take(forged, at(version * 10_000))));
     }
     assert!(adopts(&edge.revoke(|_| true, EMPTY, at(500_000))));
@@ -295,7 +515,13 @@ fn a_description_stays_when_one_of_those_that_pass_it_on_is_revoked() {
         late.hear(&name(candidate), certified(candidate, right.stamp()), at(0));
     }
     assert!(adopts(&late.take(Arc::clone(&right), at(1))));
-    assert_eq!(late.revoke(|certificate| certificate == "alpha", EMPTY, at(100)), []);
+    assert_eq!(
+        late.revoke(|certificate| certificate == "alpha", EMPTY, at(100)),
+        []
+    );
     assert_eq!(late.current(), Some(&right));
-    assert!(adopts(&late.revoke(|_| true, EMPTY, at(200))), "all who may have made it");
+    assert!(
+        adopts(&late.revoke(|_| true, EMPTY, at(200))),
+        "all who may have made it"
+    );
 }

@@ -39,12 +39,17 @@ impl FromStr for BrokerAddress {
         let invalid = || InvalidAddress(text.to_owned());
         let (host, port) = text.rsplit_once(':').ok_or_else(invalid)?;
         let bracketed = host.starts_with('[') && host.ends_with(']');
-        let allowed = |c: char| !c.is_whitespace() && c != '/' && (bracketed || !matches!(c, ':' | '[' | ']'));
+        let allowed = |c: char| {
+            !c.is_whitespace() && c != '/' && (bracketed || !matches!(c, ':' | '[' | ']'))
+        };
         let port = port.parse().map_err(|_| invalid())?;
         if host.is_empty() || port == 0 || !host.chars().all(allowed) {
             return Err(invalid());
         }
-        Ok(Self { host: host.into(), port })
+        Ok(Self {
+            host: host.into(),
+            port,
+        })
     }
 }
 
@@ -68,7 +73,10 @@ impl From<SocketAddr> for BrokerAddress {
             SocketAddr::V4(v4) => v4.ip().to_smolstr(),
             SocketAddr::V6(v6) => format_smolstr!("[{}]", v6.ip()),
         };
-        Self { host, port: address.port() }
+        Self {
+            host,
+            port: address.port(),
+        }
     }
 }
 
@@ -87,7 +95,16 @@ mod tests {
         for good in ["127.0.0.1:1883", "[::1]:8883", "broker.local:1"] {
             assert_eq!(good.parse::<BrokerAddress>().unwrap().to_string(), good);
         }
-        for bad in ["", "host", ":1883", "host:0", "host:65536", "::1:1883", "mqtt://host:1883", "a b:1"] {
+        for bad in [
+            "",
+            "host",
+            ":1883",
+            "host:0",
+            "host:65536",
+            "::1:1883",
+            "mqtt://host:1883",
+            "a b:1",
+        ] {
             assert!(bad.parse::<BrokerAddress>().is_err(), "{bad}");
         }
     }

@@ -94,7 +94,10 @@ struct PeerClock {
 impl PeerClock {
     /// Its wall clock less this node's steady clock.
     fn wall_offset_us(&self, now: Timestamp) -> Option<i64> {
-        Some(self.wall_offset_us?.saturating_add(self.filter.best(now)?.offset_us))
+        Some(
+            self.wall_offset_us?
+                .saturating_add(self.filter.best(now)?.offset_us),
+        )
     }
 }
 
@@ -112,7 +115,10 @@ impl CellTime {
 
     /// The cell's time, or the node's own wall clock while that is not known.
     pub fn reading(&self) -> ClockReading {
-        let own = ClockReading { offset_us: self.wall_offset_us.unwrap_or_default(), error_us: None };
+        let own = ClockReading {
+            offset_us: self.wall_offset_us.unwrap_or_default(),
+            error_us: None,
+        };
         self.reading.unwrap_or(own)
     }
 
@@ -120,30 +126,55 @@ impl CellTime {
     /// name. Where no two agree on a time, each may be the wrong one.
     pub fn wrong_clocks(&self, now: Timestamp) -> Vec<WrongClock<'_>> {
         let errors = self.wall_errors(now);
-        let agree =
-            |time: i64| errors.iter().filter(|(_, us)| us.saturating_sub(time).abs() < micros(MIN_CLOCK_JUMP)).count();
+        let agree = |time: i64| {
+            errors
+                .iter()
+                .filter(|(_, us)| us.saturating_sub(time).abs() < micros(MIN_CLOCK_JUMP))
+                .count()
+        };
         // The cell's time, if as many clocks have it as any other.
         let times = [0].into_iter().chain(errors.iter().map(|(_, us)| *us));
-        let time = times.rev().max_by_key(|time| agree(*time)).unwrap_or_default();
+        let time = times
+            .rev()
+            .max_by_key(|time| agree(*time))
+            .unwrap_or_default();
         let (is_cell_wrong, is_certain) = (time.abs() >= micros(MIN_CLOCK_JUMP), agree(time) > 1);
         let time = if is_cell_wrong && is_certain { time } else { 0 };
-        let errors = errors.into_iter().map(|(node, us)| (node, us.saturating_sub(time)));
+        let errors = errors
+            .into_iter()
+            .map(|(node, us)| (node, us.saturating_sub(time)));
         let wrong = errors.filter(|(_, us)| us.abs() >= micros(MIN_CLOCK_JUMP));
-        wrong.map(|(node, error_us)| WrongClock { node, error_us, is_cell_wrong: time != 0, is_certain }).collect()
+        wrong
+            .map(|(node, error_us)| WrongClock {
+                node,
+                error_us,
+                is_cell_wrong: time != 0,
+                is_certain,
+            })
+            .collect()
     }
 
     /// Errors of all wall clocks that are known in microseconds, positive if ahead of the cell's time: of the node's own,
     /// without a name, and of others. None while the node does not know the cell's time.
     pub fn wall_errors(&self, now: Timestamp) -> Vec<(Option<&NodeName>, i64)> {
-        let Some(cell) = self.reading.map(|reading| reading.offset_us) else { return Vec::new() };
+        let Some(cell) = self.reading.map(|reading| reading.offset_us) else {
+            return Vec::new();
+        };
         let own = self.wall_offset_us.map(|wall| (None, wall));
-        let others = self.peers.iter().filter_map(|(name, peer)| Some((Some(name), peer.wall_offset_us(now)?)));
-        own.into_iter().chain(others).map(|(name, wall)| (name, wall.saturating_sub(cell))).collect()
+        let others = self
+            .peers
+            .iter()
+            .filter_map(|(name, peer)| Some((Some(name), peer.wall_offset_us(now)?)));
+        own.into_iter()
+            .chain(others)
+            .map(|(name, wall)| (name, wall.saturating_sub(cell)))
+            .collect()
     }
 
     /// Stamps for a message to a node, sent `now` by the steady clock.
     pub fn stamps(&self, to: &NodeName, now: Timestamp) -> ClockStamps {
-        let lately = |peer: &&PeerClock| peer.has_stamps && now.since(peer.last.received_us) < CLOCK_MEMORY;
+        let lately =
+            |peer: &&PeerClock| peer.has_stamps && now.since(peer.last.received_us) < CLOCK_MEMORY;
         let wall = self.wall_offset_us.map(|offset| now.shifted(offset));
         ClockStamps {
             sent_us: now,
@@ -164,7 +195,10 @@ impl CellTime {
         });
         let role = rights.limit_role(message.candidacy.role);
         let wall = stamps.wall_us.filter(|wall| *wall >= EARLIEST);
-        let last = AnsweredStamps { sent_us: stamps.sent_us, received_us: now };
+        let last = AnsweredStamps {
+            sent_us: stamps.sent_us,
+            received_us: now,
+        };
         let new = || PeerClock {
             run: message.run,
             has_stamps: message.clock.is_some(),
@@ -182,21 +216,40 @@ impl CellTime {
         peer.last = last;
         (peer.wall_offset_us, peer.is_candidate) = (wall.map(offset), role != Role::Cav);
         peer.cell_offset_us = stamps.cell_us.map(offset);
-        if let Some(AnsweredStamps { sent_us, received_us }) = stamps.answers {
-            peer.filter.observe(Exchange { t1: sent_us, t2: received_us, t3: stamps.sent_us, t4: now });
+        if let Some(AnsweredStamps {
+            sent_us,
+            received_us,
+        }) = stamps.answers
+        {
+            peer.filter.observe(Exchange {
+                t1: sent_us,
+                t2: received_us,
+                t3: stamps.sent_us,
+                t4: now,
+            });
         }
     }
 
     /// Takes over the time of the leader that this node follows, after each message and each change of leader.
     pub fn follow(&mut self, leadership: &Leadership, now: Timestamp) {
         let leader = leadership.leader().filter(|_| !leadership.is_leading());
-        let Some(leader) = leader.and_then(|leader| self.peers.get(leader)) else { return };
+        let Some(leader) = leader.and_then(|leader| self.peers.get(leader)) else {
+            return;
+        };
         if !leader.has_stamps {
             self.reading = None;
-        } else if let (Some(cell_offset), Some(offset)) = (leader.cell_offset_us, leader.filter.best(now)) {
-            let Offset { offset_us, error_us } = offset;
+        } else if let (Some(cell_offset), Some(offset)) =
+            (leader.cell_offset_us, leader.filter.best(now))
+        {
+            let Offset {
+                offset_us,
+                error_us,
+            } = offset;
             let offset_us = cell_offset.saturating_add(offset_us);
-            self.reading = Some(ClockReading { offset_us, error_us: Some(error_us) });
+            self.reading = Some(ClockReading {
+                offset_us,
+                error_us: Some(error_us),
+            });
         }
     }
 
@@ -206,14 +259,26 @@ impl CellTime {
     }
 
     /// Looks at the wall clock, `wall_offset_us` ahead of the steady one. A leader adjusts the cell's time.
-    pub fn look(&mut self, wall_offset_us: i64, leadership: &Leadership, now: Timestamp) -> Vec<ClockEvent> {
+    pub fn look(
+        &mut self,
+        wall_offset_us: i64,
+        leadership: &Leadership,
+        now: Timestamp,
+    ) -> Vec<ClockEvent> {
         let mut events = Vec::new();
         if let Some(before) = self.wall_offset_us.replace(wall_offset_us) {
             let step = wall_offset_us.saturating_sub(before);
-            events.extend((step.saturating_abs() >= MIN_LOGGED_STEP_US).then_some(ClockEvent::WallStepped(step)));
+            events.extend(
+                (step.saturating_abs() >= MIN_LOGGED_STEP_US)
+                    .then_some(ClockEvent::WallStepped(step)),
+            );
         }
-        let elapsed = self.looked_at.replace(now).map_or(Duration::ZERO, |before| now.since(before));
-        self.peers.retain(|_, peer| now.since(peer.last.received_us) < CLOCK_MEMORY);
+        let elapsed = self
+            .looked_at
+            .replace(now)
+            .map_or(Duration::ZERO, |before| now.since(before));
+        self.peers
+            .retain(|_, peer| now.since(peer.last.received_us) < CLOCK_MEMORY);
         if leadership.is_leading() {
             events.extend(self.lead(elapsed, now));
         }
@@ -226,7 +291,10 @@ impl CellTime {
         let start = before.or(self.wall_offset_us)?;
         let mut walls = self.walls(now);
         walls.sort_unstable();
-        let middle = walls.len().checked_sub(1).map(|last| (walls.get(last / 2), walls.get(last.div_ceil(2))));
+        let middle = walls
+            .len()
+            .checked_sub(1)
+            .map(|last| (walls.get(last / 2), walls.get(last.div_ceil(2))));
         let target = match middle {
             Some((Some(low), Some(high))) => start.clamp(*low, *high),
             _ => start,
@@ -234,9 +302,17 @@ impl CellTime {
         let error = target.saturating_sub(start);
         let is_jump = before.is_none() || error.saturating_abs() >= micros(MIN_CLOCK_JUMP);
         let most = micros(elapsed) * MAX_CLOCK_SLEW / 1_000_000;
-        let offset_us = if is_jump { target } else { start.saturating_add(error.clamp(-most, most)) };
-        self.reading = Some(ClockReading { offset_us, error_us: Some(0) });
-        (is_jump && error.saturating_abs() >= MIN_LOGGED_STEP_US).then_some(ClockEvent::CellJumped(error))
+        let offset_us = if is_jump {
+            target
+        } else {
+            start.saturating_add(error.clamp(-most, most))
+        };
+        self.reading = Some(ClockReading {
+            offset_us,
+            error_us: Some(0),
+        });
+        (is_jump && error.saturating_abs() >= MIN_LOGGED_STEP_US)
+            .then_some(ClockEvent::CellJumped(error))
     }
 
     /// The wall clocks of all candidates that were set, as offsets from this node's steady clock.
@@ -244,7 +320,11 @@ impl CellTime {
         let is_set = |offset: &i64| self.is_candidate && now.shifted(*offset) >= EARLIEST;
         let candidates = self.peers.values().filter(|peer| peer.is_candidate);
         let others = candidates.filter_map(|peer| peer.wall_offset_us(now));
-        self.wall_offset_us.filter(is_set).into_iter().chain(others).collect()
+        self.wall_offset_us
+            .filter(is_set)
+            .into_iter()
+            .chain(others)
+            .collect()
     }
 }
 

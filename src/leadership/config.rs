@@ -65,7 +65,12 @@ impl ElectionConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         let ms = |key, value: u64, low: f64, high: f64| check_range(key, value as f64, low, high);
         ms("beat_ms", self.beat_ms, 5.0, 10_000.0)?;
-        ms("idle_beat_ms", self.idle_beat_ms, self.beat_ms as f64, 60_000.0)?;
+        ms(
+            "idle_beat_ms",
+            self.idle_beat_ms,
+            self.beat_ms as f64,
+            60_000.0,
+        )?;
         check_range("silence_beats", f64::from(self.silence_beats), 2.0, 100.0)?;
         ms("join_ms", self.join_ms, 0.0, 60_000.0)?;
         ms("claim_step_ms", self.claim_step_ms, 1.0, 10_000.0)?;
@@ -82,7 +87,10 @@ mod tests {
     #[test]
     fn defaults_are_valid_and_errors_name_the_key() {
         assert_eq!(ElectionConfig::default().validate(), Ok(()));
-        let wrong = ElectionConfig { idle_beat_ms: 20, ..ElectionConfig::default() };
+        let wrong = ElectionConfig {
+            idle_beat_ms: 20,
+            ..ElectionConfig::default()
+        };
         assert_eq!(wrong.validate().unwrap_err().key, "idle_beat_ms");
     }
 }

@@ -21,7 +21,11 @@ impl EchoMonitor {
     /// stalled.
     pub fn note_sent(&mut self, packets: u64, now: Timestamp) -> bool {
         if self.unanswered == 0 || packets != self.packets {
-            *self = Self { packets, since: now, unanswered: 0 };
+            *self = Self {
+                packets,
+                since: now,
+                unanswered: 0,
+            };
         }
         self.unanswered += 1;
         self.unanswered >= MIN_UNANSWERED && now.since(self.since) >= ECHO_TIMEOUT
@@ -35,15 +39,25 @@ mod tests {
     /// Time in ms at which the broker counts as stalled, for messages sent at these milliseconds without an answer.
     fn stalled_at(sent_ms: impl IntoIterator<Item = u64>) -> Option<u64> {
         let mut echo = EchoMonitor::default();
-        sent_ms.into_iter().find(|ms| echo.note_sent(7, Timestamp(ms * 1000)))
+        sent_ms
+            .into_iter()
+            .find(|ms| echo.note_sent(7, Timestamp(ms * 1000)))
     }
 
     #[test]
     fn many_messages_over_some_time_without_an_answer_are_a_stall() {
         assert_eq!(stalled_at((0..).step_by(100)), Some(800));
-        assert_eq!(stalled_at((0..700).step_by(1)), None, "many at once are no time");
+        assert_eq!(
+            stalled_at((0..700).step_by(1)),
+            None,
+            "many at once are no time"
+        );
         assert_eq!(stalled_at((0..2500).step_by(500)), None, "few say nothing");
-        assert_eq!(stalled_at([0, 60_000, 60_001, 60_100]), None, "nor does the time that this node was stopped");
+        assert_eq!(
+            stalled_at([0, 60_000, 60_001, 60_100]),
+            None,
+            "nor does the time that this node was stopped"
+        );
     }
 
     #[test]

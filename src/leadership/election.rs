@@ -66,8 +66,8 @@ pub use interface::{ElectionEffect, ElectionInput, Health};
 pub(crate) use message::MAX_FIRST_TERM;
 use message::MAX_ROUND_STEP;
 pub use message::{
-    Body, Candidacy, ElectionMessage, LifeSign, MAX_MESSAGE_BYTES, MAX_NO_LOGIN, MAX_ROUND, MAX_SUCCESSORS, MAX_TERM,
-    MAX_TERM_STEP,
+    Body, Candidacy, ElectionMessage, LifeSign, MAX_MESSAGE_BYTES, MAX_NO_LOGIN, MAX_ROUND,
+    MAX_SUCCESSORS, MAX_TERM, MAX_TERM_STEP,
 };
 
 use crate::leadership::timers::TERM_WINDOW;
@@ -287,7 +287,8 @@ impl Election {
             return;
         }
         if !self.peers.is_in_sequence(&message, now) {
-            self.effects.push(ElectionEffect::CountImplausible { from: message.from });
+            self.effects
+                .push(ElectionEffect::CountImplausible { from: message.from });
             return;
         }
         if !self.peers.note(&message, now) {
@@ -298,16 +299,39 @@ impl Election {
             self.terms.window = (self.terms.seen, now);
         }
         self.hear_others(&message, now);
-        let ElectionMessage { from, epoch, hears_you, .. } = message;
+        let ElectionMessage {
+            from,
+            epoch,
+            hears_you,
+            ..
+        } = message;
         match message.body {
-            Body::Status { over, no_login } => self.take_status(&from, over.as_ref(), no_login, now),
+            Body::Status { over, no_login } => {
+                self.take_status(&from, over.as_ref(), no_login, now)
+            }
             Body::Ask { ask } => self.answer(&from, ask, now),
             Body::LeaderEvidence { ask, age_ms, life } => {
                 self.take_leader_evidence(&from, epoch, ask, age_ms, life, now);
             }
-            Body::Beat { every_ms, round, followers, after, successors, life } => {
+            Body::Beat {
+                every_ms,
+                round,
+                followers,
+                after,
+                successors,
+                life,
+            } => {
                 if let Some(epoch) = epoch.filter(|epoch| epoch.leader == from) {
-                    let beat = Beat { epoch, hears_us: hears_you, every_ms, round, followers, after, successors, life };
+                    let beat = Beat {
+                        epoch,
+                        hears_us: hears_you,
+                        every_ms,
+                        round,
+                        followers,
+                        after,
+                        successors,
+                        life,
+                    };
                     self.take_beat(beat, now);
                 }
             }
@@ -321,14 +345,18 @@ impl Election {
     /// Judges the term of a message, and puts a plausible one in its place where only the term is wrong: a node that was told
     /// a wrong one is heard all the same.
     fn is_plausible(&mut self, message: &mut ElectionMessage, now: Timestamp) -> bool {
-        if !self.terms.has_own() && message.candidacy.role != Role::Cav && (1..=MAX_FIRST_TERM).contains(&message.term)
+        if !self.terms.has_own()
+            && message.candidacy.role != Role::Cav
+            && (1..=MAX_FIRST_TERM).contains(&message.term)
         {
             self.peers.note_term(&message.from, message.term);
         }
         let limit = self.term_limit(message.candidacy.role, now);
         self.unlearn_first_term(limit, now);
         if message.term > limit {
-            self.effects.push(ElectionEffect::CountImplausible { from: message.from.clone() });
+            self.effects.push(ElectionEffect::CountImplausible {
+                from: message.from.clone(),
+            });
             if message.highest_epoch() > limit {
                 return false;
             }
@@ -341,7 +369,12 @@ impl Election {
     /// that states the lowest term: one false claim does not separate it from the cell.
     fn term_limit(&mut self, role: Role, now: Timestamp) -> u64 {
         let heard_all = self.config.contact_timeout();
-        let Terms { seen, found, window: (before, since), .. } = &mut self.terms;
+        let Terms {
+            seen,
+            found,
+            window: (before, since),
+            ..
+        } = &mut self.terms;
         if *before > 0 && now.since(*since) >= heard_all {
             *found = (*found).max(*seen);
         }
@@ -349,8 +382,17 @@ impl Election {
             (*before, *since) = (*seen, now);
         }
         let has_own = self.terms.has_own();
-        let stated = if has_own { None } else { self.peers.lowest_term() };
-        match stated.into_iter().chain([self.terms.window.0]).filter(|term| *term > 0).min() {
+        let stated = if has_own {
+            None
+        } else {
+            self.peers.lowest_term()
+        };
+        match stated
+            .into_iter()
+            .chain([self.terms.window.0])
+            .filter(|term| *term > 0)
+            .min()
+        {
             None if role != Role::Cav => MAX_FIRST_TERM,
             lowest => (lowest.unwrap_or(0) + MAX_TERM_STEP).min(MAX_TERM),
         }
@@ -362,7 +404,12 @@ impl Election {
             return;
         }
         let is_beyond = |epoch: &mut Epoch| epoch.term > limit;
-        self.terms = Terms { seen: 0, persisted: 0, window: (0, now), ..self.terms };
+        self.terms = Terms {
+            seen: 0,
+            persisted: 0,
+            window: (0, now),
+            ..self.terms
+        };
         self.epoch.take_if(is_beyond);
         self.over.take_if(is_beyond);
         if self.current_epoch().is_some_and(|epoch| epoch.term > limit) {
@@ -376,17 +423,26 @@ impl Election {
 
     /// Notes the last round of a leadership as a node states it.
     fn learn_round(&mut self, from: &NodeName, round: u64) {
-        let limit = if self.round == 0 { MAX_ROUND } else { self.round.saturating_add(MAX_ROUND_STEP) };
+        let limit = if self.round == 0 {
+            MAX_ROUND
+        } else {
+            self.round.saturating_add(MAX_ROUND_STEP)
+        };
         if round <= limit.min(MAX_ROUND) {
             self.round = self.round.max(round);
         } else {
-            self.effects.push(ElectionEffect::CountImplausible { from: from.clone() });
+            self.effects
+                .push(ElectionEffect::CountImplausible { from: from.clone() });
         }
     }
 
     /// Number of the first round of a leadership. Rounds begin anew long before receivers take no more.
     fn next_round(&self) -> u64 {
-        if self.round < MAX_ROUND / 2 { self.round + 1 } else { 1 }
+        if self.round < MAX_ROUND / 2 {
+            self.round + 1
+        } else {
+            1
+        }
     }
 
     fn peer_alive(&mut self, peer: &NodeName, now: Timestamp) {
@@ -423,11 +479,22 @@ impl Election {
     /// Tells others at once that this node neither leads nor could lead any more.
     fn leave(&mut self, now: Timestamp) {
         let Health { load_percent, .. } = self.health;
-        self.set_health(Health { load_percent, ..Health::default() }, now);
+        self.set_health(
+            Health {
+                load_percent,
+                ..Health::default()
+            },
+            now,
+        );
     }
 
     fn candidacy(&self) -> Candidacy {
-        Candidacy { role: self.config.role, priority: self.config.priority, load: self.load, fit: self.health.is_fit() }
+        Candidacy {
+            role: self.config.role,
+            priority: self.config.priority,
+            load: self.load,
+            fit: self.health.is_fit(),
+        }
     }
 
     /// The epoch followed or led now.
@@ -451,12 +518,25 @@ impl Election {
         let leader = self.leader().filter(|leader| **leader != self.id).cloned();
         match leader {
             Some(leader) if self.config.role == Role::Cav => self.send_status(&leader, now),
-            _ => self.send_all(&Body::Status { over: self.over.clone(), no_login: self.no_login.clone() }, now),
+            _ => self.send_all(
+                &Body::Status {
+                    over: self.over.clone(),
+                    no_login: self.no_login.clone(),
+                },
+                now,
+            ),
         }
     }
 
     fn send_status(&mut self, to: &NodeName, now: Timestamp) {
-        self.send(to, Body::Status { over: self.over.clone(), no_login: self.no_login.clone() }, now);
+        self.send(
+            to,
+            Body::Status {
+                over: self.over.clone(),
+                no_login: self.no_login.clone(),
+            },
+            now,
+        );
     }
 
     fn send(&mut self, to: &NodeName, body: Body, now: Timestamp) {
@@ -475,7 +555,10 @@ impl Election {
             clock: None,
             description: None,
         };
-        self.effects.push(ElectionEffect::Send { to: to.clone(), message });
+        self.effects.push(ElectionEffect::Send {
+            to: to.clone(),
+            message,
+        });
     }
 
     fn send_all(&mut self, body: &Body, now: Timestamp) {

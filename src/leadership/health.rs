@@ -80,7 +80,9 @@ impl HealthMonitor {
         match state {
             // It is not known yet that nothing listens there.
             LinkState::Down | LinkState::Stalled => {
-                self.links.entry(broker.clone()).and_modify(|known| *known = state);
+                self.links
+                    .entry(broker.clone())
+                    .and_modify(|known| *known = state);
                 false
             }
             LinkState::Up => {
@@ -116,7 +118,9 @@ impl HealthMonitor {
                 }
                 // That it is refused is news of its own, which may still be under way.
                 LinkState::Down | LinkState::Refused => {
-                    self.links.entry(broker.clone()).and_modify(|known| *known = LinkState::Down);
+                    self.links
+                        .entry(broker.clone())
+                        .and_modify(|known| *known = LinkState::Down);
                 }
             }
         }
@@ -137,11 +141,19 @@ impl HealthMonitor {
     /// Health of the parts, for the election. A node that uses an external broker, its own, or both, needs one of them.
     /// A stalled link does not count as a link, rejected reports do not count as usable, nor settings of its own that
     /// contradict the cell's. All of this is overlooked in a leader with `no_other` to lead: it would make way for nobody.
-    pub fn health(&self, plane: &DataPlane, brokers: &Brokers, no_other: bool, round_period: Duration) -> Health {
+    pub fn health(
+        &self,
+        plane: &DataPlane,
+        brokers: &Brokers,
+        no_other: bool,
+        round_period: Duration,
+    ) -> Health {
         let external = self.is_up(plane.external.as_ref(), no_other);
         let embedded = plane.embedded && self.sample.broker_serves;
         let timeout = round_timeout(round_period);
-        let closes_rounds = self.round_due_at.is_some_and(|at| self.clock.now().since(at) < timeout);
+        let closes_rounds = self
+            .round_due_at
+            .is_some_and(|at| self.clock.now().since(at) < timeout);
         Health {
             broker: external || embedded,
             fuser: self.sample.fuser_runs && closes_rounds,
@@ -161,7 +173,10 @@ impl HealthMonitor {
 
     /// True if this node is logged in at a broker.
     pub fn is_logged_in(&self, broker: &BrokerAddress) -> bool {
-        matches!(self.links.get(broker), Some(LinkState::Up | LinkState::Stalled))
+        matches!(
+            self.links.get(broker),
+            Some(LinkState::Up | LinkState::Stalled)
+        )
     }
 
     /// True if this node is logged in at a node's broker, which has shown no other node's certificate.
@@ -189,7 +204,13 @@ mod tests {
     }
 
     fn sample(links: Option<BTreeMap<BrokerAddress, LinkState>>) -> HealthSample {
-        HealthSample { broker_serves: true, links, fuser_runs: true, rejects_reports: false, contradicts: false }
+        HealthSample {
+            broker_serves: true,
+            links,
+            fuser_runs: true,
+            rejects_reports: false,
+            contradicts: false,
+        }
     }
 
     /// A monitor of parts that answered, and have closed a round.
@@ -204,7 +225,10 @@ mod tests {
     fn only_an_established_link_that_broke_proves_its_process_gone() {
         let mut monitor = HealthMonitor::new(Timestamp(0));
         let broker = address(1);
-        assert!(!monitor.note_link(&broker, LinkState::Refused), "never reached");
+        assert!(
+            !monitor.note_link(&broker, LinkState::Refused),
+            "never reached"
+        );
         assert!(!monitor.note_link(&broker, LinkState::Up));
         assert!(!monitor.note_link(&broker, LinkState::Down));
         assert!(monitor.note_link(&broker, LinkState::Refused));
@@ -215,15 +239,27 @@ mod tests {
     fn a_node_is_fit_while_broker_link_and_rounds_work() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
-        let plane = DataPlane { external: None, embedded: true };
-        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
-        assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit(), "no link to its own broker yet");
+        let plane = DataPlane {
+            external: None,
+            embedded: true,
+        };
+        let brokers = Brokers {
+            own: Some(address(1)),
+            ..Brokers::default()
+        };
+        assert!(
+            !monitor.health(&plane, &brokers, false, PERIOD).is_fit(),
+            "no link to its own broker yet"
+        );
         monitor.note_link(&address(1), LinkState::Up);
         assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
         for looks in 1..=12 {
             monitor.note_look(1, 0, now + HEALTH_PERIOD * looks);
         }
-        assert!(!monitor.health(&plane, &brokers, false, PERIOD).fuser, "no rounds");
+        assert!(
+            !monitor.health(&plane, &brokers, false, PERIOD).fuser,
+            "no rounds"
+        );
         monitor.note_link(&address(1), LinkState::Down);
         assert!(!monitor.health(&plane, &brokers, false, PERIOD).gateway);
     }
@@ -233,11 +269,19 @@ mod tests {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
         let fuser = |monitor: &HealthMonitor| {
-            let plane = DataPlane { external: None, embedded: true };
-            monitor.health(&plane, &Brokers::default(), false, PERIOD).fuser
+            let plane = DataPlane {
+                external: None,
+                embedded: true,
+            };
+            monitor
+                .health(&plane, &Brokers::default(), false, PERIOD)
+                .fuser
         };
         monitor.note_look(1, 0, now + Duration::from_secs(10));
-        assert!(fuser(&monitor), "the look may come before the fuser's next round");
+        assert!(
+            fuser(&monitor),
+            "the look may come before the fuser's next round"
+        );
         let after = |ms| now + Duration::from_secs(10) + Duration::from_millis(ms);
         (1..=8).for_each(|looks| monitor.note_look(1, 0, after(250 * looks)));
         assert!(!fuser(&monitor), "the fuser had its time");
@@ -247,14 +291,29 @@ mod tests {
 
     #[test]
     fn a_leader_with_unusable_reports_or_settings_of_its_own_makes_way_if_another_could_lead() {
-        let (plane, brokers) =
-            (DataPlane { external: None, embedded: true }, Brokers { own: Some(address(1)), ..Brokers::default() });
+        let (plane, brokers) = (
+            DataPlane {
+                external: None,
+                embedded: true,
+            },
+            Brokers {
+                own: Some(address(1)),
+                ..Brokers::default()
+            },
+        );
         for (rejects_reports, contradicts) in [(true, false), (false, true)] {
             let mut monitor = monitor(Timestamp(60_000_000));
             let links = Some(BTreeMap::from([(address(1), LinkState::Up)]));
-            monitor.note_sample(HealthSample { rejects_reports, contradicts, ..sample(links) });
+            monitor.note_sample(HealthSample {
+                rejects_reports,
+                contradicts,
+                ..sample(links)
+            });
             assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
-            assert!(monitor.health(&plane, &brokers, true, PERIOD).is_fit(), "nobody else could do better");
+            assert!(
+                monitor.health(&plane, &brokers, true, PERIOD).is_fit(),
+                "nobody else could do better"
+            );
         }
     }
 
@@ -262,25 +321,40 @@ mod tests {
     fn a_link_that_came_up_unnoticed_is_found_by_asking() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
-        let plane = DataPlane { external: None, embedded: true };
-        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        let plane = DataPlane {
+            external: None,
+            embedded: true,
+        };
+        let brokers = Brokers {
+            own: Some(address(1)),
+            ..Brokers::default()
+        };
         let links = |state| Some(BTreeMap::from([(address(1), state)]));
         let answer = |state| sample(links(state));
         monitor.note_sample(answer(LinkState::Up));
         assert!(monitor.health(&plane, &brokers, false, PERIOD).is_fit());
         monitor.note_sample(answer(LinkState::Down));
         assert!(!monitor.health(&plane, &brokers, false, PERIOD).is_fit());
-        assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
+        assert!(
+            monitor.note_link(&address(1), LinkState::Refused),
+            "its end is still news"
+        );
     }
 
     #[test]
     fn a_broker_that_passes_nothing_on_is_none_unless_nobody_else_could_lead() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
-        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        let brokers = Brokers {
+            own: Some(address(1)),
+            ..Brokers::default()
+        };
         monitor.note_link(&address(1), LinkState::Up);
         let fit = |monitor: &HealthMonitor, no_other| {
-            let plane = DataPlane { external: None, embedded: true };
+            let plane = DataPlane {
+                external: None,
+                embedded: true,
+            };
             monitor.health(&plane, &brokers, no_other, PERIOD).is_fit()
         };
         assert!(fit(&monitor, false));
@@ -289,16 +363,31 @@ mod tests {
         monitor.note_link(&address(1), LinkState::Down);
         assert!(!fit(&monitor, true));
         monitor.note_link(&address(1), LinkState::Stalled);
-        assert!(monitor.note_link(&address(1), LinkState::Refused), "its end is still news");
+        assert!(
+            monitor.note_link(&address(1), LinkState::Refused),
+            "its end is still news"
+        );
     }
 
     #[test]
     fn an_external_broker_makes_up_for_a_private_one_only_while_it_is_there() {
         let mut monitor = HealthMonitor::new(Timestamp(0));
-        let plane = DataPlane { external: Some(address(9)), embedded: true };
-        let reaches = |monitor: &HealthMonitor, private| monitor.reaches_others(&plane, private, false);
-        assert_eq!((reaches(&monitor, true), reaches(&monitor, false)), (false, true), "never reached");
-        for (state, reached) in [(LinkState::Up, true), (LinkState::Stalled, false), (LinkState::Down, false)] {
+        let plane = DataPlane {
+            external: Some(address(9)),
+            embedded: true,
+        };
+        let reaches =
+            |monitor: &HealthMonitor, private| monitor.reaches_others(&plane, private, false);
+        assert_eq!(
+            (reaches(&monitor, true), reaches(&monitor, false)),
+            (false, true),
+            "never reached"
+        );
+        for (state, reached) in [
+            (LinkState::Up, true),
+            (LinkState::Stalled, false),
+            (LinkState::Down, false),
+        ] {
             monitor.note_link(&address(9), state);
             assert_eq!(reaches(&monitor, true), reached, "{state:?}");
         }
@@ -310,17 +399,29 @@ mod tests {
         monitor.note_link(&address(1), LinkState::Up);
         monitor.note_link(&address(2), LinkState::Up);
         monitor.forget_links_but(&[address(2)]);
-        assert_eq!((monitor.is_logged_in(&address(1)), monitor.is_logged_in(&address(2))), (false, true));
+        assert_eq!(
+            (
+                monitor.is_logged_in(&address(1)),
+                monitor.is_logged_in(&address(2))
+            ),
+            (false, true)
+        );
     }
 
     #[test]
     fn with_an_external_broker_its_link_counts_and_with_both_either() {
         let now = Timestamp(60_000_000);
         let mut monitor = monitor(now);
-        let brokers = Brokers { own: Some(address(1)), ..Brokers::default() };
+        let brokers = Brokers {
+            own: Some(address(1)),
+            ..Brokers::default()
+        };
         monitor.note_link(&address(1), LinkState::Up);
         let fit = |monitor: &HealthMonitor, embedded| {
-            let plane = DataPlane { external: Some(address(9)), embedded };
+            let plane = DataPlane {
+                external: Some(address(9)),
+                embedded,
+            };
             monitor.health(&plane, &brokers, false, PERIOD).is_fit()
         };
         assert!(!fit(&monitor, false));

@@ -29,13 +29,17 @@ mod growth;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use crate::leadership::timers::{EVIDENCE_TRIAL, FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD};
+use crate::leadership::timers::{
+    EVIDENCE_TRIAL, FULL_RESYNC_PAUSE, LAST_WORD_TIME, MAX_RESET_AHEAD,
+};
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
 use crate::reputation::{EntryKey, Evidence, MAX_ENTRIES, ReputationLedger};
-use crate::wire::{LedgerEntry, LedgerMark, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, SCHEMA_VERSION};
+use crate::wire::{
+    LedgerEntry, LedgerMark, LedgerShare, MAX_SHARE_ENTRIES, RejectReason, SCHEMA_VERSION,
+};
 use growth::GrowthLimit;
 pub use growth::is_plausible;
 
@@ -94,7 +98,10 @@ pub struct Merged {
 impl LedgerResync {
     /// As [`Self::new`], for a cell with certificates. The caller of [`Self::merge`] must verify signatures first.
     pub fn signed(name: NodeName, ticks_per_snapshot: u32) -> Self {
-        Self { is_signed: true, ..Self::new(name, ticks_per_snapshot) }
+        Self {
+            is_signed: true,
+            ..Self::new(name, ticks_per_snapshot)
+        }
     }
 
     /// The part of the node of this name; everything is shared each `ticks_per_snapshot` calls of [`Self::tick`].
@@ -152,11 +159,20 @@ impl LedgerResync {
     }
 
     /// Records what a round of the node's own leadership says about vehicles.
-    pub fn record(&mut self, epoch: &Epoch, evidence: &[Evidence], ledger: &mut ReputationLedger) -> Vec<LedgerShare> {
+    pub fn record(
+        &mut self,
+        epoch: &Epoch,
+        evidence: &[Evidence],
+        ledger: &mut ReputationLedger,
+    ) -> Vec<LedgerShare> {
         let lane = self.lane_in(epoch, ledger);
         let key = |evidence: &Evidence| {
             let Evidence { node, label, .. } = evidence.clone();
-            EntryKey { lane: lane.clone(), node, label }
+            EntryKey {
+                lane: lane.clone(),
+                node,
+                label,
+            }
         };
         let keys: BTreeSet<_> = evidence.iter().map(key).collect();
         for evidence in evidence {
@@ -169,10 +185,18 @@ impl LedgerResync {
 
     /// True if a broker vouches for the senders of shares: its own node's, this node's, and that of a leader that is
     /// followed or was a moment ago. `broker` is the node whose certificate it has proven, if any.
-    pub fn is_vouched_for(&self, broker: Option<&NodeName>, share: &LedgerShare, leadership: &Leadership) -> bool {
-        let is_of_leader =
-            |broker: &NodeName| leadership.leader() == Some(broker) || self.followed.contains_key(broker);
-        broker.is_none_or(|broker| [&share.node, &self.name].contains(&broker) || is_of_leader(broker))
+    pub fn is_vouched_for(
+        &self,
+        broker: Option<&NodeName>,
+        share: &LedgerShare,
+        leadership: &Leadership,
+    ) -> bool {
+        let is_of_leader = |broker: &NodeName| {
+            leadership.leader() == Some(broker) || self.followed.contains_key(broker)
+        };
+        broker.is_none_or(|broker| {
+            [&share.node, &self.name].contains(&broker) || is_of_leader(broker)
+        })
     }
 
     /// Checks the way on which a share came. A broker can let anybody publish in any name. So evidence that its sender has
@@ -188,7 +212,8 @@ impl LedgerResync {
         leadership: &Leadership,
     ) -> Result<(), Option<RejectReason>> {
         let is_signed_by_sender = share.lane().is_some_and(|lane| lane.leader == share.node);
-        if share.is_empty() || is_signed_by_sender || self.is_vouched_for(broker, share, leadership) {
+        if share.is_empty() || is_signed_by_sender || self.is_vouched_for(broker, share, leadership)
+        {
             return Ok(());
         }
         let is_news = share.entries.iter().any(|entry| ledger.lacks_entry(entry))
@@ -214,34 +239,54 @@ impl LedgerResync {
         if !candidates.contains(&share.node) {
             return Err(RejectReason::NotCandidate);
         }
-        if self.is_signed && !share.is_empty() && (share.signed.is_none() || share.lane().is_none()) {
+        if self.is_signed && !share.is_empty() && (share.signed.is_none() || share.lane().is_none())
+        {
             return Err(RejectReason::BadSignature);
         }
         let has_judged = self.note_leader(ledger, leadership, now);
         let is_reset = self.take_reset(share, ledger, date);
         let is_over = !self.is_signed && share.reset_at_us.unwrap_or_default() < ledger.reset_at();
-        let (mut taken, refused) =
-            if is_over { (share.clone(), Vec::new()) } else { self.judge(share, ledger, leadership, now) };
+        let (mut taken, refused) = if is_over {
+            (share.clone(), Vec::new())
+        } else {
+            self.judge(share, ledger, leadership, now)
+        };
         // A signed share is taken whole or not at all: it is passed on as it is.
-        let is_whole = taken.entries.len() == share.entries.len() && taken.marks.len() == share.marks.len();
+        let is_whole =
+            taken.entries.len() == share.entries.len() && taken.marks.len() == share.marks.len();
         if is_over || (self.is_signed && !is_whole) {
             (taken.entries, taken.marks) = (Vec::new(), Vec::new());
         }
         // A candidate may say that it leads while the election names another. The leader itself says it again.
-        let is_leader = leadership.leader().is_none_or(|leader| *leader == share.node);
-        let leader = share.epoch.filter(|term| is_leader && leadership.knows_term(*term));
-        self.hear(leader.map(|term| Epoch::new(term, share.node.clone())), ledger, candidates);
+        let is_leader = leadership
+            .leader()
+            .is_none_or(|leader| *leader == share.node);
+        let leader = share
+            .epoch
+            .filter(|term| is_leader && leadership.knows_term(*term));
+        self.hear(
+            leader.map(|term| Epoch::new(term, share.node.clone())),
+            ledger,
+            candidates,
+        );
         // The sender has not heard of the reset.
         self.owes_everything |= is_over;
         if self.repeats > 0 {
             self.shared.merge_share(&taken, self.leader.as_ref());
         }
-        let present = self.lane_of_leader(leadership).or(leadership.epoch.as_ref()).cloned();
+        let present = self
+            .lane_of_leader(leadership)
+            .or(leadership.epoch.as_ref())
+            .cloned();
         let present = present.as_ref();
         let taken = Arc::new(taken);
-        let is_statement = self.is_signed && taken.lane().is_some_and(|lane| !self.has_counted(&lane, ledger));
-        let trial_ends_at =
-            self.trial_end(&share.node, now).filter(|_| taken.lane().is_some_and(|lane| lane.leader == share.node));
+        let is_statement = self.is_signed
+            && taken
+                .lane()
+                .is_some_and(|lane| !self.has_counted(&lane, ledger));
+        let trial_ends_at = self
+            .trial_end(&share.node, now)
+            .filter(|_| taken.lane().is_some_and(|lane| lane.leader == share.node));
         let is_news = match trial_ends_at {
             Some(ends_at) if is_statement => ledger.merge_on_trial(&taken, present, ends_at),
             None if is_statement => ledger.merge_statement(&taken, present),
@@ -249,7 +294,11 @@ impl LedgerResync {
         };
         self.growth.note(&taken, ledger, now);
         let is_news = is_news | is_reset | has_judged;
-        Ok(Merged { is_news, refused, shares: self.take_everything(ledger, now) })
+        Ok(Merged {
+            is_news,
+            refused,
+            shares: self.take_everything(ledger, now),
+        })
     }
 
     /// The part of a share that is evidence for this node, and the reasons to leave out the rest.
@@ -285,11 +334,15 @@ impl LedgerResync {
         let mut taken = share.clone();
         taken.entries.retain(|entry| {
             let is_plausible = self.growth.admits(entry, now);
-            is_usable(lane(entry.epoch, &entry.aggregator), is_plausible, &|| ledger.lacks_entry(entry))
+            is_usable(lane(entry.epoch, &entry.aggregator), is_plausible, &|| {
+                ledger.lacks_entry(entry)
+            })
         });
         taken.marks.retain(|mark| {
             let is_plausible = self.growth.admits_mark(mark, now);
-            is_usable(lane(mark.epoch, &mark.aggregator), is_plausible, &|| ledger.lacks_mark(mark))
+            is_usable(lane(mark.epoch, &mark.aggregator), is_plausible, &|| {
+                ledger.lacks_mark(mark)
+            })
         });
         (taken, refused.into_iter().collect())
     }
@@ -301,14 +354,21 @@ impl LedgerResync {
 
     /// The lane in which the leader counts: this node's own, or by the leader's shares.
     fn lane_of_leader(&self, leadership: &Leadership) -> Option<&Epoch> {
-        let is_of_leader =
-            |lane: &&Epoch| leadership.epoch.as_ref().is_some_and(|now| now.leader == lane.leader && **lane <= *now);
-        self.lane.as_ref().or(self.leader.as_ref().filter(is_of_leader))
+        let is_of_leader = |lane: &&Epoch| {
+            leadership
+                .epoch
+                .as_ref()
+                .is_some_and(|now| now.leader == lane.leader && **lane <= *now)
+        };
+        self.lane
+            .as_ref()
+            .or(self.leader.as_ref().filter(is_of_leader))
     }
 
     /// True if a candidate may tell of a lane.
     fn may_tell(&self, sender: &NodeName, lane: &Epoch, leadership: &Leadership) -> bool {
-        let is_counting = |present: &Epoch| present == lane || self.lane_of_leader(leadership) == Some(lane);
+        let is_counting =
+            |present: &Epoch| present == lane || self.lane_of_leader(leadership) == Some(lane);
         if leadership.present_epoch().is_some_and(is_counting) {
             return *sender == lane.leader;
         }
@@ -316,17 +376,34 @@ impl LedgerResync {
     }
 
     /// Notes who leads; true if a trial of evidence ended. The last word of a leader may come when another leads already.
-    fn note_leader(&mut self, ledger: &mut ReputationLedger, leadership: &Leadership, now: Timestamp) -> bool {
+    fn note_leader(
+        &mut self,
+        ledger: &mut ReputationLedger,
+        leadership: &Leadership,
+        now: Timestamp,
+    ) -> bool {
         let leader = leadership.leader();
         if let Some(leader) = leader {
-            let latest = self.followed.iter().max_by_key(|(_, followed)| followed.last);
-            let since = latest.filter(|(latest, _)| *latest == leader).map_or(now, |(_, followed)| followed.since);
-            self.followed.insert(leader.clone(), Followed { since, last: now });
+            let latest = self
+                .followed
+                .iter()
+                .max_by_key(|(_, followed)| followed.last);
+            let since = latest
+                .filter(|(latest, _)| *latest == leader)
+                .map_or(now, |(_, followed)| followed.since);
+            self.followed
+                .insert(leader.clone(), Followed { since, last: now });
         }
-        self.followed.retain(|_, followed| now.since(followed.last) < LAST_WORD_TIME);
-        let has_failed = |lane: &Epoch| leader.is_some_and(|leader| ![&lane.leader, &self.name].contains(&leader));
+        self.followed
+            .retain(|_, followed| now.since(followed.last) < LAST_WORD_TIME);
+        let has_failed = |lane: &Epoch| {
+            leader.is_some_and(|leader| ![&lane.leader, &self.name].contains(&leader))
+        };
         let judged = ledger.end_trials(now, has_failed);
-        if judged.iter().any(|(lane, is_evidence)| *is_evidence && self.leader.as_ref() != Some(lane)) {
+        if judged
+            .iter()
+            .any(|(lane, is_evidence)| *is_evidence && self.leader.as_ref() != Some(lane))
+        {
             // A leader that ended and leads again may have lost what it had counted.
             (self.wait, self.repeats) = (self.wait.max(1), REPEATS);
         }
@@ -335,13 +412,25 @@ impl LedgerResync {
 
     /// End of the trial of what a leader tells of itself, unless it is over.
     fn trial_end(&self, leader: &NodeName, now: Timestamp) -> Option<Timestamp> {
-        self.followed.get(leader).map(|followed| followed.since + EVIDENCE_TRIAL).filter(|ends_at| *ends_at > now)
+        self.followed
+            .get(leader)
+            .map(|followed| followed.since + EVIDENCE_TRIAL)
+            .filter(|ends_at| *ends_at > now)
     }
 
     /// Forgets all evidence if the share knows of a later reset than this node; true if it does.
-    fn take_reset(&mut self, share: &LedgerShare, ledger: &mut ReputationLedger, date: Timestamp) -> bool {
-        let later = share.reset_at_us.filter(|at| *at > ledger.reset_at() && at.since(date) < MAX_RESET_AHEAD);
-        let Some(reset_at) = later.filter(|_| !self.is_signed) else { return false };
+    fn take_reset(
+        &mut self,
+        share: &LedgerShare,
+        ledger: &mut ReputationLedger,
+        date: Timestamp,
+    ) -> bool {
+        let later = share
+            .reset_at_us
+            .filter(|at| *at > ledger.reset_at() && at.since(date) < MAX_RESET_AHEAD);
+        let Some(reset_at) = later.filter(|_| !self.is_signed) else {
+            return false;
+        };
         *ledger = ReputationLedger::reset(reset_at);
         self.shared = ReputationLedger::default();
         self.growth = GrowthLimit::default();
@@ -349,7 +438,12 @@ impl LedgerResync {
     }
 
     /// Lets a publication period pass.
-    pub fn tick(&mut self, ledger: &mut ReputationLedger, leadership: &Leadership, now: Timestamp) -> Merged {
+    pub fn tick(
+        &mut self,
+        ledger: &mut ReputationLedger,
+        leadership: &Leadership,
+        now: Timestamp,
+    ) -> Merged {
         let is_news = self.note_leader(ledger, leadership, now);
         if self.growth.len() > 2 * MAX_ENTRIES {
             self.growth.retain(|lane| ledger.has_lane(lane));
@@ -363,7 +457,11 @@ impl LedgerResync {
                 shares.extend(self.snapshot(ledger));
             }
         }
-        Merged { is_news, refused: Vec::new(), shares }
+        Merged {
+            is_news,
+            refused: Vec::new(),
+            shares,
+        }
     }
 
     /// All evidence, or one share that says that there is none: a node that takes over waits for it, and a node that has
@@ -383,7 +481,8 @@ impl LedgerResync {
         }
         (self.leader, self.shared) = (leader, ReputationLedger::default());
         (self.wait, self.repeats) = (self.ticks_to_listen(candidates).max(1), REPEATS);
-        self.owes_everything = self.has_led || ledger.entries().any(|entry| entry.aggregator == self.name);
+        self.owes_everything =
+            self.has_led || ledger.entries().any(|entry| entry.aggregator == self.name);
     }
 
     /// Ticks for which a new leader is listened to before it is told what it has not shared. It shares everything in two
@@ -396,7 +495,9 @@ impl LedgerResync {
 
     /// Everything, if the leader is to have it and did not get it a moment ago.
     fn take_everything(&mut self, ledger: &ReputationLedger, now: Timestamp) -> Vec<LedgerShare> {
-        let is_due = self.everything_sent_at.is_none_or(|at| now.since(at) >= FULL_RESYNC_PAUSE);
+        let is_due = self
+            .everything_sent_at
+            .is_none_or(|at| now.since(at) >= FULL_RESYNC_PAUSE);
         if !self.owes_everything || !is_due {
             return Vec::new();
         }
@@ -414,18 +515,31 @@ impl LedgerResync {
     fn everything(&self, ledger: &ReputationLedger, except: Option<&Epoch>) -> Vec<LedgerShare> {
         let is_told = |term: u64, aggregator: &NodeName| {
             let lane = Epoch::new(term, aggregator.clone());
-            except != Some(&lane) && (!self.is_signed || (self.leads.is_some() && self.has_counted(&lane, ledger)))
+            except != Some(&lane)
+                && (!self.is_signed || (self.leads.is_some() && self.has_counted(&lane, ledger)))
         };
-        let entries: Vec<_> = ledger.entries().filter(|entry| is_told(entry.epoch, &entry.aggregator)).collect();
-        let marks: Vec<_> = ledger.marks().filter(|mark| is_told(mark.epoch, &mark.aggregator)).collect();
+        let entries: Vec<_> = ledger
+            .entries()
+            .filter(|entry| is_told(entry.epoch, &entry.aggregator))
+            .collect();
+        let marks: Vec<_> = ledger
+            .marks()
+            .filter(|mark| is_told(mark.epoch, &mark.aggregator))
+            .collect();
         let mut shares = self.shares(ledger, &entries, &marks);
-        let statements = ledger.statements().filter(|share| share.lane().as_ref() != except);
+        let statements = ledger
+            .statements()
+            .filter(|share| share.lane().as_ref() != except);
         shares.extend(statements.map(|share| self.passed_on(share)));
         shares
     }
 
     /// Evidence that nobody has shared with the leader, if it is time to send it.
-    fn take_unshared(&mut self, ledger: &ReputationLedger, leadership: &Leadership) -> Vec<LedgerShare> {
+    fn take_unshared(
+        &mut self,
+        ledger: &ReputationLedger,
+        leadership: &Leadership,
+    ) -> Vec<LedgerShare> {
         if self.leads.is_some() {
             return Vec::new();
         }
@@ -439,7 +553,10 @@ impl LedgerResync {
         }
         (self.wait, self.repeats) = (self.ticks_per_snapshot.max(1), self.repeats - 1);
         let is_told = |term: u64, aggregator: &NodeName| {
-            let is_leaders = self.leader.as_ref().is_some_and(|lane| lane.term == term && lane.leader == *aggregator);
+            let is_leaders = self
+                .leader
+                .as_ref()
+                .is_some_and(|lane| lane.term == term && lane.leader == *aggregator);
             leadership.knows_term(term) && !is_leaders
         };
         let (mut entries, mut marks) = ledger.beyond(&self.shared);
@@ -455,8 +572,14 @@ impl LedgerResync {
         untold.map(|share| self.passed_on(share)).collect()
     }
 
-    fn shares(&self, ledger: &ReputationLedger, entries: &[LedgerEntry], marks: &[LedgerMark]) -> Vec<LedgerShare> {
-        let share = |entries: &[LedgerEntry], marks: &[LedgerMark]| self.share_of(ledger, entries, marks);
+    fn shares(
+        &self,
+        ledger: &ReputationLedger,
+        entries: &[LedgerEntry],
+        marks: &[LedgerMark],
+    ) -> Vec<LedgerShare> {
+        let share =
+            |entries: &[LedgerEntry], marks: &[LedgerMark]| self.share_of(ledger, entries, marks);
         if !entries.is_empty() && entries.len() + marks.len() <= MAX_SHARE_ENTRIES {
             let together = share(entries, marks);
             if !self.is_signed || together.lane().is_some() {
@@ -464,14 +587,30 @@ impl LedgerResync {
             }
         }
         // Only what is of one lane can be signed.
-        let is_together = |one: (u64, &NodeName), next: (u64, &NodeName)| !self.is_signed || one == next;
-        let entries = entries.chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
-        let marks = marks.chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
-        let entries = entries.flat_map(|lane| lane.chunks(MAX_SHARE_ENTRIES)).map(|entries| share(entries, &[]));
-        entries.chain(marks.flat_map(|lane| lane.chunks(MAX_SHARE_ENTRIES)).map(|marks| share(&[], marks))).collect()
+        let is_together =
+            |one: (u64, &NodeName), next: (u64, &NodeName)| !self.is_signed || one == next;
+        let entries = entries
+            .chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
+        let marks =
+            marks.chunk_by(|a, b| is_together((a.epoch, &a.aggregator), (b.epoch, &b.aggregator)));
+        let entries = entries
+            .flat_map(|lane| lane.chunks(MAX_SHARE_ENTRIES))
+            .map(|entries| share(entries, &[]));
+        entries
+            .chain(
+                marks
+                    .flat_map(|lane| lane.chunks(MAX_SHARE_ENTRIES))
+                    .map(|marks| share(&[], marks)),
+            )
+            .collect()
     }
 
-    fn share_of(&self, ledger: &ReputationLedger, entries: &[LedgerEntry], marks: &[LedgerMark]) -> LedgerShare {
+    fn share_of(
+        &self,
+        ledger: &ReputationLedger,
+        entries: &[LedgerEntry],
+        marks: &[LedgerMark],
+    ) -> LedgerShare {
         LedgerShare {
             schema: SCHEMA_VERSION,
             node: self.name.clone(),
@@ -486,7 +625,11 @@ impl LedgerResync {
     /// A share of another aggregator as this node sends it.
     fn passed_on(&self, share: &LedgerShare) -> LedgerShare {
         let epoch = self.lane.as_ref().map(|lane| lane.term);
-        LedgerShare { node: self.name.clone(), epoch, ..share.clone() }
+        LedgerShare {
+            node: self.name.clone(),
+            epoch,
+            ..share.clone()
+        }
     }
 }
 

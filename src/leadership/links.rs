@@ -67,7 +67,12 @@ pub struct Links {
 impl Links {
     /// No links yet.
     pub fn new(plane: DataPlane) -> Self {
-        Self { plane, present: Brokers::default(), lingering: Vec::new(), wanted: BTreeSet::new() }
+        Self {
+            plane,
+            present: Brokers::default(),
+            lingering: Vec::new(),
+            wanted: BTreeSet::new(),
+        }
     }
 
     /// Notes the brokers of the moment; returns the links to keep if they are others than before.
@@ -77,23 +82,46 @@ impl Links {
             return None;
         }
         if brokers != self.present {
-            let left = [self.present.leader.take(), self.present.standby.take()].into_iter().flatten();
-            self.lingering.extend(left.map(|broker| (broker, now + LINK_LINGER)));
+            let left = [self.present.leader.take(), self.present.standby.take()]
+                .into_iter()
+                .flatten();
+            self.lingering
+                .extend(left.map(|broker| (broker, now + LINK_LINGER)));
             self.present = brokers;
         }
         self.lingering.retain(|(_, until)| *until > now);
         let mut wanted: BTreeSet<_> = self.plane.external.iter().cloned().collect();
         if self.plane.embedded {
-            let Brokers { own, leader, standby, missing } = &self.present;
-            wanted.extend([own, leader, standby].into_iter().flatten().chain(missing).cloned());
+            let Brokers {
+                own,
+                leader,
+                standby,
+                missing,
+            } = &self.present;
+            wanted.extend(
+                [own, leader, standby]
+                    .into_iter()
+                    .flatten()
+                    .chain(missing)
+                    .cloned(),
+            );
             wanted.extend(self.lingering.iter().map(|(broker, _)| broker.clone()));
         }
         if wanted == self.wanted {
             return None;
         }
         self.wanted = wanted;
-        let report_brokers = self.present.own.iter().chain(&self.plane.external).cloned().collect();
-        Some(WantedLinks { brokers: self.wanted.iter().cloned().collect(), report_brokers })
+        let report_brokers = self
+            .present
+            .own
+            .iter()
+            .chain(&self.plane.external)
+            .cloned()
+            .collect();
+        Some(WantedLinks {
+            brokers: self.wanted.iter().cloned().collect(),
+            report_brokers,
+        })
     }
 
     /// Forgets the wanted links, so that the next update tells them: a new gateway does not know them.
@@ -122,7 +150,12 @@ mod tests {
 
     fn brokers(own: u16, leader: u16, standby: u16) -> Brokers {
         let [own, leader, standby] = [own, leader, standby].map(broker).map(Some);
-        Brokers { own, leader, standby, missing: Vec::new() }
+        Brokers {
+            own,
+            leader,
+            standby,
+            missing: Vec::new(),
+        }
     }
 
     fn at(ms: u64) -> Timestamp {
@@ -135,27 +168,58 @@ mod tests {
 
     #[test]
     fn a_link_outlives_a_change_of_leader_for_a_while() {
-        let mut links = Links::new(DataPlane { external: None, embedded: true });
-        assert_eq!(update(&mut links, brokers(3, 1, 2), at(0)), Some(vec![broker(1), broker(2), broker(3)]));
-        assert_eq!(update(&mut links, brokers(3, 2, 3), at(100)), None, "the old leader's is kept");
-        assert_eq!(update(&mut links, brokers(3, 2, 3), at(2200)), Some(vec![broker(2), broker(3)]));
+        let mut links = Links::new(DataPlane {
+            external: None,
+            embedded: true,
+        });
+        assert_eq!(
+            update(&mut links, brokers(3, 1, 2), at(0)),
+            Some(vec![broker(1), broker(2), broker(3)])
+        );
+        assert_eq!(
+            update(&mut links, brokers(3, 2, 3), at(100)),
+            None,
+            "the old leader's is kept"
+        );
+        assert_eq!(
+            update(&mut links, brokers(3, 2, 3), at(2200)),
+            Some(vec![broker(2), broker(3)])
+        );
         links.forget();
-        assert_eq!(update(&mut links, brokers(3, 2, 3), at(2300)), Some(vec![broker(2), broker(3)]));
+        assert_eq!(
+            update(&mut links, brokers(3, 2, 3), at(2300)),
+            Some(vec![broker(2), broker(3)])
+        );
     }
 
     #[test]
     fn an_external_broker_is_used_alone_or_beside_the_others() {
         let external = Some(broker(9));
-        let mut alone = Links::new(DataPlane { external: external.clone(), embedded: false });
-        assert_eq!(update(&mut alone, brokers(3, 1, 2), at(0)), Some(vec![broker(9)]));
+        let mut alone = Links::new(DataPlane {
+            external: external.clone(),
+            embedded: false,
+        });
+        assert_eq!(
+            update(&mut alone, brokers(3, 1, 2), at(0)),
+            Some(vec![broker(9)])
+        );
         assert_eq!(update(&mut alone, brokers(3, 2, 3), at(1)), None);
-        let mut beside = Links::new(DataPlane { external, embedded: true });
-        assert_eq!(update(&mut beside, brokers(2, 1, 2), at(0)), Some(vec![broker(1), broker(2), broker(9)]));
+        let mut beside = Links::new(DataPlane {
+            external,
+            embedded: true,
+        });
+        assert_eq!(
+            update(&mut beside, brokers(2, 1, 2), at(0)),
+            Some(vec![broker(1), broker(2), broker(9)])
+        );
     }
 
     #[test]
     fn reports_are_taken_from_the_own_broker_and_the_external_one() {
-        let mut links = Links::new(DataPlane { external: Some(broker(9)), embedded: true });
+        let mut links = Links::new(DataPlane {
+            external: Some(broker(9)),
+            embedded: true,
+        });
         let wanted = links.update(brokers(3, 1, 2), at(0)).unwrap();
         assert_eq!(wanted.report_brokers, [broker(3), broker(9)]);
     }

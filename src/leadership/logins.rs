@@ -27,15 +27,27 @@ impl Logins {
     /// Notes a look at the used brokers and at those of [`Self::missing`]: whether this node is logged in at each. True if
     /// the missing logins changed.
     pub(super) fn look(&mut self, brokers: &BTreeMap<NodeName, bool>) -> bool {
-        self.nodes.retain(|name, login| login.is_missing || brokers.contains_key(name));
+        self.nodes
+            .retain(|name, login| login.is_missing || brokers.contains_key(name));
         let mut missing = self.missing().count();
         let mut has_changed = false;
         for (name, is_logged_in) in brokers {
             let login = self.nodes.entry(name.clone()).or_default();
-            login.contrary_looks = if *is_logged_in == login.is_missing { login.contrary_looks + 1 } else { 0 };
+            login.contrary_looks = if *is_logged_in == login.is_missing {
+                login.contrary_looks + 1
+            } else {
+                0
+            };
             if login.contrary_looks >= LOOKS && (login.is_missing || missing < MAX_NO_LOGIN) {
-                *login = Login { is_missing: !login.is_missing, contrary_looks: 0 };
-                missing = if login.is_missing { missing + 1 } else { missing - 1 };
+                *login = Login {
+                    is_missing: !login.is_missing,
+                    contrary_looks: 0,
+                };
+                missing = if login.is_missing {
+                    missing + 1
+                } else {
+                    missing - 1
+                };
                 has_changed = true;
             }
         }
@@ -44,12 +56,17 @@ impl Logins {
 
     /// Forgets a node that is gone, or has started anew. True if its login was missing.
     pub(super) fn forget(&mut self, name: &NodeName) -> bool {
-        self.nodes.remove(name).is_some_and(|login| login.is_missing)
+        self.nodes
+            .remove(name)
+            .is_some_and(|login| login.is_missing)
     }
 
     /// Nodes at whose brokers a login is missing.
     pub(super) fn missing(&self) -> impl Iterator<Item = &NodeName> {
-        self.nodes.iter().filter(|(_, login)| login.is_missing).map(|(name, _)| name)
+        self.nodes
+            .iter()
+            .filter(|(_, login)| login.is_missing)
+            .map(|(name, _)| name)
     }
 
     /// True if some broker was last seen without a login that is not known to be missing.
@@ -82,7 +99,8 @@ mod tests {
     #[test]
     fn a_broker_that_is_reached_now_and_then_is_not_missing() {
         let mut logins = Logins::default();
-        let look = |look: usize| BTreeMap::from([(NodeName::from_static("edge"), look.is_multiple_of(7))]);
+        let look =
+            |look: usize| BTreeMap::from([(NodeName::from_static("edge"), look.is_multiple_of(7))]);
         assert!((0..100).all(|number| !logins.look(&look(number))));
     }
 

@@ -27,12 +27,16 @@ use uuid::Uuid;
 pub use interface::{Effect, Input, NodeSettings, Notice, SeenMember};
 
 use crate::leadership::address::BrokerAddress;
-use crate::leadership::election::{Body, Election, ElectionEffect, ElectionInput, ElectionMessage, Health};
+use crate::leadership::election::{
+    Body, Election, ElectionEffect, ElectionInput, ElectionMessage, Health,
+};
 use crate::leadership::health::HealthMonitor;
 use crate::leadership::links::{Brokers, LinkState, Links};
 use crate::leadership::logins::Logins;
 use crate::leadership::rights::Rights;
-use crate::leadership::timers::{DRAIN_TIME, LATE_WAKE, LEDGER_TIMEOUT, PREPARATION_STEP, VEHICLE_CONNECT_TIME};
+use crate::leadership::timers::{
+    DRAIN_TIME, LATE_WAKE, LEDGER_TIMEOUT, PREPARATION_STEP, VEHICLE_CONNECT_TIME,
+};
 use crate::leadership::view::Leadership;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
@@ -93,12 +97,31 @@ impl LeadershipNode {
     /// The leadership of a node that starts. `saved_term` is the last [`Effect::PersistTerm`] of earlier runs, 0 without
     /// any. `before` is the leadership that an earlier machine of this process told: it may have led in that term, and
     /// there may be no disk that tells.
-    pub fn new(settings: NodeSettings, saved_term: u64, before: &Leadership, now: Timestamp) -> Self {
+    pub fn new(
+        settings: NodeSettings,
+        saved_term: u64,
+        before: &Leadership,
+        now: Timestamp,
+    ) -> Self {
         let is_vehicle_only = settings.is_vehicle_only();
-        let NodeSettings { election, plane, round_period, keeps_reputations, status } = settings;
-        let told_term = before.epoch.as_ref().map_or(0, |epoch| epoch.term.saturating_add(1));
+        let NodeSettings {
+            election,
+            plane,
+            round_period,
+            keeps_reputations,
+            status,
+        } = settings;
+        let told_term = before
+            .epoch
+            .as_ref()
+            .map_or(0, |epoch| epoch.term.saturating_add(1));
         Self {
-            election: Election::new(election, status.node.clone(), saved_term.max(told_term), now),
+            election: Election::new(
+                election,
+                status.node.clone(),
+                saved_term.max(told_term),
+                now,
+            ),
             is_vehicle_only,
             keeps_reputations,
             round_period,
@@ -114,7 +137,10 @@ impl LeadershipNode {
             runs: BTreeMap::new(),
             disconnected: BTreeMap::new(),
             preparation: None,
-            accepted: status.aggregator.clone().map(|aggregator| Epoch::new(status.epoch, aggregator)),
+            accepted: status
+                .aggregator
+                .clone()
+                .map(|aggregator| Epoch::new(status.epoch, aggregator)),
             leadership: before.clone(),
             status,
             is_status_told: false,
@@ -141,8 +167,14 @@ impl LeadershipNode {
         self.run_timers(now);
         self.tell(now);
         if !self.is_draining {
-            let preparation = self.preparation.as_ref().map(|preparation| preparation.check_at);
-            let deadline = self.election.next_deadline().min(self.monitor.next_deadline());
+            let preparation = self
+                .preparation
+                .as_ref()
+                .map(|preparation| preparation.check_at);
+            let deadline = self
+                .election
+                .next_deadline()
+                .min(self.monitor.next_deadline());
             self.deadline = preparation.map_or(deadline, |check_at| check_at.min(deadline));
         }
         std::mem::take(&mut self.effects)
@@ -155,7 +187,11 @@ impl LeadershipNode {
 
     /// Stamp of the cell's description that the node has; version 0 without one.
     pub fn description(&self) -> DescriptionStamp {
-        self.status.description.as_ref().map(DescriptionStatus::stamp).unwrap_or_default()
+        self.status
+            .description
+            .as_ref()
+            .map(DescriptionStatus::stamp)
+            .unwrap_or_default()
     }
 
     /// The election, to be asked.
@@ -167,18 +203,27 @@ impl LeadershipNode {
         match input {
             Input::Wake => {}
             Input::Receive { from, message, .. } if message.from != from => {
-                self.log(Notice::Misattributed { from, claimed: message.from });
+                self.log(Notice::Misattributed {
+                    from,
+                    claimed: message.from,
+                });
             }
-            Input::Receive { from, message, .. } if message.body == Body::Ready && !self.is_served_by(&from) => {
+            Input::Receive { from, message, .. }
+                if message.body == Body::Ready && !self.is_served_by(&from) =>
+            {
                 self.log(Notice::NotServed { challenger: from });
             }
-            Input::Receive { rights, message, .. } => self.receive(message, rights, now),
+            Input::Receive {
+                rights, message, ..
+            } => self.receive(message, rights, now),
             Input::MemberAlive { member } => self.meet(member, now),
             Input::MemberChanged { member } => {
                 self.members.place(member);
                 self.update_health(now);
             }
-            Input::MemberSuspected { name } => self.feed(ElectionInput::PeerSuspected { peer: name }, now),
+            Input::MemberSuspected { name } => {
+                self.feed(ElectionInput::PeerSuspected { peer: name }, now)
+            }
             Input::MemberDown { name } => self.part_with(name, now),
             Input::OwnBroker { address } => self.own_broker = address,
             Input::BrokerProven { broker, node } => self.monitor.note_node(broker, node),
@@ -186,11 +231,19 @@ impl LeadershipNode {
             Input::StatusHeard { status } => self.take_status(&status, now),
             Input::RoundAccepted { epoch, round } => self.take_round(epoch, round, now),
             Input::EvidenceReceived { from } => {
-                if let Some(preparation) = self.preparation.as_mut().filter(|preparation| preparation.leader == from) {
+                if let Some(preparation) = self
+                    .preparation
+                    .as_mut()
+                    .filter(|preparation| preparation.leader == from)
+                {
                     preparation.has_evidence = true;
                 }
             }
-            Input::Looked { rounds_due, load_percent, members } => {
+            Input::Looked {
+                rounds_due,
+                load_percent,
+                members,
+            } => {
                 self.take_look(rounds_due, load_percent, members, now);
             }
             Input::PartsAnswered { sample } => {
@@ -200,7 +253,13 @@ impl LeadershipNode {
             Input::FuserRestarted => {
                 // A new fuser does not lead: the leadership is over.
                 if self.election.is_leading() {
-                    self.set_health(Health { fuser: false, ..self.health }, now);
+                    self.set_health(
+                        Health {
+                            fuser: false,
+                            ..self.health
+                        },
+                        now,
+                    );
                 }
             }
             Input::GatewayRestarted => {
@@ -209,7 +268,11 @@ impl LeadershipNode {
                 self.is_status_told = false;
                 self.update_health(now);
             }
-            Input::Described { description, round_period, keeps_reputations } => {
+            Input::Described {
+                description,
+                round_period,
+                keeps_reputations,
+            } => {
                 (self.round_period, self.keeps_reputations) = (round_period, keeps_reputations);
                 if self.status.description != description {
                     self.status.description = description;
@@ -218,7 +281,8 @@ impl LeadershipNode {
                 }
             }
             Input::Telling { troubles, page } => {
-                self.is_status_told &= (&self.status.troubles, &self.status.page) == (&troubles, &page);
+                self.is_status_told &=
+                    (&self.status.troubles, &self.status.page) == (&troubles, &page);
                 (self.status.troubles, self.status.page) = (troubles, page);
             }
             Input::Leave => self.feed(ElectionInput::Leave, now),
@@ -250,10 +314,18 @@ impl LeadershipNode {
                 ElectionEffect::StopPublishing { epoch } => Effect::StopPublishing { epoch },
                 ElectionEffect::SendSnapshot { to } => Effect::SendSnapshot { to },
                 ElectionEffect::CountImplausible { from } => Effect::CountImplausible { from },
-                ElectionEffect::Lead { epoch, first_round, first } => {
+                ElectionEffect::Lead {
+                    epoch,
+                    first_round,
+                    first,
+                } => {
                     self.preparation = None;
                     self.tell_leadership();
-                    Effect::Lead { epoch, first_round, first }
+                    Effect::Lead {
+                        epoch,
+                        first_round,
+                        first,
+                    }
                 }
                 ElectionEffect::Prepare { leader } => {
                     self.preparation = Some(Preparation {
@@ -262,7 +334,9 @@ impl LeadershipNode {
                         has_evidence: !self.keeps_reputations,
                         check_at: now + VEHICLE_CONNECT_TIME,
                     });
-                    Effect::Log { notice: Notice::Preparing { leader } }
+                    Effect::Log {
+                        notice: Notice::Preparing { leader },
+                    }
                 }
             };
             self.effects.push(effect);
@@ -273,8 +347,16 @@ impl LeadershipNode {
     fn receive(&mut self, message: ElectionMessage, rights: Rights, now: Timestamp) {
         let (from, declared) = (message.from.clone(), message.candidacy);
         let limited = rights.limit(message);
-        if limited.as_ref().is_none_or(|message| message.candidacy != declared) {
-            self.log(Notice::Overreached { from, role: declared.role, priority: declared.priority, rights });
+        if limited
+            .as_ref()
+            .is_none_or(|message| message.candidacy != declared)
+        {
+            self.log(Notice::Overreached {
+                from,
+                role: declared.role,
+                priority: declared.priority,
+                rights,
+            });
         }
         if let Some(message) = limited {
             self.feed(ElectionInput::Receive { message }, now);
@@ -301,7 +383,10 @@ impl LeadershipNode {
         // A broker that belongs to no node says nothing about any.
         if is_gone && self.links.plane().external.as_ref() != Some(broker) {
             for peer in self.members.at(broker, now) {
-                self.log(Notice::ProcessGone { peer: peer.clone(), broker: broker.clone() });
+                self.log(Notice::ProcessGone {
+                    peer: peer.clone(),
+                    broker: broker.clone(),
+                });
                 self.feed(ElectionInput::PeerGone { peer }, now);
             }
         }
@@ -323,7 +408,11 @@ impl LeadershipNode {
             self.log(Notice::LeaderDisconnected { peer: peer.clone() });
             let run = self.members.run_of(&peer);
             let is_first = self.disconnected.insert(peer.clone(), run) != Some(run);
-            let input = if is_first { ElectionInput::PeerGone { peer } } else { ElectionInput::PeerSuspected { peer } };
+            let input = if is_first {
+                ElectionInput::PeerGone { peer }
+            } else {
+                ElectionInput::PeerSuspected { peer }
+            };
             self.feed(input, now);
         }
     }
@@ -332,14 +421,26 @@ impl LeadershipNode {
     /// publish some.
     fn take_round(&mut self, epoch: Epoch, round: u64, now: Timestamp) {
         if self.election.epoch() == Some(&epoch) {
-            self.feed(ElectionInput::Round { epoch: epoch.clone(), round }, now);
+            self.feed(
+                ElectionInput::Round {
+                    epoch: epoch.clone(),
+                    round,
+                },
+                now,
+            );
         }
         self.accepted = Some(epoch);
     }
 
     /// Notes a look. The list of members makes up for events from before the start, and for members that a restarted
     /// membership lost without a word.
-    fn take_look(&mut self, rounds_due: u64, load_percent: u8, members: Vec<SeenMember>, now: Timestamp) {
+    fn take_look(
+        &mut self,
+        rounds_due: u64,
+        load_percent: u8,
+        members: Vec<SeenMember>,
+        now: Timestamp,
+    ) {
         if !self.is_vehicle_only {
             self.monitor.note_look(rounds_due, load_percent, now);
             self.update_health(now);
@@ -358,19 +459,40 @@ impl LeadershipNode {
     /// Notes whether this node is logged in at the brokers of leader and standby. Beside an external broker it need not be.
     fn check_logins(&mut self, now: Timestamp) {
         let plane = self.links.plane();
-        let needs_none = !plane.embedded || plane.external.as_ref().is_some_and(|at| self.monitor.is_logged_in(at));
-        let used = [self.leadership.leader(), self.leadership.standby.as_ref()].into_iter().flatten();
-        let others = used.chain(self.logins.missing()).filter(|name| *name != self.election.name());
-        let is_at =
-            |name: &NodeName| Some(needs_none || self.monitor.is_logged_in_at(name, &self.members.broker_of(name)?));
+        let needs_none = !plane.embedded
+            || plane
+                .external
+                .as_ref()
+                .is_some_and(|at| self.monitor.is_logged_in(at));
+        let used = [self.leadership.leader(), self.leadership.standby.as_ref()]
+            .into_iter()
+            .flatten();
+        let others = used
+            .chain(self.logins.missing())
+            .filter(|name| *name != self.election.name());
+        let is_at = |name: &NodeName| {
+            Some(
+                needs_none
+                    || self
+                        .monitor
+                        .is_logged_in_at(name, &self.members.broker_of(name)?),
+            )
+        };
         let brokers = others.filter_map(|name| Some((name.clone(), is_at(name)?)));
         if self.logins.look(&brokers.collect()) {
             self.tell_logins(now);
         }
         let (without_login, followers) = self.election.followers_without_login();
-        let without_login = if self.election.is_leading() { without_login } else { 0 };
+        let without_login = if self.election.is_leading() {
+            without_login
+        } else {
+            0
+        };
         if without_login > self.without_login {
-            self.log(Notice::Deserted { without_login, followers });
+            self.log(Notice::Deserted {
+                without_login,
+                followers,
+            });
         }
         self.without_login = without_login;
         self.is_deserted = without_login > 0 && without_login == followers;
@@ -389,13 +511,17 @@ impl LeadershipNode {
     }
 
     fn check_preparation(&mut self, now: Timestamp) {
-        let Some(preparation) = &mut self.preparation else { return };
+        let Some(preparation) = &mut self.preparation else {
+            return;
+        };
         // A clock that was set back does not put the check off.
         preparation.check_at = preparation.check_at.min(now + VEHICLE_CONNECT_TIME);
         if now < preparation.check_at {
             return;
         }
-        if (preparation.has_evidence || now.since(preparation.since) >= LEDGER_TIMEOUT) && self.health.is_fit() {
+        if (preparation.has_evidence || now.since(preparation.since) >= LEDGER_TIMEOUT)
+            && self.health.is_fit()
+        {
             self.preparation = None;
             self.feed(ElectionInput::Prepared, now);
         } else {
@@ -406,10 +532,19 @@ impl LeadershipNode {
     fn update_health(&mut self, now: Timestamp) {
         let no_other = self.election.is_leading() && self.election.standby().is_none();
         let (plane, brokers) = (self.links.plane(), self.links.brokers());
-        let health = self.monitor.health(plane, brokers, no_other, self.round_period);
+        let health = self
+            .monitor
+            .health(plane, brokers, no_other, self.round_period);
         let is_reached = self.is_reached(no_other);
         let settings = health.settings || self.election.leader().is_none();
-        self.set_health(Health { broker: health.broker && is_reached, settings, ..health }, now);
+        self.set_health(
+            Health {
+                broker: health.broker && is_reached,
+                settings,
+                ..health
+            },
+            now,
+        );
     }
 
     /// True if this node is logged in at a broker with which the challenger would lead: its own, or an external one. If
@@ -417,17 +552,29 @@ impl LeadershipNode {
     fn is_served_by(&self, challenger: &NodeName) -> bool {
         let plane = self.links.plane();
         !plane.embedded
-            || plane.external.as_ref().is_some_and(|broker| self.monitor.is_logged_in(broker))
-            || self.members.broker_of(challenger).is_some_and(|at| self.monitor.is_logged_in_at(challenger, &at))
+            || plane
+                .external
+                .as_ref()
+                .is_some_and(|broker| self.monitor.is_logged_in(broker))
+            || self
+                .members
+                .broker_of(challenger)
+                .is_some_and(|at| self.monitor.is_logged_in_at(challenger, &at))
     }
 
     /// True if the members reach the broker that this node would lead with; the first time that they do not is logged.
     fn is_reached(&mut self, no_other: bool) -> bool {
-        let is_private = self.own_broker.is_some_and(|broker| broker.ip().is_loopback());
+        let is_private = self
+            .own_broker
+            .is_some_and(|broker| broker.ip().is_loopback());
         let is_reached = self.members.elsewhere().next().is_none()
-            || self.monitor.reaches_others(self.links.plane(), is_private, no_other);
+            || self
+                .monitor
+                .reaches_others(self.links.plane(), is_private, no_other);
         if !is_reached && !std::mem::replace(&mut self.was_out_of_reach, true) {
-            self.log(Notice::OutOfReach { members: self.members.elsewhere().cloned().collect() });
+            self.log(Notice::OutOfReach {
+                members: self.members.elsewhere().cloned().collect(),
+            });
         }
         is_reached
     }
@@ -456,11 +603,23 @@ impl LeadershipNode {
         let own = self.own_broker.map(BrokerAddress::from);
         let brokers = match self.leadership.leader() {
             Some(leader) => {
-                let missing = self.logins.missing().filter_map(|name| self.members.broker_of(name)).collect();
+                let missing = self
+                    .logins
+                    .missing()
+                    .filter_map(|name| self.members.broker_of(name))
+                    .collect();
                 let standby = broker(self.leadership.standby.as_ref());
-                Brokers { own, leader: broker(Some(leader)), standby, missing }
+                Brokers {
+                    own,
+                    leader: broker(Some(leader)),
+                    standby,
+                    missing,
+                }
             }
-            None => Brokers { own, ..self.links.brokers().clone() },
+            None => Brokers {
+                own,
+                ..self.links.brokers().clone()
+            },
         };
         if let Some(links) = self.links.update(brokers, now) {
             self.monitor.forget_links_but(&links.brokers);
@@ -479,15 +638,35 @@ impl LeadershipNode {
 
     fn tell_status(&mut self) {
         let epoch = self.leadership.present_epoch().or(self.accepted.as_ref());
-        let state = if self.leadership.is_leading() { NodeState::Aggregating } else { NodeState::Following };
-        let (term, aggregator) = (epoch.map_or(0, |epoch| epoch.term), epoch.map(|epoch| &epoch.leader));
+        let state = if self.leadership.is_leading() {
+            NodeState::Aggregating
+        } else {
+            NodeState::Following
+        };
+        let (term, aggregator) = (
+            epoch.map_or(0, |epoch| epoch.term),
+            epoch.map(|epoch| &epoch.leader),
+        );
         let fit = (!self.is_vehicle_only).then(|| self.health.is_fit());
-        let told = (self.status.state, self.status.epoch, self.status.aggregator.as_ref(), self.status.fit);
+        let told = (
+            self.status.state,
+            self.status.epoch,
+            self.status.aggregator.as_ref(),
+            self.status.fit,
+        );
         if !self.is_status_told || told != (state, term, aggregator, fit) {
             let aggregator = aggregator.cloned();
-            self.status = NodeStatus { state, epoch: term, aggregator, fit, ..self.status.clone() };
+            self.status = NodeStatus {
+                state,
+                epoch: term,
+                aggregator,
+                fit,
+                ..self.status.clone()
+            };
             self.is_status_told = true;
-            self.effects.push(Effect::PublishStatus { status: self.status.clone() });
+            self.effects.push(Effect::PublishStatus {
+                status: self.status.clone(),
+            });
         }
     }
 

@@ -29,14 +29,21 @@ pub fn round_timeout(round_period: Duration) -> Duration {
 impl Readiness {
     /// A node that is not ready.
     pub fn not(reason: String) -> Self {
-        Self { ready: false, reason, needs_restart: true }
+        Self {
+            ready: false,
+            reason,
+            needs_restart: true,
+        }
     }
 
     /// The readiness of the same node with what may be the cause, if it is not ready.
     #[must_use]
     pub fn because(self, cause: Option<&str>) -> Self {
         match cause {
-            Some(cause) if !self.ready => Self { reason: format!("{}: {cause}", self.reason), ..self },
+            Some(cause) if !self.ready => Self {
+                reason: format!("{}: {cause}", self.reason),
+                ..self
+            },
             _ => self,
         }
     }
@@ -45,7 +52,11 @@ impl Readiness {
     #[must_use]
     pub fn unless(self, problem: Option<String>) -> Self {
         match problem {
-            Some(reason) => Self { ready: false, reason, needs_restart: self.needs_restart },
+            Some(reason) => Self {
+                ready: false,
+                reason,
+                needs_restart: self.needs_restart,
+            },
             None => self,
         }
     }
@@ -69,7 +80,11 @@ impl Readiness {
         if leadership.is_leading() && leadership.is_deserted {
             // By the word of others: it must not restart this node.
             let reason = "leading, but no follower can log in at this node's broker".into();
-            return Self { ready: false, reason, needs_restart: false };
+            return Self {
+                ready: false,
+                reason,
+                needs_restart: false,
+            };
         }
         let leader = &epoch.leader;
         if let Some(timeout) = timeout {
@@ -81,8 +96,16 @@ impl Readiness {
                 return not(format!("no round of {leader} for {} s", age.as_secs()));
             }
         }
-        let reason = if leadership.is_leading() { "leading".into() } else { format!("following {leader}") };
-        Self { ready: true, reason, needs_restart: false }
+        let reason = if leadership.is_leading() {
+            "leading".into()
+        } else {
+            format!("following {leader}")
+        };
+        Self {
+            ready: true,
+            reason,
+            needs_restart: false,
+        }
     }
 }
 
@@ -94,9 +117,19 @@ mod tests {
 
     const TIMEOUT: Option<Duration> = Some(Duration::from_secs(2));
 
-    fn reason(leadership: &Leadership, round: Option<(u64, u64)>, broker_works: bool) -> (bool, String) {
+    fn reason(
+        leadership: &Leadership,
+        round: Option<(u64, u64)>,
+        broker_works: bool,
+    ) -> (bool, String) {
         let round = round.map(|(term, at_s)| (epoch(term), Timestamp(at_s * 1_000_000)));
-        let readiness = Readiness::judge(leadership, round.as_ref(), broker_works, TIMEOUT, Timestamp(10_000_000));
+        let readiness = Readiness::judge(
+            leadership,
+            round.as_ref(),
+            broker_works,
+            TIMEOUT,
+            Timestamp(10_000_000),
+        );
         (readiness.ready, readiness.reason)
     }
 
@@ -114,48 +147,113 @@ mod tests {
             is_deserted: false,
             is_yielding: false,
         };
-        let (seeking, following, leading) = (at(Position::Seeking), at(Position::Following), at(Position::Leading));
-        assert_eq!(reason(&seeking, Some((4, 9)), true), (false, "no leader known".into()));
-        assert_eq!(reason(&following, None, false), (false, "no round of edge yet".into()));
-        assert_eq!(reason(&following, Some((3, 9)), false), (false, "no round of edge yet".into()));
-        assert_eq!(reason(&following, Some((4, 5)), false), (false, "no round of edge for 5 s".into()));
-        assert_eq!(reason(&following, Some((4, 9)), false), (true, "following edge".into()));
-        assert_eq!(reason(&leading, Some((4, 9)), true), (true, "leading".into()));
-        assert_eq!(reason(&leading, Some((4, 9)), false), (false, "leading without a working broker".into()));
+        let (seeking, following, leading) = (
+            at(Position::Seeking),
+            at(Position::Following),
+            at(Position::Leading),
+        );
+        assert_eq!(
+            reason(&seeking, Some((4, 9)), true),
+            (false, "no leader known".into())
+        );
+        assert_eq!(
+            reason(&following, None, false),
+            (false, "no round of edge yet".into())
+        );
+        assert_eq!(
+            reason(&following, Some((3, 9)), false),
+            (false, "no round of edge yet".into())
+        );
+        assert_eq!(
+            reason(&following, Some((4, 5)), false),
+            (false, "no round of edge for 5 s".into())
+        );
+        assert_eq!(
+            reason(&following, Some((4, 9)), false),
+            (true, "following edge".into())
+        );
+        assert_eq!(
+            reason(&leading, Some((4, 9)), true),
+            (true, "leading".into())
+        );
+        assert_eq!(
+            reason(&leading, Some((4, 9)), false),
+            (false, "leading without a working broker".into())
+        );
     }
 
     #[test]
     fn a_leader_that_lets_nobody_in_is_not_ready_and_is_not_restarted_for_it() {
-        let leading = Leadership { position: Position::Leading, epoch: Some(epoch(4)), ..Leadership::default() };
-        let deserted = Leadership { is_deserted: true, ..leading };
-        let readiness = Readiness::judge(&deserted, Some(&(epoch(4), Timestamp(0))), true, None, Timestamp(0));
-        assert_eq!(readiness.reason, "leading, but no follower can log in at this node's broker");
+        let leading = Leadership {
+            position: Position::Leading,
+            epoch: Some(epoch(4)),
+            ..Leadership::default()
+        };
+        let deserted = Leadership {
+            is_deserted: true,
+            ..leading
+        };
+        let readiness = Readiness::judge(
+            &deserted,
+            Some(&(epoch(4), Timestamp(0))),
+            true,
+            None,
+            Timestamp(0),
+        );
+        assert_eq!(
+            readiness.reason,
+            "leading, but no follower can log in at this node's broker"
+        );
         assert_eq!((readiness.ready, readiness.needs_restart), (false, false));
     }
 
     #[test]
     fn a_problem_of_settings_is_told_first_and_restarts_nothing() {
-        let following = Leadership { position: Position::Following, epoch: Some(epoch(4)), ..Leadership::default() };
+        let following = Leadership {
+            position: Position::Following,
+            epoch: Some(epoch(4)),
+            ..Leadership::default()
+        };
         let judge = |problem: Option<&str>, last_round: Option<&(Epoch, Timestamp)>| {
             let judged = Readiness::judge(&following, last_round, false, TIMEOUT, Timestamp(0));
-            let Readiness { ready, reason, needs_restart } = judged.unless(problem.map(Into::into));
+            let Readiness {
+                ready,
+                reason,
+                needs_restart,
+            } = judged.unless(problem.map(Into::into));
             (ready, reason, needs_restart)
         };
         let fresh = (epoch(4), Timestamp(0));
-        assert_eq!(judge(None, Some(&fresh)), (true, "following edge".into(), false));
-        assert_eq!(judge(Some("no origin"), Some(&fresh)), (false, "no origin".into(), false));
-        assert_eq!(judge(Some("no origin"), None), (false, "no origin".into(), true), "rounds are missing, too");
+        assert_eq!(
+            judge(None, Some(&fresh)),
+            (true, "following edge".into(), false)
+        );
+        assert_eq!(
+            judge(Some("no origin"), Some(&fresh)),
+            (false, "no origin".into(), false)
+        );
+        assert_eq!(
+            judge(Some("no origin"), None),
+            (false, "no origin".into(), true),
+            "rounds are missing, too"
+        );
     }
 
     #[test]
     fn a_cause_is_told_where_a_node_is_not_ready() {
         let told = |leadership: &Leadership| {
             let judged = Readiness::judge(leadership, None, false, None, Timestamp(0));
-            judged.because(Some("heard cell lot-1 with another key from 10.0.0.7")).reason
+            judged
+                .because(Some("heard cell lot-1 with another key from 10.0.0.7"))
+                .reason
         };
         let alone = "no leader known: heard cell lot-1 with another key from 10.0.0.7";
         assert_eq!(told(&Leadership::default()), alone);
-        let following = Leadership { position: Position::Following, epoch: Some(epoch(4)), ..Leadership::default() };
+        let following = Leadership {
+            position: Position::Following,
+            epoch: Some(epoch(4)),
+            ..Leadership::default()
+        };
         assert_eq!(told(&following), "following edge");
     }
 

@@ -19,16 +19,28 @@ pub struct Rights {
 /// operator's.
 impl From<Role> for Rights {
     fn from(role: Role) -> Self {
-        Self { role, priority: ElectionConfig::default().priority, may_describe: false }
+        Self {
+            role,
+            priority: ElectionConfig::default().priority,
+            may_describe: false,
+        }
     }
 }
 
 impl Rights {
     /// The rights of all nodes in a cell without certificates: a node is what it declares.
-    pub const ALL: Self = Self { role: Role::Edge, priority: u8::MAX, may_describe: true };
+    pub const ALL: Self = Self {
+        role: Role::Edge,
+        priority: u8::MAX,
+        may_describe: true,
+    };
 
     /// The rights of a node that never leads.
-    pub const NONE: Self = Self { role: Role::Cav, priority: 0, may_describe: false };
+    pub const NONE: Self = Self {
+        role: Role::Cav,
+        priority: 0,
+        may_describe: false,
+    };
 
     /// True if a node may lead at all.
     pub fn may_lead(self) -> bool {
@@ -38,7 +50,10 @@ impl Rights {
     /// The same rights for an operator's node.
     #[must_use]
     pub fn of_operator(self) -> Self {
-        Self { may_describe: true, ..self }
+        Self {
+            may_describe: true,
+            ..self
+        }
     }
 
     /// True if a node may declare this role and priority. A priority says nothing about a node that never leads.
@@ -48,7 +63,11 @@ impl Rights {
 
     /// The lower of two roles.
     pub fn limit_role(self, role: Role) -> Role {
-        if rank(role) <= rank(self.role) { role } else { self.role }
+        if rank(role) <= rank(self.role) {
+            role
+        } else {
+            self.role
+        }
     }
 
     /// The message with role and priority lowered to these rights. `None` if only a node that may lead may send it.
@@ -85,8 +104,13 @@ mod tests {
 
     #[test]
     fn nobody_may_declare_more_than_the_certificate_says() {
-        let auto = Rights { priority: 100, ..Rights::from(Role::Auto) };
-        assert!(auto.allow(Role::Auto, 100) && auto.allow(Role::Auto, 7) && auto.allow(Role::Cav, 255));
+        let auto = Rights {
+            priority: 100,
+            ..Rights::from(Role::Auto)
+        };
+        assert!(
+            auto.allow(Role::Auto, 100) && auto.allow(Role::Auto, 7) && auto.allow(Role::Cav, 255)
+        );
         assert!(!auto.allow(Role::Auto, 101) && !auto.allow(Role::Edge, 100));
         assert!(Rights::ALL.allow(Role::Edge, 255) && !Rights::NONE.allow(Role::Auto, 0));
         assert_eq!(auto.limit_role(Role::Edge), Role::Auto);

@@ -124,7 +124,8 @@ impl RoundFilter {
     ) -> Result<AcceptedRound, Refusal> {
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
         self.check_origin(&epoch, origin)?;
-        self.maps.admit(&epoch, map.round, received_at, leadership)?;
+        self.maps
+            .admit(&epoch, map.round, received_at, leadership)?;
         check_age(&mut self.map_age, &epoch, map.fused_at_us, received_at)?;
         self.note_origin(&epoch, origin);
         self.map_accepted_at = Some(received_at);
@@ -144,10 +145,18 @@ impl RoundFilter {
     ) -> Result<AcceptedRound, Refusal> {
         let epoch = Epoch::new(verdicts.epoch, verdicts.aggregator.clone());
         self.check_origin(&epoch, origin)?;
-        self.verdicts.admit(&epoch, verdicts.round, received_at, leadership)?;
-        check_age(&mut self.verdict_age, &epoch, verdicts.fused_at_us, received_at)?;
+        self.verdicts
+            .admit(&epoch, verdicts.round, received_at, leadership)?;
+        check_age(
+            &mut self.verdict_age,
+            &epoch,
+            verdicts.fused_at_us,
+            received_at,
+        )?;
         self.note_origin(&epoch, origin);
-        let is_sign_of_life = self.map_accepted_at.is_none_or(|at| received_at.since(at) >= EPOCH_MEMORY);
+        let is_sign_of_life = self
+            .map_accepted_at
+            .is_none_or(|at| received_at.since(at) >= EPOCH_MEMORY);
         Ok(accepted(epoch, verdicts.round, is_sign_of_life, leadership))
     }
 
@@ -162,16 +171,24 @@ impl RoundFilter {
         received_at: Timestamp,
         leadership: &Leadership,
     ) -> Result<AcceptedRound, Refusal> {
-        let epoch = Epoch::new(reputations.epoch, reputations.aggregator.clone().unwrap_or(UNNAMED));
+        let epoch = Epoch::new(
+            reputations.epoch,
+            reputations.aggregator.clone().unwrap_or(UNNAMED),
+        );
         self.check_origin(&epoch, origin)?;
-        self.reputations.admit(&epoch, reputations.round, received_at, leadership)?;
+        self.reputations
+            .admit(&epoch, reputations.round, received_at, leadership)?;
         self.note_origin(&epoch, origin);
         Ok(accepted(epoch, reputations.round, false, leadership))
     }
 
     fn check_origin(&self, epoch: &Epoch, origin: Origin) -> Result<(), Refusal> {
         let is_doubtful = origin == Origin::Claimed && self.proven.as_ref() == Some(epoch);
-        if is_doubtful { Err(Refusal::Unproven) } else { Ok(()) }
+        if is_doubtful {
+            Err(Refusal::Unproven)
+        } else {
+            Ok(())
+        }
     }
 
     fn note_origin(&mut self, epoch: &Epoch, origin: Origin) {
@@ -193,11 +210,25 @@ fn check_age(
     fused_at: Timestamp,
     received_at: Timestamp,
 ) -> Result<(), Refusal> {
-    if filter.is_fresh(epoch, fused_at, received_at) { Ok(()) } else { Err(Refusal::Stale) }
+    if filter.is_fresh(epoch, fused_at, received_at) {
+        Ok(())
+    } else {
+        Err(Refusal::Stale)
+    }
 }
 
-fn accepted(epoch: Epoch, round: u64, is_sign_of_life: bool, leadership: &Leadership) -> AcceptedRound {
-    AcceptedRound { is_known_term: leadership.knows_term(epoch.term), epoch, round, is_sign_of_life }
+fn accepted(
+    epoch: Epoch,
+    round: u64,
+    is_sign_of_life: bool,
+    leadership: &Leadership,
+) -> AcceptedRound {
+    AcceptedRound {
+        is_known_term: leadership.knows_term(epoch.term),
+        epoch,
+        round,
+        is_sign_of_life,
+    }
 }
 
 /// Aggregator of reputations that name none; it sorts before all others.
@@ -214,26 +245,48 @@ mod tests {
     }
 
     fn seeking() -> Leadership {
-        Leadership { term: 7, ..Leadership::default() }
+        Leadership {
+            term: 7,
+            ..Leadership::default()
+        }
     }
 
     fn following(term: u64, leader: &'static str) -> Leadership {
         let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
-        Leadership { position: Position::Following, epoch, standby: None, term, is_deserted: false, is_yielding: false }
+        Leadership {
+            position: Position::Following,
+            epoch,
+            standby: None,
+            term,
+            is_deserted: false,
+            is_yielding: false,
+        }
     }
 
     fn map(epoch: u64, round: u64, fused_at: Timestamp) -> GlobalMap {
-        GlobalMap::new(&Epoch::new(epoch, NodeName::from_static("edge")), round, fused_at)
+        GlobalMap::new(
+            &Epoch::new(epoch, NodeName::from_static("edge")),
+            round,
+            fused_at,
+        )
     }
 
-    fn take(filter: &mut RoundFilter, map: &GlobalMap, at: Timestamp, leadership: &Leadership) -> Result<(), Refusal> {
-        filter.accept_map(map, Origin::Claimed, at, leadership).map(|_| ())
+    fn take(
+        filter: &mut RoundFilter,
+        map: &GlobalMap,
+        at: Timestamp,
+        leadership: &Leadership,
+    ) -> Result<(), Refusal> {
+        filter
+            .accept_map(map, Origin::Claimed, at, leadership)
+            .map(|_| ())
     }
 
     #[test]
     fn a_huge_epoch_silences_the_others_for_a_moment_only() {
         let (mut filter, seeking) = (RoundFilter::new(0, ms(0)), seeking());
-        let mut take = |epoch, round, at| take(&mut filter, &map(epoch, round, ms(at)), ms(at), &seeking);
+        let mut take =
+            |epoch, round, at| take(&mut filter, &map(epoch, round, ms(at)), ms(at), &seeking);
         assert_eq!(take(u64::MAX, 1, 0), Err(Refusal::NotElected));
         assert_eq!(take(u64::MAX, 2, 500), Ok(()), "it goes on and on");
         assert_eq!(take(7, 1, 1000), Err(Refusal::Superseded));
@@ -247,14 +300,20 @@ mod tests {
         let (mut filter, seeking) = (RoundFilter::new(0, ms(0)), seeking());
         let at = |round: u64| ms(100 * round);
         for round in 0..10 {
-            assert_eq!(take(&mut filter, &map(7, round, at(round)), at(round), &seeking), Ok(()));
+            assert_eq!(
+                take(&mut filter, &map(7, round, at(round)), at(round), &seeking),
+                Ok(())
+            );
         }
         let resumed = at(40);
         for round in 10..31 {
             let waited = take(&mut filter, &map(7, round, at(round)), resumed, &seeking);
             assert_eq!(waited, Err(Refusal::Stale), "round {round}");
         }
-        assert_eq!(take(&mut filter, &map(7, 31, at(31)), resumed, &seeking), Ok(()));
+        assert_eq!(
+            take(&mut filter, &map(7, 31, at(31)), resumed, &seeking),
+            Ok(())
+        );
     }
 
     #[test]
@@ -262,16 +321,31 @@ mod tests {
         let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "edge"));
         let at = |round: u64| ms(100 * round);
         for round in 0..10 {
-            assert_eq!(take(&mut filter, &map(8, round, at(round)), at(round), &leadership), Ok(()));
+            assert_eq!(
+                take(
+                    &mut filter,
+                    &map(8, round, at(round)),
+                    at(round),
+                    &leadership
+                ),
+                Ok(())
+            );
         }
         let resumed = at(40);
-        assert_eq!(take(&mut filter, &map(7, 99, at(10)), resumed, &leadership), Err(Refusal::Superseded));
-        assert_eq!(take(&mut filter, &map(8, 10, at(10)), resumed, &leadership), Err(Refusal::Stale));
+        assert_eq!(
+            take(&mut filter, &map(7, 99, at(10)), resumed, &leadership),
+            Err(Refusal::Superseded)
+        );
+        assert_eq!(
+            take(&mut filter, &map(8, 10, at(10)), resumed, &leadership),
+            Err(Refusal::Stale)
+        );
     }
 
     #[test]
     fn each_topic_goes_by_its_own_order_and_reputations_may_come_without_a_name() {
-        let (mut filter, seeking, now) = (RoundFilter::new(0, Timestamp(1)), seeking(), Timestamp(1));
+        let (mut filter, seeking, now) =
+            (RoundFilter::new(0, Timestamp(1)), seeking(), Timestamp(1));
         let reputations = |epoch, round, aggregator: Option<&'static str>| Reputations {
             schema: SCHEMA_VERSION,
             aggregator: aggregator.map(NodeName::from_static),
@@ -279,18 +353,42 @@ mod tests {
             round,
             reputations: Default::default(),
         };
-        assert!(filter.accept_map(&map(7, 9, now), Origin::Claimed, now, &seeking).is_ok());
-        assert!(filter.accept_reputations(&reputations(7, 1, None), Origin::Claimed, now, &seeking).is_ok());
-        assert!(filter.accept_reputations(&reputations(7, 1, Some("edge")), Origin::Claimed, now, &seeking).is_ok());
-        let late = filter.accept_reputations(&reputations(7, 2, None), Origin::Claimed, now, &seeking);
+        assert!(
+            filter
+                .accept_map(&map(7, 9, now), Origin::Claimed, now, &seeking)
+                .is_ok()
+        );
+        assert!(
+            filter
+                .accept_reputations(&reputations(7, 1, None), Origin::Claimed, now, &seeking)
+                .is_ok()
+        );
+        assert!(
+            filter
+                .accept_reputations(
+                    &reputations(7, 1, Some("edge")),
+                    Origin::Claimed,
+                    now,
+                    &seeking
+                )
+                .is_ok()
+        );
+        let late =
+            filter.accept_reputations(&reputations(7, 2, None), Origin::Claimed, now, &seeking);
         assert_eq!(late, Err(Refusal::Superseded));
     }
 
     #[test]
     fn a_deposed_leader_is_refused_even_when_nobody_else_is_heard() {
         let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "euclid"));
-        assert_eq!(take(&mut filter, &map(8, 1, ms(0)), ms(0), &leadership), Ok(()));
-        assert_eq!(take(&mut filter, &map(7, 99, ms(9000)), ms(9000), &leadership), Err(Refusal::Superseded));
+        assert_eq!(
+            take(&mut filter, &map(8, 1, ms(0)), ms(0), &leadership),
+            Ok(())
+        );
+        assert_eq!(
+            take(&mut filter, &map(7, 99, ms(9000)), ms(9000), &leadership),
+            Err(Refusal::Superseded)
+        );
     }
 
     #[test]
@@ -306,22 +404,44 @@ mod tests {
         };
         let is_sign = |round: u64, filter: &mut RoundFilter| {
             filter
-                .accept_verdicts(&verdicts(round), Origin::Claimed, ms(100 * round), &leadership)
+                .accept_verdicts(
+                    &verdicts(round),
+                    Origin::Claimed,
+                    ms(100 * round),
+                    &leadership,
+                )
                 .unwrap()
                 .is_sign_of_life
         };
         assert!(is_sign(1, &mut filter));
-        assert!(filter.accept_map(&map(8, 2, ms(200)), Origin::Claimed, ms(200), &leadership).unwrap().is_sign_of_life);
+        assert!(
+            filter
+                .accept_map(&map(8, 2, ms(200)), Origin::Claimed, ms(200), &leadership)
+                .unwrap()
+                .is_sign_of_life
+        );
         assert!(!is_sign(2, &mut filter));
-        assert!((3..40).any(|round| is_sign(round, &mut filter)), "maps come no more");
+        assert!(
+            (3..40).any(|round| is_sign(round, &mut filter)),
+            "maps come no more"
+        );
     }
 
     #[test]
     fn a_term_that_no_election_knows_is_accepted_and_not_gone_on_from() {
         let mut filter = RoundFilter::new(0, ms(0));
-        let next = filter.accept_map(&map(8, 1, ms(0)), Origin::Claimed, ms(0), &seeking()).unwrap();
+        let next = filter
+            .accept_map(&map(8, 1, ms(0)), Origin::Claimed, ms(0), &seeking())
+            .unwrap();
         assert!(!next.is_known_term);
-        let known = filter.accept_map(&map(8, 2, ms(100)), Origin::Claimed, ms(100), &following(8, "edge")).unwrap();
+        let known = filter
+            .accept_map(
+                &map(8, 2, ms(100)),
+                Origin::Claimed,
+                ms(100),
+                &following(8, "edge"),
+            )
+            .unwrap();
         assert!(known.is_known_term);
     }
 
@@ -330,12 +450,29 @@ mod tests {
         let (mut filter, leadership) = (RoundFilter::new(0, ms(0)), following(8, "edge"));
         let mut take = |epoch, round: u64, origin, leadership: &Leadership| {
             let at = ms(100 * round);
-            filter.accept_map(&map(epoch, round, at), origin, at, leadership).map(|_| ())
+            filter
+                .accept_map(&map(epoch, round, at), origin, at, leadership)
+                .map(|_| ())
         };
-        assert_eq!(take(8, 1, Origin::Claimed, &leadership), Ok(()), "nothing is known of it");
+        assert_eq!(
+            take(8, 1, Origin::Claimed, &leadership),
+            Ok(()),
+            "nothing is known of it"
+        );
         assert_eq!(take(8, 2, Origin::Proven, &leadership), Ok(()));
-        assert_eq!(take(8, 3, Origin::Claimed, &leadership), Err(Refusal::Unproven));
-        assert_eq!(take(8, 3, Origin::Proven, &leadership), Ok(()), "the refused one leaves no trace");
-        assert_eq!(take(9, 4, Origin::Claimed, &following(9, "edge")), Ok(()), "the next may not be able to");
+        assert_eq!(
+            take(8, 3, Origin::Claimed, &leadership),
+            Err(Refusal::Unproven)
+        );
+        assert_eq!(
+            take(8, 3, Origin::Proven, &leadership),
+            Ok(()),
+            "the refused one leaves no trace"
+        );
+        assert_eq!(
+            take(9, 4, Origin::Claimed, &following(9, "edge")),
+            Ok(()),
+            "the next may not be able to"
+        );
     }
 }

@@ -224,7 +224,11 @@ impl ElectionConfig {
 
     /// Time between two offers of the lead; after the last round between two messages that yield it, a quarter.
     pub(crate) fn handover_retry(&self, has_yielded: bool) -> Duration {
-        if has_yielded { self.beat() / 4 } else { self.beat() }
+        if has_yielded {
+            self.beat() / 4
+        } else {
+            self.beat()
+        }
     }
 
     /// Time after which a leader yields although it publishes no rounds.
@@ -265,49 +269,163 @@ mod tests {
         let round = Duration::from_secs_f64(RoundConfig::default().period_s);
         let stall = Duration::from_millis(config.stall_ms);
         for (smaller, larger, why) in [
-            (config.standby_silence(), ELECTED_SILENCE, "a new leader's first round is accepted"),
-            (config.answer_time() + config.ask_period(), config.response_timeout(), "a lost answer is repeated"),
-            (config.standby_silence(), config.given_up_timeout(), "beats weigh more than the membership"),
-            (config.given_up_timeout(), config.response_timeout(), "a given up node is not waited for"),
-            (config.answer_time(), config.ask_period(), "answers come before the next question"),
-            (config.near_beat(), config.response_timeout(), "second successors hear of changes"),
-            (config.idle_beat() * 2, config.contact_timeout(), "one lost beat is no lost contact"),
+            (
+                config.standby_silence(),
+                ELECTED_SILENCE,
+                "a new leader's first round is accepted",
+            ),
+            (
+                config.answer_time() + config.ask_period(),
+                config.response_timeout(),
+                "a lost answer is repeated",
+            ),
+            (
+                config.standby_silence(),
+                config.given_up_timeout(),
+                "beats weigh more than the membership",
+            ),
+            (
+                config.given_up_timeout(),
+                config.response_timeout(),
+                "a given up node is not waited for",
+            ),
+            (
+                config.answer_time(),
+                config.ask_period(),
+                "answers come before the next question",
+            ),
+            (
+                config.near_beat(),
+                config.response_timeout(),
+                "second successors hear of changes",
+            ),
+            (
+                config.idle_beat() * 2,
+                config.contact_timeout(),
+                "one lost beat is no lost contact",
+            ),
             (overdue(round), missing(round), "doubt before loss"),
             (2 * round, ELECTED_SILENCE, "one late round is no silence"),
-            (ELECTED_SILENCE, SUCCESSOR_CREDIT, "word of the election comes in time"),
+            (
+                ELECTED_SILENCE,
+                SUCCESSOR_CREDIT,
+                "word of the election comes in time",
+            ),
             (SUCCESSOR_CREDIT, EPOCH_MEMORY, "forged epochs end"),
-            (EPOCH_MEMORY, LEADER_DELAY_MEMORY, "a leader that comes back is known"),
+            (
+                EPOCH_MEMORY,
+                LEADER_DELAY_MEMORY,
+                "a leader that comes back is known",
+            ),
             (MAX_ROUND_AGE, EPOCH_MEMORY, "no queued round returns"),
             (MAX_ROUND_WAIT, MAX_ROUND_AGE, "the way takes the rest"),
-            (SUCCESSOR_CREDIT, MAX_ROUND_WAIT, "a failover makes no round stale"),
+            (
+                SUCCESSOR_CREDIT,
+                MAX_ROUND_WAIT,
+                "a failover makes no round stale",
+            ),
             (round, LIVE_STREAM_TIME, "two rounds prove a live stream"),
-            (MAX_ROUND_AGE, FAREWELL_TIME + Duration::from_nanos(1), "brokers pass on what receivers accept"),
+            (
+                MAX_ROUND_AGE,
+                FAREWELL_TIME + Duration::from_nanos(1),
+                "brokers pass on what receivers accept",
+            ),
             (FAREWELL_TIME, LINK_LINGER, "the last round finds a link"),
-            (2 * HEALTH_PERIOD, PART_TIMEOUT, "two looks see a part's end"),
+            (
+                2 * HEALTH_PERIOD,
+                PART_TIMEOUT,
+                "two looks see a part's end",
+            ),
             (HEALTH_PERIOD, LOOK_TOLERANCE, "a late look is still time"),
-            (ANSWER_STEP * ANSWER_STEPS as u32, PART_TIMEOUT, "a hung part shows before its rounds do"),
+            (
+                ANSWER_STEP * ANSWER_STEPS as u32,
+                PART_TIMEOUT,
+                "a hung part shows before its rounds do",
+            ),
             (ECHO_TIMEOUT, PART_TIMEOUT, "a missing echo shows first"),
-            (HEALTH_PERIOD, ANSWER_STEP * READINESS_STEPS as u32, "a page waits for two looks"),
-            (MIN_UNANSWERED * round, ECHO_TIMEOUT, "both conditions hold at once"),
-            (CONNECT_TIME, VEHICLE_CONNECT_TIME, "a planned handover waits for everybody"),
-            (VEHICLE_CONNECT_TIME, LEDGER_TIMEOUT, "evidence has more time than links"),
-            (LOGIN_TIMEOUT + HEALTH_PERIOD, config.stable(), "nobody is handed a lead in vain"),
-            (LEDGER_TIMEOUT, config.handover(), "a lost ledger ends no handover"),
-            (PREPARATION_STEP, VEHICLE_CONNECT_TIME, "checks delay a handover by little"),
+            (
+                HEALTH_PERIOD,
+                ANSWER_STEP * READINESS_STEPS as u32,
+                "a page waits for two looks",
+            ),
+            (
+                MIN_UNANSWERED * round,
+                ECHO_TIMEOUT,
+                "both conditions hold at once",
+            ),
+            (
+                CONNECT_TIME,
+                VEHICLE_CONNECT_TIME,
+                "a planned handover waits for everybody",
+            ),
+            (
+                VEHICLE_CONNECT_TIME,
+                LEDGER_TIMEOUT,
+                "evidence has more time than links",
+            ),
+            (
+                LOGIN_TIMEOUT + HEALTH_PERIOD,
+                config.stable(),
+                "nobody is handed a lead in vain",
+            ),
+            (
+                LEDGER_TIMEOUT,
+                config.handover(),
+                "a lost ledger ends no handover",
+            ),
+            (
+                PREPARATION_STEP,
+                VEHICLE_CONNECT_TIME,
+                "checks delay a handover by little",
+            ),
             (LATE_WAKE, stall, "messages are read before the clock stops"),
             (DRAIN_TIME, LATE_WAKE, "the delay is no late timer"),
-            (REDISCOVERY_TIME, DEPARTED_TIME, "a broker's end is understood"),
-            (config.response_timeout(), REDISCOVERY_TIME, "a restarted membership costs no leader"),
-            (DISK_TIMEOUT, config.handover(), "a hung disk ends no handover"),
-            (config.handover(), LAST_WORD_TIME, "the last evidence counts after a handover"),
-            (RENEWAL_PAUSE + 2 * config.idle_beat(), EVIDENCE_TRIAL, "a false claimant's evidence goes no further"),
-            (config.response_timeout(), RENEWAL_PAUSE, "a renewal is heard by all before the next"),
-            (FULL_RESYNC_PAUSE, Duration::from_secs(10), "a new leader is told before the next snapshot"),
+            (
+                REDISCOVERY_TIME,
+                DEPARTED_TIME,
+                "a broker's end is understood",
+            ),
+            (
+                config.response_timeout(),
+                REDISCOVERY_TIME,
+                "a restarted membership costs no leader",
+            ),
+            (
+                DISK_TIMEOUT,
+                config.handover(),
+                "a hung disk ends no handover",
+            ),
+            (
+                config.handover(),
+                LAST_WORD_TIME,
+                "the last evidence counts after a handover",
+            ),
+            (
+                RENEWAL_PAUSE + 2 * config.idle_beat(),
+                EVIDENCE_TRIAL,
+                "a false claimant's evidence goes no further",
+            ),
+            (
+                config.response_timeout(),
+                RENEWAL_PAUSE,
+                "a renewal is heard by all before the next",
+            ),
+            (
+                FULL_RESYNC_PAUSE,
+                Duration::from_secs(10),
+                "a new leader is told before the next snapshot",
+            ),
         ] {
-            assert!(smaller < larger, "{why}: {smaller:?} is not below {larger:?}");
+            assert!(
+                smaller < larger,
+                "{why}: {smaller:?} is not below {larger:?}"
+            );
         }
         assert_eq!(SUCCESSOR_CREDIT, 2 * ELECTED_SILENCE);
         assert_eq!(MAX_ADOPTED_MAP_AGE, MAX_ROUND_AGE);
-        assert!(config.stable() > config.response_timeout(), "a candidate's trial outlasts a restart");
+        assert!(
+            config.stable() > config.response_timeout(),
+            "a candidate's trial outlasts a restart"
+        );
     }
 }

@@ -64,7 +64,9 @@ impl Leadership {
 
     /// The epoch followed or led now; none while the node seeks.
     pub fn present_epoch(&self) -> Option<&Epoch> {
-        self.epoch.as_ref().filter(|_| self.position != Position::Seeking)
+        self.epoch
+            .as_ref()
+            .filter(|_| self.position != Position::Seeking)
     }
 
     /// True if this node leads.

@@ -22,7 +22,12 @@ impl BoundingBox {
     /// The smallest box around the points.
     pub fn around(points: &[Point2<f64>]) -> Self {
         points.iter().fold(
-            Self { x_min: f64::INFINITY, y_min: f64::INFINITY, x_max: f64::NEG_INFINITY, y_max: f64::NEG_INFINITY },
+            Self {
+                x_min: f64::INFINITY,
+                y_min: f64::INFINITY,
+                x_max: f64::NEG_INFINITY,
+                y_max: f64::NEG_INFINITY,
+            },
             |b, p| Self {
                 x_min: b.x_min.min(p.x),
                 y_min: b.y_min.min(p.y),
@@ -44,7 +49,10 @@ impl BoundingBox {
 
     /// Middle of the box in pixels.
     pub fn center(&self) -> Point2<f64> {
-        Point2::new((self.x_min + self.x_max) / 2.0, (self.y_min + self.y_max) / 2.0)
+        Point2::new(
+            (self.x_min + self.x_max) / 2.0,
+            (self.y_min + self.y_max) / 2.0,
+        )
     }
 
     /// True if all edges are finite and the box has an area.
@@ -84,16 +92,27 @@ pub struct Detection {
 /// # Errors
 /// A description of the first flaw.
 pub fn parse_detections(line: &str) -> Result<Vec<Detection>, String> {
-    let detections: Vec<Detection> = serde_json::from_str(line).map_err(|error| error.to_string())?;
-    for Detection { label, confidence, bounding_box, .. } in &detections {
+    let detections: Vec<Detection> =
+        serde_json::from_str(line).map_err(|error| error.to_string())?;
+    for Detection {
+        label,
+        confidence,
+        bounding_box,
+        ..
+    } in &detections
+    {
         if !bounding_box.is_valid() {
             return Err(format!("the box of {label:?} has no area"));
         }
         if !is_label(label) {
-            return Err(format!("the label {label:?} must be a text of 1 to {MAX_NAME_BYTES} bytes"));
+            return Err(format!(
+                "the label {label:?} must be a text of 1 to {MAX_NAME_BYTES} bytes"
+            ));
         }
         if !(0.0..=1.0).contains(confidence) {
-            return Err(format!("the confidence of {label:?} is {confidence}, must be 0 to 1"));
+            return Err(format!(
+                "the confidence of {label:?} is {confidence}, must be 0 to 1"
+            ));
         }
     }
     Ok(detections)

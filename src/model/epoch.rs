@@ -12,7 +12,20 @@ use serde::{Deserialize, Serialize};
 use crate::model::names::NodeName;
 
 /// One leadership: ordered by term, then by the leader's name; no two leaderships share one.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(
+    Debug,
+    Clone,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Hash,
+    Serialize,
+    Deserialize,
+    Encode,
+    Decode,
+    JsonSchema,
+)]
 pub struct Epoch {
     /// Counts up with every leadership that a component of the network has seen; the `epoch` of maps and verdicts.
     #[n(0)]

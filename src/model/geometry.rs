@@ -16,26 +16,39 @@ pub struct Pose {
 impl Pose {
     /// A pose from metres and radians.
     pub fn new(x_m: f64, y_m: f64, heading_rad: f64) -> Self {
-        Self { position: Point2::new(x_m, y_m), heading_rad }
+        Self {
+            position: Point2::new(x_m, y_m),
+            heading_rad,
+        }
     }
 
     /// The world position of a point `forward_m` ahead of and `left_m` left of this pose.
     pub fn transform(&self, forward_m: f64, left_m: f64) -> Point2<f64> {
         let (sin, cos) = self.heading_rad.sin_cos();
-        self.position + Vector2::new(cos * forward_m - sin * left_m, sin * forward_m + cos * left_m)
+        self.position
+            + Vector2::new(
+                cos * forward_m - sin * left_m,
+                sin * forward_m + cos * left_m,
+            )
     }
 
     /// Metres ahead and to the left of this pose of a world point: the inverse of [`Self::transform`].
     pub fn ahead_left(&self, point: &Point2<f64>) -> Vector2<f64> {
         let (sin, cos) = self.heading_rad.sin_cos();
         let offset = point - self.position;
-        Vector2::new(cos * offset.x + sin * offset.y, cos * offset.y - sin * offset.x)
+        Vector2::new(
+            cos * offset.x + sin * offset.y,
+            cos * offset.y - sin * offset.x,
+        )
     }
 
     /// Range in metres and bearing in radians, wrapped to (-π, π] and relative to the heading, of a world point.
     pub fn range_bearing(&self, point: &Point2<f64>) -> (f64, f64) {
         let offset = point - self.position;
-        (offset.norm(), wrap_angle(offset.y.atan2(offset.x) - self.heading_rad))
+        (
+            offset.norm(),
+            wrap_angle(offset.y.atan2(offset.x) - self.heading_rad),
+        )
     }
 }
 
@@ -62,7 +75,11 @@ pub struct Covariance {
 impl Covariance {
     /// The same variance in every direction.
     pub fn isotropic(sigma_m: f64) -> Self {
-        Self { xx: sigma_m * sigma_m, xy: 0.0, yy: sigma_m * sigma_m }
+        Self {
+            xx: sigma_m * sigma_m,
+            xy: 0.0,
+            yy: sigma_m * sigma_m,
+        }
     }
 
     /// Independent errors along and across a line of sight whose world direction is `bearing_rad`.
@@ -93,7 +110,8 @@ impl Covariance {
         let floor = floor_m * floor_m;
         let (xx, yy) = (self.xx + floor, self.yy + floor);
         let determinant = xx * yy - self.xy * self.xy;
-        (yy * offset.x * offset.x - 2.0 * self.xy * offset.x * offset.y + xx * offset.y * offset.y) / determinant
+        (yy * offset.x * offset.x - 2.0 * self.xy * offset.x * offset.y + xx * offset.y * offset.y)
+            / determinant
     }
 }
 
@@ -115,7 +133,11 @@ impl std::ops::Add for Covariance {
     type Output = Self;
 
     fn add(self, other: Self) -> Self {
-        Self { xx: self.xx + other.xx, xy: self.xy + other.xy, yy: self.yy + other.yy }
+        Self {
+            xx: self.xx + other.xx,
+            xy: self.xy + other.xy,
+            yy: self.yy + other.yy,
+        }
     }
 }
 
@@ -125,7 +147,10 @@ mod tests {
 
     #[test]
     fn wraps_across_north_and_the_cut() {
-        assert!((wrap_angle(359f64.to_radians() - 1f64.to_radians()) - (-2f64).to_radians()).abs() < 1e-12);
+        assert!(
+            (wrap_angle(359f64.to_radians() - 1f64.to_radians()) - (-2f64).to_radians()).abs()
+                < 1e-12
+        );
         assert_eq!(wrap_angle(PI), PI);
         assert_eq!(wrap_angle(-PI), PI);
     }
@@ -141,19 +166,46 @@ mod tests {
     fn rounding_makes_no_covariance_invalid_and_more_than_rounding_does() {
         for step in 1..1000 {
             let (xx, yy) = (1e-6 * f64::from(step), 0.003 * f64::from(step) / 7.0);
-            let of = |correlation: f64| Covariance { xx, xy: correlation * (xx * yy).sqrt(), yy };
+            let of = |correlation: f64| Covariance {
+                xx,
+                xy: correlation * (xx * yy).sqrt(),
+                yy,
+            };
             assert!(of(1.0).is_valid() && of(-1.0).is_valid(), "{:?}", of(1.0));
             assert!(!of(1.0001).is_valid());
         }
-        assert!(Covariance { xx: 0.0, xy: 0.0, yy: 1.0 }.is_valid());
-        assert!(!Covariance { xx: 0.0, xy: 1e-9, yy: 1.0 }.is_valid());
-        assert!(!Covariance { xx: 1.0, xy: f64::NAN, yy: 1.0 }.is_valid());
+        assert!(
+            Covariance {
+                xx: 0.0,
+                xy: 0.0,
+                yy: 1.0
+            }
+            .is_valid()
+        );
+        assert!(
+            !Covariance {
+                xx: 0.0,
+                xy: 1e-9,
+                yy: 1.0
+            }
+            .is_valid()
+        );
+        assert!(
+            !Covariance {
+                xx: 1.0,
+                xy: f64::NAN,
+                yy: 1.0
+            }
+            .is_valid()
+        );
     }
 
     #[test]
     fn ahead_and_left_are_as_the_pose_has_them() {
         let pose = Pose::new(3.0, -1.0, 2.0);
-        assert!((pose.ahead_left(&pose.transform(4.0, -0.5)) - Vector2::new(4.0, -0.5)).norm() < 1e-12);
+        assert!(
+            (pose.ahead_left(&pose.transform(4.0, -0.5)) - Vector2::new(4.0, -0.5)).norm() < 1e-12
+        );
     }
 
     #[test]

@@ -39,10 +39,16 @@ impl NodeName {
     /// When the name is not allowed.
     pub const fn from_static(name: &'static str) -> Self {
         let bytes = name.as_bytes();
-        assert!(!bytes.is_empty() && bytes.len() <= MAX_NAME_BYTES, "a name has 1 to 64 bytes");
+        assert!(
+            !bytes.is_empty() && bytes.len() <= MAX_NAME_BYTES,
+            "a name has 1 to 64 bytes"
+        );
         let mut at = 0;
         while at < bytes.len() {
-            assert!(is_allowed(bytes[at]), "a name has only A-Z, a-z, 0-9, _ and -");
+            assert!(
+                is_allowed(bytes[at]),
+                "a name has only A-Z, a-z, 0-9, _ and -"
+            );
             at += 1;
         }
         Self(SmolStr::new_static(name))
@@ -123,7 +129,13 @@ pub fn is_plain_text(text: &str) -> bool {
 
 /// A text as [`is_plain_text`] wants it, of at most so many bytes: control characters become spaces.
 pub fn plain_text(text: &str, max_bytes: usize) -> String {
-    let plain = |c: char| if c.is_control() || is_layout_control(c) { ' ' } else { c };
+    let plain = |c: char| {
+        if c.is_control() || is_layout_control(c) {
+            ' '
+        } else {
+            c
+        }
+    };
     let mut kept = String::new();
     for c in text.chars().map(plain) {
         if kept.len() + c.len_utf8() > max_bytes {
@@ -159,7 +171,14 @@ mod tests {
         for good in ["car", "ABCD 123", "véhicule", "می\u{200C}خواهم", "車"] {
             assert!(is_label(good), "{good}");
         }
-        for bad in ["", "car\n", "car\u{202E}rac", "\u{2066}car", "car\u{2028}van", &"x".repeat(65)] {
+        for bad in [
+            "",
+            "car\n",
+            "car\u{202E}rac",
+            "\u{2066}car",
+            "car\u{2028}van",
+            &"x".repeat(65),
+        ] {
             assert!(!is_label(bad), "{}", bad.escape_unicode());
         }
     }

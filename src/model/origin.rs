@@ -136,9 +136,20 @@ impl GeographicOrigin {
         let (sin, cos) = self.rotation_deg.to_radians().sin_cos();
         let (east, north) = (x_m * cos - y_m * sin, x_m * sin + y_m * cos);
         let (latitude, longitude) = self.radians();
-        let (latitude, longitude, height_m) =
-            enu2geodetic(east, north, z_m, latitude, longitude, self.height_m, Ellipsoid::WGS84);
-        GeographicPosition { latitude_deg: latitude.to_degrees(), longitude_deg: longitude.to_degrees(), height_m }
+        let (latitude, longitude, height_m) = enu2geodetic(
+            east,
+            north,
+            z_m,
+            latitude,
+            longitude,
+            self.height_m,
+            Ellipsoid::WGS84,
+        );
+        GeographicPosition {
+            latitude_deg: latitude.to_degrees(),
+            longitude_deg: longitude.to_degrees(),
+            height_m,
+        }
     }
 
     /// The position in the frame, and its height above the tangent plane, of a position on Earth.
@@ -163,24 +174,45 @@ impl GeographicOrigin {
     /// # Errors
     /// [`PoseError::TooFar`] at more than 100 km from the origin.
     pub fn pose_to_map(&self, pose: &GeographicPose) -> Result<Pose, PoseError> {
-        let GeographicPose { latitude_deg, longitude_deg, height_m, azimuth_deg } = *pose;
+        let GeographicPose {
+            latitude_deg,
+            longitude_deg,
+            height_m,
+            azimuth_deg,
+        } = *pose;
         let height_m = height_m.unwrap_or(self.height_m);
-        let position = self.to_map(&GeographicPosition { latitude_deg, longitude_deg, height_m });
+        let position = self.to_map(&GeographicPosition {
+            latitude_deg,
+            longitude_deg,
+            height_m,
+        });
         let distance_m = position.coords.norm();
         if distance_m > MAX_DISTANCE_M {
             return Err(PoseError::TooFar { distance_m });
         }
         let (sin, cos) = azimuth_deg.to_radians().sin_cos();
-        let (u, v, w) = enu2uvw(sin, cos, 0.0, latitude_deg.to_radians(), longitude_deg.to_radians());
+        let (u, v, w) = enu2uvw(
+            sin,
+            cos,
+            0.0,
+            latitude_deg.to_radians(),
+            longitude_deg.to_radians(),
+        );
         let (latitude, longitude) = self.radians();
         let (east, north, _) = uvw2enu(u, v, w, latitude, longitude);
         let heading_rad = wrap_angle(north.atan2(east) - self.rotation_deg.to_radians());
-        Ok(Pose { position: position.xy(), heading_rad })
+        Ok(Pose {
+            position: position.xy(),
+            heading_rad,
+        })
     }
 
     /// Latitude and longitude in radians.
     fn radians(&self) -> (f64, f64) {
-        (self.latitude_deg.to_radians(), self.longitude_deg.to_radians())
+        (
+            self.latitude_deg.to_radians(),
+            self.longitude_deg.to_radians(),
+        )
     }
 }
 

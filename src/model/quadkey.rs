@@ -35,19 +35,39 @@ impl Quadkey {
     /// The tile with this number of digits, 30 at most, in which a position is.
     pub fn of(position: &GeographicPosition, digits: u8) -> Self {
         let digits = digits.min(MAX_DIGITS as u8);
-        let sin = position.latitude_deg.clamp(-MAX_LATITUDE_DEG, MAX_LATITUDE_DEG).to_radians().sin();
+        let sin = position
+            .latitude_deg
+            .clamp(-MAX_LATITUDE_DEG, MAX_LATITUDE_DEG)
+            .to_radians()
+            .sin();
         let east = (position.longitude_deg + 180.0).rem_euclid(360.0) / 360.0;
         let south = 0.5 - ((1.0 + sin) / (1.0 - sin)).ln() / (4.0 * PI);
         let tiles = f64::from(1_u32 << digits);
         // `as` saturates, so that the edges of the map stay in it.
         let index = |share: f64| ((share * tiles) as u32).min((1 << digits) - 1);
-        Self { digits, x: index(east), y: index(south) }
+        Self {
+            digits,
+            x: index(east),
+            y: index(south),
+        }
     }
 
     /// The tile of the cell with this origin, of [`CELL_TILE_DIGITS`].
     pub fn of_cell(origin: &GeographicOrigin) -> Self {
-        let GeographicOrigin { latitude_deg, longitude_deg, height_m, .. } = *origin;
-        Self::of(&GeographicPosition { latitude_deg, longitude_deg, height_m }, CELL_TILE_DIGITS)
+        let GeographicOrigin {
+            latitude_deg,
+            longitude_deg,
+            height_m,
+            ..
+        } = *origin;
+        Self::of(
+            &GeographicPosition {
+                latitude_deg,
+                longitude_deg,
+                height_m,
+            },
+            CELL_TILE_DIGITS,
+        )
     }
 
     /// This tile and those that touch it: nine, or fewer at the ends of the map in the north and south.
@@ -56,10 +76,16 @@ impl Quadkey {
         let at = |dx: i64, dy: i64| {
             let y = i64::from(self.y) + dy;
             let x = (i64::from(self.x) + dx).rem_euclid(tiles);
-            (0..tiles).contains(&y).then_some(Self { digits: self.digits, x: x as u32, y: y as u32 })
+            (0..tiles).contains(&y).then_some(Self {
+                digits: self.digits,
+                x: x as u32,
+                y: y as u32,
+            })
         };
-        let mut tiles: Vec<_> =
-            (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| (dx, dy))).filter_map(|(dx, dy)| at(dx, dy)).collect();
+        let mut tiles: Vec<_> = (-1..=1)
+            .flat_map(|dy| (-1..=1).map(move |dx| (dx, dy)))
+            .filter_map(|(dx, dy)| at(dx, dy))
+            .collect();
         tiles.sort_unstable();
         tiles.dedup();
         tiles
@@ -74,7 +100,11 @@ impl Quadkey {
     #[must_use]
     pub fn outer(self, digits: u8) -> Self {
         let fewer = self.digits.saturating_sub(digits);
-        Self { digits: self.digits - fewer, x: self.x >> fewer, y: self.y >> fewer }
+        Self {
+            digits: self.digits - fewer,
+            x: self.x >> fewer,
+            y: self.y >> fewer,
+        }
     }
 
     /// True if another tile is this one or in it.
@@ -138,17 +168,31 @@ mod tests {
     use super::*;
 
     fn at(latitude_deg: f64, longitude_deg: f64) -> GeographicPosition {
-        GeographicPosition { latitude_deg, longitude_deg, height_m: 0.0 }
+        GeographicPosition {
+            latitude_deg,
+            longitude_deg,
+            height_m: 0.0,
+        }
     }
 
     #[test]
     fn keys_are_those_of_the_tile_system() {
         // Microsoft's example: tile (3, 5) of level 3 has the key 213.
-        let tile = Quadkey { digits: 3, x: 3, y: 5 };
-        assert_eq!((tile.to_string(), tile.levels()), ("213".to_owned(), "2/1/3".to_owned()));
+        let tile = Quadkey {
+            digits: 3,
+            x: 3,
+            y: 5,
+        };
+        assert_eq!(
+            (tile.to_string(), tile.levels()),
+            ("213".to_owned(), "2/1/3".to_owned())
+        );
         assert_eq!("213".parse(), Ok(tile));
         // The Eiffel Tower, by mercantile 1.2.1.
-        assert_eq!(Quadkey::of(&at(48.8584, 2.2945), CELL_TILE_DIGITS).to_string(), "120220011012000");
+        assert_eq!(
+            Quadkey::of(&at(48.8584, 2.2945), CELL_TILE_DIGITS).to_string(),
+            "120220011012000"
+        );
         for stranger in ["4", "21x", "0123012301230123012301230123012"] {
             assert!(stranger.parse::<Quadkey>().is_err(), "{stranger}");
         }
@@ -156,25 +200,50 @@ mod tests {
 
     #[test]
     fn a_tile_contains_its_quarters_and_nothing_beside_it() {
-        let [outer, inner, beside] = ["213", "21302", "2120"].map(|key| key.parse::<Quadkey>().unwrap());
-        assert!(outer.contains(outer) && outer.contains(inner) && Quadkey::default().contains(outer));
+        let [outer, inner, beside] =
+            ["213", "21302", "2120"].map(|key| key.parse::<Quadkey>().unwrap());
+        assert!(
+            outer.contains(outer) && outer.contains(inner) && Quadkey::default().contains(outer)
+        );
         assert!(!outer.contains(beside) && !inner.contains(outer));
         assert_eq!((inner.outer(3), inner.outer(9)), (outer, inner));
-        assert!(outer.quarters().iter().all(|quarter| outer.contains(*quarter) && quarter.digits() == 4));
+        assert!(
+            outer
+                .quarters()
+                .iter()
+                .all(|quarter| outer.contains(*quarter) && quarter.digits() == 4)
+        );
     }
 
     #[test]
     fn a_place_is_within_the_corners_of_its_tile_and_near_its_neighbours() {
-        for (latitude, longitude) in [(48.85, 2.29), (-33.9, 151.2), (0.0, -180.0), (-89.0, 179.999), (84.9, 0.1)] {
+        for (latitude, longitude) in [
+            (48.85, 2.29),
+            (-33.9, 151.2),
+            (0.0, -180.0),
+            (-89.0, 179.999),
+            (84.9, 0.1),
+        ] {
             let tile = Quadkey::of(&at(latitude, longitude), CELL_TILE_DIGITS);
             let [[north, west], [south, east]] = tile.corners_deg();
             let latitude = f64::clamp(latitude, -MAX_LATITUDE_DEG, MAX_LATITUDE_DEG);
-            assert!((south - 1e-9..=north + 1e-9).contains(&latitude), "{south} {latitude} {north}");
+            assert!(
+                (south - 1e-9..=north + 1e-9).contains(&latitude),
+                "{south} {latitude} {north}"
+            );
             assert!((west..=east).contains(&longitude));
             let around = tile.with_neighbours();
             assert!(around.contains(&tile) && around.len() >= 6, "{around:?}");
-            assert!(around.iter().all(|near| near.to_string().parse() == Ok(*near)));
+            assert!(
+                around
+                    .iter()
+                    .all(|near| near.to_string().parse() == Ok(*near))
+            );
         }
-        assert_eq!(Quadkey::of(&at(0.0, 179.999), 15).with_neighbours().len(), 9, "across the date line");
+        assert_eq!(
+            Quadkey::of(&at(0.0, 179.999), 15).with_neighbours().len(),
+            9,
+            "across the date line"
+        );
     }
 }

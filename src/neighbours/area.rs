@@ -26,7 +26,10 @@ impl CoveredArea {
             (north_deg - south_deg) / 2.0 + cover_deg,
             (east_deg - west_deg) / 2.0 + cover_deg / middle_deg[0].to_radians().cos(),
         ];
-        Self { middle_deg, half_deg }
+        Self {
+            middle_deg,
+            half_deg,
+        }
     }
 
     /// True if a cell of the tile may tell of a place.

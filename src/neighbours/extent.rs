@@ -30,8 +30,14 @@ impl Extent {
             (self.previous, self.current, self.span_start) = (self.current.take(), None, now);
         }
         for place in places {
-            let known = self.current.unwrap_or(Rectangle { least: place, greatest: place });
-            self.current = Some(Rectangle { least: known.least.inf(&place), greatest: known.greatest.sup(&place) });
+            let known = self.current.unwrap_or(Rectangle {
+                least: place,
+                greatest: place,
+            });
+            self.current = Some(Rectangle {
+                least: known.least.inf(&place),
+                greatest: known.greatest.sup(&place),
+            });
         }
     }
 
@@ -39,14 +45,18 @@ impl Extent {
     pub(super) fn distance_m(&self, place: &Point2<f64>) -> f64 {
         let parts = [self.current, self.previous];
         let distances = parts.iter().flatten().map(|part| part.distance_m(place));
-        distances.min_by(f64::total_cmp).unwrap_or(place.coords.norm())
+        distances
+            .min_by(f64::total_cmp)
+            .unwrap_or(place.coords.norm())
     }
 }
 
 impl Rectangle {
     fn distance_m(&self, place: &Point2<f64>) -> f64 {
-        let nearest =
-            Point2::new(place.x.clamp(self.least.x, self.greatest.x), place.y.clamp(self.least.y, self.greatest.y));
+        let nearest = Point2::new(
+            place.x.clamp(self.least.x, self.greatest.x),
+            place.y.clamp(self.least.y, self.greatest.y),
+        );
         (place - nearest).norm()
     }
 }

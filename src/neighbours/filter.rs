@@ -81,7 +81,12 @@ struct DelayEstimate {
 impl CellMapFilter {
     /// A filter for so many cells at most.
     pub fn new(max_cells: usize) -> Self {
-        Self { max_cells, backlog: Duration::ZERO, looked_at: Timestamp::default(), cells: BTreeMap::new() }
+        Self {
+            max_cells,
+            backlog: Duration::ZERO,
+            looked_at: Timestamp::default(),
+            cells: BTreeMap::new(),
+        }
     }
 
     /// Admits a map that came on `topic` and was read at `received_at` by this node's steady clock.
@@ -94,10 +99,17 @@ impl CellMapFilter {
         message: &CellMap,
         received_at: Timestamp,
     ) -> Result<AdmittedMap, RejectReason> {
-        let CellMap { cell, sent_at_us, origin, map, .. } = message;
+        let CellMap {
+            cell,
+            sent_at_us,
+            origin,
+            map,
+            ..
+        } = message;
         // A cell is in one tile, and its broker lets it write there only.
-        let is_own =
-            topic.cell == *cell && topic.tile == Quadkey::of_cell(origin) && topic.kind == RegionTopicKind::Map;
+        let is_own = topic.cell == *cell
+            && topic.tile == Quadkey::of_cell(origin)
+            && topic.kind == RegionTopicKind::Map;
         if !is_own {
             return Err(RejectReason::NodeMismatch);
         }
@@ -123,25 +135,43 @@ impl CellMapFilter {
             order.by_sender = DelayEstimate::new(received_at);
         }
         (order.epoch, order.round, order.received_at) = (epoch, map.round, received_at);
-        let ages = [(&mut order.by_sender, *sent_at_us), (&mut order.by_cell, map.fused_at_us)]
-            .map(|(delay, stamp)| delay.observe(received_at.micros_from(stamp), received_at));
+        let ages = [
+            (&mut order.by_sender, *sent_at_us),
+            (&mut order.by_cell, map.fused_at_us),
+        ]
+        .map(|(delay, stamp)| delay.observe(received_at.micros_from(stamp), received_at));
         let backlog = self.backlog.min(order.lag());
-        let age = ages.into_iter().flatten().min().ok_or(RejectReason::Stale)? + backlog;
-        if age > MAX_AGE { Err(RejectReason::Stale) } else { Ok(AdmittedMap { age }) }
+        let age = ages
+            .into_iter()
+            .flatten()
+            .min()
+            .ok_or(RejectReason::Stale)?
+            + backlog;
+        if age > MAX_AGE {
+            Err(RejectReason::Stale)
+        } else {
+            Ok(AdmittedMap { age })
+        }
     }
 
     /// The delay beyond that of the last minutes that three quarters of the cells share.
     fn find_backlog(&self, now: Timestamp) -> Duration {
-        let heard = self.cells.values().filter(|order| now.since(order.received_at) <= MAX_AGE);
+        let heard = self
+            .cells
+            .values()
+            .filter(|order| now.since(order.received_at) <= MAX_AGE);
         let mut lags: Vec<_> = heard.map(CellOrder::lag).collect();
         lags.sort_unstable();
-        let common = lags.get(lags.len() / 4).filter(|_| lags.len() >= MIN_BACKLOG_CELLS);
+        let common = lags
+            .get(lags.len() / 4)
+            .filter(|_| lags.len() >= MIN_BACKLOG_CELLS);
         common.copied().unwrap_or_default()
     }
 
     /// Forgets cells that have been silent for a minute.
     pub fn forget_silent(&mut self, now: Timestamp) {
-        self.cells.retain(|_, order| now.since(order.received_at) <= FORGOTTEN_AFTER);
+        self.cells
+            .retain(|_, order| now.since(order.received_at) <= FORGOTTEN_AFTER);
     }
 
     /// True if a map of the cell came lately.
@@ -154,20 +184,35 @@ impl CellOrder {
     fn new(epoch: Epoch, now: Timestamp) -> Self {
         let (by_sender, by_cell) = (DelayEstimate::new(now), DelayEstimate::new(now));
         // Rounds begin with 1.
-        Self { epoch, round: 0, by_sender, by_cell, received_at: now }
+        Self {
+            epoch,
+            round: 0,
+            by_sender,
+            by_cell,
+            received_at: now,
+        }
     }
 
     /// The least delay of late beyond that of the last minutes, by the clock that makes it shorter; none for jitter.
     fn lag(&self) -> Duration {
         let lag_us = self.by_sender.lag_us().min(self.by_cell.lag_us());
-        Duration::from_micros(if lag_us > JITTER_US { lag_us.unsigned_abs() } else { 0 })
+        Duration::from_micros(if lag_us > JITTER_US {
+            lag_us.unsigned_abs()
+        } else {
+            0
+        })
     }
 }
 
 impl DelayEstimate {
     fn new(now: Timestamp) -> Self {
         let least_long = MinimumDelay::over(BACKLOG_SPAN, now);
-        Self { least: MinimumDelay::new(now), least_long, usual_us: i64::MAX, since: now }
+        Self {
+            least: MinimumDelay::new(now),
+            least_long,
+            usual_us: i64::MAX,
+            since: now,
+        }
     }
 
     /// Takes a delay; returns what it is beyond the least one, if that is known.
@@ -180,7 +225,8 @@ impl DelayEstimate {
         }
         self.usual_us = self.usual_us.max(least_us);
         let beyond_us = delay_us.saturating_sub(least_us);
-        (now.since(self.since) >= SETTLES_AFTER).then(|| Duration::from_micros(beyond_us.unsigned_abs()))
+        (now.since(self.since) >= SETTLES_AFTER)
+            .then(|| Duration::from_micros(beyond_us.unsigned_abs()))
     }
 
     /// The least delay of late beyond that of the last minutes, in microseconds.

@@ -19,16 +19,28 @@ impl FrameChange {
         // The angle is the same for all of the frame to 1 µrad within a kilometre.
         let place = |x_m| own.to_map(&from.to_wgs84(x_m, 0.0, 0.0)).xy();
         let east = place(100.0) - place(0.0);
-        Self { own: *own, rotation: Rotation2::new(east.y.atan2(east.x)) }
+        Self {
+            own: *own,
+            rotation: Rotation2::new(east.y.atan2(east.x)),
+        }
     }
 
     /// Puts an object of the neighbour, which is at `place`, into this cell's frame.
     pub(super) fn apply(&self, place: &GeographicPosition, object: &mut FusedObject) {
         let position: Point2<f64> = self.own.to_map(place).xy();
         (object.x_m, object.y_m) = (position.x, position.y);
-        object.velocity_mps = object.velocity_mps.map(|velocity| (self.rotation * Vector2::from(velocity)).into());
-        object.heading_rad = object.heading_rad.map(|heading_rad| wrap_angle(heading_rad + self.rotation.angle()));
+        object.velocity_mps = object
+            .velocity_mps
+            .map(|velocity| (self.rotation * Vector2::from(velocity)).into());
+        object.heading_rad = object
+            .heading_rad
+            .map(|heading_rad| wrap_angle(heading_rad + self.rotation.angle()));
         let turned = self.rotation * object.covariance().matrix() * self.rotation.inverse();
-        object.covariance_m2 = Covariance { xx: turned.m11, xy: turned.m12, yy: turned.m22 }.into();
+        object.covariance_m2 = Covariance {
+            xx: turned.m11,
+            xy: turned.m12,
+            yy: turned.m22,
+        }
+        .into();
     }
 }

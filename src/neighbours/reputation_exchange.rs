@@ -111,7 +111,10 @@ impl KnownVehicle {
     fn wanted(&self) -> CellCounts {
         let mut wanted = self.heard;
         let own = self.own.unwrap_or_default();
-        wanted.merge(self.missed_reset.map_or(own, |missed| missed.region.plus(own.since(missed.own))));
+        wanted.merge(
+            self.missed_reset
+                .map_or(own, |missed| missed.region.plus(own.since(missed.own))),
+        );
         wanted
     }
 
@@ -122,7 +125,10 @@ impl KnownVehicle {
         if own.reset_at >= self.heard.reset_at.max(noted_at.unwrap_or_default()) {
             self.missed_reset = None;
         } else if noted_at.is_none_or(|at| at < self.heard.reset_at) {
-            self.missed_reset = Some(MissedReset { own, region: self.heard });
+            self.missed_reset = Some(MissedReset {
+                own,
+                region: self.heard,
+            });
         }
     }
 
@@ -133,7 +139,9 @@ impl KnownVehicle {
 
     /// True if the region is to be asked whether it has kept what was sent.
     fn is_to_be_asked(&self, now: Timestamp) -> bool {
-        let is_due = self.sent_at.is_some_and(|at| now.since(at) >= ASK_AGAIN_AFTER);
+        let is_due = self
+            .sent_at
+            .is_some_and(|at| now.since(at) >= ASK_AGAIN_AFTER);
         !self.is_present && !self.is_kept && is_due && self.is_told()
     }
 
@@ -156,12 +164,18 @@ impl KnownVehicle {
 
     /// True if the region lacks something, and it is known what it has.
     fn may_be_told(&self, now: Timestamp) -> bool {
-        let has_listened = self.filter.is_some_and(|(_, since)| self.has_heard || now.since(since) >= LISTEN_TIME);
+        let has_listened = self
+            .filter
+            .is_some_and(|(_, since)| self.has_heard || now.since(since) >= LISTEN_TIME);
         has_listened && !self.is_told()
     }
 
     fn wanted_filter(&self) -> VehicleFilter {
-        if self.is_present { VehicleFilter::AllCells } else { VehicleFilter::OwnCell }
+        if self.is_present {
+            VehicleFilter::AllCells
+        } else {
+            VehicleFilter::OwnCell
+        }
     }
 }
 
@@ -169,7 +183,11 @@ impl VehicleFilter {
     fn text(self, vehicle: &NodeName, cell: &NodeName) -> String {
         match self {
             Self::AllCells => ReputationTopic::filter_of_vehicle(vehicle),
-            Self::OwnCell => ReputationTopic { vehicle: vehicle.clone(), cell: cell.clone() }.path(),
+            Self::OwnCell => ReputationTopic {
+                vehicle: vehicle.clone(),
+                cell: cell.clone(),
+            }
+            .path(),
         }
     }
 }
@@ -179,7 +197,14 @@ impl ReputationExchange {
     pub fn new(cell: NodeName) -> Self {
         let news_at = Some(Timestamp::default());
         let (vehicles, foreign) = (BTreeMap::new(), ForeignReputations::default());
-        Self { cell, vehicles, foreign, news_at, is_news: true, dropped: 0 }
+        Self {
+            cell,
+            vehicles,
+            foreign,
+            news_at,
+            is_news: true,
+            dropped: 0,
+        }
     }
 
     /// Takes the vehicles that are present. What other cells say of the rest is forgotten. The same ones again come from an
@@ -213,14 +238,26 @@ impl ReputationExchange {
     /// Begins a connection: nothing is subscribed, and the broker may have lost what it had.
     pub fn connect(&mut self) {
         for vehicle in self.vehicles.values_mut() {
-            let KnownVehicle { is_present, own, missed_reset, .. } = *vehicle;
-            *vehicle = KnownVehicle { is_present, own, missed_reset, ..KnownVehicle::default() };
+            let KnownVehicle {
+                is_present,
+                own,
+                missed_reset,
+                ..
+            } = *vehicle;
+            *vehicle = KnownVehicle {
+                is_present,
+                own,
+                missed_reset,
+                ..KnownVehicle::default()
+            };
         }
     }
 
     /// Takes a message of the region at `now`; true if it is news of another cell about a vehicle that is present.
     pub fn hear(&mut self, message: &CellReputation, now: Timestamp) -> bool {
-        let Some(vehicle) = self.vehicles.get_mut(&message.vehicle) else { return false };
+        let Some(vehicle) = self.vehicles.get_mut(&message.vehicle) else {
+            return false;
+        };
         let counts = CellCounts::from(message);
         if message.cell == self.cell {
             // A broker keeps the last message, which need not be the largest.
@@ -231,10 +268,17 @@ impl ReputationExchange {
             return false;
         }
         let is_first = !self.foreign.has(&message.cell, &message.vehicle);
-        let is_news = vehicle.is_present && self.foreign.merge(&message.cell, &message.vehicle, counts);
+        let is_news =
+            vehicle.is_present && self.foreign.merge(&message.cell, &message.vehicle, counts);
         if is_news {
             self.is_news = true;
-            self.look_at(now + if is_first { GATHER_TIME } else { FURTHER_GATHER_TIME });
+            self.look_at(
+                now + if is_first {
+                    GATHER_TIME
+                } else {
+                    FURTHER_GATHER_TIME
+                },
+            );
         }
         is_news
     }
@@ -249,7 +293,9 @@ impl ReputationExchange {
     pub fn take_news(&mut self, now: Timestamp) -> Option<ForeignReputations> {
         self.news_at.take_if(|at| *at <= now)?;
         let vehicles = &self.vehicles;
-        let is_judged = self.foreign.judge(|vehicle| Some(vehicles.get(vehicle)?.own?.remembered()));
+        let is_judged = self
+            .foreign
+            .judge(|vehicle| Some(vehicles.get(vehicle)?.own?.remembered()));
         let is_news = std::mem::take(&mut self.is_news) || is_judged;
         is_news.then(|| self.foreign.clone())
     }
@@ -264,7 +310,8 @@ impl ReputationExchange {
         let (mut ended, mut begun) = (Vec::new(), Vec::new());
         for (name, vehicle) in &mut self.vehicles {
             if vehicle.is_to_be_asked(now) {
-                (vehicle.filter, vehicle.has_heard, vehicle.told) = (None, false, CellCounts::default());
+                (vehicle.filter, vehicle.has_heard, vehicle.told) =
+                    (None, false, CellCounts::default());
                 vehicle.is_kept = true;
             }
             let wanted = (!vehicle.is_done()).then(|| vehicle.wanted_filter());
@@ -278,11 +325,18 @@ impl ReputationExchange {
         }
         steps.extend((!begun.is_empty()).then_some(ExchangeStep::Subscribe(begun)));
         steps.extend((!ended.is_empty()).then_some(ExchangeStep::Unsubscribe(ended)));
-        self.vehicles.retain(|_, vehicle| vehicle.filter.is_some() || !vehicle.is_done());
-        let due = self.vehicles.iter_mut().filter(|(_, vehicle)| vehicle.is_due(now)).take(max_messages);
+        self.vehicles
+            .retain(|_, vehicle| vehicle.filter.is_some() || !vehicle.is_done());
+        let due = self
+            .vehicles
+            .iter_mut()
+            .filter(|(_, vehicle)| vehicle.is_due(now))
+            .take(max_messages);
         for (name, vehicle) in due {
             vehicle.sent_at = Some(now);
-            steps.push(ExchangeStep::Publish(vehicle.wanted().message(self.cell.clone(), name.clone())));
+            steps.push(ExchangeStep::Publish(
+                vehicle.wanted().message(self.cell.clone(), name.clone()),
+            ));
         }
         steps
     }
@@ -296,8 +350,13 @@ impl ReputationExchange {
 
     /// All that the region does not have, for a leader that leaves.
     pub fn farewell(&self, now: Timestamp) -> Vec<CellReputation> {
-        let untold = self.vehicles.iter().filter(|(_, vehicle)| vehicle.may_be_told(now));
-        untold.map(|(name, vehicle)| vehicle.wanted().message(self.cell.clone(), name.clone())).collect()
+        let untold = self
+            .vehicles
+            .iter()
+            .filter(|(_, vehicle)| vehicle.may_be_told(now));
+        untold
+            .map(|(name, vehicle)| vehicle.wanted().message(self.cell.clone(), name.clone()))
+            .collect()
     }
 
     /// Number of vehicles of which the region was not told for want of room.
@@ -306,14 +365,22 @@ impl ReputationExchange {
     }
 
     fn make_room(&mut self) {
-        self.vehicles.retain(|_, vehicle| vehicle.filter.is_some() || !vehicle.is_done());
-        let waiting = self.vehicles.iter().filter(|(_, vehicle)| !vehicle.is_present);
-        let mut waiting: Vec<_> =
-            waiting.map(|(name, vehicle)| (vehicle.own.unwrap_or_default().all.total(), name.clone())).collect();
+        self.vehicles
+            .retain(|_, vehicle| vehicle.filter.is_some() || !vehicle.is_done());
+        let waiting = self
+            .vehicles
+            .iter()
+            .filter(|(_, vehicle)| !vehicle.is_present);
+        let mut waiting: Vec<_> = waiting
+            .map(|(name, vehicle)| (vehicle.own.unwrap_or_default().all.total(), name.clone()))
+            .collect();
         let excess = waiting.len().saturating_sub(MAX_WAITING);
         if excess > 0 {
             waiting.sort();
-            waiting.iter().take(excess).for_each(|(_, name)| _ = self.vehicles.remove(name));
+            waiting
+                .iter()
+                .take(excess)
+                .for_each(|(_, name)| _ = self.vehicles.remove(name));
             self.dropped += excess as u64;
         }
     }

@@ -13,8 +13,12 @@ use crate::wire::{RegionTopicKind, SCHEMA_VERSION};
 
 const START: Timestamp = Timestamp(1_800_000_000_000_000);
 
-const HOME: GeographicOrigin =
-    GeographicOrigin { latitude_deg: 48.137, longitude_deg: 11.575, height_m: 520.0, rotation_deg: 0.0 };
+const HOME: GeographicOrigin = GeographicOrigin {
+    latitude_deg: 48.137,
+    longitude_deg: 11.575,
+    height_m: 520.0,
+    rotation_deg: 0.0,
+};
 
 fn ms(ms: u64) -> Timestamp {
     START + Duration::from_millis(ms)
@@ -26,22 +30,51 @@ fn name(node: &str) -> NodeName {
 
 /// Origin of a cell so far east of home, whose axes are turned.
 fn beside(east_m: f64, rotation_deg: f64) -> GeographicOrigin {
-    let GeographicPosition { latitude_deg, longitude_deg, height_m } = HOME.to_wgs84(east_m, 0.0, 0.0);
-    GeographicOrigin { latitude_deg, longitude_deg, height_m, rotation_deg }
+    let GeographicPosition {
+        latitude_deg,
+        longitude_deg,
+        height_m,
+    } = HOME.to_wgs84(east_m, 0.0, 0.0);
+    GeographicOrigin {
+        latitude_deg,
+        longitude_deg,
+        height_m,
+        rotation_deg,
+    }
 }
 
 fn object(number: u128, x_m: f64, y_m: f64) -> FusedObject {
-    FusedObject::new(Uuid::from_u128(number), "car", 0.9, x_m, y_m, Covariance::isotropic(0.5))
+    FusedObject::new(
+        Uuid::from_u128(number),
+        "car",
+        0.9,
+        x_m,
+        y_m,
+        Covariance::isotropic(0.5),
+    )
 }
 
 /// A map of a cell 200 m to the east, fused and sent at `at` by its own clock.
 fn map(epoch: u64, leader: &str, round: u64, at: Timestamp, objects: Vec<FusedObject>) -> CellMap {
-    let map = GlobalMap { objects, ..GlobalMap::new(&Epoch::new(epoch, name(leader)), round, at) };
-    CellMap { schema: SCHEMA_VERSION, cell: name("east"), sent_at_us: at, origin: beside(200.0, 90.0), map }
+    let map = GlobalMap {
+        objects,
+        ..GlobalMap::new(&Epoch::new(epoch, name(leader)), round, at)
+    };
+    CellMap {
+        schema: SCHEMA_VERSION,
+        cell: name("east"),
+        sent_at_us: at,
+        origin: beside(200.0, 90.0),
+        map,
+    }
 }
 
 fn topic(cell: &str, origin: &GeographicOrigin) -> RegionTopic {
-    RegionTopic { tile: Quadkey::of_cell(origin), cell: name(cell), kind: RegionTopicKind::Map }
+    RegionTopic {
+        tile: Quadkey::of_cell(origin),
+        cell: name(cell),
+        kind: RegionTopicKind::Map,
+    }
 }
 
 fn east() -> RegionTopic {
@@ -51,7 +84,14 @@ fn east() -> RegionTopic {
 /// The neighbours of home, whose own map reaches 150 m to the east.
 fn home() -> Neighbours {
     let mut neighbours = Neighbours::new(name("home"), HOME);
-    let own = map(1, "edge", 1, ms(0), vec![object(1, 0.0, 0.0), object(2, 150.0, 0.0)]).map;
+    let own = map(
+        1,
+        "edge",
+        1,
+        ms(0),
+        vec![object(1, 0.0, 0.0), object(2, 150.0, 0.0)],
+    )
+    .map;
     neighbours.observe_own(&own, ms(0));
     neighbours
 }
@@ -59,7 +99,13 @@ fn home() -> Neighbours {
 /// Maps of one leader ten times a second from `from` to `to` that take 50 ms.
 fn live(neighbours: &mut Neighbours, from: u64, to: u64) {
     for round in from / 100..to / 100 {
-        let message = map(1, "a", round + 1, ms(100 * round), vec![object(7, 0.0, 0.0)]);
+        let message = map(
+            1,
+            "a",
+            round + 1,
+            ms(100 * round),
+            vec![object(7, 0.0, 0.0)],
+        );
         let _ = neighbours.accept(&east(), message, ms(100 * round + 50));
     }
 }
@@ -75,13 +121,25 @@ fn objects_are_where_they_are_on_earth() {
         first_seen_us: Some(ms(1000)),
         ..object(8, 30.0, 20.0)
     };
-    neighbours.accept(&east(), map(1, "a", 100, ms(2000), vec![theirs]), ms(2060)).unwrap();
+    neighbours
+        .accept(&east(), map(1, "a", 100, ms(2000), vec![theirs]), ms(2060))
+        .unwrap();
     let near = neighbours.near(ms(2160));
-    let NeighbourObject { cell, age_s, object } = &near[0];
+    let NeighbourObject {
+        cell,
+        age_s,
+        object,
+    } = &near[0];
     // Their x axis points north.
     let expected = HOME.to_map(&beside(200.0, 90.0).to_wgs84(30.0, 20.0, 0.0));
-    assert!((expected.x - 180.0).abs() < 0.01 && (expected.y - 30.0).abs() < 0.01, "{expected}");
-    assert!((object.x_m - expected.x).hypot(object.y_m - expected.y) < 1e-6, "{object:?}");
+    assert!(
+        (expected.x - 180.0).abs() < 0.01 && (expected.y - 30.0).abs() < 0.01,
+        "{expected}"
+    );
+    assert!(
+        (object.x_m - expected.x).hypot(object.y_m - expected.y) < 1e-6,
+        "{object:?}"
+    );
     let [east, north] = object.velocity_mps.unwrap();
     assert!(east.abs() < 0.01 && (north - 10.0).abs() < 0.01);
     assert!((object.heading_rad.unwrap() - std::f64::consts::FRAC_PI_2).abs() < 1e-3);
@@ -90,18 +148,39 @@ fn objects_are_where_they_are_on_earth() {
     assert_eq!((cell.as_str(), near.len()), ("east", 1));
     // 10 ms longer on its way than the fastest, and then 100 ms here.
     assert!((age_s - 0.11).abs() < 1e-6, "{age_s}");
-    assert_eq!(object.first_seen_us, Some(ms(1050)), "by this cell's clock, 50 ms after theirs");
+    assert_eq!(
+        object.first_seen_us,
+        Some(ms(1050)),
+        "by this cell's clock, 50 ms after theirs"
+    );
 }
 
 #[test]
 fn a_cell_tells_of_its_own_tile_and_what_is_near_it() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
-    let objects = vec![object(1, 0.0, 0.0), object(2, 0.0, 3000.0), object(3, 1e5, 1e5), object(4, 0.0, -150.0)];
-    neighbours.accept(&east(), map(1, "a", 100, ms(2000), objects), ms(2050)).unwrap();
-    let ids: Vec<u128> = neighbours.near(ms(2050)).iter().map(|near| near.object.id.as_u128()).collect();
+    let objects = vec![
+        object(1, 0.0, 0.0),
+        object(2, 0.0, 3000.0),
+        object(3, 1e5, 1e5),
+        object(4, 0.0, -150.0),
+    ];
+    neighbours
+        .accept(&east(), map(1, "a", 100, ms(2000), objects), ms(2050))
+        .unwrap();
+    let ids: Vec<u128> = neighbours
+        .near(ms(2050))
+        .iter()
+        .map(|near| near.object.id.as_u128())
+        .collect();
     assert_eq!(ids, [1], "the last one is true and too far away");
-    assert_eq!(neighbours.losses()[&name("east")], NeighbourLosses { outside: 2, refused: 0 });
+    assert_eq!(
+        neighbours.losses()[&name("east")],
+        NeighbourLosses {
+            outside: 2,
+            refused: 0
+        }
+    );
     let elsewhere = topic("east", &beside(20_000.0, 0.0));
     for wrong in [elsewhere, topic("west", &beside(200.0, 90.0))] {
         let taken = neighbours.accept(&wrong, map(1, "a", 101, ms(2100), Vec::new()), ms(2150));
@@ -115,13 +194,22 @@ fn more_objects_than_there_is_room_for_are_counted_and_the_nearest_stay() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     let crowd = (0..2000).map(|number| object(number, 0.0, -0.02 * number as f64));
-    neighbours.accept(&east(), map(1, "a", 100, ms(2000), crowd.collect()), ms(2050)).unwrap();
+    neighbours
+        .accept(
+            &east(),
+            map(1, "a", 100, ms(2000), crowd.collect()),
+            ms(2050),
+        )
+        .unwrap();
     let near = neighbours.near(ms(2050));
     assert_eq!(
         (near.len(), neighbours.losses()[&name("east")].refused),
         (MAX_OBJECTS_EACH, 2000 - MAX_OBJECTS_EACH as u64)
     );
-    assert!(near.iter().all(|near| near.object.id.as_u128() < MAX_OBJECTS_EACH as u128));
+    assert!(
+        near.iter()
+            .all(|near| near.object.id.as_u128() < MAX_OBJECTS_EACH as u128)
+    );
 }
 
 #[test]
@@ -143,11 +231,20 @@ fn maps_count_in_the_order_of_epoch_and_round() {
 fn a_jump_of_the_cells_time_costs_no_map() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
-    for (round, jump_us) in [(100, -60_000_000), (101, -60_000_000), (102, 60_000_000), (103, 0)] {
+    for (round, jump_us) in [
+        (100, -60_000_000),
+        (101, -60_000_000),
+        (102, 60_000_000),
+        (103, 0),
+    ] {
         let at = ms(100 * (round - 80));
         let mut message = map(1, "a", round, at, Vec::new());
         message.map.fused_at_us = at.shifted(jump_us);
-        assert_eq!(neighbours.accept(&east(), message, at + Duration::from_millis(50)), Ok(()), "{jump_us}");
+        assert_eq!(
+            neighbours.accept(&east(), message, at + Duration::from_millis(50)),
+            Ok(()),
+            "{jump_us}"
+        );
     }
 }
 
@@ -162,17 +259,34 @@ fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
         let mut taken = 0;
         for sent in (5000..65_000).step_by(100) {
             let (epoch, leader) = if sent < 35_000 { (1, "a") } else { (2, "b") };
-            let message = map(epoch, leader, sent / 100 + 1, ms(sent), vec![object(7, 0.0, 0.0)]);
+            let message = map(
+                epoch,
+                leader,
+                sent / 100 + 1,
+                ms(sent),
+                vec![object(7, 0.0, 0.0)],
+            );
             let received = ms(65_000 + (sent - 5000) / 30);
             let is_old = received.since(ms(sent)) > MAX_AGE + Duration::from_millis(50);
             let is_taken = neighbours.accept(&east(), message, received).is_ok();
             taken += u64::from(is_taken && is_old);
-            assert!(neighbours.near(received).iter().all(|near| near.age_s <= MAX_AGE.as_secs_f64()));
+            assert!(
+                neighbours
+                    .near(received)
+                    .iter()
+                    .all(|near| near.age_s <= MAX_AGE.as_secs_f64())
+            );
         }
         assert_eq!(taken, 0, "known before: {knows_before}");
         let mut live_again = None;
         for sent in (65_000..75_000).step_by(100) {
-            let message = map(2, "b", sent / 100 + 1, ms(sent + 2000), vec![object(7, 0.0, 0.0)]);
+            let message = map(
+                2,
+                "b",
+                sent / 100 + 1,
+                ms(sent + 2000),
+                vec![object(7, 0.0, 0.0)],
+            );
             if neighbours.accept(&east(), message, ms(sent + 2050)).is_ok() {
                 live_again.get_or_insert(sent - 65_000);
             }
@@ -186,16 +300,34 @@ fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
 fn late_for_long(cells: u64, late_ms: impl Fn(u64) -> u64) -> [Vec<usize>; 2] {
     let mut filter = CellMapFilter::new(16);
     let mut counted = [0, 1].map(|_| vec![0; cells as usize]);
-    let mut messages: Vec<_> =
-        (0..420_000).step_by(500).flat_map(|sent| (0..cells).map(move |cell| (sent, cell))).collect();
-    let received = |(sent, cell): (u64, u64)| sent + 20 + if sent < 40_000 { 0 } else { late_ms(cell) };
+    let mut messages: Vec<_> = (0..420_000)
+        .step_by(500)
+        .flat_map(|sent| (0..cells).map(move |cell| (sent, cell)))
+        .collect();
+    let received =
+        |(sent, cell): (u64, u64)| sent + 20 + if sent < 40_000 { 0 } else { late_ms(cell) };
     messages.sort_by_key(|message| received(*message));
     for (sent, cell) in messages {
         // Each clock is off by seconds of its own.
-        let message = map(1, "a", sent / 500 + 1, ms(sent).shifted(3_000_000 * cell as i64), Vec::new());
-        let message = CellMap { cell: name(&format!("cell-{cell}")), ..message };
+        let message = map(
+            1,
+            "a",
+            sent / 500 + 1,
+            ms(sent).shifted(3_000_000 * cell as i64),
+            Vec::new(),
+        );
+        let message = CellMap {
+            cell: name(&format!("cell-{cell}")),
+            ..message
+        };
         let at = received((sent, cell));
-        let is_admitted = filter.admit(&topic(message.cell.as_str(), &message.origin), &message, ms(at)).is_ok();
+        let is_admitted = filter
+            .admit(
+                &topic(message.cell.as_str(), &message.origin),
+                &message,
+                ms(at),
+            )
+            .is_ok();
         for (minute, counted) in [1, 6].into_iter().zip(&mut counted) {
             counted[cell as usize] += usize::from(is_admitted && sent / 60_000 == minute);
         }
@@ -208,10 +340,22 @@ fn a_backlog_of_nearly_all_cells_is_no_clock_for_some_minutes() {
     let [none, all] = [[0; 4], [120; 4]];
     assert_eq!(late_for_long(4, |_| 0), [all, all]);
     assert_eq!(late_for_long(4, |_| 2000), [none, all], "all are late");
-    assert_eq!(late_for_long(4, |_| 1000), [all, all], "younger than the limit");
+    assert_eq!(
+        late_for_long(4, |_| 1000),
+        [all, all],
+        "younger than the limit"
+    );
     let three = late_for_long(4, |cell| if cell < 3 { 2000 } else { 0 });
-    assert_eq!(three, [[0, 0, 0, 120], all], "a cell that is not late has no backlog");
-    assert_eq!(late_for_long(4, |cell| if cell < 2 { 2000 } else { 0 }), [all, all], "two may be clocks");
+    assert_eq!(
+        three,
+        [[0, 0, 0, 120], all],
+        "a cell that is not late has no backlog"
+    );
+    assert_eq!(
+        late_for_long(4, |cell| if cell < 2 { 2000 } else { 0 }),
+        [all, all],
+        "two may be clocks"
+    );
     assert_eq!(late_for_long(2, |_| 2000), [[120; 2], [120; 2]]);
 }
 
@@ -230,11 +374,21 @@ fn a_silent_cell_is_forgotten() {
 fn a_cell_beyond_the_bound_is_refused_until_another_is_silent() {
     let mut filter = CellMapFilter::new(1);
     let admit = |filter: &mut CellMapFilter, cell: &str, at: u64| {
-        let message = CellMap { cell: name(cell), ..map(1, "a", at + 1, ms(at), Vec::new()) };
+        let message = CellMap {
+            cell: name(cell),
+            ..map(1, "a", at + 1, ms(at), Vec::new())
+        };
         filter.admit(&topic(cell, &message.origin), &message, ms(at))
     };
-    assert_eq!(admit(&mut filter, "east", 0), Err(RejectReason::Stale), "its clock is unknown yet");
-    assert_eq!(admit(&mut filter, "west", 100), Err(RejectReason::TooManyCells));
+    assert_eq!(
+        admit(&mut filter, "east", 0),
+        Err(RejectReason::Stale),
+        "its clock is unknown yet"
+    );
+    assert_eq!(
+        admit(&mut filter, "west", 100),
+        Err(RejectReason::TooManyCells)
+    );
     assert_eq!(admit(&mut filter, "west", 61_000), Err(RejectReason::Stale));
 }
 
@@ -282,35 +436,75 @@ fn whatever_a_neighbour_tells_receivers_of_the_own_map_can_read_it() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
     let origin = beside(200.0, 45.0);
-    let scores = (0..100).map(|class| (format!("class {class}").into(), 0.01)).collect();
+    let scores = (0..100)
+        .map(|class| (format!("class {class}").into(), 0.01))
+        .collect();
     let mut objects = vec![
-        FusedObject { velocity_mps: Some([1e4, 1e4]), ..object(21, 0.0, 0.0) },
-        FusedObject { covariance_m2: [1e200, 0.0, 1e-200], ..object(22, 0.0, 0.0) },
-        FusedObject { first_seen_us: Some(Timestamp(crate::wire::MAX_INTEGER)), ..object(23, 0.0, 0.0) },
-        FusedObject { first_seen_us: Some(Timestamp(0)), scores, ..object(24, 0.0, 0.0) },
-        FusedObject { contributors: vec![name("zeno"); 10_000], ..object(25, 0.0, 0.0) },
+        FusedObject {
+            velocity_mps: Some([1e4, 1e4]),
+            ..object(21, 0.0, 0.0)
+        },
+        FusedObject {
+            covariance_m2: [1e200, 0.0, 1e-200],
+            ..object(22, 0.0, 0.0)
+        },
+        FusedObject {
+            first_seen_us: Some(Timestamp(crate::wire::MAX_INTEGER)),
+            ..object(23, 0.0, 0.0)
+        },
+        FusedObject {
+            first_seen_us: Some(Timestamp(0)),
+            scores,
+            ..object(24, 0.0, 0.0)
+        },
+        FusedObject {
+            contributors: vec![name("zeno"); 10_000],
+            ..object(25, 0.0, 0.0)
+        },
         object(25, 10.0, 0.0),
     ];
     objects.extend((100..1100).map(|number| object(number, 0.0, 0.0)));
-    let mut message = CellMap { origin, ..map(1, "a", 100, ms(2000), objects) };
+    let mut message = CellMap {
+        origin,
+        ..map(1, "a", 100, ms(2000), objects)
+    };
     message.map.fused_at_us = Timestamp(5);
-    neighbours.accept(&topic("east", &origin), message, ms(2060)).unwrap();
+    neighbours
+        .accept(&topic("east", &origin), message, ms(2060))
+        .unwrap();
     let near = neighbours.near(ms(2060));
     assert!(near.iter().all(|stated| stated.object.validate().is_ok() && stated.object.contributors.is_empty()));
     let seen = near.iter().filter_map(|stated| stated.object.first_seen_us);
-    assert!(seen.into_iter().all(|seen| ms(2060).since(seen) <= MAX_SEEN_FOR + MAX_AGE && seen <= ms(2060)));
+    assert!(
+        seen.into_iter()
+            .all(|seen| ms(2060).since(seen) <= MAX_SEEN_FOR + MAX_AGE && seen <= ms(2060))
+    );
     let ids: BTreeSet<_> = near.iter().map(|stated| stated.object.id).collect();
-    assert_eq!((near.len(), ids.len()), (MAX_OBJECTS_EACH, MAX_OBJECTS_EACH), "one cell leaves room for others");
+    assert_eq!(
+        (near.len(), ids.len()),
+        (MAX_OBJECTS_EACH, MAX_OBJECTS_EACH),
+        "one cell leaves room for others"
+    );
 }
 
 #[test]
 fn a_forged_epoch_shuts_a_lone_neighbour_out_for_a_minute_only() {
     let mut neighbours = home();
     live(&mut neighbours, 0, 2000);
-    neighbours.accept(&east(), map(u64::MAX >> 11, "a", 1, ms(2000), Vec::new()), ms(2050)).ok();
+    neighbours
+        .accept(
+            &east(),
+            map(u64::MAX >> 11, "a", 1, ms(2000), Vec::new()),
+            ms(2050),
+        )
+        .ok();
     let mut accept = |round: u64| {
         let at = 2000 + 100 * round;
-        neighbours.accept(&east(), map(1, "a", 100 + round, ms(at), Vec::new()), ms(at + 50))
+        neighbours.accept(
+            &east(),
+            map(1, "a", 100 + round, ms(at), Vec::new()),
+            ms(at + 50),
+        )
     };
     assert_eq!(accept(1), Err(RejectReason::Superseded));
     assert!((2..620).filter(|round| accept(*round).is_ok()).count() > 0);

@@ -35,8 +35,11 @@ pub(super) fn one_to_one<'a, I>(
 where
     I: Iterator<Item = Pairing<'a>>,
 {
-    let mut contested: Vec<_> =
-        wishes.windows(2).filter(|pair| pair[0].place == pair[1].place).map(|pair| pair[0].place).collect();
+    let mut contested: Vec<_> = wishes
+        .windows(2)
+        .filter(|pair| pair[0].place == pair[1].place)
+        .map(|pair| pair[0].place)
+        .collect();
     if contested.is_empty() {
         return wishes;
     }
@@ -48,18 +51,33 @@ where
     let mut objects = 0;
     while let Some(place) = contested.pop() {
         let first = wishes.partition_point(|wish| wish.place < place);
-        for wish in wishes[first..].iter().take_while(|wish| wish.place == place) {
+        for wish in wishes[first..]
+            .iter()
+            .take_while(|wish| wish.place == place)
+        {
             for pairing in pairings(wish.object) {
                 if reached.insert(pairing.place) {
                     contested.push(pairing.place);
                 }
-                contestants.push(Contestant { pairing, object: objects, is_wish: pairing.place == place, gate_sigmas });
+                contestants.push(Contestant {
+                    pairing,
+                    object: objects,
+                    is_wish: pairing.place == place,
+                    gate_sigmas,
+                });
             }
             objects += 1;
         }
     }
-    let mut settled: Vec<_> = wishes.into_iter().filter(|wish| !reached.contains(&wish.place)).collect();
-    settled.extend(assign(contestants, nearest_if_crowded).iter().map(|contestant| contestant.pairing));
+    let mut settled: Vec<_> = wishes
+        .into_iter()
+        .filter(|wish| !reached.contains(&wish.place))
+        .collect();
+    settled.extend(
+        assign(contestants, nearest_if_crowded)
+            .iter()
+            .map(|contestant| contestant.pairing),
+    );
     settled.sort_by_key(|pairing| pairing.place);
     settled
 }
@@ -87,15 +105,24 @@ impl Candidate for Contestant<'_> {
     /// 1 − d²/g² in units of 2⁻⁴⁰, at least one unit.
     fn benefit(&self) -> i64 {
         const UNIT: f64 = (1i64 << 40) as f64;
-        ((1.0 - self.pairing.distance_squared / (self.gate_sigmas * self.gate_sigmas)) * UNIT) as i64 + 1
+        ((1.0 - self.pairing.distance_squared / (self.gate_sigmas * self.gate_sigmas)) * UNIT)
+            as i64
+            + 1
     }
 }
 
 /// Of a contest that is too large, the nearest object at each place.
-fn nearest_if_crowded<'a>(size: ClusterSize, contest: &[Contestant<'a>]) -> Option<Vec<Contestant<'a>>> {
+fn nearest_if_crowded<'a>(
+    size: ClusterSize,
+    contest: &[Contestant<'a>],
+) -> Option<Vec<Contestant<'a>>> {
     (size.rows.min(size.columns) > MAX_CONTEST).then(|| {
         // They come place by place, the nearest first.
-        let mut nearest: Vec<_> = contest.iter().filter(|contestant| contestant.is_wish).copied().collect();
+        let mut nearest: Vec<_> = contest
+            .iter()
+            .filter(|contestant| contestant.is_wish)
+            .copied()
+            .collect();
         nearest.dedup_by_key(|contestant| contestant.pairing.place);
         nearest
     })
@@ -122,24 +149,38 @@ mod tests {
         let objects = objects(distances.len());
         let index = |object: &PerceivedObject| object.label.parse::<usize>().unwrap();
         let pairings = |object| {
-            distances[index(object)].iter().map(move |(place, squared)| Pairing {
-                place: Place(*place),
-                object,
-                distance_squared: f64::from(*squared),
-            })
+            distances[index(object)]
+                .iter()
+                .map(move |(place, squared)| Pairing {
+                    place: Place(*place),
+                    object,
+                    distance_squared: f64::from(*squared),
+                })
         };
         let key = |pairing: &Pairing<'_>| (pairing.distance_squared as u32, pairing.place);
-        let mut wishes: Vec<_> = objects.iter().filter_map(|object| pairings(object).min_by_key(key)).collect();
+        let mut wishes: Vec<_> = objects
+            .iter()
+            .filter_map(|object| pairings(object).min_by_key(key))
+            .collect();
         wishes.sort_by_key(|wish| (wish.place, wish.distance_squared as u32));
         let settled = one_to_one(wishes, pairings, GATE_SIGMAS);
-        assert!(settled.is_sorted_by(|a, b| a.place < b.place), "ascending, and one object for a place");
-        let mut assigned: Vec<_> = settled.iter().map(|pairing| (index(pairing.object), pairing.place.0)).collect();
+        assert!(
+            settled.is_sorted_by(|a, b| a.place < b.place),
+            "ascending, and one object for a place"
+        );
+        let mut assigned: Vec<_> = settled
+            .iter()
+            .map(|pairing| (index(pairing.object), pairing.place.0))
+            .collect();
         assigned.sort_unstable();
         assigned
     }
 
     fn total(distances: &[Distances], assigned: &[(usize, u32)]) -> u32 {
-        assigned.iter().map(|(object, place)| 16 - distance(&distances[*object], *place)).sum()
+        assigned
+            .iter()
+            .map(|(object, place)| 16 - distance(&distances[*object], *place))
+            .sum()
     }
 
     fn distance(distances: &Distances, place: u32) -> u32 {
@@ -148,7 +189,9 @@ mod tests {
 
     /// The greatest benefit of any assignment of the objects to places that are free.
     fn brute_force(distances: &[Distances], taken: &mut Vec<u32>) -> u32 {
-        let Some((first, others)) = distances.split_first() else { return 0 };
+        let Some((first, others)) = distances.split_first() else {
+            return 0;
+        };
         let mut best = brute_force(others, taken);
         for (place, squared) in first {
             if !taken.contains(place) {
@@ -161,7 +204,8 @@ mod tests {
     }
 
     fn any_distances() -> impl Strategy<Value = Vec<Distances>> {
-        let object = prop::collection::btree_map(0..7u32, 0..=16u32, 0..5).prop_map(|map| map.into_iter().collect());
+        let object = prop::collection::btree_map(0..7u32, 0..=16u32, 0..5)
+            .prop_map(|map| map.into_iter().collect());
         prop::collection::vec(object, 0..8)
     }
 
@@ -176,24 +220,36 @@ mod tests {
 
     #[test]
     fn the_loser_of_a_contest_takes_its_second_choice() {
-        assert_eq!(assigned(&[vec![(0, 1), (1, 9)], vec![(0, 4), (1, 5)]]), [(0, 0), (1, 1)]);
+        assert_eq!(
+            assigned(&[vec![(0, 1), (1, 9)], vec![(0, 4), (1, 5)]]),
+            [(0, 0), (1, 1)]
+        );
     }
 
     #[test]
     fn a_contest_is_settled_for_the_good_of_all() {
         let row = [vec![(0, 4)], vec![(0, 3), (1, 4)], vec![(1, 2), (2, 4)]];
-        assert_eq!(assigned(&row), [(0, 0), (1, 1), (2, 2)], "the nearest gives way, or one has no place");
+        assert_eq!(
+            assigned(&row),
+            [(0, 0), (1, 1), (2, 2)],
+            "the nearest gives way, or one has no place"
+        );
     }
 
     #[test]
     fn whoever_has_no_place_left_is_left_out() {
-        assert_eq!(assigned(&[vec![(3, 5)], vec![(3, 1)], vec![(3, 2)]]), [(1, 3)]);
+        assert_eq!(
+            assigned(&[vec![(3, 5)], vec![(3, 1)], vec![(3, 2)]]),
+            [(1, 3)]
+        );
     }
 
     #[test]
     fn the_nearest_keep_their_places_in_an_enormous_contest() {
         let count = 2 * MAX_CONTEST as u32;
-        let crowd: Vec<_> = (0..count).flat_map(|n| [vec![(n, 1), (n + 1, 3)], vec![(n, 2), (n + 1, 4)]]).collect();
+        let crowd: Vec<_> = (0..count)
+            .flat_map(|n| [vec![(n, 1), (n + 1, 3)], vec![(n, 2), (n + 1, 4)]])
+            .collect();
         let nearest: Vec<_> = (0..count).map(|n| (2 * n as usize, n)).collect();
         assert_eq!(assigned(&crowd), nearest);
     }

@@ -64,15 +64,28 @@ impl BayesPace {
 
     pub(super) fn configured(mut self, config: PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         let place_now = places_after(Arc::clone(&self.landmarks), Arc::clone(&landmarks), 2);
-        self.vehicles.values_mut().for_each(|vehicle| vehicle.move_places(&place_now));
-        let published = |landmark: &Landmark| self.published.get(self.landmarks.position_of(&landmark.id)?)?.clone();
+        self.vehicles
+            .values_mut()
+            .for_each(|vehicle| vehicle.move_places(&place_now));
+        let published = |landmark: &Landmark| {
+            self.published
+                .get(self.landmarks.position_of(&landmark.id)?)?
+                .clone()
+        };
         let published = landmarks.landmarks().iter().map(published).collect();
-        Self { increments: Increments::new(&config), config, published, landmarks, ..self }
+        Self {
+            increments: Increments::new(&config),
+            config,
+            published,
+            landmarks,
+            ..self
+        }
     }
 
     pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {
         self.landmarks = Arc::new(self.landmarks.extended(added, self.config.gate_m));
-        self.published.resize(self.landmarks.landmarks().len(), None);
+        self.published
+            .resize(self.landmarks.landmarks().len(), None);
     }
 
     /// The known locations, and how near an object must be to one.
@@ -95,24 +108,40 @@ impl BayesPace {
             oldest.is_some()
         });
         let mut grouping = std::mem::take(&mut self.grouping);
-        let items: Vec<_> = self.vehicles.iter().map(|(node, vehicle)| vehicle.items_of(node)).collect();
+        let items: Vec<_> = self
+            .vehicles
+            .iter()
+            .map(|(node, vehicle)| vehicle.items_of(node))
+            .collect();
         let by_place = grouping.group(&items, 2 * self.landmarks.landmarks().len());
         let mut published = std::mem::take(&mut self.published);
         let mut landmarks = Vec::with_capacity(published.len());
-        for (index, (landmark, published)) in self.landmarks.landmarks().iter().zip(&mut published).enumerate() {
+        for (index, (landmark, published)) in self
+            .landmarks
+            .landmarks()
+            .iter()
+            .zip(&mut published)
+            .enumerate()
+        {
             let state = self.agree(landmark, published.as_ref(), index, &by_place);
             published.clone_from(&state.label);
             landmarks.push(state);
         }
         self.grouping = grouping;
         self.published = published;
-        PaceRound { landmarks, oldest_capture }
+        PaceRound {
+            landmarks,
+            oldest_capture,
+        }
     }
 
     /// Every place that the vehicle had in view, ascending: those with a detection and those listed as `seen`.
     fn observations<'a>(&self, report: &'a ObjectReport) -> Vec<Observation<'a>> {
         let mut observations = self.associate(&report.objects);
-        let looked_at = |landmark| Observation { place: Place::object(landmark), found: None };
+        let looked_at = |landmark| Observation {
+            place: Place::object(landmark),
+            found: None,
+        };
         match &report.seen {
             Some(seen) => {
                 let mut expected = 0;
@@ -135,10 +164,15 @@ impl BayesPace {
         let stated = report.pose.zip(report.view);
         stated.into_iter().flat_map(|(pose, view)| {
             let pose = Pose::from(pose);
-            self.landmarks.landmarks().iter().enumerate().filter_map(move |(index, landmark)| {
-                let (range_m, bearing_rad) = pose.range_bearing(&landmark.position);
-                (range_m <= view.range_m && bearing_rad.abs() <= view.angle_rad / 2.0).then_some(index)
-            })
+            self.landmarks
+                .landmarks()
+                .iter()
+                .enumerate()
+                .filter_map(move |(index, landmark)| {
+                    let (range_m, bearing_rad) = pose.range_bearing(&landmark.position);
+                    (range_m <= view.range_m && bearing_rad.abs() <= view.angle_rad / 2.0)
+                        .then_some(index)
+                })
         })
     }
 
@@ -153,22 +187,33 @@ impl BayesPace {
         let point = |object: &PerceivedObject| Point2::new(object.x_m, object.y_m);
         let wish = |object: &'a PerceivedObject| {
             let covariance = self.config.covariance(object);
-            Some(pairing(object, self.landmarks.best(&object.label, &point(object), &covariance, &gate)?))
+            Some(pairing(
+                object,
+                self.landmarks
+                    .best(&object.label, &point(object), &covariance, &gate)?,
+            ))
         };
         let pairings = |object: &'a PerceivedObject| {
             let covariance = self.config.covariance(object);
-            let candidates = self.landmarks.candidates(&object.label, point(object), covariance, gate);
+            let candidates =
+                self.landmarks
+                    .candidates(&object.label, point(object), covariance, gate);
             candidates.map(move |candidate| pairing(object, candidate))
         };
         let mut wishes: Vec<_> = objects.iter().filter_map(wish).collect();
-        wishes.sort_by(|a, b| a.place.cmp(&b.place).then(a.distance_squared.total_cmp(&b.distance_squared)));
+        wishes.sort_by(|a, b| {
+            a.place
+                .cmp(&b.place)
+                .then(a.distance_squared.total_cmp(&b.distance_squared))
+        });
         if self.config.one_to_one {
             wishes = one_to_one(wishes, pairings, self.config.gate_sigmas);
         }
         let mut observations = Vec::with_capacity(2 * wishes.len());
-        observations.extend(
-            wishes.into_iter().map(|pairing| Observation { place: pairing.place, found: Some(pairing.object) }),
-        );
+        observations.extend(wishes.into_iter().map(|pairing| Observation {
+            place: pairing.place,
+            found: Some(pairing.object),
+        }));
         observations
     }
 
@@ -204,7 +249,10 @@ impl BayesPace {
         let winner = LabelScores::of(beliefs).winner(published, self.config.switch_lead)?;
         let mut contributors = Vec::with_capacity(beliefs.len());
         let mut mean = WeightedMean::default();
-        for (node, belief) in beliefs.iter().filter(|(_, belief)| belief.nats_for(winner.label) > 0.0) {
+        for (node, belief) in beliefs
+            .iter()
+            .filter(|(_, belief)| belief.nats_for(winner.label) > 0.0)
+        {
             contributors.push((*node).clone());
             if let Some((position, covariance)) = &belief.position {
                 mean.add(position, covariance, self.config.position_floor_m);
@@ -225,17 +273,28 @@ impl BayesPace {
 
     /// The state of a landmark that is known to be empty or was not in view.
     fn without_label(&self, landmark: &Landmark, beliefs: &[NamedBelief<'_>]) -> LandmarkState {
-        let absence: f64 = -beliefs.iter().map(|(_, belief)| belief.anything).sum::<f64>();
+        let absence: f64 = -beliefs
+            .iter()
+            .map(|(_, belief)| belief.anything)
+            .sum::<f64>();
         let known_empty = absence >= self.config.empty_evidence;
         let vacancy = landmark.vacancy.as_ref().filter(|_| known_empty);
-        let observers = if known_empty { names(beliefs) } else { Vec::new() };
+        let observers = if known_empty {
+            names(beliefs)
+        } else {
+            Vec::new()
+        };
         LandmarkState {
             id: landmark.id.clone(),
             label: vacancy.map(|sign| sign.label.clone()),
             confidence: vacancy.map_or(0.0, |_| logistic(absence)),
             x_m: landmark.position.x,
             y_m: landmark.position.y,
-            contributors: if vacancy.is_some() { observers.clone() } else { Vec::new() },
+            contributors: if vacancy.is_some() {
+                observers.clone()
+            } else {
+                Vec::new()
+            },
             observers,
             readings: Vec::new(),
         }

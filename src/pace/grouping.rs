@@ -53,7 +53,11 @@ pub(super) struct ByPlace<'a, T> {
 
 impl Grouping {
     /// Groups the vehicles' items for `places` places, keeping the order of vehicles and of their items within a place.
-    pub(super) fn group<'a, T>(&'a mut self, vehicles: &'a [VehicleItems<'a, T>], places: usize) -> ByPlace<'a, T> {
+    pub(super) fn group<'a, T>(
+        &'a mut self,
+        vehicles: &'a [VehicleItems<'a, T>],
+        places: usize,
+    ) -> ByPlace<'a, T> {
         self.ends.clear();
         self.ends.resize(places + 1, 0);
         for place in vehicles.iter().flat_map(|vehicle| vehicle.places) {
@@ -71,18 +75,30 @@ impl Grouping {
                 *cursor += 1;
             }
         }
-        ByPlace { vehicles, grouping: self }
+        ByPlace {
+            vehicles,
+            grouping: self,
+        }
     }
 }
 
 impl<'a, T> ByPlace<'a, T> {
     /// The items at a place with the names of their vehicles.
-    pub(super) fn at(&self, place: Place) -> impl ExactSizeIterator<Item = (&'a NodeName, &'a T)> + Clone + '_ {
+    pub(super) fn at(
+        &self,
+        place: Place,
+    ) -> impl ExactSizeIterator<Item = (&'a NodeName, &'a T)> + Clone + '_ {
         let Grouping { entries, ends } = self.grouping;
-        let start = if place.index() == 0 { 0 } else { ends[place.index() - 1] };
-        entries[start as usize..ends[place.index()] as usize].iter().map(|&(vehicle, item)| {
-            let vehicle = &self.vehicles[vehicle as usize];
-            (&vehicle.node, &vehicle.items[item as usize])
-        })
+        let start = if place.index() == 0 {
+            0
+        } else {
+            ends[place.index() - 1]
+        };
+        entries[start as usize..ends[place.index()] as usize]
+            .iter()
+            .map(|&(vehicle, item)| {
+                let vehicle = &self.vehicles[vehicle as usize];
+                (&vehicle.node, &vehicle.items[item as usize])
+            })
     }
 }

@@ -58,11 +58,19 @@ impl PaperPace {
     pub(super) fn configured(mut self, config: &PaceConfig, landmarks: Arc<LandmarkIndex>) -> Self {
         let place_now = places_after(Arc::clone(&self.landmarks), Arc::clone(&landmarks), 1);
         for latest in self.vehicles.values_mut() {
-            let known = std::mem::take(&mut latest.places).into_iter().zip(std::mem::take(&mut latest.objects));
-            (latest.places, latest.objects) =
-                known.filter_map(|(place, object)| Some((place_now(place)?, object))).unzip();
+            let known = std::mem::take(&mut latest.places)
+                .into_iter()
+                .zip(std::mem::take(&mut latest.objects));
+            (latest.places, latest.objects) = known
+                .filter_map(|(place, object)| Some((place_now(place)?, object)))
+                .unzip();
         }
-        Self { gate_m: config.gate_m, max_age: config.max_age(), landmarks, ..self }
+        Self {
+            gate_m: config.gate_m,
+            max_age: config.max_age(),
+            landmarks,
+            ..self
+        }
     }
 
     pub(super) fn add_landmarks(&mut self, added: Vec<Landmark>) {
@@ -93,17 +101,30 @@ impl PaperPace {
     }
 
     pub(super) fn close(&mut self, now: Timestamp) -> PaceRound {
-        self.vehicles.retain(|_, latest| now.since(latest.captured_at) <= self.max_age);
+        self.vehicles
+            .retain(|_, latest| now.since(latest.captured_at) <= self.max_age);
         let items: Vec<_> = self
             .vehicles
             .iter()
-            .map(|(node, latest)| VehicleItems { node: node.clone(), places: &latest.places, items: &latest.objects })
+            .map(|(node, latest)| VehicleItems {
+                node: node.clone(),
+                places: &latest.places,
+                items: &latest.objects,
+            })
             .collect();
-        let by_place = self.grouping.group(&items, self.landmarks.landmarks().len());
+        let by_place = self
+            .grouping
+            .group(&items, self.landmarks.landmarks().len());
         let landmarks = self.landmarks.landmarks().iter().enumerate();
         PaceRound {
-            landmarks: landmarks.map(|(index, landmark)| agree(landmark, by_place.at(Place(index as u32)))).collect(),
-            oldest_capture: self.vehicles.values().map(|latest| latest.captured_at).min(),
+            landmarks: landmarks
+                .map(|(index, landmark)| agree(landmark, by_place.at(Place(index as u32))))
+                .collect(),
+            oldest_capture: self
+                .vehicles
+                .values()
+                .map(|latest| latest.captured_at)
+                .min(),
         }
     }
 }
@@ -114,16 +135,31 @@ fn agree<'a>(
     near: impl ExactSizeIterator<Item = (&'a NodeName, &'a NearbyObject)> + Clone,
 ) -> LandmarkState {
     let count = near.len();
-    let (mut position_sum, mut confidence_sum, mut confidence_square_sum) = (Vector2::zeros(), 0.0, 0.0);
+    let (mut position_sum, mut confidence_sum, mut confidence_square_sum) =
+        (Vector2::zeros(), 0.0, 0.0);
     // A separate pass: its loads, which take most of the time, do not wait for each other.
-    for (_, NearbyObject { confidence, position, .. }) in near.clone() {
+    for (
+        _,
+        NearbyObject {
+            confidence,
+            position,
+            ..
+        },
+    ) in near.clone()
+    {
         position_sum += position;
         confidence_sum += confidence;
         confidence_square_sum += confidence * confidence;
     }
     let mut labels: SmallVec<[(&Label, f64); 4]> = SmallVec::new();
     let mut contributors: Vec<NodeName> = Vec::with_capacity(count);
-    for (node, NearbyObject { label, confidence, .. }) in near {
+    for (
+        node,
+        NearbyObject {
+            label, confidence, ..
+        },
+    ) in near
+    {
         match labels.iter_mut().find(|(known, _)| *known == label) {
             Some((_, sum)) => *sum += confidence,
             None => labels.push((label, *confidence)),
@@ -132,12 +168,22 @@ fn agree<'a>(
             contributors.push(node.clone());
         }
     }
-    let best = labels.iter().max_by(|a, b| a.1.total_cmp(&b.1).then_with(|| b.0.cmp(a.0)));
-    let position = if count > 0 { Point2::from(position_sum / count as f64) } else { landmark.position };
+    let best = labels
+        .iter()
+        .max_by(|a, b| a.1.total_cmp(&b.1).then_with(|| b.0.cmp(a.0)));
+    let position = if count > 0 {
+        Point2::from(position_sum / count as f64)
+    } else {
+        landmark.position
+    };
     LandmarkState {
         id: landmark.id.clone(),
         label: best.map(|(label, _)| (*label).clone()),
-        confidence: if confidence_sum > 0.0 { confidence_square_sum / confidence_sum } else { 0.0 },
+        confidence: if confidence_sum > 0.0 {
+            confidence_square_sum / confidence_sum
+        } else {
+            0.0
+        },
         x_m: position.x,
         y_m: position.y,
         contributors,

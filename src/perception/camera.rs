@@ -28,7 +28,12 @@ pub struct Intrinsics {
 
 impl Intrinsics {
     /// A camera without distortion whose axis goes through the middle of the image: f = (w/2) / tan(fov/2).
-    pub fn from_field_of_view(width: u32, height: u32, horizontal_rad: f64, vertical_rad: f64) -> Self {
+    pub fn from_field_of_view(
+        width: u32,
+        height: u32,
+        horizontal_rad: f64,
+        vertical_rad: f64,
+    ) -> Self {
         let (half_width, half_height) = (f64::from(width) / 2.0, f64::from(height) / 2.0);
         Self {
             width,
@@ -43,7 +48,10 @@ impl Intrinsics {
     /// A camera of square pixels without distortion whose axis goes through the middle of the image.
     pub fn with_square_pixels(width: u32, height: u32, horizontal_rad: f64) -> Self {
         let camera = Self::from_field_of_view(width, height, horizontal_rad, horizontal_rad);
-        Self { fy: camera.fx, ..camera }
+        Self {
+            fy: camera.fx,
+            ..camera
+        }
     }
 
     /// Bearing of an image column in radians off the axis, counter-clockwise (left) positive.
@@ -63,13 +71,21 @@ impl Intrinsics {
 
     /// The direction of a pixel in the camera frame, not normalised: z is 1.
     pub fn ray(&self, pixel: &Point2<f64>) -> Vector3<f64> {
-        Vector3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
+        Vector3::new(
+            (pixel.x - self.cx) / self.fx,
+            (pixel.y - self.cy) / self.fy,
+            1.0,
+        )
     }
 
     /// The pixel of a point in the camera frame; `None` behind the camera.
     pub fn project(&self, point: &Point3<f64>) -> Option<Point2<f64>> {
-        (point.z > 0.0)
-            .then(|| Point2::new(self.cx + self.fx * point.x / point.z, self.cy + self.fy * point.y / point.z))
+        (point.z > 0.0).then(|| {
+            Point2::new(
+                self.cx + self.fx * point.x / point.z,
+                self.cy + self.fy * point.y / point.z,
+            )
+        })
     }
 }
 
@@ -107,7 +123,12 @@ impl Mount {
     pub fn stated_pose(&self, camera: &Pose) -> WirePose {
         let known = |angle_rad| (self.height_m.is_some() || self.is_tilted()).then_some(angle_rad);
         let (pitch_rad, roll_rad) = (known(self.pitch_rad), known(self.roll_rad));
-        WirePose { height_m: self.height_m, pitch_rad, roll_rad, ..(*camera).into() }
+        WirePose {
+            height_m: self.height_m,
+            pitch_rad,
+            roll_rad,
+            ..(*camera).into()
+        }
     }
 
     /// True if the axis is not level, or the camera leans.
@@ -136,7 +157,8 @@ impl Mount {
 
     /// The rotation from the camera frame to the level frame.
     pub fn to_level(&self) -> Matrix3<f64> {
-        let ((sin_pitch, cos_pitch), (sin_roll, cos_roll)) = (self.pitch_rad.sin_cos(), self.roll_rad.sin_cos());
+        let ((sin_pitch, cos_pitch), (sin_roll, cos_roll)) =
+            (self.pitch_rad.sin_cos(), self.roll_rad.sin_cos());
         Matrix3::new(
             -sin_roll * sin_pitch,
             -cos_roll * sin_pitch,
@@ -162,31 +184,57 @@ mod tests {
         assert!((camera.bearing(0.0) - fov / 2.0).abs() < 1e-12);
         assert!((camera.bearing(640.0) + fov / 2.0).abs() < 1e-12);
         assert_eq!(camera.bearing(320.0), 0.0);
-        let pixel = camera.project(&Point3::new(0.5, 0.0, 1.0)).expect("in front");
+        let pixel = camera
+            .project(&Point3::new(0.5, 0.0, 1.0))
+            .expect("in front");
         assert!((camera.bearing(pixel.x) + 0.5f64.atan()).abs() < 1e-12);
     }
 
     #[test]
     fn a_pitched_camera_looks_down_and_a_rolled_one_leans_to_its_right() {
         let axis = Vector3::z();
-        let pitched = Mount { pitch_rad: 0.3, ..Mount::default() }.to_level() * axis;
+        let pitched = Mount {
+            pitch_rad: 0.3,
+            ..Mount::default()
+        }
+        .to_level()
+            * axis;
         assert!((pitched - Vector3::new(0.3f64.cos(), 0.0, -(0.3f64.sin()))).norm() < 1e-12);
         let right = Vector3::x();
-        let rolled = Mount { roll_rad: 0.3, ..Mount::default() }.to_level() * right;
+        let rolled = Mount {
+            roll_rad: 0.3,
+            ..Mount::default()
+        }
+        .to_level()
+            * right;
         assert!((rolled - Vector3::new(0.0, -(0.3f64.cos()), -(0.3f64.sin()))).norm() < 1e-12);
-        assert_eq!(Mount::default().to_level() * Vector3::new(1.0, 2.0, 3.0), Vector3::new(3.0, -1.0, -2.0));
+        assert_eq!(
+            Mount::default().to_level() * Vector3::new(1.0, 2.0, 3.0),
+            Vector3::new(3.0, -1.0, -2.0)
+        );
     }
 
     #[test]
     fn a_tilted_camera_sees_the_ground_from_a_near_edge_to_a_far_one_or_the_horizon() {
         let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 40f64.to_radians());
         let view = |height_m, pitch_deg: f64| {
-            Mount { height_m, pitch_rad: pitch_deg.to_radians(), ..Mount::default() }.ground_in_view(&camera)
+            Mount {
+                height_m,
+                pitch_rad: pitch_deg.to_radians(),
+                ..Mount::default()
+            }
+            .ground_in_view(&camera)
         };
         let [near_m, far_m] = view(Some(2.0), 30.0).unwrap();
         let expected = [50f64, 10.0].map(|below_deg| 2.0 / below_deg.to_radians().tan());
-        assert!((near_m - expected[0]).abs() < 1e-9 && (far_m - expected[1]).abs() < 1e-9, "{near_m} {far_m}");
-        assert_eq!(view(Some(2.0), 10.0).map(|[_, far_m]| far_m), Some(f64::INFINITY));
+        assert!(
+            (near_m - expected[0]).abs() < 1e-9 && (far_m - expected[1]).abs() < 1e-9,
+            "{near_m} {far_m}"
+        );
+        assert_eq!(
+            view(Some(2.0), 10.0).map(|[_, far_m]| far_m),
+            Some(f64::INFINITY)
+        );
         assert_eq!((view(Some(2.0), -30.0), view(None, 30.0)), (None, None));
     }
 
@@ -194,8 +242,16 @@ mod tests {
     fn a_report_states_of_a_mount_what_is_known() {
         let camera = Pose::new(1.0, 2.0, 0.5);
         let tilt = |pitch_rad, height_m| {
-            let stated = Mount { pitch_rad, height_m, ..Mount::default() }.stated_pose(&camera);
-            assert_eq!((stated.x_m, stated.y_m, stated.heading_rad), (1.0, 2.0, 0.5));
+            let stated = Mount {
+                pitch_rad,
+                height_m,
+                ..Mount::default()
+            }
+            .stated_pose(&camera);
+            assert_eq!(
+                (stated.x_m, stated.y_m, stated.heading_rad),
+                (1.0, 2.0, 0.5)
+            );
             (stated.height_m, stated.pitch_rad, stated.roll_rad)
         };
         assert_eq!(tilt(0.0, None), (None, None, None));

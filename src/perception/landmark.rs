@@ -30,7 +30,10 @@ pub struct Landmark {
 impl Landmark {
     /// The label that `label` counts as here, if it has a synonym.
     pub fn synonym(&self, label: &Label) -> Option<&Label> {
-        self.synonyms.iter().find(|synonym| synonym.from == *label).map(|synonym| &synonym.label)
+        self.synonyms
+            .iter()
+            .find(|synonym| synonym.from == *label)
+            .map(|synonym| &synonym.label)
     }
 }
 

@@ -39,13 +39,21 @@ impl PoseHistory {
     /// The pose at a time; `None` if no pose is known near it.
     pub fn at(&self, time: Timestamp) -> Option<Pose> {
         let after = self.poses.partition_point(|(at, _)| *at < time);
-        let Some((next_at, next)) = self.poses.get(after) else { return self.extrapolate(time) };
+        let Some((next_at, next)) = self.poses.get(after) else {
+            return self.extrapolate(time);
+        };
         if *next_at == time {
             return Some(*next);
         }
         let (last_at, last) = self.poses.get(after.checked_sub(1)?)?;
         let gap = next_at.since(*last_at);
-        (gap <= MAX_GAP).then(|| interpolate(last, next, time.since(*last_at).as_secs_f64() / gap.as_secs_f64()))
+        (gap <= MAX_GAP).then(|| {
+            interpolate(
+                last,
+                next,
+                time.since(*last_at).as_secs_f64() / gap.as_secs_f64(),
+            )
+        })
     }
 
     /// The pose at a time after the newest.
@@ -55,11 +63,21 @@ impl PoseHistory {
         if ahead > MAX_AHEAD {
             return None;
         }
-        let before = self.poses.len().checked_sub(2).and_then(|index| self.poses.get(index));
-        let Some((before_at, before)) = before else { return Some(*last) };
+        let before = self
+            .poses
+            .len()
+            .checked_sub(2)
+            .and_then(|index| self.poses.get(index));
+        let Some((before_at, before)) = before else {
+            return Some(*last);
+        };
         let gap = last_at.since(*before_at);
         let share = 1.0 + ahead.as_secs_f64() / gap.as_secs_f64();
-        Some(if gap <= MAX_GAP { interpolate(before, last, share) } else { *last })
+        Some(if gap <= MAX_GAP {
+            interpolate(before, last, share)
+        } else {
+            *last
+        })
     }
 }
 
@@ -93,16 +111,27 @@ mod tests {
     #[test]
     fn a_vehicle_moves_evenly_between_two_poses_and_goes_on_for_a_moment() {
         let history = history(&[(0, 0.0, 0.0), (100, 1.0, 0.2)]);
-        for (at, x_m, heading_rad) in [(0, 0.0, 0.0), (25, 0.25, 0.05), (100, 1.0, 0.2), (150, 1.5, 0.3)] {
+        for (at, x_m, heading_rad) in [
+            (0, 0.0, 0.0),
+            (25, 0.25, 0.05),
+            (100, 1.0, 0.2),
+            (150, 1.5, 0.3),
+        ] {
             let pose = history.at(ms(at)).unwrap();
-            assert!((pose.position.x - x_m).abs() < 1e-9 && (pose.heading_rad - heading_rad).abs() < 1e-9, "{pose:?}");
+            assert!(
+                (pose.position.x - x_m).abs() < 1e-9
+                    && (pose.heading_rad - heading_rad).abs() < 1e-9,
+                "{pose:?}"
+            );
         }
         assert_eq!(history.at(ms(500)), None, "too long ago");
     }
 
     #[test]
     fn it_turns_the_shorter_way() {
-        let pose = history(&[(0, 0.0, PI - 0.1), (100, 0.0, 0.1 - PI)]).at(ms(50)).unwrap();
+        let pose = history(&[(0, 0.0, PI - 0.1), (100, 0.0, 0.1 - PI)])
+            .at(ms(50))
+            .unwrap();
         assert!((pose.heading_rad.abs() - PI).abs() < 1e-9, "{pose:?}");
     }
 

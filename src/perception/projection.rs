@@ -50,7 +50,9 @@ pub enum ProjectionError {
     #[error("the image's edge cuts the box of {0:?}")]
     Clipped(Label),
     /// The foot of the box is above the horizon, or so near it that the ground gives no distance.
-    #[error("the foot of {0:?} is not clearly below the horizon: check camera.mount.pitch_deg if it stands near")]
+    #[error(
+        "the foot of {0:?} is not clearly below the horizon: check camera.mount.pitch_deg if it stands near"
+    )]
     AboveHorizon(Label),
     /// The target's corners give no position in front of the camera.
     #[error("the corners of {0:?} give no position in front of the camera")]
@@ -93,7 +95,12 @@ pub struct Projection {
 impl Projection {
     /// A projection for a camera; `config` is taken as valid.
     pub fn new(config: ProjectionConfig, intrinsics: Intrinsics, mount: Mount) -> Self {
-        Self { config, intrinsics, mount, to_level: mount.to_level() }
+        Self {
+            config,
+            intrinsics,
+            mount,
+            to_level: mount.to_level(),
+        }
     }
 
     /// The configuration.
@@ -113,7 +120,10 @@ impl Projection {
             return Cut::default();
         }
         let bounds = &detection.bounding_box;
-        let (width, height) = (f64::from(self.intrinsics.width), f64::from(self.intrinsics.height));
+        let (width, height) = (
+            f64::from(self.intrinsics.width),
+            f64::from(self.intrinsics.height),
+        );
         Cut {
             upper: bounds.y_min < EDGE_PX,
             lower: bounds.y_max > height - EDGE_PX,
@@ -142,7 +152,10 @@ impl Projection {
         let sight = self.line_of_sight_to(detection, cut, target)?;
         let direction_rad = camera.heading_rad + sight.bearing_rad;
         let (sin, cos) = direction_rad.sin_cos();
-        let position = (camera.position.x + sight.distance_m * cos, camera.position.y + sight.distance_m * sin);
+        let position = (
+            camera.position.x + sight.distance_m * cos,
+            camera.position.y + sight.distance_m * sin,
+        );
         let covariance = self.covariance(&sight, direction_rad);
         if !(position.0.is_finite() && position.1.is_finite() && covariance.is_valid()) {
             return Err(ProjectionError::DegenerateBox(label.clone()));
@@ -162,18 +175,32 @@ impl Projection {
         let (label, bounds) = (&detection.label, &detection.bounding_box);
         let known = self.config.sizes.of(label);
         let size = known.ok_or_else(|| ProjectionError::UnknownSize(label.clone()));
-        let whole = |is_cut| if is_cut { Err(ProjectionError::Clipped(label.clone())) } else { Ok(()) };
+        let whole = |is_cut| {
+            if is_cut {
+                Err(ProjectionError::Clipped(label.clone()))
+            } else {
+                Ok(())
+            }
+        };
         let degenerate = || ProjectionError::DegenerateBox(label.clone());
         match (self.config.ranging, target) {
-            (Ranging::Auto | Ranging::Corners, Some(target)) => corners::line_of_sight(detection, target, size?, self),
-            (Ranging::Auto, None) if self.mount.height_m.is_some() => auto::line_of_sight(detection, cut, known, self),
+            (Ranging::Auto | Ranging::Corners, Some(target)) => {
+                corners::line_of_sight(detection, target, size?, self)
+            }
+            (Ranging::Auto, None) if self.mount.height_m.is_some() => {
+                auto::line_of_sight(detection, cut, known, self)
+            }
             (Ranging::Ground, _) => {
                 whole(cut.lower)?;
                 let (foot, head) = box_height::foot_and_head(bounds, self);
                 let half = HalfDepth::of(known, bounds, &foot, self);
                 let estimate = ground::from_foot(&foot, half, self);
-                let estimate = estimate.ok_or_else(|| ProjectionError::AboveHorizon(label.clone()))?;
-                Ok(estimate.along(&foot, half.middle_sigma_m(estimate.distance_m, cut, &head, self)))
+                let estimate =
+                    estimate.ok_or_else(|| ProjectionError::AboveHorizon(label.clone()))?;
+                Ok(estimate.along(
+                    &foot,
+                    half.middle_sigma_m(estimate.distance_m, cut, &head, self),
+                ))
             }
             (Ranging::BoxWidth, _) => {
                 whole(cut.side)?;
@@ -189,27 +216,58 @@ impl Projection {
 
     /// The line of sight to a point `forward_m` ahead of and `left_m` left of the camera, as judged by an extent in the
     /// image.
-    fn line_of_sight(&self, forward_m: f64, left_m: f64, extent_px: f64, size: &ObjectSize) -> LineOfSight {
-        self.sized(left_m.atan2(forward_m), forward_m.hypot(left_m), extent_px, size)
+    fn line_of_sight(
+        &self,
+        forward_m: f64,
+        left_m: f64,
+        extent_px: f64,
+        size: &ObjectSize,
+    ) -> LineOfSight {
+        self.sized(
+            left_m.atan2(forward_m),
+            forward_m.hypot(left_m),
+            extent_px,
+            size,
+        )
     }
 
     /// A line of sight whose distance is judged by an extent in the image: d ∝ size / extent. σ_d/d is the root of the sum
     /// of both squared relative errors, and both edges of the extent have pixel noise.
-    fn sized(&self, bearing_rad: f64, distance_m: f64, extent_px: f64, size: &ObjectSize) -> LineOfSight {
+    fn sized(
+        &self,
+        bearing_rad: f64,
+        distance_m: f64,
+        extent_px: f64,
+        size: &ObjectSize,
+    ) -> LineOfSight {
         let pixel_sigma_px = self.config.pixel_sigma_px;
         let edges = std::f64::consts::SQRT_2 * pixel_sigma_px / extent_px;
         let along_m = distance_m * edges.hypot(size.relative_sigma);
-        LineOfSight { bearing_rad, distance_m, along_m, turn_rad: pixel_sigma_px / self.intrinsics.fx }
+        LineOfSight {
+            bearing_rad,
+            distance_m,
+            along_m,
+            turn_rad: pixel_sigma_px / self.intrinsics.fx,
+        }
     }
 
     /// First-order error propagation along and across the line of sight. The heading's error turns it; the errors of the
     /// camera's position and the floor add to both.
     fn covariance(&self, sight: &LineOfSight, direction_rad: f64) -> Covariance {
-        let ProjectionConfig { heading_sigma_rad, position_sigma_m, floor_m, .. } = self.config;
+        let ProjectionConfig {
+            heading_sigma_rad,
+            position_sigma_m,
+            floor_m,
+            ..
+        } = self.config;
         let everywhere = position_sigma_m.hypot(floor_m);
         let along_m = sight.along_m.hypot(everywhere);
         let turn_rad = sight.turn_rad.hypot(heading_sigma_rad);
-        Covariance::along_bearing(direction_rad, along_m, (sight.distance_m * turn_rad).hypot(everywhere))
+        Covariance::along_bearing(
+            direction_rad,
+            along_m,
+            (sight.distance_m * turn_rad).hypot(everywhere),
+        )
     }
 }
 

@@ -52,10 +52,24 @@ struct Widths<'a> {
 
 impl<'a> Widths<'a> {
     fn new(config: &'a ViewConfig, sizes: &'a ObjectSizes) -> Self {
-        let listed = sizes.labels.values().chain(&sizes.default).map(|size| size.width_m);
-        let target_m = config.target_width_m.or(listed.reduce(f64::min)).unwrap_or(PLACARD_TARGET_M);
-        let unlisted_m = config.occluder_width_m.unwrap_or(target_m.max(PLACARD_OCCLUDER_M));
-        Self { config, sizes, target_m, unlisted_m }
+        let listed = sizes
+            .labels
+            .values()
+            .chain(&sizes.default)
+            .map(|size| size.width_m);
+        let target_m = config
+            .target_width_m
+            .or(listed.reduce(f64::min))
+            .unwrap_or(PLACARD_TARGET_M);
+        let unlisted_m = config
+            .occluder_width_m
+            .unwrap_or(target_m.max(PLACARD_OCCLUDER_M));
+        Self {
+            config,
+            sizes,
+            target_m,
+            unlisted_m,
+        }
     }
 }
 
@@ -71,13 +85,22 @@ pub struct PosedCamera {
 impl PosedCamera {
     /// The camera of a vehicle, with the pose of the camera itself.
     pub fn new(pose: Pose, mount: &Mount, intrinsics: Intrinsics) -> Self {
-        Self { pose, intrinsics, from_level: mount.to_level().transpose(), height_m: mount.height_m }
+        Self {
+            pose,
+            intrinsics,
+            from_level: mount.to_level().transpose(),
+            height_m: mount.height_m,
+        }
     }
 
     /// The pixel of a point on the ground, or as high as the camera if its height is not known; `None` behind the camera.
     pub fn pixel(&self, point: &Point2<f64>) -> Option<Point2<f64>> {
-        let level = self.pose.ahead_left(point).push(-self.height_m.unwrap_or(0.0));
-        self.intrinsics.project(&Point3::from(self.from_level * level))
+        let level = self
+            .pose
+            .ahead_left(point)
+            .push(-self.height_m.unwrap_or(0.0));
+        self.intrinsics
+            .project(&Point3::from(self.from_level * level))
     }
 }
 
@@ -92,8 +115,16 @@ pub fn landmarks_in_view(
 ) -> Vec<LandmarkId> {
     let widths = Widths::new(config, sizes);
     let occluder = |object: &PerceivedObject| {
-        let landmark = object.landmark.as_ref().and_then(|id| landmarks.iter().find(|landmark| landmark.id == *id));
-        Occluder::new(object, landmark.and_then(|landmark| landmark.facing_rad), &camera.pose, &widths)
+        let landmark = object
+            .landmark
+            .as_ref()
+            .and_then(|id| landmarks.iter().find(|landmark| landmark.id == *id));
+        Occluder::new(
+            object,
+            landmark.and_then(|landmark| landmark.facing_rad),
+            &camera.pose,
+            &widths,
+        )
     };
     let occluders: Vec<Occluder> = objects.iter().map(occluder).collect();
     let in_view = |landmark: &&Landmark| {
@@ -109,7 +140,11 @@ pub fn landmarks_in_view(
                 )
             })
     };
-    landmarks.iter().filter(in_view).map(|landmark| landmark.id.clone()).collect()
+    landmarks
+        .iter()
+        .filter(in_view)
+        .map(|landmark| landmark.id.clone())
+        .collect()
 }
 
 /// True if a target that faces as the landmark does is inside the image and large enough.
@@ -123,9 +158,18 @@ fn is_readable(landmark: &Landmark, camera: &PosedCamera, widths: &Widths) -> bo
     }
     // The left end as seen from the side that the target faces.
     let half_width = Vector2::new(facing_rad.sin(), -facing_rad.cos()) * (widths.target_m / 2.0);
-    let ends = [landmark.position + half_width, landmark.position - half_width].map(|end| camera.pixel(&end));
-    let [Some(left), Some(right)] = ends else { return false };
-    let (width, height) = (f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
+    let ends = [
+        landmark.position + half_width,
+        landmark.position - half_width,
+    ]
+    .map(|end| camera.pixel(&end));
+    let [Some(left), Some(right)] = ends else {
+        return false;
+    };
+    let (width, height) = (
+        f64::from(camera.intrinsics.width),
+        f64::from(camera.intrinsics.height),
+    );
     let is_on_rows = |end: &Point2<f64>| (0.0..=height).contains(&end.y);
     right.x - left.x >= config.min_target_px
         && left.x >= config.margin_px
@@ -142,12 +186,28 @@ struct Occluder {
 
 impl Occluder {
     /// An object that faces `facing_rad`, or has the same width from all sides.
-    fn new(object: &PerceivedObject, facing_rad: Option<f64>, camera: &Pose, widths: &Widths) -> Self {
+    fn new(
+        object: &PerceivedObject,
+        facing_rad: Option<f64>,
+        camera: &Pose,
+        widths: &Widths,
+    ) -> Self {
         let position = Point2::new(object.x_m, object.y_m);
         let (range_m, bearing_rad) = camera.range_bearing(&position);
-        let width_m = widths.sizes.labels.get(&object.label).map_or(widths.unlisted_m, |size| size.width_m);
-        let half_angle_rad = half_angle(width_m * visible_width_share(facing_rad, camera, &position), range_m);
-        Self { range_m, bearing_rad, half_angle_rad }
+        let width_m = widths
+            .sizes
+            .labels
+            .get(&object.label)
+            .map_or(widths.unlisted_m, |size| size.width_m);
+        let half_angle_rad = half_angle(
+            width_m * visible_width_share(facing_rad, camera, &position),
+            range_m,
+        );
+        Self {
+            range_m,
+            bearing_rad,
+            half_angle_rad,
+        }
     }
 
     /// True if any part of a target at the given range and bearing is behind this object; `width_share` is the visible
@@ -162,7 +222,9 @@ impl Occluder {
 /// The visible share of a flat target's width, 0 to 1; 1 if its facing is not known.
 fn visible_width_share(facing_rad: Option<f64>, camera: &Pose, position: &Point2<f64>) -> f64 {
     let to_camera = camera.position - position;
-    facing_rad.map_or(1.0, |facing_rad| (to_camera.y.atan2(to_camera.x) - facing_rad).cos().abs())
+    facing_rad.map_or(1.0, |facing_rad| {
+        (to_camera.y.atan2(to_camera.x) - facing_rad).cos().abs()
+    })
 }
 
 fn half_angle(width_m: f64, range_m: f64) -> f64 {
@@ -177,7 +239,13 @@ mod tests {
     use crate::perception::projection::ObjectSize;
 
     fn landmark(id: &str, x_m: f64, y_m: f64, facing_rad: Option<f64>) -> Landmark {
-        Landmark { id: id.into(), position: Point2::new(x_m, y_m), facing_rad, vacancy: None, synonyms: vec![] }
+        Landmark {
+            id: id.into(),
+            position: Point2::new(x_m, y_m),
+            facing_rad,
+            vacancy: None,
+            synonyms: vec![],
+        }
     }
 
     fn object(label: &str, x_m: f64, y_m: f64) -> PerceivedObject {
@@ -185,58 +253,106 @@ mod tests {
     }
 
     /// Seen from the origin, looking east with a field of view of 62.2°.
-    fn seen(landmarks: &[Landmark], objects: &[PerceivedObject], sizes: &ObjectSizes) -> Vec<LandmarkId> {
-        let camera = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
+    fn seen(
+        landmarks: &[Landmark],
+        objects: &[PerceivedObject],
+        sizes: &ObjectSizes,
+    ) -> Vec<LandmarkId> {
+        let camera =
+            Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
         let camera = PosedCamera::new(Pose::new(0.0, 0.0, 0.0), &Mount::default(), camera);
         landmarks_in_view(landmarks, &camera, objects, sizes, &ViewConfig::default())
     }
 
     #[test]
     fn a_camera_of_known_height_and_pitch_sees_places_on_the_ground_inside_its_rows() {
-        let intrinsics = Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
-        let config = ViewConfig { min_target_px: 0.0, ..ViewConfig::default() };
+        let intrinsics =
+            Intrinsics::from_field_of_view(640, 480, 62.2f64.to_radians(), 48.8f64.to_radians());
+        let config = ViewConfig {
+            min_target_px: 0.0,
+            ..ViewConfig::default()
+        };
         let ahead = [1.0, 3.0, 9.0].map(|x_m| landmark(&format!("{x_m} m"), x_m, 0.0, None));
         let seen = |height_m, pitch_deg: f64| {
-            let mount = Mount { height_m, pitch_rad: pitch_deg.to_radians(), ..Mount::default() };
+            let mount = Mount {
+                height_m,
+                pitch_rad: pitch_deg.to_radians(),
+                ..Mount::default()
+            };
             let camera = PosedCamera::new(Pose::new(0.0, 0.0, 0.0), &mount, intrinsics);
             landmarks_in_view(&ahead, &camera, &[], &ObjectSizes::default(), &config)
         };
         assert_eq!(seen(None, 0.0), ["1 m", "3 m", "9 m"]);
-        assert_eq!(seen(Some(1.2), 0.0), ["3 m", "9 m"], "the ground below the image is not in view");
-        assert_eq!(seen(Some(1.2), 40.0), ["1 m", "3 m"], "nor is what is above it");
+        assert_eq!(
+            seen(Some(1.2), 0.0),
+            ["3 m", "9 m"],
+            "the ground below the image is not in view"
+        );
+        assert_eq!(
+            seen(Some(1.2), 40.0),
+            ["1 m", "3 m"],
+            "nor is what is above it"
+        );
     }
 
     fn sees(x_m: f64, y_m: f64, facing_rad: Option<f64>, objects: &[PerceivedObject]) -> bool {
-        !seen(&[landmark("a", x_m, y_m, facing_rad)], objects, &ObjectSizes::default()).is_empty()
+        !seen(
+            &[landmark("a", x_m, y_m, facing_rad)],
+            objects,
+            &ObjectSizes::default(),
+        )
+        .is_empty()
     }
 
     #[test]
     fn a_target_that_is_turned_away_hides_less() {
         let behind = landmark("behind", 0.40, 0.062, None);
         let before = landmark("before", 0.25, 0.0, Some(PI - 1.0));
-        let hiding = PerceivedObject { landmark: Some("before".into()), ..object("ABC", 0.25, 0.0) };
+        let hiding = PerceivedObject {
+            landmark: Some("before".into()),
+            ..object("ABC", 0.25, 0.0)
+        };
         let all_around = landmark("before", 0.25, 0.0, None);
         assert!(
-            seen(&[behind.clone(), before], std::slice::from_ref(&hiding), &ObjectSizes::default())
+            seen(
+                &[behind.clone(), before],
+                std::slice::from_ref(&hiding),
+                &ObjectSizes::default()
+            )
+            .contains(&"behind".into())
+        );
+        assert!(
+            !seen(&[behind, all_around], &[hiding], &ObjectSizes::default())
                 .contains(&"behind".into())
         );
-        assert!(!seen(&[behind, all_around], &[hiding], &ObjectSizes::default()).contains(&"behind".into()));
     }
 
     #[test]
     fn places_are_judged_by_the_sizes_that_are_listed() {
         let (slot, car) = (landmark("slot", 8.0, 0.0, None), ObjectSize::square(1.8));
-        let sizes = ObjectSizes { labels: [("car".into(), car)].into(), ..ObjectSizes::default() };
+        let sizes = ObjectSizes {
+            labels: [("car".into(), car)].into(),
+            ..ObjectSizes::default()
+        };
         let slot = std::slice::from_ref(&slot);
-        assert!(seen(slot, &[], &ObjectSizes::default()).is_empty(), "too far for a placard");
+        assert!(
+            seen(slot, &[], &ObjectSizes::default()).is_empty(),
+            "too far for a placard"
+        );
         assert_eq!(seen(slot, &[], &sizes), ["slot"]);
-        assert!(seen(slot, &[object("dragon", 4.0, 0.8)], &sizes).is_empty(), "what is not listed hides as a car does");
+        assert!(
+            seen(slot, &[object("dragon", 4.0, 0.8)], &sizes).is_empty(),
+            "what is not listed hides as a car does"
+        );
     }
 
     #[test]
     fn a_location_ahead_that_faces_the_camera_is_in_view() {
         assert!(sees(0.5, 0.0, Some(PI), &[]));
-        assert!(sees(0.5, 0.0, Some(-PI), &[]), "the same direction, written otherwise");
+        assert!(
+            sees(0.5, 0.0, Some(-PI), &[]),
+            "the same direction, written otherwise"
+        );
         assert!(sees(0.5, 0.0, None, &[]), "readable from all around");
     }
 
@@ -244,15 +360,24 @@ mod tests {
     fn the_whole_target_must_lie_inside_the_image() {
         let edge_m = 0.5 * 31.1f64.to_radians().tan();
         assert!(sees(0.5, edge_m - 0.04, Some(PI), &[]));
-        assert!(!sees(0.5, edge_m - 0.02, Some(PI), &[]), "its left end is outside");
-        assert!(!sees(0.5, -edge_m + 0.02, Some(PI), &[]), "its right end is outside");
+        assert!(
+            !sees(0.5, edge_m - 0.02, Some(PI), &[]),
+            "its left end is outside"
+        );
+        assert!(
+            !sees(0.5, -edge_m + 0.02, Some(PI), &[]),
+            "its right end is outside"
+        );
         assert!(!sees(-0.5, 0.0, None, &[]), "behind the camera");
     }
 
     #[test]
     fn a_target_that_is_turned_away_or_too_small_is_not_in_view() {
         assert!(sees(0.4, 0.0, Some(PI - 0.8), &[]));
-        assert!(!sees(0.4, 0.0, Some(PI - 0.9), &[]), "beyond the largest yaw");
+        assert!(
+            !sees(0.4, 0.0, Some(PI - 0.9), &[]),
+            "beyond the largest yaw"
+        );
         assert!(!sees(0.4, 0.0, Some(0.0), &[]), "from behind");
         assert!(!sees(0.4, 0.0, Some(FRAC_PI_2), &[]), "edge on");
         // 0.05 m at 530 px focal length take 36 px at 0.736 m, and less when turned.
@@ -264,19 +389,41 @@ mod tests {
     #[test]
     fn nothing_beyond_the_largest_range_is_in_view() {
         let camera = Intrinsics::from_field_of_view(640, 480, 1.0, 0.8);
-        let config = ViewConfig { max_range_m: 2.0, min_target_px: 0.0, ..ViewConfig::default() };
-        let landmarks = [landmark("near", 1.9, 0.0, None), landmark("far", 2.1, 0.0, None)];
+        let config = ViewConfig {
+            max_range_m: 2.0,
+            min_target_px: 0.0,
+            ..ViewConfig::default()
+        };
+        let landmarks = [
+            landmark("near", 1.9, 0.0, None),
+            landmark("far", 2.1, 0.0, None),
+        ];
         let camera = PosedCamera::new(Pose::new(0.0, 0.0, 0.0), &Mount::default(), camera);
-        assert_eq!(landmarks_in_view(&landmarks, &camera, &[], &ObjectSizes::default(), &config), ["near"]);
+        assert_eq!(
+            landmarks_in_view(&landmarks, &camera, &[], &ObjectSizes::default(), &config),
+            ["near"]
+        );
     }
 
     #[test]
     fn a_nearer_object_hides_what_is_behind_it_but_not_its_own_place() {
         assert!(!sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.0)]));
-        assert!(!sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.045)]), "covers its left end");
-        assert!(sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.06)]), "passes beside");
-        assert!(sees(0.6, 0.0, Some(PI), &[object("QR", 0.58, 0.0)]), "stands there itself");
-        assert!(sees(0.6, 0.0, Some(PI), &[object("QR", 0.9, 0.0)]), "stands behind");
+        assert!(
+            !sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.045)]),
+            "covers its left end"
+        );
+        assert!(
+            sees(0.6, 0.0, Some(PI), &[object("QR", 0.3, 0.06)]),
+            "passes beside"
+        );
+        assert!(
+            sees(0.6, 0.0, Some(PI), &[object("QR", 0.58, 0.0)]),
+            "stands there itself"
+        );
+        assert!(
+            sees(0.6, 0.0, Some(PI), &[object("QR", 0.9, 0.0)]),
+            "stands behind"
+        );
     }
 
     #[test]
@@ -286,8 +433,17 @@ mod tests {
             "QR": {"width_m": 0.05, "height_m": 0.05}}}"#,
         )
         .unwrap();
-        let landmarks = [landmark("a", 0.6, 0.0, Some(PI)), landmark("b", 0.6, -0.2, Some(PI))];
-        assert_eq!(seen(&landmarks, &[object("truck", 0.3, 0.1)], &sizes), ["b"]);
-        assert_eq!(seen(&landmarks, &[object("van", 0.3, 0.1)], &sizes), ["a", "b"]);
+        let landmarks = [
+            landmark("a", 0.6, 0.0, Some(PI)),
+            landmark("b", 0.6, -0.2, Some(PI)),
+        ];
+        assert_eq!(
+            seen(&landmarks, &[object("truck", 0.3, 0.1)], &sizes),
+            ["b"]
+        );
+        assert_eq!(
+            seen(&landmarks, &[object("van", 0.3, 0.1)], &sizes),
+            ["a", "b"]
+        );
     }
 }

@@ -18,7 +18,10 @@ pub(super) struct VirtualClock {
 
 impl VirtualClock {
     pub(super) fn new(tolerance_s: f64) -> Self {
-        Self { now: None, tolerance: Duration::from_secs_f64(tolerance_s) }
+        Self {
+            now: None,
+            tolerance: Duration::from_secs_f64(tolerance_s),
+        }
     }
 
     /// The time of the newest line taken; zero before the first.
@@ -27,7 +30,11 @@ impl VirtualClock {
     }
 
     /// True if a line is ahead of the present, or of most lines that follow, by at most the tolerance.
-    pub(super) fn is_plausible(&self, at: Timestamp, following: impl Iterator<Item = Timestamp>) -> bool {
+    pub(super) fn is_plausible(
+        &self,
+        at: Timestamp,
+        following: impl Iterator<Item = Timestamp>,
+    ) -> bool {
         if self.now.is_some_and(|now| at.since(now) <= self.tolerance) {
             return true;
         }
@@ -68,7 +75,11 @@ impl TimeUnit {
     /// The unit in which a recording's first time is a date, if it is none in microseconds. Times that count from the
     /// beginning of a recording are none in any unit.
     pub fn of(first: Timestamp) -> Option<Self> {
-        let units = [(Self::Seconds, 1), (Self::Milliseconds, 1000), (Self::Nanoseconds, 1_000_000_000)];
+        let units = [
+            (Self::Seconds, 1),
+            (Self::Milliseconds, 1000),
+            (Self::Nanoseconds, 1_000_000_000),
+        ];
         units
             .into_iter()
             .find(|(_, in_second)| RECORDED_S.contains(&(first.micros() / in_second)))
@@ -110,7 +121,10 @@ mod tests {
         let mut clock = VirtualClock::new(2.0);
         let mut taken = Vec::new();
         for (index, &at) in times.iter().enumerate() {
-            if clock.is_plausible(Timestamp(at), times[index + 1..].iter().copied().map(Timestamp)) {
+            if clock.is_plausible(
+                Timestamp(at),
+                times[index + 1..].iter().copied().map(Timestamp),
+            ) {
                 clock.advance(Timestamp(at));
                 taken.push(at);
             }
@@ -124,7 +138,10 @@ mod tests {
         for (times, wrong) in [
             (&[1, 2, ahead, 3, 4, 5][..], &[ahead][..]),
             (&[ahead, 1, 2, 3], &[ahead]),
-            (&[1, ahead, 2, ahead + 1, 3, ahead + 2, 4], &[ahead, ahead + 1, ahead + 2]),
+            (
+                &[1, ahead, 2, ahead + 1, 3, ahead + 2, 4],
+                &[ahead, ahead + 1, ahead + 2],
+            ),
             (&[1, 2, ahead], &[ahead]),
             (&[1, 2, u64::MAX], &[u64::MAX]),
             (&[1, 2, ahead, ahead + 1, ahead + 2], &[]),
@@ -132,7 +149,11 @@ mod tests {
             (&[ahead], &[]),
             (&[5, 1, 9], &[]),
         ] {
-            let expected: Vec<u64> = times.iter().copied().filter(|at| !wrong.contains(at)).collect();
+            let expected: Vec<u64> = times
+                .iter()
+                .copied()
+                .filter(|at| !wrong.contains(at))
+                .collect();
             assert_eq!(accepted(times), expected, "{times:?}");
         }
     }

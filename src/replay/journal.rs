@@ -82,7 +82,12 @@ pub struct JournalReplay {
 impl JournalReplay {
     /// A replay without entries; `fusion` is taken as valid.
     pub fn new(fusion: FusionConfig, landmarks: Vec<Landmark>) -> Self {
-        Self { fusion, landmarks, aggregator: None, summary: JournalSummary::default() }
+        Self {
+            fusion,
+            landmarks,
+            aggregator: None,
+            summary: JournalSummary::default(),
+        }
     }
 
     /// Begins another run of the node with this configuration; `fusion` is taken as valid.
@@ -127,7 +132,12 @@ impl JournalReplay {
     }
 
     /// Takes the next report.
-    pub fn report(&mut self, kind: ReportKind, report: &Arc<ObjectReport>, at: Timestamp) -> Vec<FusedLine> {
+    pub fn report(
+        &mut self,
+        kind: ReportKind,
+        report: &Arc<ObjectReport>,
+        at: Timestamp,
+    ) -> Vec<FusedLine> {
         self.summary.reports += 1;
         match self.running(at).report(kind, report, at) {
             Ok(fused) => self.lines(fused),
@@ -157,8 +167,14 @@ impl JournalReplay {
     }
 
     fn lines(&mut self, fused: Option<Fused>) -> Vec<FusedLine> {
-        let Some(Fused { map, verdicts, .. }) = fused else { return Vec::new() };
-        let lines: Vec<_> = map.map(FusedLine::Map).into_iter().chain(verdicts.map(FusedLine::Verdicts)).collect();
+        let Some(Fused { map, verdicts, .. }) = fused else {
+            return Vec::new();
+        };
+        let lines: Vec<_> = map
+            .map(FusedLine::Map)
+            .into_iter()
+            .chain(verdicts.map(FusedLine::Verdicts))
+            .collect();
         self.summary.written += lines.len() as u64;
         lines
     }

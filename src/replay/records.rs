@@ -7,7 +7,9 @@ use super::envelope::Envelope;
 use super::flaw;
 use crate::model::names::NodeName;
 use crate::model::time::Timestamp;
-use crate::wire::{Flaw, GlobalMap, Limits, ObjectReport, RejectReason, ReportKind, Verdicts, decode};
+use crate::wire::{
+    Flaw, GlobalMap, Limits, ObjectReport, RejectReason, ReportKind, Verdicts, decode,
+};
 
 /// One line of a replay's output.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -42,30 +44,62 @@ impl RecordedReport {
             Ok(report) => return Self::new(text, report, limits),
             Err(reason) => reason,
         };
-        let Some(placed) = votes_by_name(text) else { return Err(flaw::of_line(text, reason, limits)) };
-        let limits = Limits { payload_bytes: usize::MAX, ..*limits };
-        let report = decode(&placed, &limits).map_err(|reason| flaw::of_line(&placed, reason, &limits))?;
-        Ok(Self { is_placed: false, ..Self::new(&placed, report, &limits)? })
+        let Some(placed) = votes_by_name(text) else {
+            return Err(flaw::of_line(text, reason, limits));
+        };
+        let limits = Limits {
+            payload_bytes: usize::MAX,
+            ..*limits
+        };
+        let report =
+            decode(&placed, &limits).map_err(|reason| flaw::of_line(&placed, reason, &limits))?;
+        Ok(Self {
+            is_placed: false,
+            ..Self::new(&placed, report, &limits)?
+        })
     }
 
     fn new(text: &[u8], report: ObjectReport, limits: &Limits) -> Result<Self, Flaw> {
-        let Envelope { topic, received_at_us } =
-            serde_json::from_slice(text).map_err(|_| flaw::of_line(text, RejectReason::Malformed, limits))?;
-        let kind = topic.map_or(Ok(ReportKind::default()), |topic| kind(&topic, &report.node))?;
-        Ok(Self { kind, at: received_at_us.unwrap_or(report.captured_at_us), is_placed: true, report })
+        let Envelope {
+            topic,
+            received_at_us,
+        } = serde_json::from_slice(text)
+            .map_err(|_| flaw::of_line(text, RejectReason::Malformed, limits))?;
+        let kind = topic.map_or(Ok(ReportKind::default()), |topic| {
+            kind(&topic, &report.node)
+        })?;
+        Ok(Self {
+            kind,
+            at: received_at_us.unwrap_or(report.captured_at_us),
+            is_placed: true,
+            report,
+        })
     }
 }
 
 /// A line of votes by name, with zeros for the positions that its objects do not have; `None` for other lines.
 fn votes_by_name(text: &[u8]) -> Option<Vec<u8>> {
     let mut line: Value = serde_json::from_slice(text).ok()?;
-    if !line.get("topic")?.as_str()?.split('/').any(|level| level == "vote_detections") {
+    if !line
+        .get("topic")?
+        .as_str()?
+        .split('/')
+        .any(|level| level == "vote_detections")
+    {
         return None;
     }
     let mut is_by_name = false;
-    for object in line.get_mut("objects")?.as_array_mut()?.iter_mut().filter_map(Value::as_object_mut) {
+    for object in line
+        .get_mut("objects")?
+        .as_array_mut()?
+        .iter_mut()
+        .filter_map(Value::as_object_mut)
+    {
         let is_absent = |key| object.get(key).is_none_or(Value::is_null);
-        if object.get("landmark").is_some_and(Value::is_string) && is_absent("x_m") && is_absent("y_m") {
+        if object.get("landmark").is_some_and(Value::is_string)
+            && is_absent("x_m")
+            && is_absent("y_m")
+        {
             object.extend(["x_m", "y_m"].map(|key| (key.to_owned(), 0.into())));
             is_by_name = true;
         }
@@ -78,7 +112,9 @@ fn votes_by_name(text: &[u8]) -> Option<Vec<u8>> {
 fn kind(topic: &str, node: &NodeName) -> Result<ReportKind, Flaw> {
     let mut levels = topic.rsplit('/');
     let last = levels.next().unwrap_or_default();
-    let (level, named) = levels.next().map_or((last, None), |level| (level, Some(last)));
+    let (level, named) = levels
+        .next()
+        .map_or((last, None), |level| (level, Some(last)));
     let kind = match level {
         "detections" => ReportKind::Detections,
         "vote_detections" => ReportKind::VoteDetections,
@@ -89,5 +125,9 @@ fn kind(topic: &str, node: &NodeName) -> Result<ReportKind, Flaw> {
     };
     let is_other = named.is_some_and(|named| named != node.as_str());
     let fault = || format!("names another node than `{node}`");
-    if is_other { Err(Flaw::new(RejectReason::NodeMismatch, "topic", fault())) } else { Ok(kind) }
+    if is_other {
+        Err(Flaw::new(RejectReason::NodeMismatch, "topic", fault()))
+    } else {
+        Ok(kind)
+    }
 }

@@ -79,12 +79,20 @@ impl CellCounts {
 
     /// The votes that came after `before`, an earlier state of the same counts. The oldest votes are forgotten first.
     pub fn since(&self, before: Self) -> Self {
-        Self { all: self.all.minus(before.all), old: self.old.minus(before.all), ..*self }
+        Self {
+            all: self.all.minus(before.all),
+            old: self.old.minus(before.all),
+            ..*self
+        }
     }
 
     /// These counts and `later` votes after the same reset.
     pub fn plus(&self, later: Self) -> Self {
-        Self { all: self.all.plus(later.all), old: self.old.plus(later.old), ..*self }
+        Self {
+            all: self.all.plus(later.all),
+            old: self.old.plus(later.old),
+            ..*self
+        }
     }
 
     /// The message of a cell about a vehicle.
@@ -107,8 +115,14 @@ impl From<&CellReputation> for CellCounts {
     fn from(message: &CellReputation) -> Self {
         Self {
             reset_at: message.reset_at_us.unwrap_or_default(),
-            all: Counts { correct: message.correct, incorrect: message.incorrect },
-            old: Counts { correct: message.old_correct, incorrect: message.old_incorrect },
+            all: Counts {
+                correct: message.correct,
+                incorrect: message.incorrect,
+            },
+            old: Counts {
+                correct: message.old_correct,
+                incorrect: message.old_incorrect,
+            },
         }
     }
 }
@@ -133,7 +147,9 @@ impl ForeignReputations {
         let is_news = cells.entry(cell.clone()).or_default().merge(counts);
         if cells.len() > MAX_CELLS_EACH {
             // Totals only grow, so that the result does not depend on the order of messages.
-            let least = cells.iter().min_by_key(|(cell, counts)| (counts.all.total(), (*cell).clone()));
+            let least = cells
+                .iter()
+                .min_by_key(|(cell, counts)| (counts.all.total(), (*cell).clone()));
             if let Some(least) = least.map(|(cell, _)| cell.clone()) {
                 cells.remove(&least);
                 return is_news && least != *cell;
@@ -151,7 +167,9 @@ impl ForeignReputations {
 
     /// True if a cell says something of a vehicle.
     pub fn has(&self, cell: &NodeName, vehicle: &NodeName) -> bool {
-        self.counts.get(vehicle).is_some_and(|cells| cells.contains_key(cell))
+        self.counts
+            .get(vehicle)
+            .is_some_and(|cells| cells.contains_key(cell))
     }
 
     /// The cells that say something.
@@ -164,37 +182,63 @@ impl ForeignReputations {
     pub fn judge(&mut self, own: impl Fn(&NodeName) -> Option<Counts>) -> bool {
         let mut judged = BTreeMap::<&NodeName, [f64; 2]>::new();
         for (vehicle, cells) in &self.counts {
-            let Some(own) = own(vehicle).filter(|own| own.total() >= MIN_OWN_VOTES) else { continue };
-            let said = cells.iter().map(|(cell, counts)| (cell, counts.remembered()));
+            let Some(own) = own(vehicle).filter(|own| own.total() >= MIN_OWN_VOTES) else {
+                continue;
+            };
+            let said = cells
+                .iter()
+                .map(|(cell, counts)| (cell, counts.remembered()));
             for (cell, said) in said.filter(|(_, said)| said.total() >= MIN_JUDGED_VOTES) {
                 let [contradicted, all] = judged.entry(cell).or_default();
-                *contradicted += f64::from(u8::from((said.share() - own.share()).abs() > CONTRADICTION));
+                *contradicted +=
+                    f64::from(u8::from((said.share() - own.share()).abs() > CONTRADICTION));
                 *all += 1.0;
             }
         }
-        let contradicted = judged.into_iter().filter(|(_, [contradicted, _])| *contradicted > 0.0);
-        let trust = |[contradicted, all]: [f64; 2]| (1.0 - contradicted / (all + 2.0)).max(MIN_WORD_TRUST);
-        let word_trust = contradicted.map(|(cell, counts)| (cell.clone(), trust(counts))).collect();
+        let contradicted = judged
+            .into_iter()
+            .filter(|(_, [contradicted, _])| *contradicted > 0.0);
+        let trust =
+            |[contradicted, all]: [f64; 2]| (1.0 - contradicted / (all + 2.0)).max(MIN_WORD_TRUST);
+        let word_trust = contradicted
+            .map(|(cell, counts)| (cell.clone(), trust(counts)))
+            .collect();
         let is_news = self.word_trust != word_trust;
         self.word_trust = word_trust;
         is_news
     }
 
     /// Every vehicle's votes beside a prior of this weight in votes; `trust` in each cell's map is 0 to 1.
-    pub fn votes(&self, prior_votes: f64, trust: impl Fn(&NodeName) -> f64) -> BTreeMap<NodeName, ForeignVotes> {
+    pub fn votes(
+        &self,
+        prior_votes: f64,
+        trust: impl Fn(&NodeName) -> f64,
+    ) -> BTreeMap<NodeName, ForeignVotes> {
         let of_vehicle = |(vehicle, cells): (&NodeName, &BTreeMap<NodeName, CellCounts>)| {
             let mut sum = ForeignVotes::default();
             for (cell, counts) in cells {
                 let Counts { correct, incorrect } = counts.remembered();
                 let votes = (correct as f64 + incorrect as f64).max(1.0);
-                let trust = trust(cell).min(self.word_trust.get(cell).copied().unwrap_or(1.0)).clamp(0.0, 1.0);
+                let trust = trust(cell)
+                    .min(self.word_trust.get(cell).copied().unwrap_or(1.0))
+                    .clamp(0.0, 1.0);
                 let weight = trust * DISCOUNT.min(MAX_SHARE_EACH * prior_votes / votes);
                 sum.correct += weight * correct as f64;
                 sum.incorrect += weight * incorrect as f64;
             }
             let kept = (MAX_SHARE * prior_votes / sum.total().max(f64::MIN_POSITIVE)).min(1.0);
-            (vehicle.clone(), ForeignVotes { correct: kept * sum.correct, incorrect: kept * sum.incorrect })
+            (
+                vehicle.clone(),
+                ForeignVotes {
+                    correct: kept * sum.correct,
+                    incorrect: kept * sum.incorrect,
+                },
+            )
         };
-        self.counts.iter().map(of_vehicle).filter(|(_, votes)| votes.total() > 0.0).collect()
+        self.counts
+            .iter()
+            .map(of_vehicle)
+            .filter(|(_, votes)| votes.total() > 0.0)
+            .collect()
     }
 }

@@ -48,10 +48,23 @@ impl From<LedgerSnapshot> for ReputationLedger {
         for (term, aggregators) in lanes {
             for (aggregator, vehicles) in aggregators {
                 ledger.resize(&aggregator, 0, vehicles.values().map(BTreeMap::len).sum());
-                let lane = ledger.lanes.entry(Epoch::new(term, aggregator)).or_default();
+                let lane = ledger
+                    .lanes
+                    .entry(Epoch::new(term, aggregator))
+                    .or_default();
                 for (node, labels) in vehicles {
-                    let sum = labels.values().copied().fold(Counts::default(), Counts::plus);
-                    lane.insert(node, Record { labels, sum, marks: Marks::default() });
+                    let sum = labels
+                        .values()
+                        .copied()
+                        .fold(Counts::default(), Counts::plus);
+                    lane.insert(
+                        node,
+                        Record {
+                            labels,
+                            sum,
+                            marks: Marks::default(),
+                        },
+                    );
                 }
             }
         }
@@ -65,7 +78,10 @@ impl From<ReputationLedger> for LedgerSnapshot {
         let marks = ledger.marks().collect();
         let mut lanes: BTreeMap<u64, BTreeMap<_, _>> = BTreeMap::new();
         for (Epoch { term, leader }, vehicles) in ledger.lanes {
-            let labels = vehicles.into_iter().map(|(node, record)| (node, record.labels)).collect();
+            let labels = vehicles
+                .into_iter()
+                .map(|(node, record)| (node, record.labels))
+                .collect();
             lanes.entry(term).or_default().insert(leader, labels);
         }
         Self { lanes, marks }
@@ -75,7 +91,10 @@ impl From<ReputationLedger> for LedgerSnapshot {
 impl ReputationLedger {
     /// A ledger without evidence from before a reset.
     pub fn reset(reset_at: Timestamp) -> Self {
-        Self { reset_at, ..Self::default() }
+        Self {
+            reset_at,
+            ..Self::default()
+        }
     }
 
     /// Time of the last reset; 0 if there was none.
@@ -87,8 +106,16 @@ impl ReputationLedger {
     /// way to it, see [`Self::merge_entries`]. The vote is not counted where its lane alone takes all the room.
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
         let lane = Epoch::new(epoch, aggregator.clone());
-        let Some(record) = self.record_mut(&lane, &evidence.node, Some(&evidence.label), Some(&lane)) else { return };
-        record.labels.entry(evidence.label.clone()).or_default().add(evidence.correct);
+        let Some(record) =
+            self.record_mut(&lane, &evidence.node, Some(&evidence.label), Some(&lane))
+        else {
+            return;
+        };
+        record
+            .labels
+            .entry(evidence.label.clone())
+            .or_default()
+            .add(evidence.correct);
         record.sum.add(evidence.correct);
         let sum = record.sum;
         self.reach_mark(&lane, &evidence.node, sum);
@@ -103,7 +130,10 @@ impl ReputationLedger {
     /// Every record, lane by lane.
     pub(super) fn records(&self) -> impl Iterator<Item = (&Epoch, &NodeName, &Record)> {
         let of_lane = |(lane, vehicles)| std::iter::repeat(lane).zip(vehicles);
-        self.lanes.iter().flat_map(of_lane).map(|(lane, (node, record))| (lane, node, record))
+        self.lanes
+            .iter()
+            .flat_map(of_lane)
+            .map(|(lane, (node, record))| (lane, node, record))
     }
 
     /// Every record with its vehicle, the latest lanes first.
@@ -113,7 +143,9 @@ impl ReputationLedger {
 
     /// The latest term in which each vehicle was counted.
     pub fn latest_lanes(&self) -> BTreeMap<NodeName, u64> {
-        self.records().map(|(lane, node, _)| (node.clone(), lane.term)).collect()
+        self.records()
+            .map(|(lane, node, _)| (node.clone(), lane.term))
+            .collect()
     }
 
     /// Every vehicle's (correct, incorrect) over all lanes.
@@ -123,7 +155,10 @@ impl ReputationLedger {
             let total = totals.entry(node.clone()).or_default();
             *total = total.plus(record.sum);
         }
-        totals.into_iter().map(|(node, Counts { correct, incorrect })| (node, (correct, incorrect))).collect()
+        totals
+            .into_iter()
+            .map(|(node, Counts { correct, incorrect })| (node, (correct, incorrect)))
+            .collect()
     }
 
     /// The reputations to publish: scores from the remembered votes by [`ReputationConfig::mean`], 0.30 to 1.00, and
@@ -139,12 +174,24 @@ impl ReputationLedger {
         foreign: &BTreeMap<NodeName, ForeignVotes>,
     ) -> BTreeMap<NodeName, Reputation> {
         let (mut totals, latest) = (self.totals(), self.latest(config.memory_votes));
-        foreign.keys().for_each(|node| _ = totals.entry(node.clone()).or_default());
+        foreign
+            .keys()
+            .for_each(|node| _ = totals.entry(node.clone()).or_default());
         let reputation = |(node, (correct, incorrect)): (NodeName, (u64, u64))| {
             let latest = latest.get(&node).copied().unwrap_or_default();
             let foreign = foreign.get(&node).copied();
-            let score = config.mean_with(latest.0, latest.1, foreign.unwrap_or_default()).clamp(0.30, 1.00);
-            (node, Reputation { score, correct, incorrect, foreign })
+            let score = config
+                .mean_with(latest.0, latest.1, foreign.unwrap_or_default())
+                .clamp(0.30, 1.00);
+            (
+                node,
+                Reputation {
+                    score,
+                    correct,
+                    incorrect,
+                    foreign,
+                },
+            )
         };
         totals.into_iter().map(reputation).collect()
     }
@@ -166,23 +213,42 @@ impl ReputationLedger {
         let counts = |(node, (correct, incorrect)): (NodeName, (u64, u64))| {
             let (right, wrong) = latest.get(&node).copied().unwrap_or_default();
             let older = |all: u64, latest: f64| all.saturating_sub(latest.ceil() as u64);
-            let old = Counts { correct: older(correct, right), incorrect: older(incorrect, wrong) };
-            (node, CellCounts { reset_at: self.reset_at, all: Counts { correct, incorrect }, old })
+            let old = Counts {
+                correct: older(correct, right),
+                incorrect: older(incorrect, wrong),
+            };
+            (
+                node,
+                CellCounts {
+                    reset_at: self.reset_at,
+                    all: Counts { correct, incorrect },
+                    old,
+                },
+            )
         };
         self.totals().into_iter().map(counts).collect()
     }
 
     /// The (correct, incorrect) votes of every vehicle by stated label: the `memory_votes` latest, without the very
     /// latest ones, of which `own` gives the number. Each lane's votes are divided among labels as in the whole lane.
-    pub fn remembered(&self, memory_votes: f64, own: impl Fn(&NodeName) -> u64) -> BTreeMap<NodeName, RememberedVotes> {
+    pub fn remembered(
+        &self,
+        memory_votes: f64,
+        own: impl Fn(&NodeName) -> u64,
+    ) -> BTreeMap<NodeName, RememberedVotes> {
         let mut rooms: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
         let mut remembered: BTreeMap<NodeName, RememberedVotes> = BTreeMap::new();
         for (node, record) in self.latest_first() {
-            let room = rooms.entry(node).or_insert_with(|| (own(node) as f64, memory_votes));
+            let room = rooms
+                .entry(node)
+                .or_insert_with(|| (own(node) as f64, memory_votes));
             let (correct, incorrect) = record.latest(*room);
             room.0 = (room.0 - record.sum.total() as f64).max(0.0);
             room.1 -= correct + incorrect;
-            let shares = (correct / record.sum.correct.max(1) as f64, incorrect / record.sum.incorrect.max(1) as f64);
+            let shares = (
+                correct / record.sum.correct.max(1) as f64,
+                incorrect / record.sum.incorrect.max(1) as f64,
+            );
             let labels = remembered.entry(node.clone()).or_default();
             for (label, counts) in &record.labels {
                 let sum = labels.entry(label.clone()).or_default();

@@ -20,12 +20,20 @@ impl Record {
     pub(super) fn latest(&self, (mut skip, mut room): (f64, f64)) -> (f64, f64) {
         let (mut correct, mut incorrect) = (0.0, 0.0);
         let mut end = self.sum;
-        let begins = self.marks.iter().rev().map(|(_, counts)| counts).chain([Counts::default()]);
+        let begins = self
+            .marks
+            .iter()
+            .rev()
+            .map(|(_, counts)| counts)
+            .chain([Counts::default()]);
         for begin in begins {
             // A mark may arrive before its counts.
             let right = end.correct.saturating_sub(begin.correct) as f64;
             let wrong = end.incorrect.saturating_sub(begin.incorrect) as f64;
-            end = Counts { correct: end.correct.min(begin.correct), incorrect: end.incorrect.min(begin.incorrect) };
+            end = Counts {
+                correct: end.correct.min(begin.correct),
+                incorrect: end.incorrect.min(begin.incorrect),
+            };
             let votes = right + wrong;
             let skipped = skip.min(votes);
             skip -= skipped;

@@ -33,49 +33,72 @@ impl ReputationLedger {
     /// Every count, lane by lane.
     pub fn entries(&self) -> impl Iterator<Item = LedgerEntry> {
         self.records().flat_map(|(lane, node, record)| {
-            record.labels.iter().map(move |(label, counts)| entry(lane, node, label, *counts))
+            record
+                .labels
+                .iter()
+                .map(move |(label, counts)| entry(lane, node, label, *counts))
         })
     }
 
     /// The counts that `keys` name, as they are now.
     pub fn entries_of(&self, keys: &BTreeSet<EntryKey>) -> Vec<LedgerEntry> {
         let find = |EntryKey { lane, node, label }: &EntryKey| {
-            Some(entry(lane, node, label, *self.lanes.get(lane)?.get(node)?.labels.get(label)?))
+            Some(entry(
+                lane,
+                node,
+                label,
+                *self.lanes.get(lane)?.get(node)?.labels.get(label)?,
+            ))
         };
         keys.iter().filter_map(find).collect()
     }
 
     /// The counts and marks that are missing in `other` or larger than there.
     pub fn beyond(&self, other: &Self) -> (Vec<LedgerEntry>, Vec<LedgerMark>) {
-        let entries = self.entries().filter(|entry| other.lacks_entry(entry)).collect();
-        (entries, self.marks().filter(|mark| other.lacks_mark(mark)).collect())
+        let entries = self
+            .entries()
+            .filter(|entry| other.lacks_entry(entry))
+            .collect();
+        (
+            entries,
+            self.marks().filter(|mark| other.lacks_mark(mark)).collect(),
+        )
     }
 
     /// True if a count is missing here or larger than here.
     pub fn lacks_entry(&self, entry: &LedgerEntry) -> bool {
         let record = self.record_of(entry.epoch, &entry.aggregator, &entry.node);
         let counts = record.and_then(|record| record.labels.get(&entry.label));
-        counts.is_none_or(|counts| counts.correct < entry.correct || counts.incorrect < entry.incorrect)
+        counts.is_none_or(|counts| {
+            counts.correct < entry.correct || counts.incorrect < entry.incorrect
+        })
     }
 
     /// True if a mark is missing here and would be kept.
     pub fn lacks_mark(&self, mark: &LedgerMark) -> bool {
         let record = self.record_of(mark.epoch, &mark.aggregator, &mark.node);
-        record.is_none_or(|record| record.marks.would_keep(mark.number) && !record.marks.has(mark.number))
+        record.is_none_or(|record| {
+            record.marks.would_keep(mark.number) && !record.marks.has(mark.number)
+        })
     }
 
     /// Number of votes that are known of a mark's vehicle in its lane.
     pub fn votes_of(&self, mark: &LedgerMark) -> u64 {
-        self.record_of(mark.epoch, &mark.aggregator, &mark.node).map_or(0, |record| record.sum.total())
+        self.record_of(mark.epoch, &mark.aggregator, &mark.node)
+            .map_or(0, |record| record.sum.total())
     }
 
     fn record_of(&self, term: u64, aggregator: &NodeName, node: &NodeName) -> Option<&Record> {
-        self.lanes.get(&Epoch::new(term, aggregator.clone()))?.get(node)
+        self.lanes
+            .get(&Epoch::new(term, aggregator.clone()))?
+            .get(node)
     }
 
     /// True if there is a lane after this one.
     pub fn has_later_than(&self, lane: &Epoch) -> bool {
-        self.lanes.last_key_value().is_some_and(|(last, _)| last > lane)
+        self.lanes
+            .last_key_value()
+            .is_some_and(|(last, _)| last > lane)
     }
 
     /// True if there is a lane.
@@ -87,17 +110,33 @@ impl ReputationLedger {
     ///
     /// Beyond [`MAX_LANES`] and [`MAX_ENTRIES`] the oldest lanes are forgotten, so that all who merge the same entries
     /// forget the same lanes. The lane of the `present` leader always has room and is never forgotten.
-    pub fn merge_entries(&mut self, entries: impl IntoIterator<Item = LedgerEntry>, present: Option<&Epoch>) -> bool {
+    pub fn merge_entries(
+        &mut self,
+        entries: impl IntoIterator<Item = LedgerEntry>,
+        present: Option<&Epoch>,
+    ) -> bool {
         let mut changed = false;
-        for LedgerEntry { epoch, aggregator, node, label, correct, incorrect } in entries {
+        for LedgerEntry {
+            epoch,
+            aggregator,
+            node,
+            label,
+            correct,
+            incorrect,
+        } in entries
+        {
             let lane = Epoch::new(epoch, aggregator);
-            let Some(record) = self.record_mut(&lane, &node, Some(&label), present) else { continue };
+            let Some(record) = self.record_mut(&lane, &node, Some(&label), present) else {
+                continue;
+            };
             let counts = record.labels.entry(label).or_default();
             let before = *counts;
             counts.merge(Counts { correct, incorrect });
             changed |= *counts != before;
-            let grown =
-                Counts { correct: counts.correct - before.correct, incorrect: counts.incorrect - before.incorrect };
+            let grown = Counts {
+                correct: counts.correct - before.correct,
+                incorrect: counts.incorrect - before.incorrect,
+            };
             record.sum = record.sum.plus(grown);
         }
         changed
@@ -106,7 +145,10 @@ impl ReputationLedger {
     /// Every mark, lane by lane.
     pub fn marks(&self) -> impl Iterator<Item = LedgerMark> {
         self.records().flat_map(|(lane, node, record)| {
-            record.marks.iter().map(move |(number, counts)| mark(lane, node, number, counts))
+            record
+                .marks
+                .iter()
+                .map(move |(number, counts)| mark(lane, node, number, counts))
         })
     }
 
@@ -118,10 +160,17 @@ impl ReputationLedger {
     }
 
     /// The marks that `evidence` reached in a lane; it must be what was recorded there last.
-    pub fn marks_reached(&self, epoch: u64, aggregator: &NodeName, evidence: &[Evidence]) -> Vec<LedgerMark> {
+    pub fn marks_reached(
+        &self,
+        epoch: u64,
+        aggregator: &NodeName,
+        evidence: &[Evidence],
+    ) -> Vec<LedgerMark> {
         let lane = Epoch::new(epoch, aggregator.clone());
         let mut votes: BTreeMap<&NodeName, u64> = BTreeMap::new();
-        evidence.iter().for_each(|evidence| *votes.entry(&evidence.node).or_default() += 1);
+        evidence
+            .iter()
+            .for_each(|evidence| *votes.entry(&evidence.node).or_default() += 1);
         let reached = |(node, votes): (&NodeName, u64)| {
             let record = self.lanes.get(&lane)?.get(node)?;
             let (number, counts) = record.marks.iter().next_back()?;
@@ -132,11 +181,26 @@ impl ReputationLedger {
     }
 
     /// Takes in marks, within the bounds of [`Self::merge_entries`]; true when that changed anything.
-    pub fn merge_marks(&mut self, marks: impl IntoIterator<Item = LedgerMark>, present: Option<&Epoch>) -> bool {
+    pub fn merge_marks(
+        &mut self,
+        marks: impl IntoIterator<Item = LedgerMark>,
+        present: Option<&Epoch>,
+    ) -> bool {
         let mut changed = false;
-        for LedgerMark { epoch, aggregator, node, number, correct, incorrect } in marks {
+        for LedgerMark {
+            epoch,
+            aggregator,
+            node,
+            number,
+            correct,
+            incorrect,
+        } in marks
+        {
             let lane = Epoch::new(epoch, aggregator);
-            let known = self.lanes.get(&lane).and_then(|vehicles| vehicles.get(&node));
+            let known = self
+                .lanes
+                .get(&lane)
+                .and_then(|vehicles| vehicles.get(&node));
             if known.is_some_and(|record| !record.marks.would_keep(number)) || number == 0 {
                 continue;
             }
@@ -144,7 +208,9 @@ impl ReputationLedger {
             if !is_known && !self.make_room(&lane, present) {
                 continue;
             }
-            let Some(record) = self.record_mut(&lane, &node, None, present) else { continue };
+            let Some(record) = self.record_mut(&lane, &node, None, present) else {
+                continue;
+            };
             let before = record.marks.len();
             changed |= record.marks.insert(number, Counts { correct, incorrect });
             let after = record.marks.len();
@@ -167,13 +233,20 @@ impl ReputationLedger {
         present: Option<&Epoch>,
     ) -> Option<&mut Record> {
         let known = self.lanes.get(lane).and_then(|vehicles| vehicles.get(node));
-        if label.is_some_and(|label| known.is_none_or(|record| !record.labels.contains_key(label))) {
+        if label.is_some_and(|label| known.is_none_or(|record| !record.labels.contains_key(label)))
+        {
             if !self.make_room(lane, present) {
                 return None;
             }
             self.resize(&lane.leader, 0, 1);
         }
-        Some(self.lanes.entry(lane.clone()).or_default().entry(node.clone()).or_default())
+        Some(
+            self.lanes
+                .entry(lane.clone())
+                .or_default()
+                .entry(node.clone())
+                .or_default(),
+        )
     }
 
     /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false if the lanes that are
@@ -181,11 +254,18 @@ impl ReputationLedger {
     fn make_room(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
         loop {
             let is_new = !self.lanes.contains_key(lane);
-            let of_one = self.lanes.keys().filter(|other| other.leader == lane.leader).count();
-            let has_half = self.sizes.get(&lane.leader).is_some_and(|size| *size >= MAX_ENTRIES / 2)
+            let of_one = self
+                .lanes
+                .keys()
+                .filter(|other| other.leader == lane.leader)
+                .count();
+            let has_half = self
+                .sizes
+                .get(&lane.leader)
+                .is_some_and(|size| *size >= MAX_ENTRIES / 2)
                 || (is_new && of_one >= MAX_LANES / 2);
-            let is_full =
-                self.sizes.values().sum::<usize>() >= MAX_ENTRIES || (is_new && self.lanes.len() >= MAX_LANES);
+            let is_full = self.sizes.values().sum::<usize>() >= MAX_ENTRIES
+                || (is_new && self.lanes.len() >= MAX_LANES);
             if !has_half && !is_full {
                 return true;
             }
@@ -197,12 +277,21 @@ impl ReputationLedger {
 
     /// Forgets the oldest lane except the present one, of the same aggregator or of all, if it is older than `lane` or
     /// `lane` is the present one.
-    fn forget_oldest(&mut self, lane: &Epoch, present: Option<&Epoch>, same_aggregator: bool) -> bool {
+    fn forget_oldest(
+        &mut self,
+        lane: &Epoch,
+        present: Option<&Epoch>,
+        same_aggregator: bool,
+    ) -> bool {
         let may_go = |other: &&Epoch| *other != lane && Some(*other) != present;
         let mut old = self.lanes.keys().filter(may_go);
-        let oldest = old.find(|other| !same_aggregator || other.leader == lane.leader).cloned();
+        let oldest = old
+            .find(|other| !same_aggregator || other.leader == lane.leader)
+            .cloned();
         let gives_way = |oldest: &Epoch| oldest < lane || present == Some(lane);
-        let Some(oldest) = oldest.filter(gives_way) else { return false };
+        let Some(oldest) = oldest.filter(gives_way) else {
+            return false;
+        };
         self.forget(&oldest);
         true
     }
@@ -217,7 +306,8 @@ impl ReputationLedger {
 
     /// Notes that so many counts and marks of an aggregator became so many.
     pub(super) fn resize(&mut self, aggregator: &NodeName, before: usize, after: usize) {
-        let size = (self.sizes.remove(aggregator).unwrap_or_default() + after).saturating_sub(before);
+        let size =
+            (self.sizes.remove(aggregator).unwrap_or_default() + after).saturating_sub(before);
         if size > 0 {
             self.sizes.insert(aggregator.clone(), size);
         }
@@ -225,16 +315,39 @@ impl ReputationLedger {
 
     /// Number of counts and marks in a lane.
     pub(super) fn size_of(&self, lane: &Epoch) -> usize {
-        let records = self.lanes.get(lane).into_iter().flat_map(|vehicles| vehicles.values());
-        records.map(|record| record.labels.len() + record.marks.len()).sum()
+        let records = self
+            .lanes
+            .get(lane)
+            .into_iter()
+            .flat_map(|vehicles| vehicles.values());
+        records
+            .map(|record| record.labels.len() + record.marks.len())
+            .sum()
     }
 }
 
-fn mark(lane: &Epoch, node: &NodeName, number: u64, Counts { correct, incorrect }: Counts) -> LedgerMark {
-    LedgerMark { epoch: lane.term, aggregator: lane.leader.clone(), node: node.clone(), number, correct, incorrect }
+fn mark(
+    lane: &Epoch,
+    node: &NodeName,
+    number: u64,
+    Counts { correct, incorrect }: Counts,
+) -> LedgerMark {
+    LedgerMark {
+        epoch: lane.term,
+        aggregator: lane.leader.clone(),
+        node: node.clone(),
+        number,
+        correct,
+        incorrect,
+    }
 }
 
-fn entry(lane: &Epoch, node: &NodeName, label: &Label, Counts { correct, incorrect }: Counts) -> LedgerEntry {
+fn entry(
+    lane: &Epoch,
+    node: &NodeName,
+    label: &Label,
+    Counts { correct, incorrect }: Counts,
+) -> LedgerEntry {
     LedgerEntry {
         epoch: lane.term,
         aggregator: lane.leader.clone(),
@@ -255,7 +368,11 @@ mod tests {
     }
 
     fn vote(correct: bool) -> Evidence {
-        Evidence { node: name("euclid"), label: "cup".into(), correct }
+        Evidence {
+            node: name("euclid"),
+            label: "cup".into(),
+            correct,
+        }
     }
 
     #[test]
@@ -269,13 +386,21 @@ mod tests {
         let mut copy = ReputationLedger::default();
         for share in entries.chunks(2) {
             assert!(copy.merge_entries(share.to_vec(), None));
-            assert!(!copy.merge_entries(share.to_vec(), None), "the same again changes nothing");
+            assert!(
+                !copy.merge_entries(share.to_vec(), None),
+                "the same again changes nothing"
+            );
         }
         assert_eq!(copy, ledger);
 
         let lane = Epoch::new(3, name("edge"));
         ledger.record(3, &name("edge"), &vote(false));
-        let changed = [EntryKey { lane, node: name("euclid"), label: "cup".into() }].into();
+        let changed = [EntryKey {
+            lane,
+            node: name("euclid"),
+            label: "cup".into(),
+        }]
+        .into();
         copy.merge_entries(ledger.entries_of(&changed), None);
         assert_eq!(copy, ledger);
     }
@@ -302,19 +427,33 @@ mod tests {
         let mut ledger = ReputationLedger::default();
         for epoch in 0..(2 * MAX_LANES as u64) {
             let lane = Epoch::new(epoch, name("edge"));
-            let entry = entry(&lane, &name("euclid"), &"cup".into(), Counts { correct: 1, incorrect: 0 });
+            let entry = entry(
+                &lane,
+                &name("euclid"),
+                &"cup".into(),
+                Counts {
+                    correct: 1,
+                    incorrect: 0,
+                },
+            );
             ledger.merge_entries([entry], None);
         }
         assert_eq!(ledger.lanes(), MAX_LANES / 2);
         let oldest = ledger.entries().next().unwrap();
         assert_eq!(oldest.epoch, (MAX_LANES + MAX_LANES / 2) as u64);
         let forgotten = LedgerEntry { epoch: 0, ..oldest };
-        assert!(!ledger.merge_entries([forgotten], None), "an old lane does not come back");
+        assert!(
+            !ledger.merge_entries([forgotten], None),
+            "an old lane does not come back"
+        );
     }
 
     #[test]
     fn the_present_leaders_lane_has_room_whatever_others_claim() {
-        let counted = Counts { correct: 1, incorrect: 0 };
+        let counted = Counts {
+            correct: 1,
+            incorrect: 0,
+        };
         let flood = |epoch: u64| {
             let lane = move |n| Epoch::new(epoch, name(&format!("forger{n:03}")));
             (0..2 * MAX_LANES).map(move |n| entry(&lane(n), &name("liar"), &"cup".into(), counted))
@@ -325,15 +464,26 @@ mod tests {
         let mut own = ReputationLedger::default();
         own.merge_entries(flood(7).chain(flood(8)), None);
         own.record(7, &name("edge"), &vote(true));
-        assert_eq!((vote_of(&own), own.lanes()), (Some((1, 0)), MAX_LANES), "later lanes give way");
+        assert_eq!(
+            (vote_of(&own), own.lanes()),
+            (Some((1, 0)), MAX_LANES),
+            "later lanes give way"
+        );
         own.merge_entries(flood(9), Some(&present));
-        assert_eq!((vote_of(&own), own.lanes()), (Some((1, 0)), MAX_LANES), "and none displaces it");
+        assert_eq!(
+            (vote_of(&own), own.lanes()),
+            (Some((1, 0)), MAX_LANES),
+            "and none displaces it"
+        );
 
         let mut copy = ReputationLedger::default();
         copy.merge_entries(flood(8), None);
         let told = entry(&present, &name("euclid"), &"cup".into(), counted);
         assert!(!copy.merge_entries([told.clone()], None));
-        assert!(copy.merge_entries([told], Some(&present)), "nor does it at whoever follows");
+        assert!(
+            copy.merge_entries([told], Some(&present)),
+            "nor does it at whoever follows"
+        );
     }
 
     #[test]
@@ -343,26 +493,46 @@ mod tests {
         ledger.record(2, &name("edge"), &vote(true));
         for number in 0..MAX_ENTRIES / 2 {
             let node = name(&format!("v{number}"));
-            ledger.record(2, &name("edge"), &Evidence { node, label: "cup".into(), correct: true });
+            ledger.record(
+                2,
+                &name("edge"),
+                &Evidence {
+                    node,
+                    label: "cup".into(),
+                    correct: true,
+                },
+            );
         }
         ledger.record(2, &name("edge"), &vote(true));
-        assert_eq!((ledger.entries().count(), ledger.lanes()), (MAX_ENTRIES / 2, 1));
-        assert_eq!(ledger.totals()[&name("euclid")], (2, 0), "who is known goes on being counted");
+        assert_eq!(
+            (ledger.entries().count(), ledger.lanes()),
+            (MAX_ENTRIES / 2, 1)
+        );
+        assert_eq!(
+            ledger.totals()[&name("euclid")],
+            (2, 0),
+            "who is known goes on being counted"
+        );
     }
 
     /// Its signed shares may invent any number of leaderships and vehicles.
     #[test]
     fn a_false_leader_displaces_none_of_the_latest_half() {
-        let counted = Counts { correct: 1, incorrect: 0 };
+        let counted = Counts {
+            correct: 1,
+            incorrect: 0,
+        };
         let mut ledger = ReputationLedger::default();
         for term in 0..MAX_LANES as u64 / 2 {
             ledger.record(term, &name("edge"), &vote(true));
         }
         let lane = |term: usize| Epoch::new(1000 + term as u64, name("liar"));
-        let lanes = (0..2 * MAX_LANES).map(|term| entry(&lane(term), &name("v"), &"cup".into(), counted));
+        let lanes =
+            (0..2 * MAX_LANES).map(|term| entry(&lane(term), &name("v"), &"cup".into(), counted));
         ledger.merge_entries(lanes, None);
         let present = lane(2 * MAX_LANES);
-        let vehicles = (0..2 * MAX_ENTRIES).map(|n| entry(&present, &name(&format!("v{n}")), &"cup".into(), counted));
+        let vehicles = (0..2 * MAX_ENTRIES)
+            .map(|n| entry(&present, &name(&format!("v{n}")), &"cup".into(), counted));
         ledger.merge_entries(vehicles, Some(&present));
         assert_eq!(ledger.totals()[&name("euclid")], (MAX_LANES as u64 / 2, 0));
         assert!(ledger.entries().count() <= MAX_LANES + MAX_ENTRIES / 2);

@@ -32,7 +32,12 @@ impl ReputationLedger {
     }
 
     /// As [`Self::merge_statement`], on trial until `ends_at`.
-    pub fn merge_on_trial(&mut self, share: &Arc<LedgerShare>, present: Option<&Epoch>, ends_at: Timestamp) -> bool {
+    pub fn merge_on_trial(
+        &mut self,
+        share: &Arc<LedgerShare>,
+        present: Option<&Epoch>,
+        ends_at: Timestamp,
+    ) -> bool {
         let changed = self.merge_share(share, present);
         if let Some(lane) = share.lane().filter(|lane| self.lanes.contains_key(lane)) {
             let size = self.size_of(&lane);
@@ -45,16 +50,28 @@ impl ReputationLedger {
 
     /// Ends trials: those that `has_failed` names, whose shares and counts are dropped, and those whose time is over. The
     /// result is their lanes, and whether each is evidence now.
-    pub fn end_trials(&mut self, now: Timestamp, has_failed: impl Fn(&Epoch) -> bool) -> Vec<(Epoch, bool)> {
+    pub fn end_trials(
+        &mut self,
+        now: Timestamp,
+        has_failed: impl Fn(&Epoch) -> bool,
+    ) -> Vec<(Epoch, bool)> {
         let mut ended = Vec::new();
         for (lane, (tried, ends_at)) in std::mem::take(&mut self.on_trial) {
             if has_failed(&lane) {
-                let kept = self.statements.get(&lane).map(|statements| statements.signed.clone()).unwrap_or_default();
+                let kept = self
+                    .statements
+                    .get(&lane)
+                    .map(|statements| statements.signed.clone())
+                    .unwrap_or_default();
                 self.forget(&lane);
-                kept.iter().for_each(|share| _ = self.merge_statement(share, None));
+                kept.iter()
+                    .for_each(|share| _ = self.merge_statement(share, None));
                 ended.push((lane, false));
             } else if now >= ends_at {
-                tried.signed.iter().for_each(|share| _ = self.merge_statement(share, None));
+                tried
+                    .signed
+                    .iter()
+                    .for_each(|share| _ = self.merge_statement(share, None));
                 ended.push((lane, true));
             } else {
                 self.on_trial.insert(lane, (tried, ends_at));
@@ -84,11 +101,24 @@ impl ReputationLedger {
     /// Drops the signed shares that are not valid, and the counts that came by them alone; true if there were any.
     pub fn retain_statements(&mut self, mut is_valid: impl FnMut(&LedgerShare) -> bool) -> bool {
         let mut has_dropped = false;
-        let lanes: BTreeSet<_> = self.statements.keys().chain(self.on_trial.keys()).cloned().collect();
+        let lanes: BTreeSet<_> = self
+            .statements
+            .keys()
+            .chain(self.on_trial.keys())
+            .cloned()
+            .collect();
         for lane in lanes {
-            let signed = self.statements.get(&lane).map(|lane| lane.signed.clone()).unwrap_or_default();
+            let signed = self
+                .statements
+                .get(&lane)
+                .map(|lane| lane.signed.clone())
+                .unwrap_or_default();
             let (tried, ends_at) = self.on_trial.get(&lane).cloned().unwrap_or_default();
-            if signed.iter().chain(&tried.signed).all(|share| is_valid(share)) {
+            if signed
+                .iter()
+                .chain(&tried.signed)
+                .all(|share| is_valid(share))
+            {
                 continue;
             }
             self.forget(&lane);
@@ -107,5 +137,7 @@ impl ReputationLedger {
 /// Keeps a share among the statements of a lane that has `lane_size` counts and marks.
 fn keep(statements: &mut Statements, share: &Arc<LedgerShare>, lane_size: usize) {
     let mut later = ReputationLedger::default();
-    statements.push(Arc::clone(share), lane_size, |share| later.merge_share(share, None));
+    statements.push(Arc::clone(share), lane_size, |share| {
+        later.merge_share(share, None)
+    });
 }

@@ -23,7 +23,12 @@ pub(super) struct Statements {
 impl Statements {
     /// Adds a share to a lane that has `lane_size` counts and marks. `adds` merges a statement into evidence that is empty at
     /// first, the latest statement first: true if that changed anything.
-    pub(super) fn push(&mut self, share: Arc<LedgerShare>, lane_size: usize, adds: impl FnMut(&LedgerShare) -> bool) {
+    pub(super) fn push(
+        &mut self,
+        share: Arc<LedgerShare>,
+        lane_size: usize,
+        adds: impl FnMut(&LedgerShare) -> bool,
+    ) {
         self.signed.push(share);
         if self.signed.len() >= self.clear_at.max(MAX_NEW) {
             self.clear(lane_size, adds);
@@ -41,7 +46,11 @@ impl Statements {
             room -= size;
             true
         };
-        let mut kept: Vec<_> = std::mem::take(&mut self.signed).into_iter().rev().filter(is_needed).collect();
+        let mut kept: Vec<_> = std::mem::take(&mut self.signed)
+            .into_iter()
+            .rev()
+            .filter(is_needed)
+            .collect();
         kept.reverse();
         self.clear_at = kept.len() * 2 + MAX_NEW;
         self.signed = kept;

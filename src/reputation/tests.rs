@@ -9,7 +9,11 @@ fn ledger() -> impl Strategy<Value = ReputationLedger> {
         let name = |prefix: &str, n: usize| NodeName::new(format!("{prefix}{n}")).unwrap();
         let mut ledger = ReputationLedger::default();
         for ((epoch, aggregator, node, label, correct), times) in votes {
-            let evidence = Evidence { node: name("v", node), label: format!("l{label}").into(), correct };
+            let evidence = Evidence {
+                node: name("v", node),
+                label: format!("l{label}").into(),
+                correct,
+            };
             (0..times).for_each(|_| ledger.record(epoch, &name("a", aggregator), &evidence));
         }
         ledger
@@ -44,13 +48,21 @@ proptest! {
 fn a_new_epoch_alone_changes_no_score_and_new_evidence_displaces_old() {
     let name = |n: &str| NodeName::new(n).unwrap();
     let config = ReputationConfig::default();
-    let vote = |correct| Evidence { node: name("euclid"), label: "cup".into(), correct };
+    let vote = |correct| Evidence {
+        node: name("euclid"),
+        label: "cup".into(),
+        correct,
+    };
     let mut ledger = ReputationLedger::default();
     (0..2000).for_each(|_| ledger.record(1, &name("edge"), &vote(true)));
     let score = |ledger: &ReputationLedger| ledger.reputations(&config)[&name("euclid")].score;
     let before = score(&ledger);
     ledger.record(1_732_154_400, &name("gauss"), &vote(true));
-    assert!((score(&ledger) - before).abs() < 1e-9, "{} {before}", score(&ledger));
+    assert!(
+        (score(&ledger) - before).abs() < 1e-9,
+        "{} {before}",
+        score(&ledger)
+    );
     (0..400).for_each(|_| ledger.record(1_732_154_400, &name("gauss"), &vote(false)));
     assert!(score(&ledger) < 0.35, "{}", score(&ledger));
 }
@@ -58,7 +70,11 @@ fn a_new_epoch_alone_changes_no_score_and_new_evidence_displaces_old() {
 #[test]
 fn partitions_that_counted_apart_merge_to_their_sum() {
     let name = |n: &str| NodeName::new(n).unwrap();
-    let evidence = Evidence { node: name("euclid"), label: "cup".into(), correct: true };
+    let evidence = Evidence {
+        node: name("euclid"),
+        label: "cup".into(),
+        correct: true,
+    };
     let mut common = ReputationLedger::default();
     common.record(1, &name("edge"), &evidence);
     let (mut left, mut right) = (common.clone(), common);
@@ -73,7 +89,11 @@ fn turncoat(wrong: u64) -> ReputationLedger {
     let mut ledger = ReputationLedger::default();
     for number in 0..10_000 + wrong {
         let label = if number % 3 == 0 { "cup" } else { "vase" }.into();
-        let evidence = Evidence { node: NodeName::from_static("turncoat"), label, correct: number < 10_000 };
+        let evidence = Evidence {
+            node: NodeName::from_static("turncoat"),
+            label,
+            correct: number < 10_000,
+        };
         ledger.record(1, &NodeName::from_static("edge"), &evidence);
     }
     ledger
@@ -96,7 +116,15 @@ fn who_was_right_for_long_and_turns_is_found_out_within_what_is_remembered() {
 #[test]
 fn a_ledger_of_a_million_votes_has_few_marks() {
     let mut marks = marks::Marks::default();
-    (1..=31_250).for_each(|number| assert!(marks.insert(number, Counts { correct: 32 * number, incorrect: 0 })));
+    (1..=31_250).for_each(|number| {
+        assert!(marks.insert(
+            number,
+            Counts {
+                correct: 32 * number,
+                incorrect: 0
+            }
+        ))
+    });
     assert!((20..=32).contains(&marks.len()), "{}", marks.len());
 }
 
@@ -135,9 +163,15 @@ fn what_is_remembered_before_ones_own_votes_is_the_others() {
     };
     // Where the 500 began lies between two marks.
     let (correct, incorrect) = remembered(0);
-    assert!(correct < 10.0 && (correct + incorrect - 500.0).abs() < 1e-6, "{correct} {incorrect}");
+    assert!(
+        correct < 10.0 && (correct + incorrect - 500.0).abs() < 1e-6,
+        "{correct} {incorrect}"
+    );
     let (correct, incorrect) = remembered(1500);
-    assert!(incorrect < 1.0 && (correct - 500.0).abs() < 1.0, "{correct} {incorrect}");
+    assert!(
+        incorrect < 1.0 && (correct - 500.0).abs() < 1.0,
+        "{correct} {incorrect}"
+    );
 }
 
 fn name(name: &str) -> NodeName {
@@ -145,7 +179,10 @@ fn name(name: &str) -> NodeName {
 }
 
 fn counts(correct: u64, incorrect: u64) -> CellCounts {
-    CellCounts { all: Counts { correct, incorrect }, ..CellCounts::default() }
+    CellCounts {
+        all: Counts { correct, incorrect },
+        ..CellCounts::default()
+    }
 }
 
 /// What some cells say of a vehicle, and the score from which it starts.
@@ -155,7 +192,10 @@ fn start_score(said: &[CellCounts], trust: f64) -> f64 {
     for (number, counts) in said.iter().enumerate() {
         foreign.merge(&name(&format!("cell-{number}")), &name("v"), *counts);
     }
-    let votes = foreign.votes(config.initial_votes, |_| trust).remove(&name("v")).unwrap_or_default();
+    let votes = foreign
+        .votes(config.initial_votes, |_| trust)
+        .remove(&name("v"))
+        .unwrap_or_default();
     config.mean_with(0.0, 0.0, votes)
 }
 
@@ -228,9 +268,19 @@ fn a_liar_that_moves_on_starts_below_a_newcomer_and_a_proven_vehicle_above() {
     assert!(liar < 0.4 && known_to_four < 0.3 && proven > 0.65);
     assert!((0.45..0.5).contains(&hardly_known));
     assert!((disputed - 0.5).abs() < 0.01);
-    assert_eq!(start_score(&[counts(10, 90)], 0.0), 0.5, "a cell that nobody believes says nothing");
+    assert_eq!(
+        start_score(&[counts(10, 90)], 0.0),
+        0.5,
+        "a cell that nobody believes says nothing"
+    );
     // It was right for long and turned, and the cell remembers the latest votes.
-    let turned = CellCounts { old: Counts { correct: 9_900, incorrect: 0 }, ..counts(10_000, 400) };
+    let turned = CellCounts {
+        old: Counts {
+            correct: 9_900,
+            incorrect: 0,
+        },
+        ..counts(10_000, 400)
+    };
     assert!(start_score(&[turned], 1.0) < 0.45);
 }
 
@@ -243,8 +293,12 @@ fn a_cell_whose_word_the_own_evidence_contradicts_is_believed_less() {
             foreign.merge(&liar, &vehicle, counts(1, 90));
             foreign.merge(&honest, &vehicle, counts(80, 10));
         }
-        [&liar, &honest].into_iter().for_each(|cell| _ = foreign.merge(cell, &newcomer, counts(0, 90)));
-        let is_known = |vehicle: &NodeName| (0..vehicles).any(|number| *vehicle == name(&format!("v{number}")));
+        [&liar, &honest]
+            .into_iter()
+            .for_each(|cell| _ = foreign.merge(cell, &newcomer, counts(0, 90)));
+        let is_known = |vehicle: &NodeName| {
+            (0..vehicles).any(|number| *vehicle == name(&format!("v{number}")))
+        };
         let is_news = foreign.judge(|vehicle| is_known(vehicle).then_some(own));
         let alone = |cell: &NodeName| {
             let votes = foreign.votes(2.0, |other| f64::from(u8::from(other == cell)));
@@ -252,9 +306,22 @@ fn a_cell_whose_word_the_own_evidence_contradicts_is_believed_less() {
         };
         (is_news, alone(&liar) / alone(&honest))
     };
-    let right = Counts { correct: 90, incorrect: 10 };
+    let right = Counts {
+        correct: 90,
+        incorrect: 10,
+    };
     assert_eq!(judged(0, right), (false, 1.0), "nobody can be judged");
-    assert_eq!(judged(8, Counts { correct: 12, incorrect: 1 }), (false, 1.0), "by so few votes neither");
+    assert_eq!(
+        judged(
+            8,
+            Counts {
+                correct: 12,
+                incorrect: 1
+            }
+        ),
+        (false, 1.0),
+        "by so few votes neither"
+    );
     let weights = [1, 2, 8].map(|vehicles| judged(vehicles, right).1);
     println!("weight of the word of a cell that slandered 1, 2, 8 vehicles: {weights:.2?}");
     assert!((0.6..0.7).contains(&weights[0]) && weights[1..] == [0.5, 0.5]);
@@ -264,9 +331,17 @@ fn a_cell_whose_word_the_own_evidence_contradicts_is_believed_less() {
 fn own_evidence_soon_outweighs_what_all_others_say() {
     let config = ReputationConfig::default();
     let mut foreign = ForeignReputations::default();
-    (0..16).for_each(|cell| _ = foreign.merge(&name(&format!("cell-{cell}")), &name("v"), counts(0, 100_000)));
+    (0..16).for_each(|cell| {
+        _ = foreign.merge(
+            &name(&format!("cell-{cell}")),
+            &name("v"),
+            counts(0, 100_000),
+        )
+    });
     let votes = foreign.votes(config.initial_votes, |_| 1.0)[&name("v")];
-    let needed = (0..500).find(|own| config.mean_with(f64::from(*own), 0.0, votes) > 0.5).unwrap();
+    let needed = (0..500)
+        .find(|own| config.mean_with(f64::from(*own), 0.0, votes) > 0.5)
+        .unwrap();
     println!("{needed} right votes make up for what sixteen cells say");
     assert!(needed <= 25, "{needed}");
     assert!(config.mean_with(200.0, 0.0, votes) > 0.85);
@@ -275,14 +350,37 @@ fn own_evidence_soon_outweighs_what_all_others_say() {
 #[test]
 fn cells_are_told_of_votes_that_are_remembered_and_of_older_ones() {
     let mut ledger = ReputationLedger::default();
-    let vote = |correct| Evidence { node: name("v"), label: "cup".into(), correct };
+    let vote = |correct| Evidence {
+        node: name("v"),
+        label: "cup".into(),
+        correct,
+    };
     (0..2000).for_each(|_| ledger.record(1, &name("edge"), &vote(true)));
     (0..300).for_each(|_| ledger.record(2, &name("gauss"), &vote(false)));
     let told = ledger.cell_counts(500.0)[&name("v")];
-    assert_eq!(told.all, Counts { correct: 2000, incorrect: 300 });
-    assert_eq!(told.remembered(), Counts { correct: 200, incorrect: 300 });
+    assert_eq!(
+        told.all,
+        Counts {
+            correct: 2000,
+            incorrect: 300
+        }
+    );
+    assert_eq!(
+        told.remembered(),
+        Counts {
+            correct: 200,
+            incorrect: 300
+        }
+    );
     let message = told.message(name("lot-1"), name("v"));
     assert_eq!(CellCounts::from(&message), told);
-    let beside = ledger.reputations_beside(&ReputationConfig::default(), &[(name("w"), Default::default())].into());
-    assert_eq!((beside[&name("w")].score, beside[&name("w")].correct), (0.5, 0), "others' word is enough to be listed");
+    let beside = ledger.reputations_beside(
+        &ReputationConfig::default(),
+        &[(name("w"), Default::default())].into(),
+    );
+    assert_eq!(
+        (beside[&name("w")].score, beside[&name("w")].correct),
+        (0.5, 0),
+        "others' word is enough to be listed"
+    );
 }

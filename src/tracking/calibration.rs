@@ -61,7 +61,13 @@ impl DetectionCalibration {
     /// A calibration that assumes the even confidence.
     pub(super) fn new(even_confidence: f64) -> Self {
         let assumed = log_odds(even_confidence);
-        Self { bins: [(0.0, 0.0); BINS], assumed, even: assumed, slope: SLOPE, since_fit: 0 }
+        Self {
+            bins: [(0.0, 0.0); BINS],
+            assumed,
+            even: assumed,
+            slope: SLOPE,
+            since_fit: 0,
+        }
     }
 
     /// Log-odds that a detection is real, by the log-odds of its confidence.
@@ -117,8 +123,12 @@ impl DetectionCalibration {
             above = Some((middle, rate));
         }
         let lowest = above.map_or(self.assumed, |(lowest, _)| lowest);
-        let even = found.unwrap_or_else(|| self.assumed.min(lowest - BIN_NATS)).min(median);
-        let spread = self.median_above(even).map_or(USUAL_SPREAD, |median| median - even);
+        let even = found
+            .unwrap_or_else(|| self.assumed.min(lowest - BIN_NATS))
+            .min(median);
+        let spread = self
+            .median_above(even)
+            .map_or(USUAL_SPREAD, |median| median - even);
         let trust = total / (total + 10.0 * PRIOR_LOOKS);
         let wider = trust * (spread.max(0.1) / USUAL_SPREAD).ln();
         self.even = self.assumed + beyond_tolerance(even - self.assumed, EVEN_TOLERANCE);
@@ -133,7 +143,12 @@ impl DetectionCalibration {
     /// The median of all log-odds above a limit.
     fn median_above(&self, limit: f64) -> Option<f64> {
         let middle = |bin: usize| MIN_NATS + BIN_NATS * (bin as f64 + 0.5);
-        let above = || self.bins.iter().enumerate().filter(|(bin, _)| middle(*bin) > limit);
+        let above = || {
+            self.bins
+                .iter()
+                .enumerate()
+                .filter(|(bin, _)| middle(*bin) > limit)
+        };
         let half = above().map(|(_, (_, looks))| looks).sum::<f64>() / 2.0;
         let mut sum = 0.0;
         above().find_map(|(bin, (_, looks))| {

@@ -124,7 +124,11 @@ impl TracksConfig {
         check_range("min_confidence", self.min_confidence, 0.0, 1.0)?;
         check_range("vehicle_radius_m", self.vehicle_radius_m, 0.0, 100.0)?;
         if !is_label(&self.vehicle_label) {
-            return Err(ConfigError::new("vehicle_label", &self.vehicle_label, "a label of 1 to 64 bytes"));
+            return Err(ConfigError::new(
+                "vehicle_label",
+                &self.vehicle_label,
+                "a label of 1 to 64 bytes",
+            ));
         }
         check_range("align_offset_m", self.align_offset_m, 1e-3, 10.0)?;
         check_range("align_heading_rad", self.align_heading_rad, 1e-5, 0.5)?;

@@ -33,9 +33,15 @@ struct Bin {
 
 impl Default for Coverage {
     fn default() -> Self {
-        let DetectionRates { after_hit, after_miss } = DetectionRates::PRIOR;
+        let DetectionRates {
+            after_hit,
+            after_miss,
+        } = DetectionRates::PRIOR;
         let prior = |rate: f64| (rate as f32 * Self::PRIOR_LOOKS, Self::PRIOR_LOOKS);
-        let bin = Bin { after_hit: prior(after_hit), after_miss: prior(after_miss) };
+        let bin = Bin {
+            after_hit: prior(after_hit),
+            after_miss: prior(after_miss),
+        };
         Self {
             pose: None,
             stated: None,
@@ -73,8 +79,12 @@ impl Coverage {
         });
         // A stated view is relative to the pose.
         self.stated = report.view.filter(|_| report.pose.is_some());
-        let Some(here) = self.position().or_else(|| median(report)).or(self.centre) else { return false };
-        let has_jumped = self.centre.is_some_and(|before| (here - before).norm() > Self::JUMP_M);
+        let Some(here) = self.position().or_else(|| median(report)).or(self.centre) else {
+            return false;
+        };
+        let has_jumped = self
+            .centre
+            .is_some_and(|before| (here - before).norm() > Self::JUMP_M);
         if has_jumped {
             (self.farthest_m, self.directions) = (0.0, [0.0; Self::DIRECTIONS]);
         }
@@ -109,7 +119,9 @@ impl Coverage {
 
     /// Range around the centre, metres.
     pub(super) fn range_m(&self) -> f64 {
-        self.stated.map_or(self.farthest_m, |view| view.range_m).min(Self::MAX_RANGE_M)
+        self.stated
+            .map_or(self.farthest_m, |view| view.range_m)
+            .min(Self::MAX_RANGE_M)
     }
 
     /// True if the vehicle states its field of view.
@@ -126,14 +138,21 @@ impl Coverage {
         }
         let bin = &self.rates[Self::bin(distance_m)];
         let rate = |(hits, looks): (f32, f32)| f64::from(hits / looks).clamp(0.02, 0.98);
-        Some(DetectionRates { after_hit: rate(bin.after_hit), after_miss: rate(bin.after_miss) })
+        Some(DetectionRates {
+            after_hit: rate(bin.after_hit),
+            after_miss: rate(bin.after_miss),
+        })
     }
 
     /// Learns from a look at an object that certainly exists; `was_hit` is the result of the look before.
     pub(super) fn learn(&mut self, reported: &Vector2<f64>, was_hit: bool, is_hit: bool) {
         let Some(centre) = self.centre else { return };
         let bin = &mut self.rates[Self::bin((reported - centre).norm())];
-        let (hits, looks) = if was_hit { &mut bin.after_hit } else { &mut bin.after_miss };
+        let (hits, looks) = if was_hit {
+            &mut bin.after_hit
+        } else {
+            &mut bin.after_miss
+        };
         *hits += f32::from(u8::from(is_hit));
         *looks += 1.0;
         if *looks > Self::MEMORY {
@@ -144,9 +163,12 @@ impl Coverage {
     }
 
     fn faces(&self, offset: &Vector2<f64>, distance_m: f64) -> bool {
-        let Some((_, heading)) = self.pose else { return true };
+        let Some((_, heading)) = self.pose else {
+            return true;
+        };
         if let Some(view) = self.stated {
-            return offset.dot(&heading) >= distance_m * (view.angle_rad / 2.0).min(PI).cos() - 1e-9;
+            return offset.dot(&heading)
+                >= distance_m * (view.angle_rad / 2.0).min(PI).cos() - 1e-9;
         }
         self.directions[self.direction(offset)] > self.min_detections
     }
@@ -183,5 +205,8 @@ fn median(report: &ObjectReport) -> Option<Vector2<f64>> {
         let last = values.len().checked_sub(1)?;
         Some((values[last / 2] + values[last.div_ceil(2)]) / 2.0)
     };
-    Some(Vector2::new(median(|object| object.x_m)?, median(|object| object.y_m)?))
+    Some(Vector2::new(
+        median(|object| object.x_m)?,
+        median(|object| object.y_m)?,
+    ))
 }

@@ -45,14 +45,26 @@ impl DetectionHistory {
     }
 
     /// The history of a vehicle that looks at the object, if there is room for it.
-    pub(super) fn for_look(&mut self, sensor: SensorId, at: Timestamp) -> Option<&mut SensorHistory> {
+    pub(super) fn for_look(
+        &mut self,
+        sensor: SensorId,
+        at: Timestamp,
+    ) -> Option<&mut SensorHistory> {
         let slot = self.find_slot(sensor, at)?;
         Some(self.occupy(slot, sensor, at))
     }
 
     /// The history of a vehicle that detects the object; it may replace one that never did.
-    pub(super) fn for_hit(&mut self, sensor: SensorId, at: Timestamp) -> Option<&mut SensorHistory> {
-        let without_hit = || self.histories.iter().position(|history| history.last_hit.is_none());
+    pub(super) fn for_hit(
+        &mut self,
+        sensor: SensorId,
+        at: Timestamp,
+    ) -> Option<&mut SensorHistory> {
+        let without_hit = || {
+            self.histories
+                .iter()
+                .position(|history| history.last_hit.is_none())
+        };
         let slot = self.find_slot(sensor, at).or_else(without_hit)?;
         Some(self.occupy(slot, sensor, at))
     }
@@ -74,7 +86,9 @@ impl DetectionHistory {
     pub(super) fn merge(&mut self, other: Self) {
         for theirs in other.histories {
             match self.slot_of(theirs.sensor) {
-                Some(slot) if self.histories[slot].last_hit < theirs.last_hit => self.histories[slot] = theirs,
+                Some(slot) if self.histories[slot].last_hit < theirs.last_hit => {
+                    self.histories[slot] = theirs
+                }
                 None if self.histories.len() < MAX_SLOTS => {
                     self.sensors.push(theirs.sensor);
                     self.histories.push(theirs);
@@ -92,7 +106,11 @@ impl DetectionHistory {
     fn find_slot(&self, sensor: SensorId, at: Timestamp) -> Option<usize> {
         let unused = || Some(self.histories.len()).filter(|count| *count < MAX_SLOTS);
         let expired = || {
-            let looks = self.histories.iter().map(|history| history.last_look).enumerate();
+            let looks = self
+                .histories
+                .iter()
+                .map(|history| history.last_look)
+                .enumerate();
             let (oldest, look) = looks.min_by_key(|(_, look)| *look)?;
             (at.since(look) > SLOT_KEPT).then_some(oldest)
         };

@@ -82,7 +82,11 @@ pub(super) struct SensorQuality {
 /// Log-odds of existence of a track before any evidence, beside the base rate. `looks_hz` is the rate at which all vehicles
 /// look at it, `even_excess` the least of those that detect it.
 pub(super) fn alone_nats(looks_hz: f64, even_excess: f64) -> f64 {
-    let looks = if looks_hz > 0.0 { (looks_hz / USUAL_LOOKS_HZ).ln() } else { 0.0 };
+    let looks = if looks_hz > 0.0 {
+        (looks_hz / USUAL_LOOKS_HZ).ln()
+    } else {
+        0.0
+    };
     ALONE_NATS - LOOKS_NATS * looks - EVEN_NATS * even_excess.max(0.0)
 }
 
@@ -127,14 +131,24 @@ pub(super) struct DetectionRates {
 
 impl DetectionRates {
     /// Rates of a real object in an unknown view.
-    pub(super) const PRIOR: Self = Self { after_hit: 0.9, after_miss: 0.15 };
+    pub(super) const PRIOR: Self = Self {
+        after_hit: 0.9,
+        after_miss: 0.15,
+    };
 
     /// Usual rates of clutter.
-    const CLUTTER: Self = Self { after_hit: 0.5, after_miss: 0.02 };
+    const CLUTTER: Self = Self {
+        after_hit: 0.5,
+        after_miss: 0.02,
+    };
 
     /// The rate after a hit or a miss.
     pub(super) fn after(&self, was_hit: bool) -> f64 {
-        if was_hit { self.after_hit } else { self.after_miss }
+        if was_hit {
+            self.after_hit
+        } else {
+            self.after_miss
+        }
     }
 }
 
@@ -149,13 +163,20 @@ pub(super) struct LookRates {
 
 impl LookRates {
     /// Usual rates.
-    pub(super) const PRIOR: Self =
-        Self { object: DetectionRates::PRIOR, clutter: DetectionRates::CLUTTER, is_view_stated: false };
+    pub(super) const PRIOR: Self = Self {
+        object: DetectionRates::PRIOR,
+        clutter: DetectionRates::CLUTTER,
+        is_view_stated: false,
+    };
 
     /// Ratio of the probabilities of a look's result, if an object is there and if it is clutter.
     fn ratio(&self, was_hit: bool, is_hit: bool) -> f64 {
         let [object, clutter] = [self.object, self.clutter].map(|rates| rates.after(was_hit));
-        if is_hit { object / clutter } else { (1.0 - object) / (1.0 - clutter) }
+        if is_hit {
+            object / clutter
+        } else {
+            (1.0 - object) / (1.0 - clutter)
+        }
     }
 }
 
@@ -169,9 +190,15 @@ pub(super) struct ClutterRates {
 
 impl Default for ClutterRates {
     fn default() -> Self {
-        let DetectionRates { after_hit, after_miss } = DetectionRates::CLUTTER;
+        let DetectionRates {
+            after_hit,
+            after_miss,
+        } = DetectionRates::CLUTTER;
         let usual = |rate: f64| (rate * Self::USUAL_LOOKS, Self::USUAL_LOOKS);
-        Self { after_hit: usual(after_hit), after_miss: usual(after_miss) }
+        Self {
+            after_hit: usual(after_hit),
+            after_miss: usual(after_miss),
+        }
     }
 }
 
@@ -185,12 +212,19 @@ impl ClutterRates {
     /// The rates.
     pub(super) fn rates(&self) -> DetectionRates {
         let rate = |(hits, looks): (f64, f64)| hits / looks;
-        DetectionRates { after_hit: rate(self.after_hit), after_miss: rate(self.after_miss) }
+        DetectionRates {
+            after_hit: rate(self.after_hit),
+            after_miss: rate(self.after_miss),
+        }
     }
 
     /// Learns from a look at a track that is clutter with a probability; `was_hit` is the result of the look before.
     pub(super) fn learn(&mut self, probability: f64, was_hit: bool, is_hit: bool) {
-        let (hits, looks) = if was_hit { &mut self.after_hit } else { &mut self.after_miss };
+        let (hits, looks) = if was_hit {
+            &mut self.after_hit
+        } else {
+            &mut self.after_miss
+        };
         *hits += probability * f64::from(u8::from(is_hit));
         *looks += probability;
         let kept = (Self::MEMORY / *looks).min(1.0);
@@ -222,7 +256,13 @@ impl SensorHistory {
     /// Records a detection whose confidence is worth `nats`. `rates` are `None` for the detection that spawns a track:
     /// it is no evidence that a known object was found again.
     #[inline]
-    pub(super) fn hit(&mut self, at: Timestamp, position: Vector2<f64>, nats: f64, rates: Option<LookRates>) {
+    pub(super) fn hit(
+        &mut self,
+        at: Timestamp,
+        position: Vector2<f64>,
+        nats: f64,
+        rates: Option<LookRates>,
+    ) {
         let share = self.look(at);
         if let Some(rates) = rates {
             self.add(share * rates.ratio(self.was_hit, true).ln());
@@ -250,7 +290,11 @@ impl SensorHistory {
     /// Fades earlier evidence; returns the independence of this look from the last, 0 to 1.
     fn look(&mut self, at: Timestamp) -> f64 {
         let dt = at.since(self.last_look).as_secs_f64();
-        let share = if self.looks == 0 { 1.0 } else { (dt / INDEPENDENT_S).min(1.0) };
+        let share = if self.looks == 0 {
+            1.0
+        } else {
+            (dt / INDEPENDENT_S).min(1.0)
+        };
         let kept = (-dt / MEMORY_S).exp();
         self.score *= kept;
         self.weight *= kept;
@@ -263,10 +307,12 @@ impl SensorHistory {
 
     /// The statement since the last judgement, if a judgement is due.
     pub(super) fn take_due(&mut self, at: Timestamp) -> Option<ExistenceStatement> {
-        (at.since(self.judged_at) >= JUDGED_AFTER && self.unjudged.looks >= MIN_JUDGED_LOOKS).then(|| {
-            self.judged_at = at;
-            std::mem::take(&mut self.unjudged)
-        })
+        (at.since(self.judged_at) >= JUDGED_AFTER && self.unjudged.looks >= MIN_JUDGED_LOOKS).then(
+            || {
+                self.judged_at = at;
+                std::mem::take(&mut self.unjudged)
+            },
+        )
     }
 
     fn add(&mut self, nats: f64) {
@@ -282,8 +328,15 @@ impl SensorHistory {
     /// Its part in the evidence of all, and what it denies beyond that, nats.
     pub(super) fn shared_nats(&self, at: Timestamp) -> (f64, f64) {
         let (sequence, confidence) = self.evidence(at);
-        let denied = if self.is_view_stated { DENIAL_WEIGHT * (-sequence).max(0.0) } else { 0.0 };
-        (SEQUENCE_WEIGHT * sequence + CONFIDENCE_WEIGHT * confidence, denied)
+        let denied = if self.is_view_stated {
+            DENIAL_WEIGHT * (-sequence).max(0.0)
+        } else {
+            0.0
+        };
+        (
+            SEQUENCE_WEIGHT * sequence + CONFIDENCE_WEIGHT * confidence,
+            denied,
+        )
     }
 
     /// Evidence of the sequence and of the confidences, nats.
@@ -336,24 +389,36 @@ impl BaseRate {
     /// Log-odds that a track is an object.
     pub(super) fn log_odds(&self) -> f64 {
         let objects = Self::USUAL * Self::USUAL_TRACKS + self.objects;
-        let clutter = (1.0 - Self::USUAL) * Self::USUAL_TRACKS + (self.tracks - self.objects).max(0.0);
+        let clutter =
+            (1.0 - Self::USUAL) * Self::USUAL_TRACKS + (self.tracks - self.objects).max(0.0);
         (objects / clutter).ln()
     }
 
     /// Learns from the existences of all tracks of a round, each with the only vehicle that detects the object, if there is
     /// but one.
-    pub(super) fn learn(&mut self, at: Timestamp, existences: impl Iterator<Item = (Option<SensorId>, f64)>) {
+    pub(super) fn learn(
+        &mut self,
+        at: Timestamp,
+        existences: impl Iterator<Item = (Option<SensorId>, f64)>,
+    ) {
         let mut sums: BTreeMap<Option<SensorId>, (f64, f64)> = BTreeMap::new();
         for (witness, existence) in existences {
             let (tracks, objects) = sums.entry(witness).or_default();
             (*tracks, *objects) = (*tracks + 1.0, *objects + existence);
         }
         let weight = |witness: &Option<SensorId>, tracks| {
-            if witness.is_none() { 1.0 } else { f64::min(1.0, Self::MAX_OF_ONE / tracks) }
+            if witness.is_none() {
+                1.0
+            } else {
+                f64::min(1.0, Self::MAX_OF_ONE / tracks)
+            }
         };
-        let weighted = sums.iter().map(|(witness, sums)| (weight(witness, sums.0), sums));
-        let (tracks, objects) =
-            weighted.fold((0.0, 0.0), |all, (weight, sums)| (all.0 + weight * sums.0, all.1 + weight * sums.1));
+        let weighted = sums
+            .iter()
+            .map(|(witness, sums)| (weight(witness, sums.0), sums));
+        let (tracks, objects) = weighted.fold((0.0, 0.0), |all, (weight, sums)| {
+            (all.0 + weight * sums.0, all.1 + weight * sums.1)
+        });
         let kept = (-at.since(self.at).as_secs_f64() / Self::MEMORY_S).exp();
         self.tracks += (1.0 - kept) * (tracks - self.tracks);
         self.objects += (1.0 - kept) * (objects - self.objects);

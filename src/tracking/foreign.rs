@@ -82,26 +82,43 @@ impl ForeignObject {
         if let Some(velocity) = object.velocity_mps {
             lend_velocity(&mut track.state, fused_at, velocity.into(), config);
         }
-        Self { cell: cell.clone(), track, stated: stated.clone(), fused_at, judged_at: fused_at, same: None }
+        Self {
+            cell: cell.clone(),
+            track,
+            stated: stated.clone(),
+            fused_at,
+            judged_at: fused_at,
+            same: None,
+        }
     }
 
     /// True if its cell states that it exists.
     pub(super) fn is_stated(&self) -> bool {
         let object = &self.stated.object;
-        object.existence.unwrap_or(object.confidence) >= MIN_STATED && object.age_s.unwrap_or(0.0) <= MAX_STATED_AGE_S
+        object.existence.unwrap_or(object.confidence) >= MIN_STATED
+            && object.age_s.unwrap_or(0.0) <= MAX_STATED_AGE_S
     }
 
     /// The object with its errors at `at`, as a measurement.
     fn measured_at(&self, at: Timestamp, config: &TracksConfig) -> Measurement {
         let independent = self.track.state.covariance_at(at, config.density());
-        Measurement { position: self.track.state.position_at(at), independent, common_m: 0.0 }
+        Measurement {
+            position: self.track.state.position_at(at),
+            independent,
+            common_m: 0.0,
+        }
     }
 
     /// Squared distance from a track in standard deviations, if both can be one object at `at`.
     fn distance_from(&self, track: &Track, at: Timestamp, config: &TracksConfig) -> Option<f64> {
-        let innovation = track.state.innovation(at, &self.measured_at(at, config), config.density());
+        let innovation =
+            track
+                .state
+                .innovation(at, &self.measured_at(at, config), config.density());
         let velocity = self.track.state.velocity - track.state.velocity;
-        let variance = (self.track.state.velocity_covariance() + track.state.velocity_covariance()).trace() / 2.0;
+        let variance = (self.track.state.velocity_covariance() + track.state.velocity_covariance())
+            .trace()
+            / 2.0;
         let reach_m = MERGE_M + CLOCK_ERROR_S * self.track.state.velocity.norm();
         let is_same = innovation.offset.norm() <= reach_m
             && innovation.distance_squared <= config.gate()
@@ -133,7 +150,9 @@ impl ForeignObjects {
                 // An object that changes its identity all the time is judged nevertheless.
                 let at_place = || {
                     let position = object.track.state.position;
-                    of_cell().find(|known| (known.track.state.position_at(fused_at) - position).norm() < MERGE_M)
+                    of_cell().find(|known| {
+                        (known.track.state.position_at(fused_at) - position).norm() < MERGE_M
+                    })
                 };
                 if let Some(known) = by_id.or_else(at_place) {
                     object.track.history = known.track.history.clone();
@@ -151,7 +170,9 @@ impl ForeignObjects {
     /// Forgets objects whose maps were fused before `limit`, and vehicles that are not `known`.
     pub(super) fn forget(&mut self, limit: Timestamp, known: impl Fn(SensorId) -> bool) {
         self.objects.retain(|object| object.fused_at >= limit);
-        self.objects.iter_mut().for_each(|object| object.track.history.retain(&known));
+        self.objects
+            .iter_mut()
+            .for_each(|object| object.track.history.retain(&known));
     }
 
     /// Finds the track that is the same as each object: of each cell one to one, the nearest first.
@@ -166,12 +187,18 @@ impl ForeignObjects {
                 let track = &tracks[indexed.track];
                 if is_known && track.id == object.track.id {
                     pairs.push((0.0, number, indexed.track));
-                } else if let Some(distance) = object.distance_from(track, now, config).filter(|_| !is_known) {
+                } else if let Some(distance) = object
+                    .distance_from(track, now, config)
+                    .filter(|_| !is_known)
+                {
                     pairs.push((distance, number, indexed.track));
                 }
             });
         }
-        pairs.sort_by(|a, b| a.0.total_cmp(&b.0).then_with(|| (a.1, a.2).cmp(&(b.1, b.2))));
+        pairs.sort_by(|a, b| {
+            a.0.total_cmp(&b.0)
+                .then_with(|| (a.1, a.2).cmp(&(b.1, b.2)))
+        });
         let mut taken: BTreeSet<(&NodeName, TrackIndex)> = BTreeSet::new();
         let mut same: Vec<Option<Uuid>> = vec![None; self.objects.len()];
         for (_, number, track) in pairs {
@@ -180,7 +207,12 @@ impl ForeignObjects {
             }
         }
         for (object, same) in self.objects.iter_mut().zip(same) {
-            let since = |id| object.same.filter(|(known, _)| *known == id).map_or(now, |(_, since)| since);
+            let since = |id| {
+                object
+                    .same
+                    .filter(|(known, _)| *known == id)
+                    .map_or(now, |(_, since)| since)
+            };
             object.same = same.map(|id| (id, since(id)));
         }
     }
@@ -189,15 +221,23 @@ impl ForeignObjects {
     fn agree(&mut self, tracks: &mut TrackStore, now: Timestamp, fleet: &Fleet) {
         let mut ids: BTreeSet<Uuid> = tracks.iter().map(|track| track.id).collect();
         for object in &mut self.objects {
-            let Some((id, since)) = object.same.filter(|(id, _)| *id != object.track.id) else { continue };
+            let Some((id, since)) = object.same.filter(|(id, _)| *id != object.track.id) else {
+                continue;
+            };
             let agreed = now.since(since);
             if agreed < AGREES_AFTER || !self.trust.of(&object.cell).is_proven(fleet.reputation()) {
                 continue;
             }
-            let Some(track) = tracks.iter_mut().find(|track| track.id == id) else { continue };
+            let Some(track) = tracks.iter_mut().find(|track| track.id == id) else {
+                continue;
+            };
             let older_s = track.first_seen.micros_from(object.track.first_seen) as f64 * 1e-6;
             let is_tie = older_s.abs() <= TIE_S || agreed >= TIES_AFTER;
-            let is_theirs = if is_tie { object.track.id < id } else { older_s > 0.0 };
+            let is_theirs = if is_tie {
+                object.track.id < id
+            } else {
+                older_s > 0.0
+            };
             if is_theirs && track.renames < MAX_RENAMES && ids.insert(object.track.id) {
                 ids.remove(&id);
                 (track.id, track.renames) = (object.track.id, track.renames + 1);
@@ -210,8 +250,14 @@ impl ForeignObjects {
 
     /// True if an object is not shown: it is one of this cell's, or its cell is not believed.
     pub(super) fn hides(&self, stated: &NeighbourObject, fleet: &Fleet) -> bool {
-        let is_this = |object: &&ForeignObject| object.track.id == stated.object.id && object.cell == stated.cell;
-        let is_same = self.objects.iter().find(is_this).is_some_and(|object| object.same.is_some());
+        let is_this = |object: &&ForeignObject| {
+            object.track.id == stated.object.id && object.cell == stated.cell
+        };
+        let is_same = self
+            .objects
+            .iter()
+            .find(is_this)
+            .is_some_and(|object| object.same.is_some());
         is_same || !self.is_trusted(&stated.cell, fleet)
     }
 
@@ -251,7 +297,11 @@ impl ForeignObjects {
 
     /// Judges the statements that are due at `at`.
     pub(super) fn judge(&mut self, fleet: &Fleet, at: Timestamp) {
-        for object in self.objects.iter_mut().filter(|object| at.since(object.judged_at) >= JUDGED_AFTER) {
+        for object in self
+            .objects
+            .iter_mut()
+            .filter(|object| at.since(object.judged_at) >= JUDGED_AFTER)
+        {
             object.judged_at = at;
             let judgement = Some(&object.track.history).filter(|_| object.is_stated());
             if let Some(judgement) = judgement.and_then(|history| fleet.judge_stated(history, at)) {
@@ -274,10 +324,15 @@ impl ForeignObjects {
     ) -> Option<&ForeignObject> {
         let candidates = self.objects.iter().filter(|object| object.same.is_none());
         let near = candidates.filter_map(|object| {
-            let innovation = object.track.state.innovation(at, measurement, config.density());
-            let is_near = innovation.offset.norm() <= config.gate_m && innovation.distance_squared <= config.gate();
+            let innovation = object
+                .track
+                .state
+                .innovation(at, measurement, config.density());
+            let is_near = innovation.offset.norm() <= config.gate_m
+                && innovation.distance_squared <= config.gate();
             let is_like = |detected| object.track.label_similarity(detected) > MIN_LABEL_SIMILARITY;
-            (is_near && detected.is_none_or(is_like)).then_some((innovation.distance_squared, object))
+            (is_near && detected.is_none_or(is_like))
+                .then_some((innovation.distance_squared, object))
         });
         // A cell that is not believed, or copies identities, must not stand before others. One that is not proven lends only
         // what it can be judged by.
@@ -288,13 +343,20 @@ impl ForeignObjects {
                 && (object.is_stated() || trust.is_proven(fleet.reputation()))
                 && tracks.iter().all(|track| track.id != object.track.id)
         });
-        usable.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.track.id.cmp(&b.1.track.id))).map(|(_, object)| object)
+        usable
+            .min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.track.id.cmp(&b.1.track.id)))
+            .map(|(_, object)| object)
     }
 }
 
 impl ForeignObject {
     /// A track that begins with a measurement of this object at `at`.
-    pub(super) fn lend(&self, at: Timestamp, measurement: &Measurement, config: &TracksConfig) -> Track {
+    pub(super) fn lend(
+        &self,
+        at: Timestamp,
+        measurement: &Measurement,
+        config: &TracksConfig,
+    ) -> Track {
         let mut track = Track::new(self.track.id, at, measurement, config);
         track.inherit(&self.stated.object, at);
         if let Some(velocity) = self.stated.object.velocity_mps {
@@ -304,7 +366,12 @@ impl ForeignObject {
     }
 }
 
-fn lend_velocity(state: &mut KinematicState, at: Timestamp, velocity: Vector2<f64>, config: &TracksConfig) {
+fn lend_velocity(
+    state: &mut KinematicState,
+    at: Timestamp,
+    velocity: Vector2<f64>,
+    config: &TracksConfig,
+) {
     let sigma_mps = VELOCITY_SIGMA_MPS.hypot(VELOCITY_SIGMA_SHARE * velocity.norm());
     state.update_velocity(at, velocity, sigma_mps, config.density());
     state.limit_speed(config.max_speed_mps);

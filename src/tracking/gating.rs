@@ -40,32 +40,49 @@ impl ReportUpdate<'_> {
         let reach_m = gate_m + self.tracks.slack_m(self.at);
         let mut pairings = Vec::with_capacity(2 * detections.len());
         for (number, detection) in detections.iter().enumerate() {
-            let alone = detection.measurement.independent.trace() / 2.0 + self.config.common_m.powi(2);
-            self.tracks.near(&detection.measurement.position, reach_m, |indexed| {
-                let track = &self.tracks[indexed.track];
-                let offset = detection.measurement.position - track.state.position_at(self.at);
-                if track.vehicle == Some(self.sensor.id) || offset.norm_squared() > gate_m.powi(2) {
-                    return;
-                }
-                let innovation = track.state.innovation(self.at, &detection.measurement, self.config.density());
-                if innovation.distance_squared > gate {
-                    return;
-                }
-                let similarity = track.label_similarity(detection.object);
-                let spread = innovation.covariance.determinant().sqrt() / alone;
-                let maturity = f64::from(track.hits.clamp(1, MAX_MATURITY));
-                let benefit = gate - innovation.distance_squared + (maturity * similarity.powi(2) / spread).ln();
-                if benefit > 0.0 || similarity > MIN_LABEL_SIMILARITY {
-                    let benefit = benefit.max(MIN_BENEFIT);
-                    pairings.push(GatedPair { detection: number, track: indexed.track, benefit });
-                }
-            });
+            let alone =
+                detection.measurement.independent.trace() / 2.0 + self.config.common_m.powi(2);
+            self.tracks
+                .near(&detection.measurement.position, reach_m, |indexed| {
+                    let track = &self.tracks[indexed.track];
+                    let offset = detection.measurement.position - track.state.position_at(self.at);
+                    if track.vehicle == Some(self.sensor.id)
+                        || offset.norm_squared() > gate_m.powi(2)
+                    {
+                        return;
+                    }
+                    let innovation = track.state.innovation(
+                        self.at,
+                        &detection.measurement,
+                        self.config.density(),
+                    );
+                    if innovation.distance_squared > gate {
+                        return;
+                    }
+                    let similarity = track.label_similarity(detection.object);
+                    let spread = innovation.covariance.determinant().sqrt() / alone;
+                    let maturity = f64::from(track.hits.clamp(1, MAX_MATURITY));
+                    let benefit = gate - innovation.distance_squared
+                        + (maturity * similarity.powi(2) / spread).ln();
+                    if benefit > 0.0 || similarity > MIN_LABEL_SIMILARITY {
+                        let benefit = benefit.max(MIN_BENEFIT);
+                        pairings.push(GatedPair {
+                            detection: number,
+                            track: indexed.track,
+                            benefit,
+                        });
+                    }
+                });
         }
         best(pairings)
     }
 
     /// Adds pairings of the remaining likely detections with tracks that are so new that they may have any velocity.
-    pub(super) fn associate_fast(&mut self, detections: &[TimedDetection<'_>], pairings: &mut Vec<GatedPair>) {
+    pub(super) fn associate_fast(
+        &mut self,
+        detections: &[TimedDetection<'_>],
+        pairings: &mut Vec<GatedPair>,
+    ) {
         if pairings.len() == detections.len() {
             return;
         }
@@ -74,21 +91,32 @@ impl ReportUpdate<'_> {
         let mut continued: Vec<TrackIndex> = pairings.iter().map(|pairing| pairing.track).collect();
         continued.sort_unstable();
         let mut matched = pairings.iter().map(|pairing| pairing.detection).peekable();
-        let rest = detections.iter().enumerate().filter(|(number, _)| matched.next_if_eq(number).is_none());
+        let rest = detections
+            .iter()
+            .enumerate()
+            .filter(|(number, _)| matched.next_if_eq(number).is_none());
         let is_likely = self.sensor.calibration.likely();
         let likely = rest.filter(|(_, detection)| is_likely(detection.object.confidence));
         let mut fast = Vec::new();
         for (number, detection) in likely.take(MAX_FAST) {
-            self.tracks.near(&detection.measurement.position, reach_m, |indexed| {
-                if continued.binary_search(&indexed.track).is_err()
-                    && let Some(benefit) = self.benefit_if_fast(&self.tracks[indexed.track], detection)
-                {
-                    fast.push(GatedPair { detection: number, track: indexed.track, benefit });
-                }
-            });
+            self.tracks
+                .near(&detection.measurement.position, reach_m, |indexed| {
+                    if continued.binary_search(&indexed.track).is_err()
+                        && let Some(benefit) =
+                            self.benefit_if_fast(&self.tracks[indexed.track], detection)
+                    {
+                        fast.push(GatedPair {
+                            detection: number,
+                            track: indexed.track,
+                            benefit,
+                        });
+                    }
+                });
         }
         for pairing in best(fast) {
-            self.tracks[pairing.track].state.inflate_velocity_covariance(max_mps / 2.0);
+            self.tracks[pairing.track]
+                .state
+                .inflate_velocity_covariance(max_mps / 2.0);
             pairings.push(pairing);
         }
         pairings.sort_by_key(|pairing| pairing.detection);
@@ -107,7 +135,8 @@ impl ReportUpdate<'_> {
         let mut state = track.state.clone();
         state.inflate_velocity_covariance(max_mps / 2.0);
         let innovation = state.innovation(self.at, &detection.measurement, self.config.density());
-        let is_possible = innovation.distance_squared <= self.config.gate() && similarity > MIN_LABEL_SIMILARITY;
+        let is_possible =
+            innovation.distance_squared <= self.config.gate() && similarity > MIN_LABEL_SIMILARITY;
         let benefit = self.config.gate() - innovation.distance_squared + 2.0 * similarity.ln();
         is_possible.then_some(benefit.max(MIN_BENEFIT))
     }
@@ -128,7 +157,10 @@ fn greedy_if_large(size: ClusterSize, cluster: &[GatedPair]) -> Option<Vec<Gated
         by_benefit.sort_by(|a, b| b.benefit.total_cmp(&a.benefit));
         let mut chosen: Vec<GatedPair> = Vec::new();
         for pairing in by_benefit {
-            if chosen.iter().all(|other| other.detection != pairing.detection && other.track != pairing.track) {
+            if chosen
+                .iter()
+                .all(|other| other.detection != pairing.detection && other.track != pairing.track)
+            {
                 chosen.push(pairing);
             }
         }

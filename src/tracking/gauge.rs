@@ -38,7 +38,8 @@ impl Gauge {
     pub(super) fn hold(mut self, sensors: &mut Sensors, prior: &BiasPrior) {
         let known = self.towards.len();
         let observers = || sensors.iter().filter(|sensor| sensor.id.number() < known);
-        let weight = |sensor: &SensorModel| sensors.fleet.trust(sensor.id) * sensor.pose_bias.weight(prior);
+        let weight =
+            |sensor: &SensorModel| sensors.fleet.trust(sensor.id) * sensor.pose_bias.weight(prior);
         // Those that were silent have not faded yet.
         let before = |before: &[Option<(Vector4<f64>, f64)>], sensor: &SensorModel| {
             before[sensor.id.number()].unwrap_or((sensor.pose_bias.error(), 1.0))
@@ -54,10 +55,18 @@ impl Gauge {
             let (group, pose_bias) = (self.group(sensor.id.number()), &sensor.pose_bias);
             let kept = kept[group].0 / kept[group].1.max(f64::MIN_POSITIVE);
             let (error, _) = before(&self.before, sensor);
-            sums[group].add(&pose_bias.pivot(), &(pose_bias.error() - error * kept), weight(sensor), prior);
+            sums[group].add(
+                &pose_bias.pivot(),
+                &(pose_bias.error() - error * kept),
+                weight(sensor),
+                prior,
+            );
         }
         let common: Vec<Option<Motion>> = sums.iter().map(MotionSums::motion).collect();
-        for sensor in sensors.iter_mut().filter(|sensor| sensor.id.number() < known) {
+        for sensor in sensors
+            .iter_mut()
+            .filter(|sensor| sensor.id.number() < known)
+        {
             if let Some(common) = &common[self.group(sensor.id.number())] {
                 let part = common.at(&sensor.pose_bias.pivot());
                 sensor.pose_bias.take_back(&part, prior);
@@ -113,8 +122,17 @@ impl MotionSums {
         let offset = weight / (prior.offset_m * prior.offset_m);
         let rotation = weight / (prior.heading_rad * prior.heading_rad);
         let both = arm * offset;
-        self.normal +=
-            Matrix3::new(offset, 0.0, both.x, 0.0, offset, both.y, both.x, both.y, both.dot(&arm) + rotation);
+        self.normal += Matrix3::new(
+            offset,
+            0.0,
+            both.x,
+            0.0,
+            offset,
+            both.y,
+            both.x,
+            both.y,
+            both.dot(&arm) + rotation,
+        );
         let turned = both.dot(&change.xy()) + rotation * change.z;
         self.gradient += Vector3::new(offset * change.x, offset * change.y, turned);
         self.delay_s += weight * change.w;

@@ -26,7 +26,10 @@ pub(super) struct IndexedTrack {
 impl TrackGrid {
     /// An empty grid with cells of `cell_m` metres.
     pub(super) fn new(cell_m: f64) -> Self {
-        Self { cell_m, cells: HashMap::new() }
+        Self {
+            cell_m,
+            cells: HashMap::new(),
+        }
     }
 
     /// Removes all tracks.
@@ -36,27 +39,52 @@ impl TrackGrid {
 
     /// Adds a track.
     pub(super) fn insert(&mut self, track: IndexedTrack) {
-        self.cells.entry((self.line(track.position.x), self.line(track.position.y))).or_default().push(track);
+        self.cells
+            .entry((self.line(track.position.x), self.line(track.position.y)))
+            .or_default()
+            .push(track);
     }
 
     /// Number of tracks in the square around a position. The grid of squares has sides of `side_m`, which divides the
     /// side of a cell.
     pub(super) fn crowd(&self, position: &Vector2<f64>, side_m: f64) -> usize {
-        let square = |point: &Vector2<f64>| point.map(|coordinate_m| (coordinate_m / side_m).floor());
+        let square =
+            |point: &Vector2<f64>| point.map(|coordinate_m| (coordinate_m / side_m).floor());
         let here = square(position);
-        let tracks = self.cells.get(&(self.line(position.x), self.line(position.y))).into_iter().flatten();
-        tracks.filter(|track| square(&track.position) == here).count()
+        let tracks = self
+            .cells
+            .get(&(self.line(position.x), self.line(position.y)))
+            .into_iter()
+            .flatten();
+        tracks
+            .filter(|track| square(&track.position) == here)
+            .count()
     }
 
     /// Visits the tracks that were within `reach_m` of a position.
-    pub(super) fn near(&self, position: &Vector2<f64>, reach_m: f64, mut visit: impl FnMut(&IndexedTrack)) {
-        let (west, east) = (self.line(position.x - reach_m), self.line(position.x + reach_m));
-        let (south, north) = (self.line(position.y - reach_m), self.line(position.y + reach_m));
+    pub(super) fn near(
+        &self,
+        position: &Vector2<f64>,
+        reach_m: f64,
+        mut visit: impl FnMut(&IndexedTrack),
+    ) {
+        let (west, east) = (
+            self.line(position.x - reach_m),
+            self.line(position.x + reach_m),
+        );
+        let (south, north) = (
+            self.line(position.y - reach_m),
+            self.line(position.y + reach_m),
+        );
         for column in west..=east {
             for row in south..=north {
-                let tracks = self.cells.get(&(column, row)).map_or(&[][..], SmallVec::as_slice);
-                let near =
-                    tracks.iter().filter(|track| (track.position - position).norm_squared() <= reach_m * reach_m);
+                let tracks = self
+                    .cells
+                    .get(&(column, row))
+                    .map_or(&[][..], SmallVec::as_slice);
+                let near = tracks.iter().filter(|track| {
+                    (track.position - position).norm_squared() <= reach_m * reach_m
+                });
                 near.for_each(&mut visit);
             }
         }
@@ -78,8 +106,26 @@ mod tests {
     #[test]
     fn a_coordinate_lies_in_the_cell_that_begins_at_or_below_it() {
         let grid = TrackGrid::new(24.0);
-        for coordinate_m in [-1e12, -48.0, -24.000_000_1, -24.0, -23.9, -0.5, -0.0, 0.0, 0.5, 23.9, 24.0, 1e8, 1e12] {
-            assert_eq!(grid.line(coordinate_m), (coordinate_m / 24.0).floor() as i32, "{coordinate_m}");
+        for coordinate_m in [
+            -1e12,
+            -48.0,
+            -24.000_000_1,
+            -24.0,
+            -23.9,
+            -0.5,
+            -0.0,
+            0.0,
+            0.5,
+            23.9,
+            24.0,
+            1e8,
+            1e12,
+        ] {
+            assert_eq!(
+                grid.line(coordinate_m),
+                (coordinate_m / 24.0).floor() as i32,
+                "{coordinate_m}"
+            );
         }
     }
 }

@@ -84,7 +84,10 @@ impl KinematicState {
 
     fn independent_at(&self, dt: f64, density: f64) -> Matrix2<f64> {
         let drift = density * dt.abs().powi(3) / 3.0;
-        self.pp + (self.pv + self.pv.transpose()) * dt + self.vv * (dt * dt) + Matrix2::identity() * drift
+        self.pp
+            + (self.pv + self.pv.transpose()) * dt
+            + self.vv * (dt * dt)
+            + Matrix2::identity() * drift
     }
 
     /// Moves the state to `at`; an earlier time changes nothing.
@@ -101,11 +104,23 @@ impl KinematicState {
     }
 
     /// The innovation of a measurement taken at `at`.
-    pub(super) fn innovation(&self, at: Timestamp, measurement: &Measurement, density: f64) -> Innovation {
+    pub(super) fn innovation(
+        &self,
+        at: Timestamp,
+        measurement: &Measurement,
+        density: f64,
+    ) -> Innovation {
         let offset = measurement.position - self.position_at(at);
-        let covariance = self.covariance_at(at, density) + measurement.independent + isotropic(measurement.common_m);
-        let distance_squared = inverse(&covariance).map_or(f64::INFINITY, |inverse| offset.dot(&(inverse * offset)));
-        Innovation { offset, covariance, distance_squared }
+        let covariance = self.covariance_at(at, density)
+            + measurement.independent
+            + isotropic(measurement.common_m);
+        let distance_squared =
+            inverse(&covariance).map_or(f64::INFINITY, |inverse| offset.dot(&(inverse * offset)));
+        Innovation {
+            offset,
+            covariance,
+            distance_squared,
+        }
     }
 
     /// Updates the state with a measurement taken at `at`.
@@ -117,7 +132,9 @@ impl KinematicState {
         let dt = self.seconds_to(at).min(0.0);
         let noise = self.independent_at(dt, density) + measurement.independent;
         let total = noise + isotropic(self.common_m) + isotropic(measurement.common_m);
-        let Some(inverse) = inverse(&total) else { return };
+        let Some(inverse) = inverse(&total) else {
+            return;
+        };
         let offset = measurement.position - self.position_at(at);
         let at_position = self.pp + self.pv * dt;
         let at_velocity = self.pv.transpose() + self.vv * dt;
@@ -125,7 +142,11 @@ impl KinematicState {
         let velocity_gain = at_velocity * inverse;
         self.position += position_gain * offset;
         self.velocity += velocity_gain * offset;
-        self.joseph([at_position, at_velocity], [position_gain, velocity_gain], &noise);
+        self.joseph(
+            [at_position, at_velocity],
+            [position_gain, velocity_gain],
+            &noise,
+        );
         let share = (position_gain.trace() / 2.0).clamp(0.0, 1.0);
         self.common_m = (1.0 - share) * self.common_m + share * measurement.common_m;
     }
@@ -134,7 +155,13 @@ impl KinematicState {
     /// in each direction.
     ///
     /// Errors of successive velocities may be the same. The velocity is therefore never better known than by one.
-    pub(super) fn update_velocity(&mut self, at: Timestamp, velocity: Vector2<f64>, sigma_mps: f64, density: f64) {
+    pub(super) fn update_velocity(
+        &mut self,
+        at: Timestamp,
+        velocity: Vector2<f64>,
+        sigma_mps: f64,
+        density: f64,
+    ) {
         let stated = sigma_mps * sigma_mps + density * self.seconds_to(at).abs();
         let known = self.vv.trace() / 2.0;
         if known <= stated {
@@ -143,7 +170,9 @@ impl KinematicState {
         // A measurement of this variance leaves the stated one.
         let variance = known * stated / (known - stated);
         let noise = self.vv + Matrix2::identity() * variance;
-        let Some(inverse) = inverse(&noise) else { return };
+        let Some(inverse) = inverse(&noise) else {
+            return;
+        };
         let offset = velocity - self.velocity;
         let gains = [self.pv * inverse, self.vv * inverse];
         self.position += gains[0] * offset;
@@ -156,7 +185,8 @@ impl KinematicState {
     /// `cross` are the covariances of the state with the measured quantity, `noise` is that of the innovation.
     fn joseph(&mut self, cross: [Matrix2<f64>; 2], gain: [Matrix2<f64>; 2], noise: &Matrix2<f64>) {
         let kept = [0, 1].map(|i| gain[i] * noise - cross[i]);
-        let change = |i: usize, j: usize| kept[i] * gain[j].transpose() - gain[i] * cross[j].transpose();
+        let change =
+            |i: usize, j: usize| kept[i] * gain[j].transpose() - gain[i] * cross[j].transpose();
         self.pp = symmetric(self.pp + change(0, 0));
         self.pv += change(0, 1);
         self.vv = symmetric(self.vv + change(1, 1));
@@ -187,5 +217,7 @@ fn symmetric(matrix: Matrix2<f64>) -> Matrix2<f64> {
 /// The inverse of a covariance; `None` unless its determinant is positive and finite.
 fn inverse(covariance: &Matrix2<f64>) -> Option<Matrix2<f64>> {
     let determinant = covariance.determinant();
-    covariance.try_inverse().filter(|_| determinant > 0.0 && determinant.is_finite())
+    covariance
+        .try_inverse()
+        .filter(|_| determinant > 0.0 && determinant.is_finite())
 }

@@ -43,13 +43,25 @@ struct Neighbouring {
 pub(super) fn merge(tracks: &mut TrackStore, now: Timestamp, config: &TracksConfig) {
     tracks.reindex(now);
     let neighbouring = neighbouring(tracks, now);
-    for Neighbouring { older, later, is_resolved } in &neighbouring {
+    for Neighbouring {
+        older,
+        later,
+        is_resolved,
+    } in &neighbouring
+    {
         let (id, seen) = (tracks[*later].id, tracks[*later].last_seen);
         let track = &mut tracks[*older];
-        track.neighbours.observe(id, *is_resolved, seen.max(track.last_seen));
+        track
+            .neighbours
+            .observe(id, *is_resolved, seen.max(track.last_seen));
     }
     let mut merged = BTreeSet::new();
-    for Neighbouring { older, later, is_resolved } in neighbouring {
+    for Neighbouring {
+        older,
+        later,
+        is_resolved,
+    } in neighbouring
+    {
         // A merge before may have separated the older track from this one.
         let is_candidate = !is_resolved && !merged.contains(&older) && !merged.contains(&later);
         if is_candidate && is_same(&tracks[older], &tracks[later], now, config) {
@@ -67,7 +79,11 @@ fn neighbouring(tracks: &TrackStore, now: Timestamp) -> Vec<Neighbouring> {
         tracks.near(&position, MERGE_M, |indexed| {
             let (later, other) = (indexed.track, &tracks[indexed.track]);
             if later > older && (other.state.position_at(now) - position).norm() < MERGE_M {
-                neighbouring.push(Neighbouring { older, later, is_resolved: track.is_resolved_from(other) });
+                neighbouring.push(Neighbouring {
+                    older,
+                    later,
+                    is_resolved: track.is_resolved_from(other),
+                });
             }
         });
     }
@@ -78,18 +94,30 @@ fn is_same(track: &Track, other: &Track, now: Timestamp, config: &TracksConfig) 
     let distance_m = (other.state.position_at(now) - track.state.position_at(now)).norm();
     let are_vehicles = track.vehicle.is_some() && other.vehicle.is_some();
     let are_unlike = track.label(config) != other.label(config) && distance_m >= MERGE_UNLIKE_M;
-    if are_vehicles || are_unlike || track.is_resolved_from(other) || track.neighbours.is_separate(other.id, now) {
+    if are_vehicles
+        || are_unlike
+        || track.is_resolved_from(other)
+        || track.neighbours.is_separate(other.id, now)
+    {
         return false;
     }
     let density = config.density();
-    let covariance = track.state.covariance_at(now, density) + other.state.covariance_at(now, density);
+    let covariance =
+        track.state.covariance_at(now, density) + other.state.covariance_at(now, density);
     distance_m * distance_m < MERGE_SIGMAS.powi(2) * covariance.trace() / 2.0
 }
 
 /// Removes tracks of objects that have disappeared, and vehicles that have been silent for longer than any track lives.
-pub(super) fn prune(tracks: &mut TrackStore, sensors: &mut Sensors, now: Timestamp, config: &TracksConfig) {
+pub(super) fn prune(
+    tracks: &mut TrackStore,
+    sensors: &mut Sensors,
+    now: Timestamp,
+    config: &TracksConfig,
+) {
     let life = Duration::from_secs_f64(config.life_s);
-    tracks.retain(|_, track| now.since(track.last_seen) <= life && track.survival(now) > MIN_SURVIVAL);
+    tracks.retain(|_, track| {
+        now.since(track.last_seen) <= life && track.survival(now) > MIN_SURVIVAL
+    });
     if sensors.forget_silent(now - life - REMEMBERED) {
         tracks.retain_vehicles(|vehicle| sensors.get(vehicle).is_some());
     }
@@ -97,7 +125,12 @@ pub(super) fn prune(tracks: &mut TrackStore, sensors: &mut Sensors, now: Timesta
 
 /// Takes over the objects of another aggregator's map, received at `now`: the identities of known objects, and unknown
 /// objects as tracks whose existence fades.
-pub(super) fn adopt_map(tracks: &mut TrackStore, map: &GlobalMap, now: Timestamp, config: &TracksConfig) {
+pub(super) fn adopt_map(
+    tracks: &mut TrackStore,
+    map: &GlobalMap,
+    now: Timestamp,
+    config: &TracksConfig,
+) {
     tracks.reindex(now);
     let stated: BTreeSet<Uuid> = map.objects.iter().map(|object| object.id).collect();
     let mut known: BTreeSet<Uuid> = tracks.iter().map(|track| track.id).collect();
@@ -121,7 +154,9 @@ pub(super) fn adopt_map(tracks: &mut TrackStore, map: &GlobalMap, now: Timestamp
         }
         let mut track = Track::new(object.id, now, &measurement, config);
         if let Some([x, y]) = object.velocity_mps {
-            track.state.update_velocity(now, Vector2::new(x, y), 1.0, config.density());
+            track
+                .state
+                .update_velocity(now, Vector2::new(x, y), 1.0, config.density());
         }
         track.state.limit_speed(config.max_speed_mps);
         track.inherit(object, now);
@@ -146,7 +181,14 @@ pub(super) fn track_id(report: &ObjectReport, index: usize) -> Uuid {
     const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
     const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
     let numbers = [report.captured_at_us.micros(), report.seq, index as u64];
-    let bytes = report.node.as_str().bytes().chain([0]).chain(numbers.into_iter().flat_map(u64::to_be_bytes));
-    let hash = bytes.fold(OFFSET, |hash, byte| (hash ^ u128::from(byte)).wrapping_mul(PRIME));
+    let bytes = report
+        .node
+        .as_str()
+        .bytes()
+        .chain([0])
+        .chain(numbers.into_iter().flat_map(u64::to_be_bytes));
+    let hash = bytes.fold(OFFSET, |hash, byte| {
+        (hash ^ u128::from(byte)).wrapping_mul(PRIME)
+    });
     Uuid::new_v8(hash.to_be_bytes())
 }

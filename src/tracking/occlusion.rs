@@ -25,7 +25,10 @@ impl OcclusionMap {
 
     /// A frame without detections, seen from `origin`.
     pub(super) fn new(origin: Option<Vector2<f64>>) -> Self {
-        Self { origin, sight_m: [f32::INFINITY; Self::RAYS] }
+        Self {
+            origin,
+            sight_m: [f32::INFINITY; Self::RAYS],
+        }
     }
 
     /// Adds a detection as an occluder, unless it is nearer than `min_m`: a part of the vehicle itself.

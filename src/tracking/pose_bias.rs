@@ -154,20 +154,30 @@ impl PoseBias {
     /// Mean variance of a corrected position in each direction, m², of an object with a velocity in m/s.
     pub(super) fn variance_at(&self, reported: &Vector2<f64>, velocity: &Vector2<f64>) -> f64 {
         let lever = (reported - self.pivot).norm_squared();
-        let rotation_and_delay = lever * self.covariance.m33 + velocity.norm_squared() * self.covariance.m44;
+        let rotation_and_delay =
+            lever * self.covariance.m33 + velocity.norm_squared() * self.covariance.m44;
         (self.covariance.m11 + self.covariance.m22 + rotation_and_delay) / 2.0
     }
 
     /// Updates the estimate; returns the part of the error before that was left at `at`. The references hold for `at`,
     /// which is the report's stamp less `delay_s`.
-    pub(super) fn observe(&mut self, at: Timestamp, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) -> f64 {
+    pub(super) fn observe(
+        &mut self,
+        at: Timestamp,
+        delay_s: f64,
+        pairs: &[Correspondence],
+        prior: &BiasPrior,
+    ) -> f64 {
         let kept = self.fade(at, prior);
         self.fit(delay_s, pairs, prior);
         kept
     }
 
     fn fit(&mut self, delay_s: f64, pairs: &[Correspondence], prior: &BiasPrior) {
-        let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty()) else { return };
+        let Some(prior_information) = self.covariance.try_inverse().filter(|_| !pairs.is_empty())
+        else {
+            return;
+        };
         let predicted = self.error;
         let mut counted = 0.0;
         for _ in 0..ITERATIONS {
@@ -182,12 +192,19 @@ impl PoseBias {
                 let trust = 1.0 / (1.0 + squared / (CAUCHY * CAUCHY));
                 // More references do not reduce the error that they share.
                 let weight = trust / (pair.variance + pair.common * pairs.len() as f64);
-                normal.add(&Matrix2::from_columns(&[Vector2::new(-arm.y, arm.x), pair.velocity]), &residual, weight);
+                normal.add(
+                    &Matrix2::from_columns(&[Vector2::new(-arm.y, arm.x), pair.velocity]),
+                    &residual,
+                    weight,
+                );
                 counted += trust;
             }
             let (information, gradient) = (normal.information(), normal.gradient());
-            let Some(covariance) = (prior_information + information).try_inverse() else { return };
-            self.error = covariance * (prior_information * predicted + information * self.error + gradient);
+            let Some(covariance) = (prior_information + information).try_inverse() else {
+                return;
+            };
+            self.error =
+                covariance * (prior_information * predicted + information * self.error + gradient);
             self.limit_delay(prior);
             self.covariance = (covariance + covariance.transpose()) * 0.5;
         }
@@ -205,7 +222,8 @@ impl PoseBias {
         let stood = 1.0 + self.stood_s / STANDS_S;
         let kept = (-at.since(self.at).as_secs_f64() / (prior.memory_s * stood * stood)).exp();
         self.error *= kept;
-        self.covariance = self.covariance * (kept * kept) + prior.covariance() * (1.0 - kept * kept);
+        self.covariance =
+            self.covariance * (kept * kept) + prior.covariance() * (1.0 - kept * kept);
         self.pairs *= kept;
         self.at = self.at.max(at);
         kept
@@ -247,14 +265,25 @@ impl NormalEquations {
 
     fn information(&self) -> Matrix4<f64> {
         let mut information = Matrix4::from_diagonal_element(self.weight);
-        information.fixed_view_mut::<2, 2>(0, 2).copy_from(&self.first);
-        information.fixed_view_mut::<2, 2>(2, 0).copy_from(&self.first.transpose());
-        information.fixed_view_mut::<2, 2>(2, 2).copy_from(&self.second);
+        information
+            .fixed_view_mut::<2, 2>(0, 2)
+            .copy_from(&self.first);
+        information
+            .fixed_view_mut::<2, 2>(2, 0)
+            .copy_from(&self.first.transpose());
+        information
+            .fixed_view_mut::<2, 2>(2, 2)
+            .copy_from(&self.second);
         information
     }
 
     fn gradient(&self) -> Vector4<f64> {
-        Vector4::new(self.residual.x, self.residual.y, self.turned.x, self.turned.y)
+        Vector4::new(
+            self.residual.x,
+            self.residual.y,
+            self.turned.x,
+            self.turned.y,
+        )
     }
 }
 
@@ -269,31 +298,58 @@ mod tests {
     /// four metres away, always on the same side.
     #[test]
     fn three_wrong_pairs_in_ten_do_not_mislead() {
-        let prior = BiasPrior { offset_m: 0.5, heading_rad: 0.01, delay_s: 0.02, memory_s: 10.0 };
+        let prior = BiasPrior {
+            offset_m: 0.5,
+            heading_rad: 0.01,
+            delay_s: 0.02,
+            memory_s: 10.0,
+        };
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         let start = Timestamp(1_732_154_400_000_000);
         let mut pose_bias = PoseBias::new(start, &prior);
         let error = Vector2::new(0.6, -0.4);
         for round in 0..50 {
             let pair = |n: u32| {
-                let reported = Vector2::new(f64::from(n % 4) * 15.0 - 22.0, f64::from(n / 4) * 20.0 - 20.0);
+                let reported = Vector2::new(
+                    f64::from(n % 4) * 15.0 - 22.0,
+                    f64::from(n / 4) * 20.0 - 20.0,
+                );
                 let mut noise = || rng.random_range(-0.2..0.2);
                 let reference = reported + error + Vector2::new(noise(), noise());
-                let wrong = if rng.random_bool(0.3) { rng.random_range(2.0..4.0) } else { 0.0 };
+                let wrong = if rng.random_bool(0.3) {
+                    rng.random_range(2.0..4.0)
+                } else {
+                    0.0
+                };
                 let reference = reference + Vector2::new(0.0, wrong);
-                Correspondence { reported, reference, velocity: Vector2::zeros(), variance: 0.04, common: 0.02 }
+                Correspondence {
+                    reported,
+                    reference,
+                    velocity: Vector2::zeros(),
+                    variance: 0.04,
+                    common: 0.02,
+                }
             };
             let pairs: Vec<_> = (0..12).map(pair).collect();
             pose_bias.observe(Timestamp(start.0 + round * 100_000), 0.0, &pairs, &prior);
         }
         let off = pose_bias.corrector()(&Vector2::zeros()) - error;
         assert!(off.norm() < 0.15, "off by {off:?}");
-        assert!(pose_bias.correction().is_some_and(|correction| correction.dheading_rad.abs() < 0.004));
+        assert!(
+            pose_bias
+                .correction()
+                .is_some_and(|correction| correction.dheading_rad.abs() < 0.004)
+        );
     }
 
     /// Stamps late by `late_s`, and objects of 8 m/s each way, for `seconds` of ten rounds.
     fn delay_after(seconds: u64, late_s: f64) -> f64 {
-        let prior = BiasPrior { offset_m: 0.5, heading_rad: 0.01, delay_s: 0.02, memory_s: 10.0 };
+        let prior = BiasPrior {
+            offset_m: 0.5,
+            heading_rad: 0.01,
+            delay_s: 0.02,
+            memory_s: 10.0,
+        };
         let mut rng = ChaCha8Rng::seed_from_u64(7);
         let start = Timestamp(1_732_154_400_000_000);
         let mut pose_bias = PoseBias::new(start, &prior);
@@ -304,10 +360,21 @@ mod tests {
                 let reported = Vector2::new(f64::from(n) * 10.0 - 30.0, 5.0);
                 let noise = Vector2::new(rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
                 let reference = reported + noise + velocity * (late_s - delay_s);
-                Correspondence { reported, reference, velocity, variance: 0.08, common: 0.02 }
+                Correspondence {
+                    reported,
+                    reference,
+                    velocity,
+                    variance: 0.08,
+                    common: 0.02,
+                }
             };
             let pairs: Vec<_> = (0..6).map(pair).collect();
-            pose_bias.observe(Timestamp(start.0 + round * 100_000), delay_s, &pairs, &prior);
+            pose_bias.observe(
+                Timestamp(start.0 + round * 100_000),
+                delay_s,
+                &pairs,
+                &prior,
+            );
         }
         pose_bias.delay_s(&prior)
     }

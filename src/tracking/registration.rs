@@ -52,10 +52,16 @@ pub(super) fn register(
     for frame in frames {
         pairs.clear();
         let samples = frame.samples.iter();
-        pairs.extend(samples.filter_map(|sample| Correspondence::of(sample, &frame, tracks, sensors, &mut gauge)));
+        pairs.extend(
+            samples.filter_map(|sample| {
+                Correspondence::of(sample, &frame, tracks, sensors, &mut gauge)
+            }),
+        );
         if let Some(sensor) = sensors.get_mut(frame.sensor) {
             let error = sensor.pose_bias.error();
-            let kept = sensor.pose_bias.observe(frame.at, frame.delay_s, &pairs, &prior);
+            let kept = sensor
+                .pose_bias
+                .observe(frame.at, frame.delay_s, &pairs, &prior);
             gauge.note(frame.sensor, error, kept);
         }
     }
@@ -74,8 +80,13 @@ impl Correspondence {
         let track = &tracks[sample.track];
         let velocity = track.state.velocity;
         let (mut sum, mut weight, mut common) = (Vector2::zeros(), 0.0, 0.0);
-        for other in track.seen_by(frame.at - SIMULTANEOUS).filter(|history| history.sensor != frame.sensor) {
-            let (Some(hit), Some(theirs)) = (other.last_hit, sensors.get(other.sensor)) else { continue };
+        for other in track
+            .seen_by(frame.at - SIMULTANEOUS)
+            .filter(|history| history.sensor != frame.sensor)
+        {
+            let (Some(hit), Some(theirs)) = (other.last_hit, sensors.get(other.sensor)) else {
+                continue;
+            };
             let passed_us = frame.at.micros_from(hit);
             let trust = sensors.fleet.trust(other.sensor);
             if passed_us.unsigned_abs() > SIMULTANEOUS.as_micros() as u64 || trust <= 0.0 {

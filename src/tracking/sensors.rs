@@ -67,7 +67,11 @@ impl Sensors {
     ) -> (&mut SensorModel, &mut Fleet) {
         let number = match self.ids.get(node) {
             Some(id) => id.number(),
-            None => self.models.iter().position(Option::is_none).unwrap_or(self.models.len()),
+            None => self
+                .models
+                .iter()
+                .position(Option::is_none)
+                .unwrap_or(self.models.len()),
         };
         if number == self.models.len() {
             self.models.push(None);
@@ -76,7 +80,11 @@ impl Sensors {
             let id = SensorId(number as u32);
             let counts = self.dormant.of(node);
             self.ids.insert(node.clone(), id);
-            self.fleet.set_foreign(id, self.foreign.get(node).copied().unwrap_or_default(), &counts);
+            self.fleet.set_foreign(
+                id,
+                self.foreign.get(node).copied().unwrap_or_default(),
+                &counts,
+            );
             Box::new(SensorModel::new(id, node.clone(), at, counts, config))
         });
         (model, &mut self.fleet)
@@ -110,18 +118,25 @@ impl Sensors {
     /// Properties of all vehicles that their evidence depends on, by number.
     pub(super) fn qualities(&self) -> Vec<SensorQuality> {
         let quality = |model: &SensorModel| model.quality(self.fleet.trust(model.id));
-        self.models.iter().map(|slot| slot.as_deref().map(quality).unwrap_or_default()).collect()
+        self.models
+            .iter()
+            .map(|slot| slot.as_deref().map(quality).unwrap_or_default())
+            .collect()
     }
 
     /// Takes the counts of all vehicles from a ledger: of the latest votes that are remembered. Vehicles that are not in
     /// it have none.
     pub(super) fn adopt(&mut self, ledger: &ReputationLedger) {
         let config = self.fleet.reputation();
-        let votes = ledger.remembered(config.memory_votes, |_| 0).into_iter().map(|(node, labels)| {
-            let (correct, incorrect) =
-                labels.values().fold((0.0, 0.0), |sum, votes| (sum.0 + votes.0, sum.1 + votes.1));
-            (node, TrustCounts::new(correct, incorrect, config))
-        });
+        let votes = ledger
+            .remembered(config.memory_votes, |_| 0)
+            .into_iter()
+            .map(|(node, labels)| {
+                let (correct, incorrect) = labels
+                    .values()
+                    .fold((0.0, 0.0), |sum, votes| (sum.0 + votes.0, sum.1 + votes.1));
+                (node, TrustCounts::new(correct, incorrect, config))
+            });
         let mut votes: BTreeMap<_, _> = votes.collect();
         for sensor in self.models.iter_mut().flatten() {
             sensor.counts = votes.remove(&sensor.node).unwrap_or_default();
@@ -143,7 +158,11 @@ impl Sensors {
     /// Counts evidence about vehicles that are heard.
     pub(super) fn learn(&mut self, evidence: &[Evidence]) {
         for Evidence { node, correct, .. } in evidence {
-            if let Some(sensor) = self.ids.get(node).and_then(|id| self.models[id.number()].as_deref_mut()) {
+            if let Some(sensor) = self
+                .ids
+                .get(node)
+                .and_then(|id| self.models[id.number()].as_deref_mut())
+            {
                 self.fleet.count(sensor.id, &mut sensor.counts, *correct);
             }
         }
@@ -153,7 +172,11 @@ impl Sensors {
     pub(super) fn forget_silent(&mut self, limit: Timestamp) -> bool {
         let is_silent = |model: &mut Box<SensorModel>| model.last_report < limit;
         let mut silent = Vec::new();
-        for sensor in self.models.iter_mut().filter_map(|slot| slot.take_if(is_silent)) {
+        for sensor in self
+            .models
+            .iter_mut()
+            .filter_map(|slot| slot.take_if(is_silent))
+        {
             self.ids.remove(&sensor.node);
             self.fleet.forget(sensor.id);
             silent.push((sensor.node, sensor.counts));
@@ -184,7 +207,13 @@ pub(super) struct SensorModel {
 }
 
 impl SensorModel {
-    fn new(id: SensorId, node: NodeName, at: Timestamp, counts: TrustCounts, config: &TracksConfig) -> Self {
+    fn new(
+        id: SensorId,
+        node: NodeName,
+        at: Timestamp,
+        counts: TrustCounts,
+        config: &TracksConfig,
+    ) -> Self {
         Self {
             id,
             node,
@@ -203,17 +232,32 @@ impl SensorModel {
 
     /// Properties that its evidence of any object depends on, with its trust.
     fn quality(&self, trust: f64) -> SensorQuality {
-        let looks_hz = self.interval_s.map_or(USUAL_LOOKS_HZ, |interval_s| 1.0 / interval_s);
-        SensorQuality { trust, looks_hz, even_excess: self.calibration.even_excess() }
+        let looks_hz = self
+            .interval_s
+            .map_or(USUAL_LOOKS_HZ, |interval_s| 1.0 / interval_s);
+        SensorQuality {
+            trust,
+            looks_hz,
+            even_excess: self.calibration.even_excess(),
+        }
     }
 
     /// Rates at a look, with those of an object.
     pub(super) fn look_rates(&self, object: DetectionRates) -> LookRates {
-        LookRates { object, clutter: self.clutter.rates(), is_view_stated: self.coverage.is_stated() }
+        LookRates {
+            object,
+            clutter: self.clutter.rates(),
+            is_view_stated: self.coverage.is_stated(),
+        }
     }
 
     /// Updates time, place and field of view from a report; true if the vehicle has jumped to another place.
-    pub(super) fn observe(&mut self, report: &ObjectReport, at: Timestamp, config: &TracksConfig) -> bool {
+    pub(super) fn observe(
+        &mut self,
+        report: &ObjectReport,
+        at: Timestamp,
+        config: &TracksConfig,
+    ) -> bool {
         let passed_s = at.since(self.last_report).as_secs_f64();
         self.last_report = self.last_report.max(at);
         if passed_s > 0.0 {
@@ -229,7 +273,11 @@ impl SensorModel {
         let stands = self.stands(report, at);
         self.pose_bias.stand(stands.then_some(passed_s));
         self.pose = report.pose;
-        if let Some(centre) = self.coverage.centre().filter(|_| !stands || !is_placed || has_jumped) {
+        if let Some(centre) = self
+            .coverage
+            .centre()
+            .filter(|_| !stands || !is_placed || has_jumped)
+        {
             self.pose_bias.set_pivot(centre);
         }
         has_jumped
@@ -242,7 +290,11 @@ impl SensorModel {
         let (place, since) = self.place;
         let centre = self.coverage.centre().unwrap_or(place);
         let is_declared = report.moving == Some(false);
-        let stays = if is_declared && report.pose.is_none() { DECLARED_STAYS } else { STAYS };
+        let stays = if is_declared && report.pose.is_none() {
+            DECLARED_STAYS
+        } else {
+            STAYS
+        };
         if (centre - place).norm() > stays * self.coverage.range_m().max(MIN_RANGE_M) {
             self.place = (centre, at);
         }
@@ -263,7 +315,10 @@ pub(super) struct NoiseModel {
 
 impl Default for NoiseModel {
     fn default() -> Self {
-        Self { scale: 1.0, weight: 30.0 }
+        Self {
+            scale: 1.0,
+            weight: 30.0,
+        }
     }
 }
 
@@ -272,23 +327,39 @@ impl NoiseModel {
     const MEMORY: f64 = 500.0;
 
     /// Covariance of a reported position, m².
-    pub(super) fn covariance(&self, object: &PerceivedObject, config: &TracksConfig) -> Matrix2<f64> {
+    pub(super) fn covariance(
+        &self,
+        object: &PerceivedObject,
+        config: &TracksConfig,
+    ) -> Matrix2<f64> {
         let floor = Matrix2::identity() * (config.noise_floor_m * config.noise_floor_m);
         stated(object, config).matrix() * self.scale + floor
     }
 
     /// Learns from the squared distance of a detection from a well-known track, m²; `expected` is the track's part of it.
-    pub(super) fn learn(&mut self, object: &PerceivedObject, squared: f64, expected: f64, config: &TracksConfig) {
+    pub(super) fn learn(
+        &mut self,
+        object: &PerceivedObject,
+        squared: f64,
+        expected: f64,
+        config: &TracksConfig,
+    ) {
         let stated = stated(object, config);
         let ratio = ((squared - expected) / (stated.xx + stated.yy)).clamp(0.0, 25.0);
         self.weight = (self.weight + 1.0).min(Self::MEMORY);
         self.scale += (ratio - self.scale) / self.weight;
         // A stated covariance is a lower bound.
-        let min = if object.covariance_m2.is_some() { 1.0 } else { 0.05 };
+        let min = if object.covariance_m2.is_some() {
+            1.0
+        } else {
+            0.05
+        };
         self.scale = self.scale.max(min);
     }
 }
 
 fn stated(object: &PerceivedObject, config: &TracksConfig) -> Covariance {
-    object.covariance().unwrap_or_else(|| Covariance::isotropic(config.noise_m))
+    object
+        .covariance()
+        .unwrap_or_else(|| Covariance::isotropic(config.noise_m))
 }

@@ -36,7 +36,12 @@ const MIN_CELL_M: f64 = 24.0;
 impl TrackStore {
     /// An empty store.
     pub(super) fn new(config: &TracksConfig) -> Self {
-        let TracksConfig { max_tracks, max_density, gate_m, .. } = *config;
+        let TracksConfig {
+            max_tracks,
+            max_density,
+            gate_m,
+            ..
+        } = *config;
         Self {
             tracks: Vec::new(),
             grid: TrackGrid::new(gate_m * (MIN_CELL_M / gate_m).ceil()),
@@ -52,8 +57,15 @@ impl TrackStore {
 
     /// Goes on with other limits. Tracks stay, also more than there is room for.
     pub(super) fn configure(&mut self, config: &TracksConfig) {
-        let Self { max_tracks, max_density, gate_m, grid, .. } = Self::new(config);
-        (self.max_tracks, self.max_density, self.gate_m, self.grid) = (max_tracks, max_density, gate_m, grid);
+        let Self {
+            max_tracks,
+            max_density,
+            gate_m,
+            grid,
+            ..
+        } = Self::new(config);
+        (self.max_tracks, self.max_density, self.gate_m, self.grid) =
+            (max_tracks, max_density, gate_m, grid);
         self.reindex(self.indexed_at);
     }
 
@@ -74,7 +86,10 @@ impl TrackStore {
 
     /// All tracks with their indices, the oldest first.
     pub(super) fn indexed(&self) -> impl Iterator<Item = (TrackIndex, &Track)> {
-        self.tracks.iter().enumerate().map(|(index, track)| (TrackIndex(index as u32), track))
+        self.tracks
+            .iter()
+            .enumerate()
+            .map(|(index, track)| (TrackIndex(index as u32), track))
     }
 
     /// Adds a track unless there is no room for it.
@@ -94,11 +109,16 @@ impl TrackStore {
     /// Indexes all tracks where they are at `at`.
     pub(super) fn reindex(&mut self, at: Timestamp) {
         self.indexed_at = at;
-        self.fastest_mps = self.tracks.iter().map(|track| track.state.velocity.norm()).fold(0.0, f64::max);
+        self.fastest_mps = self
+            .tracks
+            .iter()
+            .map(|track| track.state.velocity.norm())
+            .fold(0.0, f64::max);
         self.clear_indexes();
         for (number, track) in self.tracks.iter().enumerate() {
             let index = TrackIndex(number as u32);
-            self.of_vehicle.extend(track.vehicle.map(|vehicle| (vehicle, index)));
+            self.of_vehicle
+                .extend(track.vehicle.map(|vehicle| (vehicle, index)));
             self.grid.insert(track.indexed(index, at));
         }
     }
@@ -129,7 +149,12 @@ impl TrackStore {
     }
 
     /// Visits the tracks whose indexed position is within `reach_m` of a position.
-    pub(super) fn near(&self, position: &Vector2<f64>, reach_m: f64, visit: impl FnMut(&IndexedTrack)) {
+    pub(super) fn near(
+        &self,
+        position: &Vector2<f64>,
+        reach_m: f64,
+        visit: impl FnMut(&IndexedTrack),
+    ) {
         self.grid.near(position, reach_m, visit);
     }
 

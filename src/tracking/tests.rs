@@ -39,7 +39,10 @@ fn car(x_m: f64, y_m: f64) -> PerceivedObject {
 }
 
 fn report(node: &str, frame: u64, objects: Vec<PerceivedObject>) -> ObjectReport {
-    ObjectReport { objects, ..ObjectReport::new(name(node), frame, at(frame)) }
+    ObjectReport {
+        objects,
+        ..ObjectReport::new(name(node), frame, at(frame))
+    }
 }
 
 fn tracker() -> Tracker {
@@ -48,7 +51,11 @@ fn tracker() -> Tracker {
 
 /// Objects with a confidence above 0.5.
 fn sure(round: &TracksRound) -> Vec<&FusedObject> {
-    round.objects.iter().filter(|object| object.confidence > 0.5).collect()
+    round
+        .objects
+        .iter()
+        .filter(|object| object.confidence > 0.5)
+        .collect()
 }
 
 fn noise(rng: &mut ChaCha8Rng, m: f64) -> f64 {
@@ -56,12 +63,17 @@ fn noise(rng: &mut ChaCha8Rng, m: f64) -> f64 {
 }
 
 /// Two cars, one standing and one going east at 10 m/s, seen by two vehicles; returns the last round.
-fn two_cars(tracker: &mut Tracker, frames: std::ops::Range<u64>, seen: impl Fn(u64) -> bool) -> TracksRound {
+fn two_cars(
+    tracker: &mut Tracker,
+    frames: std::ops::Range<u64>,
+    seen: impl Fn(u64) -> bool,
+) -> TracksRound {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut last = TracksRound::default();
     for frame in frames {
         for node in ["euclid", "gauss"] {
-            let mut place = |x: f64, y: f64| car(x + noise(&mut rng, 0.3), y + noise(&mut rng, 0.3));
+            let mut place =
+                |x: f64, y: f64| car(x + noise(&mut rng, 0.3), y + noise(&mut rng, 0.3));
             let mut objects = vec![place(0.0, 20.0)];
             if seen(frame) {
                 objects.push(place(frame as f64, 0.0));
@@ -82,9 +94,15 @@ fn what_several_vehicles_see_is_one_object_with_a_velocity() {
     let round = two_cars(&mut tracker(), 0..30, |_| true);
     let cars = sure(&round);
     assert_eq!(cars.len(), 2, "{cars:?}");
-    assert!(near(cars[0], 0.0, 20.0, 0.3) && near(cars[1], 29.0, 0.0, 0.5), "{cars:?}");
+    assert!(
+        near(cars[0], 0.0, 20.0, 0.3) && near(cars[1], 29.0, 0.0, 0.5),
+        "{cars:?}"
+    );
     let [east, north] = cars[1].velocity_mps.unwrap();
-    assert!((east - 10.0).abs() < 1.0 && north.abs() < 1.0, "{east} {north}");
+    assert!(
+        (east - 10.0).abs() < 1.0 && north.abs() < 1.0,
+        "{east} {north}"
+    );
     assert_eq!(cars[1].contributors, [name("euclid"), name("gauss")]);
     assert_eq!((&*cars[1].label, cars[1].age_s), ("car", Some(0.0)));
 }
@@ -94,7 +112,13 @@ fn an_object_keeps_its_identity_through_occlusion_and_fades_while_it_is_hidden()
     let mut tracker = tracker();
     let before = two_cars(&mut tracker, 0..30, |_| true);
     let hidden = two_cars(&mut tracker, 30..38, |_| false);
-    let find = |round: &TracksRound| round.objects.iter().find(|object| object.y_m.abs() < 3.0).cloned();
+    let find = |round: &TracksRound| {
+        round
+            .objects
+            .iter()
+            .find(|object| object.y_m.abs() < 3.0)
+            .cloned()
+    };
     let (seen, coasting) = (find(&before).unwrap(), find(&hidden).unwrap());
     assert_eq!(seen.id, coasting.id);
     assert!(near(&coasting, 37.0, 0.0, 2.0), "{coasting:?}");
@@ -107,7 +131,10 @@ fn an_object_keeps_its_identity_through_occlusion_and_fades_while_it_is_hidden()
 
 #[test]
 fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
-    let config = TracksConfig { vehicle_label: "van".into(), ..TracksConfig::default() };
+    let config = TracksConfig {
+        vehicle_label: "van".into(),
+        ..TracksConfig::default()
+    };
     let mut tracker = Tracker::new(config, ReputationConfig::default());
     let mut round = TracksRound::default();
     for frame in 0..20 {
@@ -115,14 +142,32 @@ fn a_vehicle_is_an_object_but_never_its_own_obstacle() {
         for (node, x_m, sees) in [("euclid", x_m, x_m + 0.4), ("gauss", 30.0, x_m - 0.5)] {
             // euclid detects its own bonnet, gauss detects euclid.
             let pose = Some(WirePose::new(x_m, 0.0, 0.0));
-            tracker.observe(ObjectReport { pose, ..report(node, frame, vec![car(sees, 0.2)]) }, at(frame));
+            tracker.observe(
+                ObjectReport {
+                    pose,
+                    ..report(node, frame, vec![car(sees, 0.2)])
+                },
+                at(frame),
+            );
         }
         round = tracker.close(at(frame));
     }
-    let vehicles: Vec<_> = round.objects.iter().map(|object| object.vehicle.clone()).collect();
-    assert_eq!(vehicles, [Some(name("euclid")), Some(name("gauss"))], "{:?}", round.objects);
+    let vehicles: Vec<_> = round
+        .objects
+        .iter()
+        .map(|object| object.vehicle.clone())
+        .collect();
+    assert_eq!(
+        vehicles,
+        [Some(name("euclid")), Some(name("gauss"))],
+        "{:?}",
+        round.objects
+    );
     assert!(near(&round.objects[0], 9.5, 0.0, 1.0));
-    assert_eq!((&*round.objects[0].label, &*round.objects[1].label), ("car", "van"));
+    assert_eq!(
+        (&*round.objects[0].label, &*round.objects[1].label),
+        ("car", "van")
+    );
 }
 
 #[test]
@@ -132,12 +177,23 @@ fn a_fixed_camera_is_no_object() {
     for frame in 0..20 {
         let pose = Some(WirePose::new(0.0, 0.0, 0.0));
         // An object at a known place is of no concern here.
-        let known = PerceivedObject { landmark: Some("gate".into()), ..car(5.0, 5.0) };
-        let seen = ObjectReport { pose, moving: Some(false), ..report("mast", frame, vec![car(10.0, 0.2), known]) };
-        tracker.observe_only(Arc::new(seen), at(frame), |object| object.landmark.is_none());
+        let known = PerceivedObject {
+            landmark: Some("gate".into()),
+            ..car(5.0, 5.0)
+        };
+        let seen = ObjectReport {
+            pose,
+            moving: Some(false),
+            ..report("mast", frame, vec![car(10.0, 0.2), known])
+        };
+        tracker.observe_only(Arc::new(seen), at(frame), |object| {
+            object.landmark.is_none()
+        });
         round = tracker.close(at(frame));
     }
-    let [object] = &round.objects[..] else { panic!("{:?}", round.objects) };
+    let [object] = &round.objects[..] else {
+        panic!("{:?}", round.objects)
+    };
     assert!(near(object, 10.0, 0.0, 1.0) && object.vehicle.is_none());
 }
 
@@ -148,11 +204,22 @@ fn a_vehicle_that_is_somewhere_else_all_at_once_is_still_one_object() {
     for frame in 0..40 {
         let x_m = if frame < 20 { 0.0 } else { 500.0 };
         let pose = Some(WirePose::new(x_m, 0.0, 0.0));
-        tracker.observe(ObjectReport { pose, ..report("euclid", frame, vec![]) }, at(frame));
+        tracker.observe(
+            ObjectReport {
+                pose,
+                ..report("euclid", frame, vec![])
+            },
+            at(frame),
+        );
         let round = tracker.close(at(frame));
-        let [vehicle] = &*round.objects else { panic!("{:?}", round.objects) };
+        let [vehicle] = &*round.objects else {
+            panic!("{:?}", round.objects)
+        };
         assert!(near(vehicle, x_m, 0.0, 0.5), "{vehicle:?}");
-        assert!(vehicle.velocity_mps.is_none_or(|[x, y]| x.hypot(y) < 2.0), "{vehicle:?}");
+        assert!(
+            vehicle.velocity_mps.is_none_or(|[x, y]| x.hypot(y) < 2.0),
+            "{vehicle:?}"
+        );
         ids.insert(vehicle.id);
     }
     assert_eq!(ids.len(), 1);
@@ -166,16 +233,33 @@ fn nobody_overlooks_a_vehicle_where_it_no_longer_is() {
         for frame in 0..=20 {
             let pose = |x_m| Some(WirePose::new(x_m, 0.0, 0.0));
             let place = pose(if frame < 20 { 0.0 } else { 500.0 });
-            tracker.observe(ObjectReport { pose: place, ..report("euclid", frame, vec![]) }, at(frame));
-            let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
+            tracker.observe(
+                ObjectReport {
+                    pose: place,
+                    ..report("euclid", frame, vec![])
+                },
+                at(frame),
+            );
+            let view = Some(FieldOfView {
+                range_m: 60.0,
+                angle_rad: std::f64::consts::TAU,
+            });
             for watcher in (0..watchers).filter(|_| frame == 20) {
                 let node = format!("watcher-{watcher}");
-                let report = ObjectReport { pose: pose(10.0), view, ..report(&node, frame, vec![]) };
+                let report = ObjectReport {
+                    pose: pose(10.0),
+                    view,
+                    ..report(&node, frame, vec![])
+                };
                 tracker.observe(report, at(frame));
             }
             round = tracker.close(at(frame));
         }
-        round.objects.iter().find(|object| object.vehicle == Some(name("euclid"))).and_then(|object| object.existence)
+        round
+            .objects
+            .iter()
+            .find(|object| object.vehicle == Some(name("euclid")))
+            .and_then(|object| object.existence)
     };
     assert!(existence(0).is_some());
     assert_eq!(existence(5), existence(0));
@@ -187,7 +271,13 @@ fn the_pose_that_spawns_a_track_is_not_counted_twice() {
     let mut tracker = tracker();
     for frame in 0..2 {
         let pose = Some(WirePose::new(frame as f64, 0.0, 0.0));
-        tracker.observe(ObjectReport { pose, ..report("euclid", 0, vec![]) }, at(0));
+        tracker.observe(
+            ObjectReport {
+                pose,
+                ..report("euclid", 0, vec![])
+            },
+            at(0),
+        );
         let round = tracker.close(at(0));
         let variance = round.objects[0].covariance_m2[0];
         let config = TracksConfig::default();
@@ -211,11 +301,18 @@ fn what_is_said_of_velocities_is_never_taken_for_better_than_one_of_them_says() 
     assert!((state.velocity.x - 10.0).abs() < 0.5);
     let mut late = KinematicState::new(at(5), &measurement(), 8.0);
     late.update_velocity(at(0), said, 1.0, 4.0);
-    assert!((late.velocity_covariance().trace() / 2.0 - 3.0).abs() < 1e-9, "half a second ago is less sure");
+    assert!(
+        (late.velocity_covariance().trace() / 2.0 - 3.0).abs() < 1e-9,
+        "half a second ago is less sure"
+    );
 }
 
 fn measurement() -> Measurement {
-    Measurement { position: Vector2::zeros(), independent: Matrix2::identity(), common_m: 0.2 }
+    Measurement {
+        position: Vector2::zeros(),
+        independent: Matrix2::identity(),
+        common_m: 0.2,
+    }
 }
 
 #[test]
@@ -223,7 +320,10 @@ fn a_heading_about_due_east_is_not_averaged_to_west() {
     let mut tracker = tracker();
     for frame in 0..30 {
         let heading_rad = Some(if frame % 2 == 0 { 359f64 } else { 1.0 }.to_radians());
-        let seen = PerceivedObject { heading_rad, ..car(0.0, 0.0) };
+        let seen = PerceivedObject {
+            heading_rad,
+            ..car(0.0, 0.0)
+        };
         tracker.observe(report("euclid", frame, vec![seen]), at(frame));
         let round = tracker.close(at(frame));
         let heading_deg = round.objects[0].heading_rad.unwrap().to_degrees();
@@ -248,14 +348,25 @@ fn a_late_report_of_a_car_that_goes_so_far_in_a_frame(frame_m: f64) {
         }
         on_time.observe(report("gauss", frame, vec![car(x_m, 0.0)]), at(frame));
         if frame >= 3 {
-            late.observe(report("gauss", frame - 3, vec![car(x_m - 3.0 * frame_m, 0.0)]), at(frame - 3));
+            late.observe(
+                report("gauss", frame - 3, vec![car(x_m - 3.0 * frame_m, 0.0)]),
+                at(frame - 3),
+            );
         }
         on_time.close(at(frame));
         late.close(at(frame));
     }
     let [a, b] = [&mut on_time, &mut late].map(|tracker| tracker.close(at(30)));
-    assert_eq!((a.objects.len(), b.objects.len()), (1, 1), "{:?}", b.objects);
-    assert!(near(&b.objects[0], a.objects[0].x_m, a.objects[0].y_m, 0.3), "held against where it was then");
+    assert_eq!(
+        (a.objects.len(), b.objects.len()),
+        (1, 1),
+        "{:?}",
+        b.objects
+    );
+    assert!(
+        near(&b.objects[0], a.objects[0].x_m, a.objects[0].y_m, 0.3),
+        "held against where it was then"
+    );
     assert_eq!(b.objects[0].contributors.len(), 2);
     late.observe(report("gauss", 20, vec![car(0.0, 0.0)]), at(20));
     assert_eq!(late.losses().late, 1);
@@ -269,7 +380,11 @@ fn a_vehicle_without_a_pose_that_is_somewhere_else_looks_only_there() {
         assert!(!coverage.observe(&report("euclid", frame, place(0.0))));
     }
     assert!(coverage.observe(&report("euclid", 10, place(5_000.0))));
-    assert!((coverage.range_m() - 20.0).abs() < 1e-9, "{}", coverage.range_m());
+    assert!(
+        (coverage.range_m() - 20.0).abs() < 1e-9,
+        "{}",
+        coverage.range_m()
+    );
     assert!(coverage.rates_at(&Vector2::new(4_990.0, 0.0)).is_some());
     assert!(coverage.rates_at(&Vector2::new(10.0, 0.0)).is_none());
 }
@@ -279,23 +394,45 @@ fn a_view_has_its_stated_angle_and_no_more_than_all_around() {
     let sees = |angle_rad: f64, bearing_rad: f64| {
         let mut coverage = Coverage::default();
         let pose = Some(WirePose::new(10.0, -5.0, 2.0));
-        let stated = Some(FieldOfView { range_m: 50.0, angle_rad });
-        coverage.observe(&ObjectReport { pose, view: stated, ..report("euclid", 0, vec![]) });
+        let stated = Some(FieldOfView {
+            range_m: 50.0,
+            angle_rad,
+        });
+        coverage.observe(&ObjectReport {
+            pose,
+            view: stated,
+            ..report("euclid", 0, vec![])
+        });
         coverage
-            .rates_at(&(Vector2::new(10.0, -5.0) + Vector2::new(bearing_rad.cos(), bearing_rad.sin()) * 20.0))
+            .rates_at(
+                &(Vector2::new(10.0, -5.0)
+                    + Vector2::new(bearing_rad.cos(), bearing_rad.sin()) * 20.0),
+            )
             .is_some()
     };
     assert!(sees(1.0, 2.0) && sees(1.0, 2.45) && sees(1.0, 1.55));
     assert!(!sees(1.0, 2.55) && !sees(1.0, 1.45) && !sees(1.0, 5.1));
-    for angle_rad in [std::f64::consts::TAU, 7.0, 2.0 * std::f64::consts::TAU, 360.0] {
-        assert!((0..36).all(|n| sees(angle_rad, f64::from(n) * 0.18)), "{angle_rad}");
+    for angle_rad in [
+        std::f64::consts::TAU,
+        7.0,
+        2.0 * std::f64::consts::TAU,
+        360.0,
+    ] {
+        assert!(
+            (0..36).all(|n| sees(angle_rad, f64::from(n) * 0.18)),
+            "{angle_rad}"
+        );
     }
 }
 
 #[test]
 fn what_a_vehicle_was_off_by_says_nothing_of_where_it_has_jumped_to() {
     let mut tracker = tracker();
-    let place = |x_m: f64| (0..4).map(|n| car(x_m + 10.0 * f64::from(n), 0.0)).collect::<Vec<_>>();
+    let place = |x_m: f64| {
+        (0..4)
+            .map(|n| car(x_m + 10.0 * f64::from(n), 0.0))
+            .collect::<Vec<_>>()
+    };
     for frame in 0..30 {
         tracker.observe(report("euclid", frame, place(0.0)), at(frame));
         tracker.observe(report("gauss", frame, place(0.5)), at(frame));
@@ -305,7 +442,10 @@ fn what_a_vehicle_was_off_by_says_nothing_of_where_it_has_jumped_to() {
     tracker.observe(report("gauss", 30, place(0.5)), at(30));
     tracker.observe(report("gauss", 31, place(5_000.0)), at(31));
     let corrections = tracker.close(at(31)).pose_corrections;
-    assert!(corrections.contains_key(&name("euclid")) && !corrections.contains_key(&name("gauss")), "{corrections:?}");
+    assert!(
+        corrections.contains_key(&name("euclid")) && !corrections.contains_key(&name("gauss")),
+        "{corrections:?}"
+    );
 }
 
 /// Twelve parked cars seen by both, `gauss` off by an offset and a rotation; returns the last round.
@@ -319,7 +459,10 @@ fn misaligned(config: TracksConfig) -> TracksRound {
             let mut seen = |n| {
                 let (x, y): (f64, f64) = place(n);
                 let (sin, cos) = turn.sin_cos();
-                car(cos * x - sin * y + dx + noise(&mut rng, 0.2), sin * x + cos * y + noise(&mut rng, 0.2))
+                car(
+                    cos * x - sin * y + dx + noise(&mut rng, 0.2),
+                    sin * x + cos * y + noise(&mut rng, 0.2),
+                )
             };
             let objects = (0..12).map(&mut seen).collect();
             tracker.observe(report(node, frame, objects), at(frame));
@@ -335,8 +478,14 @@ fn offsets_and_rotations_of_poses_are_found_and_published() {
     assert_eq!(sure(&round).len(), 12);
     let [a, b] = ["euclid", "gauss"].map(|node| round.pose_corrections[&name(node)]);
     assert!((a.dx_m - b.dx_m - 0.7).abs() < 0.15, "{a:?} {b:?}");
-    assert!((a.dheading_rad - b.dheading_rad - 0.01).abs() < 0.004, "{a:?} {b:?}");
-    let off = misaligned(TracksConfig { align: false, ..TracksConfig::default() });
+    assert!(
+        (a.dheading_rad - b.dheading_rad - 0.01).abs() < 0.004,
+        "{a:?} {b:?}"
+    );
+    let off = misaligned(TracksConfig {
+        align: false,
+        ..TracksConfig::default()
+    });
     assert!(off.pose_corrections.is_empty());
 }
 
@@ -346,18 +495,37 @@ fn whoever_hears_the_same_gives_the_same_identities_and_whoever_comes_later_take
     let map = two_cars(&mut leader, 0..30, |_| true);
     assert_eq!(two_cars(&mut standby, 0..30, |_| true), map);
     let other = two_cars(&mut newcomer, 20..30, |_| true);
-    let ids = |round: &TracksRound| sure(round).iter().map(|object| object.id).collect::<BTreeSet<Uuid>>();
+    let ids = |round: &TracksRound| {
+        sure(round)
+            .iter()
+            .map(|object| object.id)
+            .collect::<BTreeSet<Uuid>>()
+    };
     assert!(ids(&map).is_disjoint(&ids(&other)));
     let unseen = FusedObject {
         existence: Some(0.9),
-        ..FusedObject::new(Uuid::from_u128(7), "bus", 0.9, 60.0, 60.0, Covariance::isotropic(0.2))
+        ..FusedObject::new(
+            Uuid::from_u128(7),
+            "bus",
+            0.9,
+            60.0,
+            60.0,
+            Covariance::isotropic(0.2),
+        )
     };
     let objects = map.objects.into_iter().chain([unseen]).collect();
-    let map = GlobalMap { objects, ..GlobalMap::new(&Epoch::new(1, name("edge")), 30, at(29)) };
+    let map = GlobalMap {
+        objects,
+        ..GlobalMap::new(&Epoch::new(1, name("edge")), 30, at(29))
+    };
     newcomer.adopt_map(&map, at(29));
     let adopted = two_cars(&mut newcomer, 30..31, |_| true);
     assert!(ids(&adopted).is_superset(&map.objects[..2].iter().map(|object| object.id).collect()));
-    let taken_over = adopted.objects.iter().find(|object| object.id == Uuid::from_u128(7)).unwrap();
+    let taken_over = adopted
+        .objects
+        .iter()
+        .find(|object| object.id == Uuid::from_u128(7))
+        .unwrap();
     assert!(taken_over.existence.unwrap() > 0.8, "{taken_over:?}");
     let later = two_cars(&mut newcomer, 31..80, |_| true);
     assert_eq!(later.objects.len(), 2, "a map alone keeps nothing alive");
@@ -372,12 +540,22 @@ fn a_person_beside_a_car_is_not_the_car() {
             scores: [("person".into(), 0.7), ("cyclist".into(), 0.2)].into(),
             ..PerceivedObject::new("person", 0.7, 1.2, 0.0)
         };
-        let objects = if frame % 2 == 0 { vec![car(0.0, 0.0), person] } else { vec![person, car(0.0, 0.0)] };
+        let objects = if frame % 2 == 0 {
+            vec![car(0.0, 0.0), person]
+        } else {
+            vec![person, car(0.0, 0.0)]
+        };
         tracker.observe(report("euclid", frame, objects), at(frame));
         round = tracker.close(at(frame));
     }
-    let labels: Vec<_> = sure(&round).iter().map(|object| (object.label.to_string(), object.x_m.round())).collect();
-    assert_eq!(labels, [("car".to_owned(), 0.0), ("person".to_owned(), 1.0)]);
+    let labels: Vec<_> = sure(&round)
+        .iter()
+        .map(|object| (object.label.to_string(), object.x_m.round()))
+        .collect();
+    assert_eq!(
+        labels,
+        [("car".to_owned(), 0.0), ("person".to_owned(), 1.0)]
+    );
     let person = sure(&round)[1];
     assert!(person.scores["person"] > 0.7 && person.scores["cyclist"] < 0.3);
 }
@@ -388,11 +566,17 @@ fn a_detector_with_low_confidences_is_understood_after_a_while() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..200 {
-        let mut objects: Vec<_> =
-            (0..10).map(|n| PerceivedObject::new("car", rng.random_range(0.12..0.3), n as f64 * 10.0, 0.0)).collect();
+        let mut objects: Vec<_> = (0..10)
+            .map(|n| PerceivedObject::new("car", rng.random_range(0.12..0.3), n as f64 * 10.0, 0.0))
+            .collect();
         for _ in 0..5 {
             let (x, y) = (rng.random_range(0.0..90.0), rng.random_range(10.0..60.0));
-            objects.push(PerceivedObject::new("car", rng.random_range(0.02..0.08), x, y));
+            objects.push(PerceivedObject::new(
+                "car",
+                rng.random_range(0.02..0.08),
+                x,
+                y,
+            ));
         }
         tracker.observe(report("euclid", frame, objects), at(frame));
         round = tracker.close(at(frame));
@@ -411,7 +595,13 @@ fn a_new_detection_is_the_likelier_an_object_the_rarer_the_looks() {
             tracker.observe(report("euclid", frame, objects), at(frame));
             round = tracker.close(at(frame));
         }
-        round.objects.iter().find(|object| near(object, 30.0, 0.0, 1.0)).unwrap().existence.unwrap()
+        round
+            .objects
+            .iter()
+            .find(|object| near(object, 30.0, 0.0, 1.0))
+            .unwrap()
+            .existence
+            .unwrap()
     };
     let [often, rarely] = [1, 5].map(existence);
     assert!(rarely > often + 0.05, "{often} at 10 Hz, {rarely} at 2 Hz");
@@ -419,9 +609,15 @@ fn a_new_detection_is_the_likelier_an_object_the_rarer_the_looks() {
 
 #[test]
 fn no_more_objects_than_an_area_can_hold_are_kept() {
-    let config = TracksConfig { max_density: 4, max_tracks: 20, ..TracksConfig::default() };
+    let config = TracksConfig {
+        max_density: 4,
+        max_tracks: 20,
+        ..TracksConfig::default()
+    };
     let mut tracker = Tracker::new(config, ReputationConfig::default());
-    let crowd = (0..100).map(|n| car((n % 10) as f64 * 0.3, (n / 10) as f64 * 0.3)).collect();
+    let crowd = (0..100)
+        .map(|n| car((n % 10) as f64 * 0.3, (n / 10) as f64 * 0.3))
+        .collect();
     tracker.observe(report("euclid", 0, crowd), at(0));
     let round = tracker.close(at(0));
     assert!(round.objects.len() <= 4, "{}", round.objects.len());

@@ -82,7 +82,12 @@ pub(super) struct Track {
 
 impl Track {
     /// A track with one measurement.
-    pub(super) fn new(id: Uuid, at: Timestamp, measurement: &Measurement, config: &TracksConfig) -> Self {
+    pub(super) fn new(
+        id: Uuid,
+        at: Timestamp,
+        measurement: &Measurement,
+        config: &TracksConfig,
+    ) -> Self {
         Self {
             id,
             state: KinematicState::new(at, measurement, config.speed_mps),
@@ -105,14 +110,20 @@ impl Track {
 
     /// The entry of the grid at `at`.
     pub(super) fn indexed(&self, track: TrackIndex, at: Timestamp) -> IndexedTrack {
-        IndexedTrack { position: self.state.position_at(at), velocity: self.state.velocity, track }
+        IndexedTrack {
+            position: self.state.position_at(at),
+            velocity: self.state.velocity,
+            track,
+        }
     }
 
     /// Updates labels, heading and size from a detection.
     pub(super) fn update_attributes(&mut self, object: &PerceivedObject, heading_rad: Option<f64>) {
         const KEPT: f64 = 0.95;
         const SHARE: f64 = 0.3;
-        self.labels.iter_mut().for_each(|(_, weight)| *weight *= KEPT);
+        self.labels
+            .iter_mut()
+            .for_each(|(_, weight)| *weight *= KEPT);
         let label = [(&object.label, object.confidence)];
         let scores = object.scores.iter().map(|(label, score)| (label, *score));
         let has_no_scores = object.scores.is_empty();
@@ -152,7 +163,8 @@ impl Track {
         if at > self.last_seen {
             // It was there when another vehicle saw it meanwhile.
             let unseen_s = dt_s.min(at.since(self.last_seen).as_secs_f64());
-            self.disappeared = ((self.disappeared + DISAPPEARANCE_RATE * unseen_s) / (1.0 - rate)).min(1e6);
+            self.disappeared =
+                ((self.disappeared + DISAPPEARANCE_RATE * unseen_s) / (1.0 - rate)).min(1e6);
         }
     }
 
@@ -170,7 +182,11 @@ impl Track {
                 object.scores.get(label).copied().unwrap_or(0.0) / stated.max(1e-9)
             }
         };
-        let common: f64 = self.labels.iter().map(|(label, weight)| weight / total * share(label)).sum();
+        let common: f64 = self
+            .labels
+            .iter()
+            .map(|(label, weight)| weight / total * share(label))
+            .sum();
         common.max(MIN_LABEL_SIMILARITY)
     }
 
@@ -198,14 +214,28 @@ impl Track {
             if history.last_hit.is_some() && sensor.trust > 0.0 {
                 witnesses += 1;
                 detected = sensor.trust.max(detected);
-                even_excess = Some(even_excess.unwrap_or(sensor.even_excess).min(sensor.even_excess));
+                even_excess = Some(
+                    even_excess
+                        .unwrap_or(sensor.even_excess)
+                        .min(sensor.even_excess),
+                );
             }
         }
         let persistence = persistence_nats(self.last_seen.since(self.first_seen).as_secs_f64());
-        let inherited = self.inherited.map_or(0.0, |(nats, since)| nats * (-at.since(since).as_secs_f64()).exp());
-        let evidence = if witnesses < 2 { evidence - denied.min(MAX_DENIAL_NATS) } else { evidence };
+        let inherited = self.inherited.map_or(0.0, |(nats, since)| {
+            nats * (-at.since(since).as_secs_f64()).exp()
+        });
+        let evidence = if witnesses < 2 {
+            evidence - denied.min(MAX_DENIAL_NATS)
+        } else {
+            evidence
+        };
         // Looks count beside each other, not less for all: those who are trusted little find an object no surer by that.
-        let looks_hz = if most_trusted > 0.0 { looks_hz / most_trusted } else { 0.0 };
+        let looks_hz = if most_trusted > 0.0 {
+            looks_hz / most_trusted
+        } else {
+            0.0
+        };
         let alone = alone_nats(looks_hz, even_excess.unwrap_or_default());
         let nats = base_rate + alone + evidence + detected * persistence + inherited;
         self.clutter = Some(logistic(-nats));
@@ -219,7 +249,10 @@ impl Track {
     }
 
     fn witnesses(&self) -> impl Iterator<Item = SensorId> {
-        self.history.iter().filter(|history| history.last_hit.is_some()).map(|history| history.sensor)
+        self.history
+            .iter()
+            .filter(|history| history.last_hit.is_some())
+            .map(|history| history.sensor)
     }
 
     /// Probability that an object that existed is still there.
@@ -230,12 +263,15 @@ impl Track {
 
     /// The histories of the vehicles that detected the object since `limit`.
     pub(super) fn seen_by(&self, limit: Timestamp) -> impl Iterator<Item = &SensorHistory> {
-        self.history.iter().filter(move |history| history.last_hit.is_some_and(|hit| hit >= limit))
+        self.history
+            .iter()
+            .filter(move |history| history.last_hit.is_some_and(|hit| hit >= limit))
     }
 
     /// Whether another vehicle than `sensor` detected the object shortly before `at`.
     pub(super) fn is_confirmed(&self, sensor: SensorId, at: Timestamp) -> bool {
-        self.seen_by(at - CONFIRMED_WITHIN).any(|history| history.sensor != sensor)
+        self.seen_by(at - CONFIRMED_WITHIN)
+            .any(|history| history.sensor != sensor)
     }
 
     /// True if a vehicle detected both objects in the frame of its last detection. Detections of long ago do not count: a
@@ -244,7 +280,10 @@ impl Track {
         let since = self.last_seen.max(other.last_seen) - LOOKS_FOR;
         self.history.iter().any(|own| {
             own.last_hit.is_some_and(|hit| hit >= since)
-                && other.history.iter().any(|theirs| theirs.sensor == own.sensor && theirs.last_hit == own.last_hit)
+                && other
+                    .history
+                    .iter()
+                    .any(|theirs| theirs.sensor == own.sensor && theirs.last_hit == own.last_hit)
         })
     }
 
@@ -266,11 +305,20 @@ impl Track {
 
     /// Takes existence and attributes from another aggregator's object.
     pub(super) fn inherit(&mut self, object: &FusedObject, at: Timestamp) {
-        let existence = object.existence.unwrap_or(object.confidence).clamp(0.01, 0.99);
+        let existence = object
+            .existence
+            .unwrap_or(object.confidence)
+            .clamp(0.01, 0.99);
         let alone = BaseRate::usual_log_odds() + alone_nats(0.0, 0.0);
         self.inherited = Some(((existence / (1.0 - existence)).ln() - alone, at));
-        self.first_seen = object.first_seen_us.map_or(self.first_seen, |first| first.min(self.first_seen));
-        self.labels = object.scores.iter().map(|(label, score)| (label.clone(), *score)).collect();
+        self.first_seen = object
+            .first_seen_us
+            .map_or(self.first_seen, |first| first.min(self.first_seen));
+        self.labels = object
+            .scores
+            .iter()
+            .map(|(label, score)| (label.clone(), *score))
+            .collect();
         self.inherited_heading_rad = object.heading_rad;
         self.size_m = object.size_m;
     }
@@ -287,10 +335,18 @@ impl Track {
         let position = self.state.position_at(now);
         let total: f64 = self.labels.iter().map(|(_, weight)| weight).sum();
         let mut scores = BTreeMap::new();
-        scores.extend(self.labels.iter().map(|(label, weight)| (label.clone(), weight / total.max(1e-9))));
+        scores.extend(
+            self.labels
+                .iter()
+                .map(|(label, weight)| (label.clone(), weight / total.max(1e-9))),
+        );
         let sigma_m = (covariance.trace() / 2.0).sqrt();
         let usable = 1.0 - (-ERROR_RATE * USABLE_M / sigma_m).exp();
-        let covariance = Covariance { xx: covariance.m11, xy: covariance.m12, yy: covariance.m22 };
+        let covariance = Covariance {
+            xx: covariance.m11,
+            xy: covariance.m12,
+            yy: covariance.m22,
+        };
         let confidence = existence * usable;
         let has_velocity = self.hits > 1;
         let seen_by = self.seen_by(now - Duration::from_secs_f64(config.life_s));
@@ -301,18 +357,31 @@ impl Track {
             existence: Some(existence),
             scores,
             velocity_mps: has_velocity.then_some([self.state.velocity.x, self.state.velocity.y]),
-            heading_rad: self.heading_rad.or_else(|| self.course_rad()).or(self.inherited_heading_rad),
+            heading_rad: self
+                .heading_rad
+                .or_else(|| self.course_rad())
+                .or(self.inherited_heading_rad),
             size_m: self.size_m,
             age_s: Some(now.since(self.last_seen).as_secs_f64()),
             first_seen_us: Some(self.first_seen),
             vehicle: self.vehicle.and_then(name),
-            ..FusedObject::new(self.id, self.label(config), confidence, position.x, position.y, covariance)
+            ..FusedObject::new(
+                self.id,
+                self.label(config),
+                confidence,
+                position.x,
+                position.y,
+                covariance,
+            )
         }
     }
 
     /// The likeliest label; a track without labels is a vehicle that only its own pose reports.
     pub(super) fn label(&self, config: &TracksConfig) -> Label {
-        let best = self.labels.iter().max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
+        let best = self
+            .labels
+            .iter()
+            .max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
         best.map_or_else(|| config.vehicle_label.clone(), |(label, _)| label.clone())
     }
 
@@ -333,7 +402,11 @@ mod tests {
         let config = TracksConfig::default();
         let (before, at) = (Timestamp(1_000_000), Timestamp(1_500_000));
         let independent = nalgebra::Matrix2::identity() * 0.01;
-        let measurement = Measurement { position: Vector2::zeros(), independent, common_m: 0.0 };
+        let measurement = Measurement {
+            position: Vector2::zeros(),
+            independent,
+            common_m: 0.0,
+        };
         let mut track = Track::new(Uuid::nil(), before, &measurement, &config);
         track.record_hit(at);
         (1..=3).for_each(|ms| track.record_miss(at + Duration::from_millis(ms), 0.5, 0.9));

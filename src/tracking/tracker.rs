@@ -20,7 +20,8 @@ use crate::model::time::Timestamp;
 use crate::neighbours::MAX_AGE;
 use crate::reputation::{Evidence, ReputationConfig, ReputationLedger};
 use crate::wire::{
-    ForeignVotes, FusedObject, GlobalMap, NeighbourObject, ObjectReport, PerceivedObject, PoseCorrection,
+    ForeignVotes, FusedObject, GlobalMap, NeighbourObject, ObjectReport, PerceivedObject,
+    PoseCorrection,
 };
 
 /// Tracks objects; see the [module](super).
@@ -67,7 +68,11 @@ impl Tracker {
     }
 
     /// Takes one admitted report, captured at `captured_at` on the aggregator's clock; false if it came too late.
-    pub fn observe(&mut self, report: impl Into<Arc<ObjectReport>>, captured_at: Timestamp) -> bool {
+    pub fn observe(
+        &mut self,
+        report: impl Into<Arc<ObjectReport>>,
+        captured_at: Timestamp,
+    ) -> bool {
         self.observe_only(report.into(), captured_at, |_| true)
     }
 
@@ -108,13 +113,24 @@ impl Tracker {
     /// Takes identities, and objects that are unknown here, from another aggregator's map, received at `now`.
     pub fn adopt_map(&mut self, map: &GlobalMap, now: Timestamp) {
         let steady = self.frame.steady_map(map, now);
-        adopt_map(&mut self.tracks, steady.as_ref().unwrap_or(map), now, &self.config);
+        adopt_map(
+            &mut self.tracks,
+            steady.as_ref().unwrap_or(map),
+            now,
+            &self.config,
+        );
     }
 
     /// Takes all objects of neighbouring cells, of the age that they state at `stated_at`; their times are by its clock.
     /// Frames that turn have no place on Earth and no neighbours.
     pub fn take_neighbours(&mut self, objects: &[NeighbourObject], stated_at: Timestamp) {
-        self.foreign.take(objects, stated_at, &mut self.tracks, &self.sensors.fleet, &self.config);
+        self.foreign.take(
+            objects,
+            stated_at,
+            &mut self.tracks,
+            &self.sensors.fleet,
+            &self.config,
+        );
     }
 
     /// True if an object of a neighbouring cell is not to be shown: it is one of the tracks, or its cell is not believed.
@@ -139,7 +155,10 @@ impl Tracker {
 
     /// Reports and objects that were not used so far.
     pub fn losses(&self) -> TracksLosses {
-        TracksLosses { late: self.late, refused: self.tracks.refused }
+        TracksLosses {
+            late: self.late,
+            refused: self.tracks.refused,
+        }
     }
 
     /// Closes the round at `now`.
@@ -149,8 +168,11 @@ impl Tracker {
         for (at, report) in &pending {
             self.frame.note(report, *at);
         }
-        let trust =
-            |node: &NodeName| self.sensors.by_name(node).map_or(1.0, |sensor| self.sensors.fleet.trust(sensor.id));
+        let trust = |node: &NodeName| {
+            self.sensors
+                .by_name(node)
+                .map_or(1.0, |sensor| self.sensors.fleet.trust(sensor.id))
+        };
         self.frame.advance(now, |node| trust(node) > 0.0);
         let (frames, evidence) = self.update(&self.in_order(pending), now);
         if self.config.align {
@@ -158,10 +180,17 @@ impl Tracker {
         }
         merge(&mut self.tracks, now, &self.config);
         prune(&mut self.tracks, &mut self.sensors, now, &self.config);
-        self.foreign.forget(now - MAX_AGE, |vehicle| self.sensors.get(vehicle).is_some());
+        self.foreign
+            .forget(now - MAX_AGE, |vehicle| self.sensors.get(vehicle).is_some());
         let (mut objects, mut pose_corrections) = (self.objects(now), self.corrections());
-        self.frame.restore(now, &mut objects, pose_corrections.values_mut());
-        TracksRound { objects, pose_corrections, oldest_capture, evidence }
+        self.frame
+            .restore(now, &mut objects, pose_corrections.values_mut());
+        TracksRound {
+            objects,
+            pose_corrections,
+            oldest_capture,
+            evidence,
+        }
     }
 
     /// The reports of a round in the order of capture, whatever the order of arrival.
@@ -173,29 +202,61 @@ impl Tracker {
                 let sensor = self.sensors.by_name(&report.node);
                 let delay_s = sensor.map_or(0.0, |sensor| sensor.pose_bias.delay_s(&prior));
                 let at = stamp.shifted((-delay_s * 1e6) as i64);
-                Captured { at, delay_s, report: self.frame.steady(report, at) }
+                Captured {
+                    at,
+                    delay_s,
+                    report: self.frame.steady(report, at),
+                }
             })
             .collect();
-        reports.sort_by(|a, b| (a.at, &a.report.node, a.report.seq).cmp(&(b.at, &b.report.node, b.report.seq)));
+        reports.sort_by(|a, b| {
+            (a.at, &a.report.node, a.report.seq).cmp(&(b.at, &b.report.node, b.report.seq))
+        });
         reports
     }
 
     /// Updates the tracks by each report; returns what registration needs, and judgements of the vehicles.
-    fn update(&mut self, reports: &[Captured], now: Timestamp) -> (Vec<RegistrationFrame>, Vec<Evidence>) {
-        let (mut frames, mut evidence): (Vec<RegistrationFrame>, Vec<Evidence>) = Default::default();
-        self.tracks.reindex(reports.first().map_or(now, |report| report.at));
-        for Captured { at, delay_s, report } in reports {
+    fn update(
+        &mut self,
+        reports: &[Captured],
+        now: Timestamp,
+    ) -> (Vec<RegistrationFrame>, Vec<Evidence>) {
+        let (mut frames, mut evidence): (Vec<RegistrationFrame>, Vec<Evidence>) =
+            Default::default();
+        self.tracks
+            .reindex(reports.first().map_or(now, |report| report.at));
+        for Captured {
+            at,
+            delay_s,
+            report,
+        } in reports
+        {
             let (at, delay_s) = (*at, *delay_s);
             self.tracks.reindex_if_stale(at);
             let (sensor, fleet) = self.sensors.hear(&report.node, at, &self.config);
             let id = sensor.id;
-            let update =
-                ReportUpdate::new(&self.config, &mut self.tracks, (sensor, fleet), &mut self.foreign, report, at);
-            let ReportOutcome { has_jumped, samples, evidence: judged } = update.run();
+            let update = ReportUpdate::new(
+                &self.config,
+                &mut self.tracks,
+                (sensor, fleet),
+                &mut self.foreign,
+                report,
+                at,
+            );
+            let ReportOutcome {
+                has_jumped,
+                samples,
+                evidence: judged,
+            } = update.run();
             if has_jumped {
                 frames.retain(|earlier| earlier.sensor != id);
             }
-            frames.push(RegistrationFrame { sensor: id, at, delay_s, samples });
+            frames.push(RegistrationFrame {
+                sensor: id,
+                at,
+                delay_s,
+                samples,
+            });
             if at >= self.recorded_from {
                 evidence.extend(judged);
             }
@@ -210,11 +271,17 @@ impl Tracker {
         let name = |id| self.sensors.get(id).map(|sensor| sensor.node.clone());
         let base_rate = self.base_rate.log_odds();
         let mut existences = Vec::with_capacity(self.tracks.len());
-        existences.extend(self.tracks.iter_mut().map(|track| track.estimate_existence(now, base_rate, quality)));
+        existences.extend(
+            self.tracks
+                .iter_mut()
+                .map(|track| track.estimate_existence(now, base_rate, quality)),
+        );
         let witnesses = self.tracks.iter().map(Track::only_witness);
-        self.base_rate.learn(now, witnesses.zip(existences.iter().copied()));
+        self.base_rate
+            .learn(now, witnesses.zip(existences.iter().copied()));
         let tracks = self.tracks.iter().zip(existences);
-        let objects = tracks.map(|(track, existence)| track.object(now, &self.config, existence, name));
+        let objects =
+            tracks.map(|(track, existence)| track.object(now, &self.config, existence, name));
         let mut published = Vec::with_capacity(self.tracks.len());
         published.extend(objects.filter(|object| object.confidence >= self.config.min_confidence));
         published
@@ -225,7 +292,9 @@ impl Tracker {
             return BTreeMap::new();
         }
         let corrections = self.sensors.iter();
-        corrections.filter_map(|sensor| Some((sensor.node.clone(), sensor.pose_bias.correction()?))).collect()
+        corrections
+            .filter_map(|sensor| Some((sensor.node.clone(), sensor.pose_bias.correction()?)))
+            .collect()
     }
 }
 

@@ -56,16 +56,26 @@ struct PeerEvidence {
 }
 
 impl PeerEvidence {
-    fn of(history: &DetectionHistory, sensor: Option<SensorId>, at: Timestamp, fleet: &Fleet) -> Self {
+    fn of(
+        history: &DetectionHistory,
+        sensor: Option<SensorId>,
+        at: Timestamp,
+        fleet: &Fleet,
+    ) -> Self {
         let mut peers = Self::default();
-        for history in history.iter().filter(|history| Some(history.sensor) != sensor) {
+        for history in history
+            .iter()
+            .filter(|history| Some(history.sensor) != sensor)
+        {
             if at.since(history.last_look) > JUDGED_AFTER {
                 continue;
             }
             let weight = fleet.trust(history.sensor);
             peers.nats += weight * history.nats(at);
             peers.looking += usize::from(weight > MIN_PEER_WEIGHT && history.looks > 5);
-            let is_recent = history.last_hit.is_some_and(|hit| at.since(hit) <= JUDGED_AFTER);
+            let is_recent = history
+                .last_hit
+                .is_some_and(|hit| at.since(hit) <= JUDGED_AFTER);
             peers.detecting += usize::from(weight > MIN_PEER_WEIGHT && is_recent);
         }
         peers
@@ -78,7 +88,11 @@ impl PeerEvidence {
             Some(Judgement::Correct)
         } else if self.detecting >= 2 && exists && statement.hits == 0 {
             Some(Judgement::Miss)
-        } else if self.looking >= 2 && self.detecting == 0 && self.nats <= ABSENT_NATS && share >= MIN_STATED {
+        } else if self.looking >= 2
+            && self.detecting == 0
+            && self.nats <= ABSENT_NATS
+            && share >= MIN_STATED
+        {
             Some(Judgement::FalsePositive)
         } else {
             None
@@ -103,7 +117,11 @@ impl TrustCounts {
 
     /// Adds one statement.
     pub(super) fn count(&mut self, is_correct: bool, config: &ReputationConfig) {
-        *(if is_correct { &mut self.correct } else { &mut self.incorrect }) += 1.0;
+        *(if is_correct {
+            &mut self.correct
+        } else {
+            &mut self.incorrect
+        }) += 1.0;
         self.fade(config);
     }
 
@@ -119,7 +137,8 @@ impl TrustCounts {
 
     /// True if there are as many statements as the initial score weighs, and the reputation is no worse.
     pub(super) fn is_proven(&self, config: &ReputationConfig) -> bool {
-        self.total() >= config.initial_votes && config.mean(self.correct, self.incorrect) >= config.initial
+        self.total() >= config.initial_votes
+            && config.mean(self.correct, self.incorrect) >= config.initial
     }
 
     /// Weight of the vehicle's evidence: 1 from a newcomer's reputation up, 0 at that of a proven liar.
@@ -149,10 +168,18 @@ impl DormantCounts {
 
     /// Keeps the counts of vehicles; those with the fewest statements make room.
     pub(super) fn keep(&mut self, vehicles: impl IntoIterator<Item = (NodeName, TrustCounts)>) {
-        self.0.extend(vehicles.into_iter().filter(|(_, counts)| counts.total() > 0.0));
+        self.0.extend(
+            vehicles
+                .into_iter()
+                .filter(|(_, counts)| counts.total() > 0.0),
+        );
         let excess = self.0.len().saturating_sub(Self::MAX);
         if excess > 0 {
-            let mut totals: Vec<_> = self.0.iter().map(|(node, counts)| (counts.total(), node.clone())).collect();
+            let mut totals: Vec<_> = self
+                .0
+                .iter()
+                .map(|(node, counts)| (counts.total(), node.clone()))
+                .collect();
             totals.sort_by(|a, b| a.0.total_cmp(&b.0).then_with(|| a.1.cmp(&b.1)));
             for (_, node) in totals.iter().take(excess) {
                 self.0.remove(node);
@@ -183,7 +210,12 @@ impl Fleet {
 
     /// A fleet without vehicles.
     pub(super) fn new(reputation: ReputationConfig) -> Self {
-        Self { reputation, trust: Vec::new(), foreign: Vec::new(), detections: vec![(0.0, 1.0); Self::BINS] }
+        Self {
+            reputation,
+            trust: Vec::new(),
+            foreign: Vec::new(),
+            detections: vec![(0.0, 1.0); Self::BINS],
+        }
     }
 
     /// Goes on with other parameters of reputations.
@@ -209,7 +241,12 @@ impl Fleet {
     }
 
     /// Sets the votes of other cells about a vehicle with these counts.
-    pub(super) fn set_foreign(&mut self, sensor: SensorId, foreign: ForeignVotes, counts: &TrustCounts) {
+    pub(super) fn set_foreign(
+        &mut self,
+        sensor: SensorId,
+        foreign: ForeignVotes,
+        counts: &TrustCounts,
+    ) {
         self.make_room(sensor);
         self.foreign[sensor.number()] = foreign;
         self.set_counts(sensor, counts);
@@ -251,7 +288,11 @@ impl Fleet {
     }
 
     /// Judges the statement of somebody beyond these vehicles that an object exists, by what they saw of it.
-    pub(super) fn judge_stated(&self, history: &DetectionHistory, at: Timestamp) -> Option<Judgement> {
+    pub(super) fn judge_stated(
+        &self,
+        history: &DetectionHistory,
+        at: Timestamp,
+    ) -> Option<Judgement> {
         PeerEvidence::of(history, None, at, self).judge(ExistenceStatement { hits: 1, looks: 1 })
     }
 

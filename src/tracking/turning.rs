@@ -47,10 +47,15 @@ impl TurningFrame {
         rates.sort_by(f64::total_cmp);
         let middle = rates.len().saturating_sub(1) / 2..=rates.len() / 2;
         let middle = rates.get(middle).unwrap_or_default();
-        let rate_radps = middle.iter().copied().min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(0.0);
+        let rate_radps = middle
+            .iter()
+            .copied()
+            .min_by(|a, b| a.abs().total_cmp(&b.abs()))
+            .unwrap_or(0.0);
         let passed_s = now.since(self.at).as_secs_f64();
         if self.is_turning() {
-            self.angle_rad = wrap_angle(self.angle_rad + (self.rate_radps + rate_radps) / 2.0 * passed_s);
+            self.angle_rad =
+                wrap_angle(self.angle_rad + (self.rate_radps + rate_radps) / 2.0 * passed_s);
         }
         self.rate_radps = rate_radps;
         self.at = self.at.max(now);
@@ -64,20 +69,31 @@ impl TurningFrame {
     fn turn(&self, at: Timestamp) -> Option<Turn> {
         let passed_s = at.micros_from(self.at) as f64 * 1e-6;
         let angle_rad = self.angle_rad + self.rate_radps * passed_s;
-        self.is_turning().then_some(Turn { angle_rad, rate_radps: self.rate_radps })
+        self.is_turning().then_some(Turn {
+            angle_rad,
+            rate_radps: self.rate_radps,
+        })
     }
 
     /// A report, captured at `at`, in the frame of the tracks.
     pub(super) fn steady(&self, report: Arc<ObjectReport>, at: Timestamp) -> Arc<ObjectReport> {
-        let Some(turn) = self.turn(at) else { return report };
+        let Some(turn) = self.turn(at) else {
+            return report;
+        };
         let mut report = Arc::unwrap_or_clone(report);
         if let Some(pose) = &mut report.pose {
             [pose.x_m, pose.y_m] = turn.vector([pose.x_m, pose.y_m]);
             pose.heading_rad = turn.heading(pose.heading_rad);
         }
         for object in &mut report.objects {
-            turn.motion([&mut object.x_m, &mut object.y_m], &mut object.velocity_mps, &mut object.heading_rad);
-            object.covariance_m2 = object.covariance_m2.map(|covariance| turn.covariance(covariance));
+            turn.motion(
+                [&mut object.x_m, &mut object.y_m],
+                &mut object.velocity_mps,
+                &mut object.heading_rad,
+            );
+            object.covariance_m2 = object
+                .covariance_m2
+                .map(|covariance| turn.covariance(covariance));
         }
         Arc::new(report)
     }
@@ -86,7 +102,9 @@ impl TurningFrame {
     pub(super) fn steady_map(&self, map: &GlobalMap, now: Timestamp) -> Option<GlobalMap> {
         let turn = self.turn(now)?;
         let mut map = map.clone();
-        map.objects.iter_mut().for_each(|object| turn.object(object));
+        map.objects
+            .iter_mut()
+            .for_each(|object| turn.object(object));
         Some(map)
     }
 
@@ -97,7 +115,9 @@ impl TurningFrame {
         objects: &mut [FusedObject],
         corrections: impl Iterator<Item = &'a mut PoseCorrection>,
     ) {
-        let Some(turn) = self.turn(now).map(Turn::reversed) else { return };
+        let Some(turn) = self.turn(now).map(Turn::reversed) else {
+            return;
+        };
         objects.iter_mut().for_each(|object| turn.object(object));
         for correction in corrections {
             correction.about_m = turn.vector(correction.about_m);
@@ -115,7 +135,10 @@ struct Turn {
 
 impl Turn {
     fn reversed(self) -> Self {
-        Self { angle_rad: -self.angle_rad, rate_radps: -self.rate_radps }
+        Self {
+            angle_rad: -self.angle_rad,
+            rate_radps: -self.rate_radps,
+        }
     }
 
     fn rotation(&self) -> Rotation2<f64> {
@@ -136,15 +159,25 @@ impl Turn {
         [turned.m11, turned.m12, turned.m22]
     }
 
-    fn motion(&self, [x_m, y_m]: [&mut f64; 2], velocity_mps: &mut Option<[f64; 2]>, heading_rad: &mut Option<f64>) {
+    fn motion(
+        &self,
+        [x_m, y_m]: [&mut f64; 2],
+        velocity_mps: &mut Option<[f64; 2]>,
+        heading_rad: &mut Option<f64>,
+    ) {
         let rate = self.rate_radps;
-        *velocity_mps = velocity_mps.map(|[east, north]| self.vector([east - rate * *y_m, north + rate * *x_m]));
+        *velocity_mps = velocity_mps
+            .map(|[east, north]| self.vector([east - rate * *y_m, north + rate * *x_m]));
         *heading_rad = heading_rad.map(|heading_rad| self.heading(heading_rad));
         [*x_m, *y_m] = self.vector([*x_m, *y_m]);
     }
 
     fn object(&self, object: &mut FusedObject) {
-        self.motion([&mut object.x_m, &mut object.y_m], &mut object.velocity_mps, &mut object.heading_rad);
+        self.motion(
+            [&mut object.x_m, &mut object.y_m],
+            &mut object.velocity_mps,
+            &mut object.heading_rad,
+        );
         object.covariance_m2 = self.covariance(object.covariance_m2);
     }
 }

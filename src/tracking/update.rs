@@ -90,13 +90,32 @@ impl<'a> ReportUpdate<'a> {
         let has_jumped = sensor.observe(report, at, config);
         let is_likely = sensor.calibration.likely();
         let mut occlusion = OcclusionMap::new(sensor.coverage.position());
-        for object in report.objects.iter().filter(|object| is_likely(object.confidence)) {
+        for object in report
+            .objects
+            .iter()
+            .filter(|object| is_likely(object.confidence))
+        {
             occlusion.add(object, config.vehicle_radius_m);
         }
         let trust = fleet.trust(sensor.id);
         let samples = Vec::with_capacity(report.objects.len());
-        let outcome = ReportOutcome { has_jumped, samples, evidence: Vec::new() };
-        Self { config, tracks, sensor, at, fleet, foreign, report, trust, occlusion, outcome }
+        let outcome = ReportOutcome {
+            has_jumped,
+            samples,
+            evidence: Vec::new(),
+        };
+        Self {
+            config,
+            tracks,
+            sensor,
+            at,
+            fleet,
+            foreign,
+            report,
+            trust,
+            occlusion,
+            outcome,
+        }
     }
 
     /// Carries out the update.
@@ -122,7 +141,9 @@ impl<'a> ReportUpdate<'a> {
         self.count_misses(&detected);
         self.look_at_foreign(&detections);
         if self.is_trusted() {
-            unassociated.into_iter().for_each(|detection| self.spawn(detection));
+            unassociated
+                .into_iter()
+                .for_each(|detection| self.spawn(detection));
         }
         self.outcome
     }
@@ -134,7 +155,13 @@ impl<'a> ReportUpdate<'a> {
 
     /// Updates or spawns the track of the vehicle itself from its pose; no other report may do so.
     fn update_own_track(&mut self) {
-        let Some(pose) = self.report.pose.filter(|_| self.report.moving != Some(false)) else { return };
+        let Some(pose) = self
+            .report
+            .pose
+            .filter(|_| self.report.moving != Some(false))
+        else {
+            return;
+        };
         let sigma_m = (self.config.vehicle_radius_m / 2.0).max(self.config.noise_floor_m);
         let measurement = Measurement {
             position: self.sensor.pose_bias.corrector()(&Vector2::new(pose.x_m, pose.y_m)),
@@ -144,14 +171,19 @@ impl<'a> ReportUpdate<'a> {
         let (density, vehicle, at) = (self.config.density(), self.sensor.id, self.at);
         let known = self.tracks.of_vehicle(vehicle);
         let is_in_reach = known.is_some_and(|track| {
-            let innovation = self.tracks[track].state.innovation(at, &measurement, density);
-            innovation.offset.norm() <= self.config.gate_m || innovation.distance_squared <= self.config.gate()
+            let innovation = self.tracks[track]
+                .state
+                .innovation(at, &measurement, density);
+            innovation.offset.norm() <= self.config.gate_m
+                || innovation.distance_squared <= self.config.gate()
         });
         let begin = |update: &mut Self| {
             let track = update.begin(&measurement, usize::MAX, None);
             update.tracks.add(track)
         };
-        let Some(index) = known.or_else(|| begin(self)) else { return };
+        let Some(index) = known.or_else(|| begin(self)) else {
+            return;
+        };
         self.tracks.set_vehicle(index, vehicle);
         let track = &mut self.tracks[index];
         if is_in_reach {
@@ -171,19 +203,29 @@ impl<'a> ReportUpdate<'a> {
 
     /// The report's detections, but for those of the vehicle itself.
     fn detections(&self) -> Vec<TimedDetection<'a>> {
-        let own = self.report.pose.map(|pose| Vector2::new(pose.x_m, pose.y_m));
+        let own = self
+            .report
+            .pose
+            .map(|pose| Vector2::new(pose.x_m, pose.y_m));
         let trust = self.trust.max(MIN_TRUST);
         let correct = self.sensor.pose_bias.corrector();
         let detection = |(index, object): (usize, &'a PerceivedObject)| {
             let reported = Vector2::new(object.x_m, object.y_m);
-            let is_itself = own.is_some_and(|own| (own - reported).norm() < self.config.vehicle_radius_m);
+            let is_itself =
+                own.is_some_and(|own| (own - reported).norm() < self.config.vehicle_radius_m);
             let measurement = Measurement {
                 position: correct(&reported),
                 independent: self.sensor.noise.covariance(object, self.config) / trust,
                 common_m: self.config.common_m,
             };
             let log_odds = log_odds(object.confidence);
-            (!is_itself).then_some(TimedDetection { index, object, log_odds, reported, measurement })
+            (!is_itself).then_some(TimedDetection {
+                index,
+                object,
+                log_odds,
+                reported,
+                measurement,
+            })
         };
         let mut detections = Vec::with_capacity(self.report.objects.len());
         detections.extend(self.report.objects.iter().enumerate().filter_map(detection));
@@ -193,26 +235,47 @@ impl<'a> ReportUpdate<'a> {
     /// Updates a track with its detection, and the sensor model with what the track tells of it.
     fn update_track(&mut self, index: TrackIndex, detection: &TimedDetection<'_>) {
         let (id, at, density) = (self.sensor.id, self.at, self.config.density());
-        let TimedDetection { object, reported, measurement, .. } = detection;
+        let TimedDetection {
+            object,
+            reported,
+            measurement,
+            ..
+        } = detection;
         let track = &mut self.tracks[index];
         let is_vehicle = track.vehicle.is_some();
         if track.hits >= MATURE_HITS && !is_vehicle {
             let offset = measurement.position - track.state.position_at(at);
             let expected = track.state.covariance_at(at, density).trace();
-            self.sensor.noise.learn(object, offset.norm_squared(), expected, self.config);
+            self.sensor
+                .noise
+                .learn(object, offset.norm_squared(), expected, self.config);
         }
         if track.hits >= ESTABLISHED_HITS && !is_vehicle {
             let variance = measurement.independent.trace() / 2.0;
-            self.outcome.samples.push(RegistrationSample { track: index, reported: *reported, variance });
+            self.outcome.samples.push(RegistrationSample {
+                track: index,
+                reported: *reported,
+                variance,
+            });
         }
-        let rates = self.sensor.coverage.rates_at(reported).filter(|_| !self.occlusion.hides(reported));
-        let look_rates = self.sensor.look_rates(rates.unwrap_or(DetectionRates::PRIOR));
+        let rates = self
+            .sensor
+            .coverage
+            .rates_at(reported)
+            .filter(|_| !self.occlusion.hides(reported));
+        let look_rates = self
+            .sensor
+            .look_rates(rates.unwrap_or(DetectionRates::PRIOR));
         let history = track.history.get(id);
         if let (Some(history), Some(probability)) = (history, track.clutter) {
-            self.sensor.clutter.learn(probability, history.was_hit, true);
+            self.sensor
+                .clutter
+                .learn(probability, history.was_hit, true);
         }
         let has_room = history.is_some() || track.history.has_room(id, at);
-        let last_hit = history.filter(|history| history.was_hit).map(|history| history.confidence_log_odds);
+        let last_hit = history
+            .filter(|history| history.was_hit)
+            .map(|history| history.confidence_log_odds);
         let was_hit = last_hit.is_some();
         let exists = track.hits >= ESTABLISHED_HITS && (was_hit || track.is_confirmed(id, at));
         if rates.is_some() && exists && has_room {
@@ -226,7 +289,11 @@ impl<'a> ReportUpdate<'a> {
             self.sensor.calibration.learn(log_odds, true);
         }
         let nats = self.sensor.calibration.nats(detection.log_odds);
-        let slot = if self.trust > 0.0 { track.history.for_hit(id, at) } else { track.history.for_look(id, at) };
+        let slot = if self.trust > 0.0 {
+            track.history.for_hit(id, at)
+        } else {
+            track.history.for_look(id, at)
+        };
         let due = slot.and_then(|history| {
             history.hit(at, measurement.position, nats, Some(look_rates));
             history.confidence_log_odds = detection.log_odds;
@@ -241,7 +308,9 @@ impl<'a> ReportUpdate<'a> {
     /// Counts a miss for every track in the vehicle's view that is not among the `detected`.
     fn count_misses(&mut self, detected: &[TrackIndex]) {
         let (id, at) = (self.sensor.id, self.at);
-        let Some(centre) = self.sensor.coverage.centre() else { return };
+        let Some(centre) = self.sensor.coverage.centre() else {
+            return;
+        };
         // Positions are those of the index, so that updates of the same round make no difference.
         let since_indexed_s = self.tracks.seconds_since_indexed(at);
         let mut in_view = Vec::new();
@@ -249,8 +318,11 @@ impl<'a> ReportUpdate<'a> {
         self.tracks.near(&centre, reach_m, |indexed| {
             let position = indexed.position + indexed.velocity * since_indexed_s;
             if detected.binary_search(&indexed.track).is_err()
-                && let Some(rates) =
-                    self.sensor.coverage.rates_at(&position).filter(|_| !self.occlusion.hides(&position))
+                && let Some(rates) = self
+                    .sensor
+                    .coverage
+                    .rates_at(&position)
+                    .filter(|_| !self.occlusion.hides(&position))
             {
                 in_view.push((indexed.track, position, rates));
             }
@@ -262,7 +334,9 @@ impl<'a> ReportUpdate<'a> {
                 continue;
             }
             let history = track.history.get(id);
-            if history.map_or(!track.history.has_room(id, at), |history| history.last_look >= at) {
+            if history.map_or(!track.history.has_room(id, at), |history| {
+                history.last_look >= at
+            }) {
                 continue;
             }
             let was_hit = history.is_some_and(|history| history.was_hit);
@@ -271,7 +345,9 @@ impl<'a> ReportUpdate<'a> {
                 self.sensor.clutter.learn(probability, was_hit, false);
             }
             if let Some(history) = history.filter(|history| history.was_hit) {
-                self.sensor.calibration.learn(history.confidence_log_odds, false);
+                self.sensor
+                    .calibration
+                    .learn(history.confidence_log_odds, false);
             }
             let had_detected = history.is_some_and(|history| history.last_hit.is_some());
             let dt_s = history.map_or(0.0, |history| at.since(history.last_look).as_secs_f64());
@@ -294,30 +370,54 @@ impl<'a> ReportUpdate<'a> {
     /// Takes note of what the vehicle sees where cells state that objects are, and judges those cells.
     fn look_at_foreign(&mut self, detections: &[TimedDetection<'_>]) {
         let (id, at, gate) = (self.sensor.id, self.at, self.config.gate());
-        let Some(centre) = self.sensor.coverage.centre().filter(|_| !self.foreign.is_empty()) else { return };
+        let Some(centre) = self
+            .sensor
+            .coverage
+            .centre()
+            .filter(|_| !self.foreign.is_empty())
+        else {
+            return;
+        };
         let (coverage, occlusion) = (&self.sensor.coverage, &self.occlusion);
         let (reach_m, near_m) = (coverage.range_m(), 2.0 * self.config.gate_m);
-        let rates_at = |place: &Vector2<f64>| coverage.rates_at(place).filter(|_| !occlusion.hides(place));
+        let rates_at =
+            |place: &Vector2<f64>| coverage.rates_at(place).filter(|_| !occlusion.hides(place));
         // Objects that nobody can see take no place from others.
         let is_looked_at = |place: &Vector2<f64>| {
             let is_within = (place - centre).norm() <= reach_m;
-            let mut places = detections.iter().map(|detection| detection.measurement.position);
-            is_within && (rates_at(place).is_some() || places.any(|other| (other - place).norm() <= near_m))
+            let mut places = detections
+                .iter()
+                .map(|detection| detection.measurement.position);
+            is_within
+                && (rates_at(place).is_some()
+                    || places.any(|other| (other - place).norm() <= near_m))
         };
         for foreign in self.foreign.stated(MAX_FOREIGN_EACH, at, is_looked_at) {
             let position = foreign.state.position_at(at);
             let rates = rates_at(&position);
             let near = detections.iter().filter(|detection| {
-                let innovation = foreign.state.innovation(at, &detection.measurement, self.config.density());
+                let innovation =
+                    foreign
+                        .state
+                        .innovation(at, &detection.measurement, self.config.density());
                 // Its place is as old as its cell's map.
                 innovation.offset.norm() <= near_m && innovation.distance_squared <= gate
             });
-            let likeliest = near.map(|detection| detection.log_odds).max_by(f64::total_cmp);
+            let likeliest = near
+                .map(|detection| detection.log_odds)
+                .max_by(f64::total_cmp);
             match (likeliest, rates) {
                 (Some(log_odds), rates) => {
-                    let rates = self.sensor.look_rates(rates.unwrap_or(DetectionRates::PRIOR));
+                    let rates = self
+                        .sensor
+                        .look_rates(rates.unwrap_or(DetectionRates::PRIOR));
                     if let Some(history) = foreign.history.for_hit(id, at) {
-                        history.hit(at, position, self.sensor.calibration.nats(log_odds), Some(rates));
+                        history.hit(
+                            at,
+                            position,
+                            self.sensor.calibration.nats(log_odds),
+                            Some(rates),
+                        );
                     }
                 }
                 (None, Some(rates)) => {
@@ -335,19 +435,42 @@ impl<'a> ReportUpdate<'a> {
     /// Judges the vehicle's statement about a track by the evidence of the others.
     fn judge(&mut self, index: TrackIndex, reported: &Vector2<f64>, statement: ExistenceStatement) {
         let track = &self.tracks[index];
-        let distance_m = self.sensor.coverage.centre().map_or(0.0, |centre| (reported - centre).norm());
-        let judgement = self.fleet.judge(self.sensor.id, statement, &track.history, distance_m, self.at);
+        let distance_m = self
+            .sensor
+            .coverage
+            .centre()
+            .map_or(0.0, |centre| (reported - centre).norm());
+        let judgement = self.fleet.judge(
+            self.sensor.id,
+            statement,
+            &track.history,
+            distance_m,
+            self.at,
+        );
         let Some(judgement) = judgement else { return };
         let correct = judgement == Judgement::Correct;
-        self.fleet.count(self.sensor.id, &mut self.sensor.counts, correct);
+        self.fleet
+            .count(self.sensor.id, &mut self.sensor.counts, correct);
         let label = track.label(self.config);
-        self.outcome.evidence.push(Evidence { node: self.sensor.node.clone(), label, correct });
+        self.outcome.evidence.push(Evidence {
+            node: self.sensor.node.clone(),
+            label,
+            correct,
+        });
     }
 
     /// A new track at a measurement of object `index` of the report: an object of a neighbouring cell, if one is there.
-    fn begin(&mut self, measurement: &Measurement, index: usize, detected: Option<&PerceivedObject>) -> Track {
+    fn begin(
+        &mut self,
+        measurement: &Measurement,
+        index: usize,
+        detected: Option<&PerceivedObject>,
+    ) -> Track {
         let (at, config) = (self.at, self.config);
-        match self.foreign.find(at, measurement, detected, self.tracks, self.fleet, config) {
+        match self
+            .foreign
+            .find(at, measurement, detected, self.tracks, self.fleet, config)
+        {
             Some(foreign) => {
                 let track = foreign.lend(at, measurement, config);
                 self.foreign.hand_overs.begun += 1;
@@ -360,7 +483,11 @@ impl<'a> ReportUpdate<'a> {
     /// Spawns a track from a detection that no track explains.
     fn spawn(&mut self, detection: &TimedDetection<'_>) {
         let at = self.at;
-        let mut track = self.begin(&detection.measurement, detection.index, Some(detection.object));
+        let mut track = self.begin(
+            &detection.measurement,
+            detection.index,
+            Some(detection.object),
+        );
         detection.describe(&mut track, self.sensor, at, self.config);
         let nats = self.sensor.calibration.nats(detection.log_odds);
         if let Some(history) = track.history.for_hit(self.sensor.id, at) {
@@ -373,13 +500,24 @@ impl<'a> ReportUpdate<'a> {
 
 impl TimedDetection<'_> {
     /// Updates velocity, attributes and time of a track.
-    fn describe(&self, track: &mut Track, sensor: &SensorModel, at: Timestamp, config: &TracksConfig) {
+    fn describe(
+        &self,
+        track: &mut Track,
+        sensor: &SensorModel,
+        at: Timestamp,
+        config: &TracksConfig,
+    ) {
         if let Some([x, y]) = self.object.velocity_mps {
             let velocity = sensor.pose_bias.correct_velocity(&Vector2::new(x, y));
-            track.state.update_velocity(at, velocity, VELOCITY_SIGMA_MPS, config.density());
+            track
+                .state
+                .update_velocity(at, velocity, VELOCITY_SIGMA_MPS, config.density());
         }
         track.state.limit_speed(config.max_speed_mps);
-        let heading_rad = self.object.heading_rad.map(|heading_rad| sensor.pose_bias.correct_heading(heading_rad));
+        let heading_rad = self
+            .object
+            .heading_rad
+            .map(|heading_rad| sensor.pose_bias.correct_heading(heading_rad));
         track.update_attributes(self.object, heading_rad);
         track.record_hit(at);
     }

@@ -32,7 +32,10 @@ impl BandCounts {
     }
 
     fn fade(&mut self, factor: f64) {
-        self.votes.iter_mut().chain(&mut self.agreed).for_each(|n| *n *= factor);
+        self.votes
+            .iter_mut()
+            .chain(&mut self.agreed)
+            .for_each(|n| *n *= factor);
     }
 }
 
@@ -68,7 +71,10 @@ pub(super) struct ConfidenceCalibration {
 impl ConfidenceCalibration {
     /// No evidence yet; `prior_votes` is the weight of a stated confidence against evidence, in votes.
     pub(super) fn new(prior_votes: f64) -> Self {
-        Self { prior_votes, ..Self::default() }
+        Self {
+            prior_votes,
+            ..Self::default()
+        }
     }
 
     /// Goes on with another weight of stated confidences.
@@ -79,7 +85,8 @@ impl ConfidenceCalibration {
     /// Counts that a vehicle stated a confidence.
     pub(super) fn record_confidence(&mut self, vehicle: usize, confidence: f64) {
         if self.histograms.len() <= vehicle {
-            self.histograms.resize(vehicle + 1, ConfidenceHistogram::default());
+            self.histograms
+                .resize(vehicle + 1, ConfidenceHistogram::default());
         }
         self.stated = (self.stated.0 + confidence, self.stated.1 + 1.0);
         let histogram = &mut self.histograms[vehicle];
@@ -98,10 +105,14 @@ impl ConfidenceCalibration {
 
     /// Band of a vote: the rank of its confidence among the vehicle's.
     pub(super) fn band(&self, vehicle: usize, confidence: f64) -> usize {
-        let (stated, total) = self.histograms.get(vehicle).map_or(([0.0; BINS], 0.0), |s| (s.stated, s.total));
+        let (stated, total) = self
+            .histograms
+            .get(vehicle)
+            .map_or(([0.0; BINS], 0.0), |s| (s.stated, s.total));
         let bin = bin(confidence);
         let below: f64 = stated[..bin].iter().sum();
-        let rank = (below + 0.5 * stated[bin] + 0.5 * RANK_PRIOR_VOTES) / (total + RANK_PRIOR_VOTES);
+        let rank =
+            (below + 0.5 * stated[bin] + 0.5 * RANK_PRIOR_VOTES) / (total + RANK_PRIOR_VOTES);
         ((rank * BANDS as f64) as usize).min(BANDS - 1)
     }
 
@@ -133,9 +144,14 @@ impl ConfidenceCalibration {
             bands.votes[band] = (bands.votes[band] + self.live.votes[band]).max(0.0);
             bands.agreed[band] = (bands.agreed[band] + self.live.agreed[band]).max(0.0);
         }
-        let (agreed, votes) = (bands.agreed.iter().sum::<f64>(), bands.votes.iter().sum::<f64>());
+        let (agreed, votes) = (
+            bands.agreed.iter().sum::<f64>(),
+            bands.votes.iter().sum::<f64>(),
+        );
         let rate = (agreed + 0.7) / (votes + 1.0);
-        let shrunk = |agreed: f64, votes: f64| odds((agreed + BAND_PRIOR_VOTES * rate) / (votes + BAND_PRIOR_VOTES));
+        let shrunk = |agreed: f64, votes: f64| {
+            odds((agreed + BAND_PRIOR_VOTES * rate) / (votes + BAND_PRIOR_VOTES))
+        };
         let overall = shrunk(agreed, votes);
         let mut ratios = [1.0; BANDS];
         if overall > 0.1 {
@@ -148,7 +164,12 @@ impl ConfidenceCalibration {
                 band += width;
             }
         }
-        Weights { ratios, votes, mean: self.stated.0 / self.stated.1.max(1.0), prior_votes: self.prior_votes }
+        Weights {
+            ratios,
+            votes,
+            mean: self.stated.0 / self.stated.1.max(1.0),
+            prior_votes: self.prior_votes,
+        }
     }
 }
 
@@ -171,12 +192,20 @@ fn pool_adjacent_violators(bands: &BandCounts) -> Vec<(f64, f64, usize)> {
 /// Kept part of the difference between pools: positive-part James–Stein shrinkage towards one rate for all.
 fn shrinkage(pools: &[(f64, f64, usize)]) -> f64 {
     let with_votes = || pools.iter().filter(|(_, votes, _)| *votes > 0.0);
-    let (agreed, votes) = with_votes().fold((0.0, 0.0), |(a, n), (agreed, votes, _)| (a + agreed, n + votes));
+    let (agreed, votes) = with_votes().fold((0.0, 0.0), |(a, n), (agreed, votes, _)| {
+        (a + agreed, n + votes)
+    });
     // Counts that are taken back leave rounding errors: more votes may seem to have agreed than there are.
     let rate = (agreed / f64::max(votes, 1e-9)).clamp(0.0, 1.0);
-    let spread: f64 = with_votes().map(|(agreed, votes, _)| votes * (agreed / votes - rate).powi(2)).sum();
+    let spread: f64 = with_votes()
+        .map(|(agreed, votes, _)| votes * (agreed / votes - rate).powi(2))
+        .sum();
     let noise = NOISE * rate * (1.0 - rate);
-    if spread > noise { 1.0 - noise / spread } else { 0.0 }
+    if spread > noise {
+        1.0 - noise / spread
+    } else {
+        0.0
+    }
 }
 
 fn odds(rate: f64) -> f64 {
@@ -202,7 +231,11 @@ impl Weights {
     pub(super) fn of(&self, band: usize, confidence: f64) -> f64 {
         let n = self.votes;
         let (low, high) = WEIGHT_RANGE;
-        let stated = if self.mean > 0.0 { (confidence / self.mean).clamp(low, high) } else { 1.0 };
+        let stated = if self.mean > 0.0 {
+            (confidence / self.mean).clamp(low, high)
+        } else {
+            1.0
+        };
         (n * self.ratios[band] + self.prior_votes * stated) / (n + self.prior_votes)
     }
 }
@@ -213,7 +246,9 @@ mod tests {
 
     fn learned(votes: impl Iterator<Item = (usize, f64, bool)> + Clone) -> ConfidenceCalibration {
         let mut calibration = ConfidenceCalibration::new(10.0);
-        votes.clone().for_each(|(vehicle, confidence, _)| calibration.record_confidence(vehicle, confidence));
+        votes.clone().for_each(|(vehicle, confidence, _)| {
+            calibration.record_confidence(vehicle, confidence)
+        });
         for (vehicle, confidence, agreed) in votes {
             calibration.settle(calibration.band(vehicle, confidence), f64::from(agreed));
         }
@@ -221,7 +256,9 @@ mod tests {
     }
 
     fn weight(calibration: &ConfidenceCalibration, vehicle: usize, confidence: f64) -> f64 {
-        calibration.weights().of(calibration.band(vehicle, confidence), confidence)
+        calibration
+            .weights()
+            .of(calibration.band(vehicle, confidence), confidence)
     }
 
     #[test]
@@ -245,15 +282,25 @@ mod tests {
 
     #[test]
     fn confidence_that_misleads_weighs_nothing() {
-        let calibration = learned((0..4000).map(|n| if n % 2 == 0 { (0, 0.9, n % 4 == 0) } else { (0, 0.4, true) }));
+        let calibration = learned((0..4000).map(|n| {
+            if n % 2 == 0 {
+                (0, 0.9, n % 4 == 0)
+            } else {
+                (0, 0.4, true)
+            }
+        }));
         let (high, low) = (weight(&calibration, 0, 0.9), weight(&calibration, 0, 0.4));
-        assert!((high - 1.0).abs() < 0.05 && (low - 1.0).abs() < 0.05, "{high} {low}");
+        assert!(
+            (high - 1.0).abs() < 0.05 && (low - 1.0).abs() < 0.05,
+            "{high} {low}"
+        );
     }
 
     #[test]
     fn confidence_that_says_nothing_weighs_nothing() {
         // Agreement and confidence repeat with periods that have no common factor.
-        let calibration = learned((0..2000).map(|n| (0, f64::from(n % 19) / 19.0 + 0.02, n % 7 > 1)));
+        let calibration =
+            learned((0..2000).map(|n| (0, f64::from(n % 19) / 19.0 + 0.02, n % 7 > 1)));
         for bin in 0..19 {
             let weight = weight(&calibration, 0, f64::from(bin) / 19.0 + 0.02);
             assert!((weight - 1.0).abs() < 0.02, "{weight}");
@@ -271,7 +318,8 @@ mod tests {
 
     #[test]
     fn a_boastful_vehicle_weighs_no_more_than_a_modest_one() {
-        let calibration = learned((0..8000).map(|n| (n % 2, if n % 2 == 0 { 0.99 } else { 0.5 }, n % 5 != 0)));
+        let calibration =
+            learned((0..8000).map(|n| (n % 2, if n % 2 == 0 { 0.99 } else { 0.5 }, n % 5 != 0)));
         assert!((weight(&calibration, 0, 0.99) - weight(&calibration, 1, 0.5)).abs() < 0.05);
     }
 }

@@ -150,8 +150,20 @@ mod tests {
         let config: VoteConfig = toml::from_str("synonyms = { vase = \"sports ball\" }").unwrap();
         assert_eq!(config.synonyms["vase"], "sports ball");
         assert_eq!(config.validate(), Ok(()));
-        assert_eq!(toml::from_str::<VoteConfig>(&toml::to_string(&config).unwrap()), Ok(config));
-        let nameless = VoteConfig { synonyms: [("vase".into(), "".into())].into(), ..VoteConfig::default() };
-        assert!(nameless.validate().unwrap_err().to_string().contains("synonyms"));
+        assert_eq!(
+            toml::from_str::<VoteConfig>(&toml::to_string(&config).unwrap()),
+            Ok(config)
+        );
+        let nameless = VoteConfig {
+            synonyms: [("vase".into(), "".into())].into(),
+            ..VoteConfig::default()
+        };
+        assert!(
+            nameless
+                .validate()
+                .unwrap_err()
+                .to_string()
+                .contains("synonyms")
+        );
     }
 }

@@ -16,7 +16,9 @@ impl ConfiguredMethod {
     pub(super) fn new(config: &VoteConfig) -> Self {
         match config.mode {
             VoteMode::Paper => Self::Paper(PaperVoting::new(config.paper.clone())),
-            VoteMode::Weighted => Self::Weighted(Box::new(WeightedVoting::new(config.weighted.clone()))),
+            VoteMode::Weighted => {
+                Self::Weighted(Box::new(WeightedVoting::new(config.weighted.clone())))
+            }
         }
     }
 

@@ -21,7 +21,13 @@ pub(super) struct Confusion {
 
 impl Default for Confusion {
     fn default() -> Self {
-        Self { cells: BTreeMap::new(), rows: BTreeMap::new(), correct: 0.0, total: 0.0, scale: 1.0 }
+        Self {
+            cells: BTreeMap::new(),
+            rows: BTreeMap::new(),
+            correct: 0.0,
+            total: 0.0,
+            scale: 1.0,
+        }
     }
 }
 
@@ -42,9 +48,15 @@ impl Confusion {
 
     /// Forgets all evidence about any of `labels`.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
-        let is_about =
-            |&(truth, stated): &(LabelIndex, LabelIndex)| labels.contains(&truth) || labels.contains(&stated);
-        let gone: Vec<_> = self.cells.iter().filter(|(cell, _)| is_about(cell)).map(|(cell, n)| (*cell, *n)).collect();
+        let is_about = |&(truth, stated): &(LabelIndex, LabelIndex)| {
+            labels.contains(&truth) || labels.contains(&stated)
+        };
+        let gone: Vec<_> = self
+            .cells
+            .iter()
+            .filter(|(cell, _)| is_about(cell))
+            .map(|(cell, n)| (*cell, *n))
+            .collect();
         for ((truth, stated), count) in gone {
             self.add_scaled(truth, stated, -count);
             self.cells.remove(&(truth, stated));
@@ -66,17 +78,23 @@ impl Confusion {
 
     /// Number of votes for `stated` where `truth` was true.
     pub(super) fn cell(&self, truth: LabelIndex, stated: LabelIndex) -> f64 {
-        self.cells.get(&(truth, stated)).map_or(0.0, |c| self.scale * c.max(0.0))
+        self.cells
+            .get(&(truth, stated))
+            .map_or(0.0, |c| self.scale * c.max(0.0))
     }
 
     /// Number of votes where `truth` was true.
     pub(super) fn row(&self, truth: LabelIndex) -> f64 {
-        self.rows.get(&truth).map_or(0.0, |r| self.scale * r.max(0.0))
+        self.rows
+            .get(&truth)
+            .map_or(0.0, |r| self.scale * r.max(0.0))
     }
 
     /// True labels with their numbers of votes.
     pub(super) fn rows(&self) -> impl Iterator<Item = (LabelIndex, f64)> {
-        self.rows.iter().map(|(&truth, &count)| (truth, self.scale * count.max(0.0)))
+        self.rows
+            .iter()
+            .map(|(&truth, &count)| (truth, self.scale * count.max(0.0)))
     }
 
     /// Number of right votes.
@@ -97,7 +115,13 @@ mod tests {
     #[test]
     fn a_forgotten_label_leaves_the_rest_as_if_it_had_never_been() {
         let (mut confusion, mut without) = (Confusion::default(), Confusion::default());
-        for (truth, stated, weight) in [(0, 0, 4.0), (0, 1, 1.0), (1, 0, 2.0), (1, 1, 8.0), (2, 0, 0.5)] {
+        for (truth, stated, weight) in [
+            (0, 0, 4.0),
+            (0, 1, 1.0),
+            (1, 0, 2.0),
+            (1, 1, 8.0),
+            (2, 0, 0.5),
+        ] {
             confusion.add(truth, stated, weight);
             if truth != 1 && stated != 1 {
                 without.add(truth, stated, weight);
@@ -115,7 +139,11 @@ mod tests {
             confusion.add(0, (step % 2) as LabelIndex, 1.0);
             expected = expected * if step % 1000 == 0 { 0.1 } else { 0.998 } + 1.0;
         }
-        assert!((confusion.total() / expected - 1.0).abs() < 1e-9, "{} {expected}", confusion.total());
+        assert!(
+            (confusion.total() / expected - 1.0).abs() < 1e-9,
+            "{} {expected}",
+            confusion.total()
+        );
         assert!((confusion.cell(0, 0) + confusion.cell(0, 1) - confusion.row(0)).abs() < 1e-9);
         assert!((confusion.cell(0, 0) - confusion.correct()).abs() < 1e-9);
     }

@@ -4,7 +4,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::config::WeightedConfig;
 use super::confusion::{Confusion, LabelIndex};
-use super::likelihood::{LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability};
+use super::likelihood::{
+    LandmarkPosterior, Likelihood, Posterior, WeightedVote, normalise, probability,
+};
 use crate::model::names::Label;
 use crate::reputation::RememberedVotes;
 use crate::wire::ForeignVotes;
@@ -114,7 +116,10 @@ const KEPT_AFTER_ALARM: f64 = 0.1;
 
 impl DawidSkene {
     pub(super) fn new(config: WeightedConfig) -> Self {
-        Self { config, ..Self::default() }
+        Self {
+            config,
+            ..Self::default()
+        }
     }
 
     /// Goes on under other settings.
@@ -136,7 +141,9 @@ impl DawidSkene {
 
     /// Number of correct votes by label.
     pub(super) fn support(&self) -> Vec<f64> {
-        let evidence = [&self.live, &self.settled].into_iter().chain(self.vehicles.iter().map(|w| &w.inherited));
+        let evidence = [&self.live, &self.settled]
+            .into_iter()
+            .chain(self.vehicles.iter().map(|w| &w.inherited));
         let mut support = vec![0.0; self.labels];
         for confusion in evidence {
             for (label, sum) in support.iter_mut().enumerate() {
@@ -148,9 +155,17 @@ impl DawidSkene {
 
     /// Forgets labels, none of which is in the live evidence; their indices may be reused.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
-        labels.iter().for_each(|label| self.shares[usize::from(*label)] = 0.0);
-        let of_vehicles = self.vehicles.iter_mut().flat_map(|w| [&mut w.live, &mut w.settled, &mut w.inherited]);
-        [&mut self.live, &mut self.settled].into_iter().chain(of_vehicles).for_each(|c| c.forget_labels(labels));
+        labels
+            .iter()
+            .for_each(|label| self.shares[usize::from(*label)] = 0.0);
+        let of_vehicles = self
+            .vehicles
+            .iter_mut()
+            .flat_map(|w| [&mut w.live, &mut w.settled, &mut w.inherited]);
+        [&mut self.live, &mut self.settled]
+            .into_iter()
+            .chain(of_vehicles)
+            .for_each(|c| c.forget_labels(labels));
     }
 
     fn wrong_labels(&self) -> f64 {
@@ -164,21 +179,37 @@ impl DawidSkene {
     }
 
     fn fleet(&self, truth: LabelIndex, stated: LabelIndex, accuracy: f64) -> f64 {
-        let tied = if truth == stated { accuracy } else { (1.0 - accuracy) / self.wrong_labels() };
+        let tied = if truth == stated {
+            accuracy
+        } else {
+            (1.0 - accuracy) / self.wrong_labels()
+        };
         let row = self.live.row(truth) + self.settled.row(truth);
         let count = self.live.cell(truth, stated) + self.settled.cell(truth, stated);
-        let prior = FLEET_PRIOR_VOTES + FLEET_PRIOR_SHARE * (self.live.total() + self.settled.total());
+        let prior =
+            FLEET_PRIOR_VOTES + FLEET_PRIOR_SHARE * (self.live.total() + self.settled.total());
         (count + prior * tied) / (row + prior)
     }
 
     fn coupling(&self) -> Coupling {
-        let (saved, votes) = (self.saving.0 + self.inherited_saving.0, self.saving.1 + self.inherited_saving.1);
-        if saved > CHANCE_SAVING + MIN_SAVING * votes { Coupling::Free } else { Coupling::Tied }
+        let (saved, votes) = (
+            self.saving.0 + self.inherited_saving.0,
+            self.saving.1 + self.inherited_saving.1,
+        );
+        if saved > CHANCE_SAVING + MIN_SAVING * votes {
+            Coupling::Free
+        } else {
+            Coupling::Tied
+        }
     }
 
     /// Judges new votes by the coupling that predicts votes better, after both have predicted every one of these votes from
     /// the others. The model must not contain the votes yet: the evidence on the coupling is prequential (Dawid 1984).
-    pub(super) fn judge_new(&mut self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> LandmarkPosterior {
+    pub(super) fn judge_new(
+        &mut self,
+        votes: &[WeightedVote],
+        candidates: &[LabelIndex],
+    ) -> LandmarkPosterior {
         if votes.len() < 2 {
             return self.judge(votes, candidates);
         }
@@ -187,34 +218,74 @@ impl DawidSkene {
         let predicted: f64 = votes.iter().map(|vote| vote.independence).sum();
         let kept = (-predicted / SAVING_MEMORY_VOTES).exp();
         let saved = free.log_probability - tied.log_probability;
-        self.saving = (kept * self.saving.0 + saved, kept * self.saving.1 + predicted);
-        self.inherited_saving = (kept * self.inherited_saving.0, kept * self.inherited_saving.1);
-        if self.coupling() == Coupling::Free { free } else { tied }
+        self.saving = (
+            kept * self.saving.0 + saved,
+            kept * self.saving.1 + predicted,
+        );
+        self.inherited_saving = (
+            kept * self.inherited_saving.0,
+            kept * self.inherited_saving.1,
+        );
+        if self.coupling() == Coupling::Free {
+            free
+        } else {
+            tied
+        }
     }
 
     /// Judges votes that the model does not contain; newcomers together are limited to their share.
-    pub(super) fn judge(&self, votes: &[WeightedVote], candidates: &[LabelIndex]) -> LandmarkPosterior {
+    pub(super) fn judge(
+        &self,
+        votes: &[WeightedVote],
+        candidates: &[LabelIndex],
+    ) -> LandmarkPosterior {
         self.judge_by(self.coupling(), votes, candidates)
     }
 
-    fn judge_by(&self, coupling: Coupling, votes: &[WeightedVote], candidates: &[LabelIndex]) -> LandmarkPosterior {
+    fn judge_by(
+        &self,
+        coupling: Coupling,
+        votes: &[WeightedVote],
+        candidates: &[LabelIndex],
+    ) -> LandmarkPosterior {
         let likelihoods = self.likelihoods(coupling, votes, candidates);
         let newcomer = self.newcomer_factor(votes);
         let mut labels: Posterior = candidates.iter().map(|&label| (label, 0.0)).collect();
         for (vote, likelihood) in votes.iter().zip(&likelihoods) {
-            let factor = if self.is_newcomer(vote.vehicle) { newcomer } else { 1.0 };
+            let factor = if self.is_newcomer(vote.vehicle) {
+                newcomer
+            } else {
+                1.0
+            };
             let weight = factor * vote.weight * vote.independence;
-            labels.iter_mut().zip(&likelihood.logs).for_each(|((_, log), said)| *log += weight * said);
+            labels
+                .iter_mut()
+                .zip(&likelihood.logs)
+                .for_each(|((_, log), said)| *log += weight * said);
         }
-        labels.iter_mut().for_each(|(label, log)| *log += self.log_shares[usize::from(*label)]);
-        let most = labels.iter().map(|(_, log)| *log).fold(f64::NEG_INFINITY, f64::max);
-        labels.iter_mut().for_each(|(_, log)| *log = (*log - most).exp());
+        labels
+            .iter_mut()
+            .for_each(|(label, log)| *log += self.log_shares[usize::from(*label)]);
+        let most = labels
+            .iter()
+            .map(|(_, log)| *log)
+            .fold(f64::NEG_INFINITY, f64::max);
+        labels
+            .iter_mut()
+            .for_each(|(_, log)| *log = (*log - most).exp());
         normalise(&mut labels);
-        let mut judged =
-            LandmarkPosterior { labels, agreements: Vec::with_capacity(votes.len()), log_probability: 0.0 };
+        let mut judged = LandmarkPosterior {
+            labels,
+            agreements: Vec::with_capacity(votes.len()),
+            log_probability: 0.0,
+        };
         for (vote, likelihood) in votes.iter().zip(&likelihoods) {
             let others = likelihood.leave_out(vote, &judged.labels);
-            let predicted: f64 = others.iter().zip(&likelihood.stating).map(|((_, p), stating)| p * stating).sum();
+            let predicted: f64 = others
+                .iter()
+                .zip(&likelihood.stating)
+                .map(|((_, p), stating)| p * stating)
+                .sum();
             judged.log_probability += vote.independence * predicted.max(1e-9).ln();
             judged.agreements.push(probability(&others, vote.label));
         }
@@ -225,7 +296,10 @@ impl DawidSkene {
     /// stated label. Under equal accuracy on all classes, Bayes' rule still makes a rare label right less often than a
     /// frequent one. Rates by label count as far as they explain more than that, and more than chance does: the Bayes factor
     /// by Laplace's approximation (Kass & Raftery 1995).
-    pub(super) fn inherit_coupling<'a>(&mut self, vehicles: impl Iterator<Item = &'a RememberedVotes> + Clone) {
+    pub(super) fn inherit_coupling<'a>(
+        &mut self,
+        vehicles: impl Iterator<Item = &'a RememberedVotes> + Clone,
+    ) {
         self.inherited_saving = (0.0, 0.0);
         let mut right: BTreeMap<&Label, f64> = BTreeMap::new();
         for (label, (correct, _)) in vehicles.clone().flatten() {
@@ -238,16 +312,21 @@ impl DawidSkene {
         let wrong_labels = (right.len() - 1) as f64;
         let prior = self.config.class_prior_votes;
         for labels in vehicles {
-            let (correct, votes) =
-                labels.values().fold((0.0, 0.0), |(c, n), label| (c + label.0, n + label.0 + label.1));
+            let (correct, votes) = labels.values().fold((0.0, 0.0), |(c, n), label| {
+                (c + label.0, n + label.0 + label.1)
+            });
             let accuracy = (correct + self.config.assumed_accuracy) / (votes + 1.0);
             for (label, &(correct, incorrect)) in labels {
                 let share = (right[label] + 1.0) / all;
-                let (if_right, if_wrong) = (accuracy * share, (1.0 - accuracy) * (1.0 - share) / wrong_labels);
+                let (if_right, if_wrong) = (
+                    accuracy * share,
+                    (1.0 - accuracy) * (1.0 - share) / wrong_labels,
+                );
                 let tied = (if_right / (if_right + if_wrong)).clamp(MIN_WRONG, 1.0 - MIN_WRONG);
                 let for_label = correct + incorrect;
                 let own = (correct + prior * tied) / (for_label + prior);
-                let saved = correct * (own / tied).ln() + incorrect * ((1.0 - own) / (1.0 - tied)).ln();
+                let saved =
+                    correct * (own / tied).ln() + incorrect * ((1.0 - own) / (1.0 - tied)).ln();
                 self.inherited_saving.0 += saved - (for_label / prior).ln_1p() / 2.0;
                 self.inherited_saving.1 += for_label;
             }
@@ -266,11 +345,18 @@ impl DawidSkene {
         let accuracy = self.fleet_accuracy();
         for vehicle in vehicles {
             let evidence = &self.vehicles[vehicle];
-            let expected = |rows: &Confusion| -> f64 { rows.rows().map(|(t, n)| n * self.fleet(t, t, accuracy)).sum() };
+            let expected = |rows: &Confusion| -> f64 {
+                rows.rows()
+                    .map(|(t, n)| n * self.fleet(t, t, accuracy))
+                    .sum()
+            };
             let (correct, votes) = (evidence.correct(), evidence.votes());
             let foreign = evidence.foreign;
             let free = if votes > 1e-9 {
-                (expected(&evidence.live) + expected(&evidence.settled) + expected(&evidence.inherited)) / votes
+                (expected(&evidence.live)
+                    + expected(&evidence.settled)
+                    + expected(&evidence.inherited))
+                    / votes
             } else {
                 accuracy
             };
@@ -281,7 +367,10 @@ impl DawidSkene {
                 let own = ((right + prior * fleet) / (all + prior)).clamp(1e-6, 1.0 - 1e-6);
                 log_odds(own) - log_odds(fleet)
             };
-            self.vehicles[vehicle].advantage = [advantage(free, prior), advantage(accuracy, TIED_PRIOR_FACTOR * prior)];
+            self.vehicles[vehicle].advantage = [
+                advantage(free, prior),
+                advantage(accuracy, TIED_PRIOR_FACTOR * prior),
+            ];
         }
     }
 
@@ -301,42 +390,87 @@ impl DawidSkene {
     }
 
     /// The posterior without `vote`, given all votes but this one.
-    pub(super) fn leave_one_out(&self, posterior: &[(LabelIndex, f64)], vote: &WeightedVote) -> Posterior {
+    pub(super) fn leave_one_out(
+        &self,
+        posterior: &[(LabelIndex, f64)],
+        vote: &WeightedVote,
+    ) -> Posterior {
         let candidates: Vec<_> = posterior.iter().map(|(label, _)| *label).collect();
-        let likelihoods = self.likelihoods(self.coupling(), std::slice::from_ref(vote), &candidates);
-        likelihoods.first().map_or_else(Vec::new, |likelihood| likelihood.leave_out(vote, posterior))
+        let likelihoods =
+            self.likelihoods(self.coupling(), std::slice::from_ref(vote), &candidates);
+        likelihoods
+            .first()
+            .map_or_else(Vec::new, |likelihood| likelihood.leave_out(vote, posterior))
     }
 
     /// Likelihood of each vote under each of `candidates`, among which its label is.
-    fn likelihoods(&self, coupling: Coupling, votes: &[WeightedVote], candidates: &[LabelIndex]) -> Vec<Likelihood> {
+    fn likelihoods(
+        &self,
+        coupling: Coupling,
+        votes: &[WeightedVote],
+        candidates: &[LabelIndex],
+    ) -> Vec<Likelihood> {
         let accuracy = self.fleet_accuracy();
         let stating: Vec<Vec<f64>> = match coupling {
-            Coupling::Tied => votes.iter().map(|vote| self.stating_tied(vote, candidates, accuracy)).collect(),
+            Coupling::Tied => votes
+                .iter()
+                .map(|vote| self.stating_tied(vote, candidates, accuracy))
+                .collect(),
             Coupling::Free => {
-                let fleet: Vec<_> =
-                    candidates.iter().map(|&truth| self.fleet_row(truth, candidates, accuracy)).collect();
-                votes.iter().map(|vote| self.stating_free(vote, &fleet)).collect()
+                let fleet: Vec<_> = candidates
+                    .iter()
+                    .map(|&truth| self.fleet_row(truth, candidates, accuracy))
+                    .collect();
+                votes
+                    .iter()
+                    .map(|vote| self.stating_free(vote, &fleet))
+                    .collect()
             }
         };
-        votes.iter().zip(stating).map(|(vote, stating)| Likelihood::new(vote, candidates, stating)).collect()
+        votes
+            .iter()
+            .zip(stating)
+            .map(|(vote, stating)| Likelihood::new(vote, candidates, stating))
+            .collect()
     }
 
-    fn stating_tied(&self, vote: &WeightedVote, candidates: &[LabelIndex], accuracy: f64) -> Vec<f64> {
-        let right = shifted(log_odds(accuracy.clamp(1e-6, 1.0 - 1e-6)), self.vehicles[vote.vehicle].advantage[1]);
+    fn stating_tied(
+        &self,
+        vote: &WeightedVote,
+        candidates: &[LabelIndex],
+        accuracy: f64,
+    ) -> Vec<f64> {
+        let right = shifted(
+            log_odds(accuracy.clamp(1e-6, 1.0 - 1e-6)),
+            self.vehicles[vote.vehicle].advantage[1],
+        );
         let wrong = ((1.0 - right) / self.wrong_labels()).max(1e-12);
-        candidates.iter().map(|&truth| if truth == vote.label { right.max(1e-12) } else { wrong }).collect()
+        candidates
+            .iter()
+            .map(|&truth| {
+                if truth == vote.label {
+                    right.max(1e-12)
+                } else {
+                    wrong
+                }
+            })
+            .collect()
     }
 
     fn fleet_row(&self, truth: LabelIndex, candidates: &[LabelIndex], accuracy: f64) -> FleetRow {
         let right = self.fleet(truth, truth, accuracy).clamp(1e-6, 1.0 - 1e-6);
         let sharing = self.config.confusion_sharing;
         let wrong = |stated| {
-            sharing * (self.fleet(truth, stated, accuracy) / (1.0 - right)) + (1.0 - sharing) / self.wrong_labels()
+            sharing * (self.fleet(truth, stated, accuracy) / (1.0 - right))
+                + (1.0 - sharing) / self.wrong_labels()
         };
         FleetRow {
             truth,
             log_odds: log_odds(right),
-            wrong: candidates.iter().map(|&stated| (stated, wrong(stated))).collect(),
+            wrong: candidates
+                .iter()
+                .map(|&stated| (stated, wrong(stated)))
+                .collect(),
         }
     }
 
@@ -346,8 +480,11 @@ impl DawidSkene {
         let prior = self.config.class_prior_votes;
         let stating = |row: &FleetRow| {
             let right = shifted(row.log_odds, known.advantage[0]);
-            let assumed =
-                if row.truth == vote.label { right } else { (1.0 - right) * probability(&row.wrong, vote.label) };
+            let assumed = if row.truth == vote.label {
+                right
+            } else {
+                (1.0 - right) * probability(&row.wrong, vote.label)
+            };
             let count: f64 = evidence.iter().map(|e| e.cell(row.truth, vote.label)).sum();
             let votes: f64 = evidence.iter().map(|e| e.row(row.truth)).sum();
             ((count + prior * assumed) / (votes + prior)).max(1e-12)
@@ -367,20 +504,34 @@ impl DawidSkene {
     pub(super) fn newcomer_factor(&self, votes: &[WeightedVote]) -> f64 {
         let (mut newcomers, mut proven) = (0.0, 0.0);
         for vote in votes {
-            *(if self.is_newcomer(vote.vehicle) { &mut newcomers } else { &mut proven }) +=
-                vote.weight * vote.independence;
+            *(if self.is_newcomer(vote.vehicle) {
+                &mut newcomers
+            } else {
+                &mut proven
+            }) += vote.weight * vote.independence;
         }
         let most = self.config.newcomer_share * proven;
-        if proven > 0.0 && newcomers > most { most / newcomers } else { 1.0 }
+        if proven > 0.0 && newcomers > most {
+            most / newcomers
+        } else {
+            1.0
+        }
     }
 
     /// Adds the votes as live evidence; `sign` −1 takes them back. A single vote is no evidence about its vehicle.
-    pub(super) fn add_live(&mut self, votes: &[WeightedVote], posterior: &[(LabelIndex, f64)], sign: f64) {
+    pub(super) fn add_live(
+        &mut self,
+        votes: &[WeightedVote],
+        posterior: &[(LabelIndex, f64)],
+        sign: f64,
+    ) {
         for &(truth, p) in posterior {
             self.shares[usize::from(truth)] += sign * p;
             for vote in votes.iter().filter(|_| votes.len() > 1) {
                 let weight = sign * p * vote.weight.min(1.0);
-                self.vehicles[vote.vehicle].live.add(truth, vote.label, weight);
+                self.vehicles[vote.vehicle]
+                    .live
+                    .add(truth, vote.label, weight);
                 self.live.add(truth, vote.label, weight);
             }
         }
@@ -390,20 +541,31 @@ impl DawidSkene {
     ///
     /// The vehicle is judged by the posterior of the `others`, the fleet by that of `all`. Otherwise few vehicles that
     /// outvote one would together seem wrong more often than right.
-    pub(super) fn settle(&mut self, vote: &WeightedVote, others: &[(LabelIndex, f64)], all: &[(LabelIndex, f64)]) {
+    pub(super) fn settle(
+        &mut self,
+        vote: &WeightedVote,
+        others: &[(LabelIndex, f64)],
+        all: &[(LabelIndex, f64)],
+    ) {
         let fade = 1.0 - 1.0 / self.config.memory_votes;
         let fleet_fade = 1.0 - 1.0 / (self.config.memory_votes * self.vehicles.len().max(1) as f64);
         let evidence = &mut self.vehicles[vote.vehicle];
-        let right = others.iter().find(|(truth, _)| *truth == vote.label).map_or(0.0, |(_, p)| *p);
+        let right = others
+            .iter()
+            .find(|(truth, _)| *truth == vote.label)
+            .map_or(0.0, |(_, p)| *p);
         evidence.watch_for_drop(right);
         evidence.settled.fade(fade);
         evidence.inherited.fade(fade);
         self.settled.fade(fleet_fade);
         for (truth, p) in sharpened(others) {
-            evidence.settled.add(truth, vote.label, p * vote.weight.min(1.0));
+            evidence
+                .settled
+                .add(truth, vote.label, p * vote.weight.min(1.0));
         }
         for (truth, p) in sharpened(all) {
-            self.settled.add(truth, vote.label, p * vote.weight.min(1.0));
+            self.settled
+                .add(truth, vote.label, p * vote.weight.min(1.0));
         }
     }
 
@@ -422,7 +584,9 @@ impl DawidSkene {
     pub(super) fn clear_live(&mut self) {
         self.live = Confusion::default();
         self.shares.iter_mut().for_each(|s| *s = 0.0);
-        self.vehicles.iter_mut().for_each(|w| w.live = Confusion::default());
+        self.vehicles
+            .iter_mut()
+            .for_each(|w| w.live = Confusion::default());
     }
 
     /// Probability that a vehicle is right, shrunk towards the fleet's.
@@ -439,7 +603,8 @@ impl DawidSkene {
         let evidence = &self.vehicles[vehicle];
         let prior = self.config.vehicle_prior_votes;
         let own = evidence.votes() + prior;
-        (own * self.reliability(vehicle) + evidence.foreign.correct) / (own + evidence.foreign.total())
+        (own * self.reliability(vehicle) + evidence.foreign.correct)
+            / (own + evidence.foreign.total())
     }
 }
 
@@ -449,7 +614,9 @@ impl DawidSkene {
 /// are stated, from votes on other labels only.
 fn sharpened(posterior: &[(LabelIndex, f64)]) -> impl Iterator<Item = (LabelIndex, f64)> + '_ {
     let squares: f64 = posterior.iter().map(|(_, p)| p * p).sum();
-    posterior.iter().map(move |&(label, p)| (label, p * p / squares.max(f64::MIN_POSITIVE)))
+    posterior
+        .iter()
+        .map(move |&(label, p)| (label, p * p / squares.max(f64::MIN_POSITIVE)))
 }
 
 /// Probability whose log-odds are `log_odds + advantage`.

@@ -93,7 +93,12 @@ pub(super) struct Dependence {
 impl Dependence {
     /// Without comparisons; the counts of a pair fade over `memory` comparisons to 1/e.
     pub(super) fn new(memory: f64) -> Self {
-        Self { memory, max_compared: MAX_COMPARED, significance: SIGNIFICANCE, ..Self::default() }
+        Self {
+            memory,
+            max_compared: MAX_COMPARED,
+            significance: SIGNIFICANCE,
+            ..Self::default()
+        }
     }
 
     /// Goes on with another memory.
@@ -104,23 +109,39 @@ impl Dependence {
     /// As [`Self::new`], for all stored votes together: nothing fades.
     pub(super) fn of_stored() -> Self {
         let (max_compared, significance) = (MAX_COMPARED_STORED, SIGNIFICANCE_STORED);
-        Self { memory: f64::INFINITY, max_compared, significance, ..Self::default() }
+        Self {
+            memory: f64::INFINITY,
+            max_compared,
+            significance,
+            ..Self::default()
+        }
     }
 
     /// Forgets vehicles, whose indices may be reused.
     pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
-        self.pairs.retain(|(one, other), _| !vehicles.contains(one) && !vehicles.contains(other));
-        self.partners.iter_mut().for_each(|partners| partners.retain(|(other, _)| !vehicles.contains(other)));
+        self.pairs
+            .retain(|(one, other), _| !vehicles.contains(one) && !vehicles.contains(other));
+        self.partners
+            .iter_mut()
+            .for_each(|partners| partners.retain(|(other, _)| !vehicles.contains(other)));
         for &vehicle in vehicles {
-            self.tenure.get_mut(vehicle).into_iter().for_each(|tenure| *tenure = 0.0);
-            self.partners.get_mut(vehicle).into_iter().for_each(Vec::clear);
+            self.tenure
+                .get_mut(vehicle)
+                .into_iter()
+                .for_each(|tenure| *tenure = 0.0);
+            self.partners
+                .get_mut(vehicle)
+                .into_iter()
+                .for_each(Vec::clear);
         }
     }
 
     /// Forgets how often labels were stated; their indices may be reused.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         for &label in labels {
-            let Some(stated) = self.stated.get_mut(usize::from(label)).map(std::mem::take) else { continue };
+            let Some(stated) = self.stated.get_mut(usize::from(label)).map(std::mem::take) else {
+                continue;
+            };
             self.total -= stated;
             self.squares -= stated * stated;
         }
@@ -152,7 +173,10 @@ impl Dependence {
         self.count_label(other.1);
         let chance = self.squares / (self.total * self.total);
         let fade = 1.0 - 1.0 / self.memory;
-        let pair = self.pairs.entry((one.0.min(other.0), one.0.max(other.0))).or_default();
+        let pair = self
+            .pairs
+            .entry((one.0.min(other.0), one.0.max(other.0)))
+            .or_default();
         pair.compared = pair.compared * fade + 1.0;
         pair.agreed = pair.agreed * fade + f64::from(one.1 == other.1);
         pair.chance = pair.chance * fade + chance;
@@ -177,7 +201,11 @@ impl Dependence {
     /// Σ ρ), the design effect of correlated answers (Kish 1965).
     pub(super) fn independence(&self, vehicle: usize, agrees: impl Fn(usize) -> bool) -> f64 {
         let partners = self.partners.get(vehicle).map_or(&[][..], Vec::as_slice);
-        let shared: f64 = partners.iter().filter(|(other, _)| agrees(*other)).map(|(_, rho)| rho).sum();
+        let shared: f64 = partners
+            .iter()
+            .filter(|(other, _)| agrees(*other))
+            .map(|(_, rho)| rho)
+            .sum();
         1.0 / (1.0 + shared)
     }
 
@@ -192,13 +220,24 @@ impl Dependence {
         let vehicles = present.len();
         let influence = |vehicle: usize| {
             let tenure = self.tenure.get(vehicle).copied().unwrap_or(0.0);
-            if present[vehicle] { tenure / (tenure + TENURE_VOTES) } else { 0.0 }
+            if present[vehicle] {
+                tenure / (tenure + TENURE_VOTES)
+            } else {
+                0.0
+            }
         };
         let influences: Vec<f64> = (0..vehicles).map(influence).collect();
-        let pairs: Vec<_> = self.pairs.iter().map(|(&(one, other), &pair)| (one, other, pair)).collect();
+        let pairs: Vec<_> = self
+            .pairs
+            .iter()
+            .map(|(&(one, other), &pair)| (one, other, pair))
+            .collect();
         let belonging = main_group(&influences, &pairs);
         let typical = typical_agreement(&belonging, &pairs);
-        let mut rhos: Vec<f64> = pairs.iter().map(|(_, _, pair)| pair.excess(typical, self.significance)).collect();
+        let mut rhos: Vec<f64> = pairs
+            .iter()
+            .map(|(_, _, pair)| pair.excess(typical, self.significance))
+            .collect();
         let mut factors = vec![0.5; vehicles];
         for _ in 0..FACTOR_STEPS {
             factors = next_factors(&factors, &belonging, &pairs, &rhos);
@@ -211,7 +250,8 @@ impl Dependence {
             self.partners[one].push((other, rho));
             self.partners[other].push((one, rho));
         }
-        let is_dependent = |v: usize| present[v] && self.independence(v, |other| present[other]) <= 0.5;
+        let is_dependent =
+            |v: usize| present[v] && self.independence(v, |other| present[other]) <= 0.5;
         let is_copy = |v: usize| belonging[v] < 0.1 && is_dependent(v);
         AgreementGroups {
             main: (0..vehicles).filter(|&v| belonging[v] >= 0.5).collect(),
@@ -228,8 +268,8 @@ fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
     for _ in 0..GROUPING_STEPS {
         let mut support = vec![0.0; influences.len()];
         for (one, other, pair) in pairs {
-            let affinity =
-                (pair.kappa() / SAME_GROUP).clamp(-1.0, 1.0) * pair.compared / (pair.compared + PRIOR_COMPARISONS);
+            let affinity = (pair.kappa() / SAME_GROUP).clamp(-1.0, 1.0) * pair.compared
+                / (pair.compared + PRIOR_COMPARISONS);
             support[*one] += affinity * belonging[*other];
             support[*other] += affinity * belonging[*one];
         }
@@ -237,14 +277,20 @@ fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
         if most <= 0.0 {
             break;
         }
-        belonging = support.iter().zip(influences).map(|(s, influence)| influence * s.max(0.0) / most).collect();
+        belonging = support
+            .iter()
+            .zip(influences)
+            .map(|(s, influence)| influence * s.max(0.0) / most)
+            .collect();
     }
     belonging
 }
 
 /// Mean agreement κ within the main group, of pairs in proportion to their comparisons; at least 0.
 fn typical_agreement(belonging: &[f64], pairs: &[(usize, usize, Pair)]) -> f64 {
-    let weight = |(one, other, pair): &(usize, usize, Pair)| belonging[*one] * belonging[*other] * pair.compared;
+    let weight = |(one, other, pair): &(usize, usize, Pair)| {
+        belonging[*one] * belonging[*other] * pair.compared
+    };
     let weights: f64 = pairs.iter().map(weight).sum();
     let agreed: f64 = pairs.iter().map(|pair| weight(pair) * pair.2.kappa()).sum();
     (agreed / weights.max(1e-9)).clamp(0.0, 0.99)
@@ -252,9 +298,19 @@ fn typical_agreement(belonging: &[f64], pairs: &[(usize, usize, Pair)]) -> f64 {
 
 /// One step of alternating least squares for κ = r_i · r_j. Agreement counts as far as it is with the main group and not
 /// excessive.
-fn next_factors(factors: &[f64], belonging: &[f64], pairs: &[(usize, usize, Pair)], rhos: &[f64]) -> Vec<f64> {
+fn next_factors(
+    factors: &[f64],
+    belonging: &[f64],
+    pairs: &[(usize, usize, Pair)],
+    rhos: &[f64],
+) -> Vec<f64> {
     let members: f64 = belonging.iter().sum();
-    let typical = factors.iter().zip(belonging).map(|(r, b)| r * b).sum::<f64>() / members.max(1e-9);
+    let typical = factors
+        .iter()
+        .zip(belonging)
+        .map(|(r, b)| r * b)
+        .sum::<f64>()
+        / members.max(1e-9);
     let prior = PRIOR_COMPARISONS * typical * typical;
     let mut sums = vec![(prior * typical, prior); factors.len()];
     for ((one, other, pair), rho) in pairs.iter().zip(rhos) {
@@ -264,5 +320,7 @@ fn next_factors(factors: &[f64], belonging: &[f64], pairs: &[(usize, usize, Pair
             sums[vehicle].1 += weight * factors[reference] * factors[reference];
         }
     }
-    sums.into_iter().map(|(product, square)| (product / square.max(1e-9)).clamp(0.0, 0.99)).collect()
+    sums.into_iter()
+        .map(|(product, square)| (product / square.max(1e-9)).clamp(0.0, 0.99))
+        .collect()
 }

@@ -48,14 +48,22 @@ impl LabelTable {
     }
 
     /// The index of a label, a new or free one if it has none; `stated` is the vehicle that stated it and when.
-    pub(super) fn intern(&mut self, label: &Label, stated: Option<(usize, Timestamp)>) -> LabelIndex {
+    pub(super) fn intern(
+        &mut self,
+        label: &Label,
+        stated: Option<(usize, Timestamp)>,
+    ) -> LabelIndex {
         let (introduced_by, stated_at) = stated.unzip();
         if let Some(index) = self.index(label) {
             let entry = &mut self.entries[usize::from(index)];
             entry.stated_at = stated_at.or(entry.stated_at);
             return index;
         }
-        let entry = LabelEntry { name: label.clone(), introduced_by, stated_at };
+        let entry = LabelEntry {
+            name: label.clone(),
+            introduced_by,
+            stated_at,
+        };
         let index = if let Some(index) = self.free.pop() {
             self.entries[usize::from(index)] = entry;
             index
@@ -80,20 +88,35 @@ impl LabelTable {
     /// fair queueing, McKenney 1990), the longest unseen first. A vehicle that invents labels loses its own.
     pub(super) fn make_room(&mut self, support: &[f64]) -> BTreeSet<LabelIndex> {
         let is_supported = |index: LabelIndex| support[usize::from(index)] >= SUPPORTED_VOTES;
-        let mut latest: Vec<_> = self.indices.values().map(|&n| (&self.entries[usize::from(n)], n)).collect();
+        let mut latest: Vec<_> = self
+            .indices
+            .values()
+            .map(|&n| (&self.entries[usize::from(n)], n))
+            .collect();
         latest.sort_by_key(|(entry, index)| (std::cmp::Reverse(entry.stated_at), *index));
         let mut introduced: BTreeMap<(bool, Option<usize>), usize> = BTreeMap::new();
         let mut ranked: Vec<_> = latest
             .into_iter()
             .map(|(entry, index)| {
-                let rank = introduced.entry((is_supported(index), entry.introduced_by)).or_default();
+                let rank = introduced
+                    .entry((is_supported(index), entry.introduced_by))
+                    .or_default();
                 *rank += 1;
-                (is_supported(index), std::cmp::Reverse(*rank), entry.stated_at, index)
+                (
+                    is_supported(index),
+                    std::cmp::Reverse(*rank),
+                    entry.stated_at,
+                    index,
+                )
             })
             .collect();
         ranked.sort();
         let count = ranked.len().div_ceil(EVICTION_DIVISOR);
-        let evicted: BTreeSet<_> = ranked.into_iter().take(count).map(|(.., index)| index).collect();
+        let evicted: BTreeSet<_> = ranked
+            .into_iter()
+            .take(count)
+            .map(|(.., index)| index)
+            .collect();
         self.indices.retain(|_, index| !evicted.contains(index));
         self.free.extend(&evicted);
         evicted

@@ -52,18 +52,29 @@ impl RecentStatements {
     pub(super) fn add(&mut self, label: LabelIndex, weight: f64, kept: f64) -> LabelIndex {
         self.statements = self.statements * kept + 1.0;
         self.labels.iter_mut().for_each(|(_, sum)| *sum *= kept);
-        let known = self.labels.iter().position(|(known, sum)| *known == label && *sum > 0.0);
-        let least = (0..self.labels.len()).min_by(|&a, &b| self.labels[a].1.total_cmp(&self.labels[b].1));
+        let known = self
+            .labels
+            .iter()
+            .position(|(known, sum)| *known == label && *sum > 0.0);
+        let least =
+            (0..self.labels.len()).min_by(|&a, &b| self.labels[a].1.total_cmp(&self.labels[b].1));
         let place = &mut self.labels[known.or(least).unwrap_or_default()];
         *place = (label, weight + known.map_or(0.0, |_| place.1));
         let stated = *place;
-        let more = self.labels.iter().copied().filter(|(_, sum)| *sum > stated.1);
+        let more = self
+            .labels
+            .iter()
+            .copied()
+            .filter(|(_, sum)| *sum > stated.1);
         more.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
     }
 
     /// Forgets statements of labels whose indices may be reused.
     pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
-        self.labels.iter_mut().filter(|(label, _)| is_gone(*label)).for_each(|place| *place = (0, 0.0));
+        self.labels
+            .iter_mut()
+            .filter(|(label, _)| is_gone(*label))
+            .for_each(|place| *place = (0, 0.0));
     }
 
     /// Certainty, 0 to 1, that the label stated most is not so by chance: the lead over the next label in standard
@@ -75,14 +86,20 @@ impl RecentStatements {
         let [third, second, first] = sums;
         let total = (first + second + third).max(f64::MIN_POSITIVE);
         let lead = (first - second) / total;
-        let variance = ((first + second) / total - lead * lead) / (INDEPENDENT_FRAMES * self.statements).max(1.0);
+        let variance = ((first + second) / total - lead * lead)
+            / (INDEPENDENT_FRAMES * self.statements).max(1.0);
         (NORMAL_TO_LOGISTIC * lead / variance.max(1e-9).sqrt()).tanh()
     }
 }
 
 impl StoredVote {
     pub(super) fn weighted(&self) -> WeightedVote {
-        WeightedVote { vehicle: self.vehicle, label: self.label, weight: self.weight, independence: self.independence }
+        WeightedVote {
+            vehicle: self.vehicle,
+            label: self.label,
+            weight: self.weight,
+            independence: self.independence,
+        }
     }
 }
 
@@ -106,7 +123,12 @@ impl LandmarkVotes {
     }
 
     pub(super) fn candidates(&self) -> Vec<LabelIndex> {
-        self.votes.iter().map(|c| c.label).collect::<BTreeSet<_>>().into_iter().collect()
+        self.votes
+            .iter()
+            .map(|c| c.label)
+            .collect::<BTreeSet<_>>()
+            .into_iter()
+            .collect()
     }
 
     /// Counts new votes as evidence on dependence and on confidences; where there are many voters, `order` decides which
@@ -118,7 +140,11 @@ impl LandmarkVotes {
         order: impl Fn(usize) -> usize,
     ) {
         if self.votes.iter().any(|c| !c.compared) {
-            let mut votes: Vec<_> = self.votes.iter().map(|c| (c.vehicle, c.label, !c.compared)).collect();
+            let mut votes: Vec<_> = self
+                .votes
+                .iter()
+                .map(|c| (c.vehicle, c.label, !c.compared))
+                .collect();
             votes.sort_by_key(|(vehicle, ..)| order(*vehicle));
             dependence.compare(&votes);
             for vote in self.votes.iter_mut().filter(|c| !c.compared) {
@@ -129,22 +155,43 @@ impl LandmarkVotes {
     }
 
     /// Sets the weight of every vote.
-    pub(super) fn weigh(&mut self, dependence: &Dependence, calibration: &ConfidenceCalibration, weights: &Weights) {
+    pub(super) fn weigh(
+        &mut self,
+        dependence: &Dependence,
+        calibration: &ConfidenceCalibration,
+        weights: &Weights,
+    ) {
         for place in 0..self.votes.len() {
-            let StoredVote { vehicle, label, confidence, visibility, recent, .. } = self.votes[place];
+            let StoredVote {
+                vehicle,
+                label,
+                confidence,
+                visibility,
+                recent,
+                ..
+            } = self.votes[place];
             let agrees = |other: usize| {
-                self.votes.binary_search_by_key(&other, |c| c.vehicle).is_ok_and(|at| self.votes[at].label == label)
+                self.votes
+                    .binary_search_by_key(&other, |c| c.vehicle)
+                    .is_ok_and(|at| self.votes[at].label == label)
             };
             let independence = dependence.independence(vehicle, agrees);
             let band = calibration.band(vehicle, confidence);
             let vote = &mut self.votes[place];
-            (vote.independence, vote.band, vote.weight) =
-                (independence, band, weights.of(band, confidence) * visibility * recent.certainty());
+            (vote.independence, vote.band, vote.weight) = (
+                independence,
+                band,
+                weights.of(band, confidence) * visibility * recent.certainty(),
+            );
         }
     }
 
     /// Takes a judgement, and adds to the evidence on confidences how probable the others make the label of each vote.
-    pub(super) fn take(&mut self, judged: LandmarkPosterior, calibration: &mut ConfidenceCalibration) {
+    pub(super) fn take(
+        &mut self,
+        judged: LandmarkPosterior,
+        calibration: &mut ConfidenceCalibration,
+    ) {
         if self.has_several_voters() {
             for (vote, agreement) in self.votes.iter_mut().zip(judged.agreements) {
                 calibration.count(vote.band, agreement, 1.0);
@@ -162,7 +209,9 @@ impl LandmarkVotes {
                 best = Some((label, p));
             }
         }
-        let kept = self.published.map_or(0.0, |published| probability(&self.posterior, published));
+        let kept = self
+            .published
+            .map_or(0.0, |published| probability(&self.posterior, published));
         if kept == 0.0 || best.is_some_and(|(_, p)| p > kept + hysteresis) {
             self.published = best.map(|(label, _)| label);
         }
@@ -174,8 +223,16 @@ impl LandmarkVotes {
         let candidates = self.candidates();
         let equal = 1.0 / candidates.len() as f64;
         let of_label = |label| self.votes.iter().filter(move |c| c.label == label);
-        let share = |label| of_label(label).map(|c| c.weight * c.independence).sum::<f64>() / total;
-        candidates.into_iter().map(|label| (label, if total > 0.0 { share(label) } else { equal })).collect()
+        let share = |label| {
+            of_label(label)
+                .map(|c| c.weight * c.independence)
+                .sum::<f64>()
+                / total
+        };
+        candidates
+            .into_iter()
+            .map(|label| (label, if total > 0.0 { share(label) } else { equal }))
+            .collect()
     }
 
     /// Forgets labels with the votes for them; returns the number of votes. Not allowed while it is counted.

@@ -41,18 +41,34 @@ pub(super) struct Likelihood {
 impl Likelihood {
     /// From the probabilities by candidate; the vote's label is one of the candidates.
     pub(super) fn new(vote: &WeightedVote, candidates: &[LabelIndex], stating: Vec<f64>) -> Self {
-        let own = candidates.iter().zip(&stating).find(|(label, _)| **label == vote.label).map_or(1.0, |(_, own)| *own);
-        Self { logs: stating.iter().map(|p| p.min(own).ln()).collect(), own_log: own.ln(), stating }
+        let own = candidates
+            .iter()
+            .zip(&stating)
+            .find(|(label, _)| **label == vote.label)
+            .map_or(1.0, |(_, own)| *own);
+        Self {
+            logs: stating.iter().map(|p| p.min(own).ln()).collect(),
+            own_log: own.ln(),
+            stating,
+        }
     }
 
     /// The posterior of the same candidates without `vote`.
-    pub(super) fn leave_out(&self, vote: &WeightedVote, posterior: &[(LabelIndex, f64)]) -> Posterior {
+    pub(super) fn leave_out(
+        &self,
+        vote: &WeightedVote,
+        posterior: &[(LabelIndex, f64)],
+    ) -> Posterior {
         let weight = vote.weight * vote.independence;
         let without = |((label, p), log): (&(LabelIndex, f64), &f64)| {
             (*label, p * (weight * (self.own_log - log)).min(500.0).exp())
         };
         let mut others: Posterior = posterior.iter().zip(&self.logs).map(without).collect();
-        if normalise(&mut others) { others } else { posterior.to_vec() }
+        if normalise(&mut others) {
+            others
+        } else {
+            posterior.to_vec()
+        }
     }
 }
 
@@ -67,5 +83,8 @@ pub(super) fn normalise(posterior: &mut [(LabelIndex, f64)]) -> bool {
 
 /// Probability of a label; 0 for one that is not listed.
 pub(super) fn probability(posterior: &[(LabelIndex, f64)], label: LabelIndex) -> f64 {
-    posterior.iter().find(|(l, _)| *l == label).map_or(0.0, |(_, p)| *p)
+    posterior
+        .iter()
+        .find(|(l, _)| *l == label)
+        .map_or(0.0, |(_, p)| *p)
 }

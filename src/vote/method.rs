@@ -90,10 +90,24 @@ pub(super) fn verdict(
     contributors: Vec<NodeName>,
 ) -> Verdict {
     let label = published.or_else(|| best(&votes).cloned());
-    let score = label.as_ref().and_then(|l| votes.get(l)).copied().unwrap_or(0.0);
-    let others = votes.iter().filter(|(l, _)| Some(*l) != label.as_ref()).map(|(_, s)| *s);
+    let score = label
+        .as_ref()
+        .and_then(|l| votes.get(l))
+        .copied()
+        .unwrap_or(0.0);
+    let others = votes
+        .iter()
+        .filter(|(l, _)| Some(*l) != label.as_ref())
+        .map(|(_, s)| *s);
     let margin = (score - others.fold(0.0, f64::max)).max(0.0);
-    Verdict { landmark, label, score, margin, votes, contributors }
+    Verdict {
+        landmark,
+        label,
+        score,
+        margin,
+        votes,
+        contributors,
+    }
 }
 
 /// The label of the highest score, the first in alphabetical order on a tie.

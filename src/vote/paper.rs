@@ -48,12 +48,27 @@ pub(super) struct PaperVoting {
 impl PaperVoting {
     /// Without votes.
     pub(super) fn new(config: PaperConfig) -> Self {
-        Self { config, landmarks: HashMap::new(), vehicles: BTreeMap::new(), changed: Vec::new() }
+        Self {
+            config,
+            landmarks: HashMap::new(),
+            vehicles: BTreeMap::new(),
+            changed: Vec::new(),
+        }
     }
 
     fn vehicle(&mut self, node: &NodeName) -> &mut VehicleScore {
-        let reputation = Reputation { score: self.config.initial_reputation, correct: 0, incorrect: 0, foreign: None };
-        self.vehicles.entry(node.clone()).or_insert_with(|| VehicleScore { reputation, votes: Vec::new() })
+        let reputation = Reputation {
+            score: self.config.initial_reputation,
+            correct: 0,
+            incorrect: 0,
+            foreign: None,
+        };
+        self.vehicles
+            .entry(node.clone())
+            .or_insert_with(|| VehicleScore {
+                reputation,
+                votes: Vec::new(),
+            })
     }
 }
 
@@ -73,19 +88,27 @@ impl VotingMethod for PaperVoting {
     /// Forgets reputations and names; the votes stay in the sums.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.vehicles.retain(|node, _| !nodes.contains(node));
-        self.landmarks.values_mut().for_each(|known| known.contributors.retain(|node| !nodes.contains(node)));
+        self.landmarks
+            .values_mut()
+            .for_each(|known| known.contributors.retain(|node| !nodes.contains(node)));
     }
 
     fn make_room_for(&mut self, vote: &NewVote<'_>, max_labels: usize) -> Option<usize> {
         let known = self.landmarks.get(vote.landmark);
-        known.is_none_or(|l| l.scores.len() < max_labels || l.scores.contains_key(vote.label)).then_some(0)
+        known
+            .is_none_or(|l| l.scores.len() < max_labels || l.scores.contains_key(vote.label))
+            .then_some(0)
     }
 
     /// Adds r_v · c_ω · k for one detection.
     fn add_vote(&mut self, vote: &NewVote<'_>) {
-        let visibility = vote.range_bearing.map_or(1.0, |(d, a)| visibility::paper(&self.config, d, a));
+        let visibility = vote
+            .range_bearing
+            .map_or(1.0, |(d, a)| visibility::paper(&self.config, d, a));
         let vehicle = self.vehicle(vote.node);
-        vehicle.votes.push((vote.landmark.clone(), vote.label.clone()));
+        vehicle
+            .votes
+            .push((vote.landmark.clone(), vote.label.clone()));
         let score = vehicle.reputation.score * vote.confidence * visibility;
         let landmark = self.landmarks.entry_ref(vote.landmark).or_default();
         *landmark.scores.entry(vote.label.clone()).or_insert(0.0) += score;
@@ -106,10 +129,13 @@ impl VotingMethod for PaperVoting {
                 labels.insert(id, method::best(&landmark.scores).cloned());
             }
         }
-        for VehicleScore { reputation, votes } in self.vehicles.values_mut().filter(|v| !v.votes.is_empty()) {
+        for VehicleScore { reputation, votes } in
+            self.vehicles.values_mut().filter(|v| !v.votes.is_empty())
+        {
             let objects = votes.len() as u64;
-            let is_correct =
-                |(landmark, label): &&(LandmarkId, Label)| labels.get(landmark).and_then(Option::as_ref) == Some(label);
+            let is_correct = |(landmark, label): &&(LandmarkId, Label)| {
+                labels.get(landmark).and_then(Option::as_ref) == Some(label)
+            };
             let correct = votes.iter().filter(is_correct).count() as u64;
             let balance = (2.0 * correct as f64 - objects as f64) / objects as f64;
             let (low, high) = REPUTATION_RANGE;
@@ -123,19 +149,34 @@ impl VotingMethod for PaperVoting {
     }
 
     fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
-        let LandmarkScores { scores, contributors, .. } = self.landmarks.get(landmark)?;
-        Some(method::verdict(landmark.clone(), scores.clone(), None, contributors.iter().cloned().collect()))
+        let LandmarkScores {
+            scores,
+            contributors,
+            ..
+        } = self.landmarks.get(landmark)?;
+        Some(method::verdict(
+            landmark.clone(),
+            scores.clone(),
+            None,
+            contributors.iter().cloned().collect(),
+        ))
     }
 
     fn reputations(&self) -> BTreeMap<NodeName, Reputation> {
-        self.vehicles.iter().map(|(node, vehicle)| (node.clone(), vehicle.reputation)).collect()
+        self.vehicles
+            .iter()
+            .map(|(node, vehicle)| (node.clone(), vehicle.reputation))
+            .collect()
     }
 
     /// Reputations of vehicles that are not named stay.
     fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
         let (low, high) = REPUTATION_RANGE;
         for (node, reputation) in reputations {
-            self.vehicle(node).reputation = Reputation { score: reputation.score.clamp(low, high), ..*reputation };
+            self.vehicle(node).reputation = Reputation {
+                score: reputation.score.clamp(low, high),
+                ..*reputation
+            };
         }
     }
 }

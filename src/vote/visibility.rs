@@ -16,7 +16,8 @@ pub fn paper(config: &PaperConfig, distance_m: f64, angle_rad: f64) -> f64 {
 pub fn weighted(config: &WeightedConfig, distance_m: f64, angle_rad: f64) -> f64 {
     let distance = (distance_m / config.max_range_m).clamp(0.0, 1.0);
     let angle = angle_rad / config.half_visibility_rad;
-    (1.0 - (1.0 - config.visibility_at_max_range) * distance * distance) * (-LN_2 * angle * angle).exp()
+    (1.0 - (1.0 - config.visibility_at_max_range) * distance * distance)
+        * (-LN_2 * angle * angle).exp()
 }
 
 #[cfg(test)]
@@ -32,7 +33,10 @@ mod tests {
 
     #[test]
     fn visibility_falls_off_axis_and_with_distance() {
-        let config = WeightedConfig { max_range_m: 2.0, ..WeightedConfig::default() };
+        let config = WeightedConfig {
+            max_range_m: 2.0,
+            ..WeightedConfig::default()
+        };
         assert_eq!(weighted(&config, 0.0, 0.0), 1.0);
         assert!((weighted(&config, 0.0, 0.8) - 0.5).abs() < 1e-12);
         assert!((weighted(&config, 2.0, 0.0) - 0.3).abs() < 1e-12);

@@ -104,16 +104,26 @@ impl WeightedVoting {
     /// Judges a landmark's votes from scratch.
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
         self.remove_live(landmark);
-        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
-        landmark_votes.compare(&mut self.dependence, &mut self.calibration, |vehicle| vehicle);
+        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
+            return;
+        };
+        landmark_votes.compare(&mut self.dependence, &mut self.calibration, |vehicle| {
+            vehicle
+        });
         landmark_votes.weigh(&self.dependence, &self.calibration, weights);
         let is_new = landmark_votes.votes.iter().any(|vote| !vote.judged);
-        landmark_votes.votes.iter_mut().for_each(|vote| vote.judged = true);
+        landmark_votes
+            .votes
+            .iter_mut()
+            .for_each(|vote| vote.judged = true);
         let votes = landmark_votes.weighted_votes();
         self.model.refresh(votes.iter().map(|vote| vote.vehicle));
         let candidates = landmark_votes.candidates();
-        let judged =
-            if is_new { self.model.judge_new(&votes, &candidates) } else { self.model.judge(&votes, &candidates) };
+        let judged = if is_new {
+            self.model.judge_new(&votes, &candidates)
+        } else {
+            self.model.judge(&votes, &candidates)
+        };
         landmark_votes.take(judged, &mut self.calibration);
         self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
         landmark_votes.counted = true;
@@ -127,15 +137,23 @@ impl WeightedVoting {
     /// to be dependent, whose agreement has passed for reliability.
     fn fit_dependence(&mut self) {
         let mut present = vec![false; self.names.len()];
-        self.landmarks.values().flat_map(|l| &l.votes).for_each(|vote| present[vote.vehicle] = true);
+        self.landmarks
+            .values()
+            .flat_map(|l| &l.votes)
+            .for_each(|vote| present[vote.vehicle] = true);
         let groups = self.dependence.fit(&present);
         let trust = |vehicles: &[usize]| {
-            vehicles.iter().map(|&v| self.model.reliability(v)).sum::<f64>() / vehicles.len().max(1) as f64
+            vehicles
+                .iter()
+                .map(|&v| self.model.reliability(v))
+                .sum::<f64>()
+                / vehicles.len().max(1) as f64
         };
         if trust(&groups.copies) > 0.5 && trust(&groups.main) < 0.5 && !groups.main.is_empty() {
             self.model.clear_settled();
             self.start_from_majorities();
-        } else if groups.dependent as f64 >= MANY_DEPENDENT * present.iter().filter(|present| **present).count() as f64
+        } else if groups.dependent as f64
+            >= MANY_DEPENDENT * present.iter().filter(|present| **present).count() as f64
             && groups.dependent > 2 * self.known_dependent
         {
             self.known_dependent = groups.dependent;
@@ -146,12 +164,19 @@ impl WeightedVoting {
     /// Judges older landmarks in turn, as far as the budget for this round's fresh votes goes; adds those whose
     /// published label changed to `changed`.
     fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<LandmarkId>) {
-        let mut budget = (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
+        let mut budget =
+            (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
         let mut visits = self.landmarks.len();
         while budget > 0 && visits > 0 {
             visits -= 1;
-            let after = self.revisit_after.as_ref().map_or(Bound::Unbounded, Bound::Excluded);
-            let next = self.landmarks.range::<LandmarkId, _>((after, Bound::Unbounded)).next();
+            let after = self
+                .revisit_after
+                .as_ref()
+                .map_or(Bound::Unbounded, Bound::Excluded);
+            let next = self
+                .landmarks
+                .range::<LandmarkId, _>((after, Bound::Unbounded))
+                .next();
             let Some((landmark, landmark_votes)) = next.map(|(l, v)| (l.clone(), v)) else {
                 self.revisit_after = None;
                 continue;
@@ -159,7 +184,11 @@ impl WeightedVoting {
             budget = budget.saturating_sub(landmark_votes.votes.len().max(1));
             let before = landmark_votes.published;
             self.judge(&landmark, weights);
-            if self.landmarks.get(&landmark).is_some_and(|l| l.published != before) {
+            if self
+                .landmarks
+                .get(&landmark)
+                .is_some_and(|l| l.published != before)
+            {
                 changed.insert(landmark.clone());
             }
             self.revisit_after = Some(landmark);
@@ -167,7 +196,9 @@ impl WeightedVoting {
     }
 
     fn score(&self, vehicle: usize) -> f64 {
-        self.model.reliability_beside(vehicle).clamp(REPUTATION_RANGE.0, REPUTATION_RANGE.1)
+        self.model
+            .reliability_beside(vehicle)
+            .clamp(REPUTATION_RANGE.0, REPUTATION_RANGE.1)
     }
 }
 
@@ -186,7 +217,11 @@ impl VotingMethod for WeightedVoting {
     /// Keeps what its votes taught.
     fn remove_landmark(&mut self, landmark: &LandmarkId) {
         self.remove_votes(landmark, |_| true);
-        if let Some(due) = self.landmarks.remove(landmark).and_then(|landmark_votes| landmark_votes.due) {
+        if let Some(due) = self
+            .landmarks
+            .remove(landmark)
+            .and_then(|landmark_votes| landmark_votes.due)
+        {
             self.expiries.remove(&(due, landmark.clone()));
         }
         self.changed.remove(landmark);
@@ -203,20 +238,36 @@ impl VotingMethod for WeightedVoting {
 
     /// Takes a vote in the place of the vehicle's earlier one on the landmark.
     fn add_vote(&mut self, vote: &NewVote<'_>) {
-        let &NewVote { landmark, confidence, at, .. } = vote;
-        let visibility = vote.range_bearing.map_or(1.0, |(d, a)| visibility::weighted(&self.config, d, a));
+        let &NewVote {
+            landmark,
+            confidence,
+            at,
+            ..
+        } = vote;
+        let visibility = vote
+            .range_bearing
+            .map_or(1.0, |(d, a)| visibility::weighted(&self.config, d, a));
         self.expire(at);
         let vehicle = self.vehicle(vote.node);
         let label = self.label(vote.label, Some((vehicle, at)));
         let freshness = self.freshness();
-        let earlier = self.landmarks.get(landmark).and_then(|l| l.votes.iter().find(|v| v.vehicle == vehicle).copied());
+        let earlier = self
+            .landmarks
+            .get(landmark)
+            .and_then(|l| l.votes.iter().find(|v| v.vehicle == vehicle).copied());
         let mut recent = earlier.map_or_else(RecentStatements::default, |earlier| earlier.recent);
         let age_s = earlier.map_or(0.0, |earlier| at.since(earlier.at).as_secs_f64());
         let fading_s = self.config.freshness_s * self.config.smoothing_share;
-        let kept = if fading_s > 0.0 { (-age_s / fading_s).exp() } else { 0.0 };
+        let kept = if fading_s > 0.0 {
+            (-age_s / fading_s).exp()
+        } else {
+            0.0
+        };
         let stated_most = recent.add(label, (confidence * visibility).max(MIN_WEIGHT), kept);
         let (label, confidence, visibility) = match earlier {
-            Some(earlier) if stated_most != label => (earlier.label, earlier.confidence, earlier.visibility),
+            Some(earlier) if stated_most != label => {
+                (earlier.label, earlier.confidence, earlier.visibility)
+            }
             _ => (label, confidence, visibility),
         };
         let first = StoredVote {
@@ -241,11 +292,27 @@ impl VotingMethod for WeightedVoting {
             }
             Some(earlier) => {
                 self.remove_live(landmark);
-                let StoredVote { since, compared, .. } = earlier;
+                let StoredVote {
+                    since, compared, ..
+                } = earlier;
                 let is_repeated = earlier.label == label;
-                let rest =
-                    if is_repeated { StoredVote { confidence, visibility, recent, at, ..earlier } } else { first };
-                StoredVote { since, compared, agreement: None, ..rest }
+                let rest = if is_repeated {
+                    StoredVote {
+                        confidence,
+                        visibility,
+                        recent,
+                        at,
+                        ..earlier
+                    }
+                } else {
+                    first
+                };
+                StoredVote {
+                    since,
+                    compared,
+                    agreement: None,
+                    ..rest
+                }
             }
             None => {
                 self.remove_live(landmark);
@@ -253,7 +320,10 @@ impl VotingMethod for WeightedVoting {
             }
         };
         let landmark_votes = self.landmarks.entry(landmark.clone()).or_default();
-        match landmark_votes.votes.binary_search_by_key(&vehicle, |vote| vote.vehicle) {
+        match landmark_votes
+            .votes
+            .binary_search_by_key(&vehicle, |vote| vote.vehicle)
+        {
             Ok(place) => landmark_votes.votes[place] = stored,
             Err(place) => landmark_votes.votes.insert(place, stored),
         }
@@ -280,20 +350,47 @@ impl VotingMethod for WeightedVoting {
     }
 
     fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict> {
-        let LandmarkVotes { votes, posterior, published, .. } = self.landmarks.get(landmark)?;
-        let mass: f64 = votes.iter().map(|v| self.score(v.vehicle) * v.weight * v.independence).sum();
+        let LandmarkVotes {
+            votes,
+            posterior,
+            published,
+            ..
+        } = self.landmarks.get(landmark)?;
+        let mass: f64 = votes
+            .iter()
+            .map(|v| self.score(v.vehicle) * v.weight * v.independence)
+            .sum();
         let name = |label: LabelIndex| self.labels.name(label).clone();
-        let scores = posterior.iter().map(|&(label, p)| (name(label), p * mass)).collect();
-        let mut contributors: Vec<_> = votes.iter().map(|vote| self.names[vote.vehicle].clone()).collect();
+        let scores = posterior
+            .iter()
+            .map(|&(label, p)| (name(label), p * mass))
+            .collect();
+        let mut contributors: Vec<_> = votes
+            .iter()
+            .map(|vote| self.names[vote.vehicle].clone())
+            .collect();
         contributors.sort();
-        Some(method::verdict(landmark.clone(), scores, published.map(name), contributors))
+        Some(method::verdict(
+            landmark.clone(),
+            scores,
+            published.map(name),
+            contributors,
+        ))
     }
 
     fn readings(&self, landmark: &LandmarkId) -> BTreeMap<Label, Vec<NodeName>> {
         let mut readings: BTreeMap<Label, Vec<NodeName>> = BTreeMap::new();
-        for vote in self.landmarks.get(landmark).into_iter().flat_map(|known| &known.votes) {
+        for vote in self
+            .landmarks
+            .get(landmark)
+            .into_iter()
+            .flat_map(|known| &known.votes)
+        {
             let label = self.labels.name(vote.label).clone();
-            readings.entry(label).or_default().push(self.names[vote.vehicle].clone());
+            readings
+                .entry(label)
+                .or_default()
+                .push(self.names[vote.vehicle].clone());
         }
         readings
     }
@@ -307,25 +404,38 @@ impl VotingMethod for WeightedVoting {
                 score: self.score(vehicle),
                 correct: correct + live_correct,
                 incorrect: incorrect + (live.total().round() as u64).saturating_sub(live_correct),
-                foreign: Some(self.model.vehicles[vehicle].foreign).filter(|foreign| foreign.total() > 0.0),
+                foreign: Some(self.model.vehicles[vehicle].foreign)
+                    .filter(|foreign| foreign.total() > 0.0),
             }
         };
-        self.vehicles.iter().map(|(node, &vehicle)| (node.clone(), reputation(vehicle))).collect()
+        self.vehicles
+            .iter()
+            .map(|(node, &vehicle)| (node.clone(), reputation(vehicle)))
+            .collect()
     }
 
     fn is_proven(&self, node: &NodeName) -> bool {
-        let is_proven = |vehicle: usize| !self.model.is_newcomer(vehicle) && self.model.reliability(vehicle) > 0.5;
-        self.vehicles.get(node).is_some_and(|&vehicle| is_proven(vehicle))
+        let is_proven = |vehicle: usize| {
+            !self.model.is_newcomer(vehicle) && self.model.reliability(vehicle) > 0.5
+        };
+        self.vehicles
+            .get(node)
+            .is_some_and(|&vehicle| is_proven(vehicle))
     }
 
     fn is_trusted(&self, node: &NodeName) -> bool {
-        self.vehicles.get(node).is_none_or(|&vehicle| self.model.reliability(vehicle) > 0.5)
+        self.vehicles
+            .get(node)
+            .is_none_or(|&vehicle| self.model.reliability(vehicle) > 0.5)
     }
 
     fn begin_record(&mut self, now: Timestamp) {
         self.recorded_from = now;
         self.evidence.clear();
-        self.landmarks.values_mut().flat_map(|l| &mut l.votes).for_each(|vote| vote.since = now);
+        self.landmarks
+            .values_mut()
+            .flat_map(|l| &mut l.votes)
+            .for_each(|vote| vote.since = now);
     }
 
     fn refine(&mut self, passes: u32) {
@@ -339,7 +449,8 @@ impl VotingMethod for WeightedVoting {
     fn set_foreign(&mut self, votes_beside: &dyn Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {
         self.foreign = votes_beside(self.config.vehicle_prior_votes);
         for (node, &vehicle) in &self.vehicles {
-            self.model.vehicles[vehicle].foreign = self.foreign.get(node).copied().unwrap_or_default();
+            self.model.vehicles[vehicle].foreign =
+                self.foreign.get(node).copied().unwrap_or_default();
         }
     }
 }

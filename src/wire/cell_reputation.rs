@@ -39,7 +39,9 @@ pub struct CellReputation {
 }
 
 /// Votes of other cells about a vehicle at the weight that they have here. They are not whole numbers.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(
+    Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema,
+)]
 pub struct ForeignVotes {
     /// Votes that agreed with the verdict.
     #[cbor(n(0), with = "Half")]

@@ -4,7 +4,9 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::compact::{self, is_compact};
-use super::{InvalidEntry, LedgerShare, Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION};
+use super::{
+    InvalidEntry, LedgerShare, Limits, ObjectReport, Payload, RejectReason, SCHEMA_VERSION,
+};
 use crate::model::names::NodeName;
 
 /// The encoding of a payload.
@@ -28,8 +30,12 @@ pub enum Encoding {
 pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
     match encoding {
-        Encoding::Json => serde_json::to_writer(&mut bytes, payload).expect("payloads serialise into memory"),
-        Encoding::Cbor => ciborium::into_writer(payload, &mut bytes).expect("payloads serialise into memory"),
+        Encoding::Json => {
+            serde_json::to_writer(&mut bytes, payload).expect("payloads serialise into memory")
+        }
+        Encoding::Cbor => {
+            ciborium::into_writer(payload, &mut bytes).expect("payloads serialise into memory")
+        }
         Encoding::Compact => compact::write(payload, &mut bytes),
     }
     bytes
@@ -48,7 +54,10 @@ pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReas
 ///
 /// # Errors
 /// The first reason found; see [`RejectReason`].
-pub fn decode_entries<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<(T, Vec<InvalidEntry>), RejectReason> {
+pub fn decode_entries<T: Payload>(
+    bytes: &[u8],
+    limits: &Limits,
+) -> Result<(T, Vec<InvalidEntry>), RejectReason> {
     if bytes.len() > T::max_bytes(limits) {
         return Err(RejectReason::TooLarge);
     }
@@ -68,15 +77,25 @@ pub fn decode_entries<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<(T, V
 ///
 /// # Errors
 /// The first reason found; see [`RejectReason`].
-pub fn decode_report(bytes: &[u8], topic_node: &NodeName, limits: &Limits) -> Result<ObjectReport, RejectReason> {
-    decode_from(bytes, topic_node, limits, |report: &ObjectReport| &report.node)
+pub fn decode_report(
+    bytes: &[u8],
+    topic_node: &NodeName,
+    limits: &Limits,
+) -> Result<ObjectReport, RejectReason> {
+    decode_from(bytes, topic_node, limits, |report: &ObjectReport| {
+        &report.node
+    })
 }
 
 /// Reads a share and checks every value in it; `topic_node` is the node named by its topic.
 ///
 /// # Errors
 /// The first reason found; see [`RejectReason`].
-pub fn decode_share(bytes: &[u8], topic_node: &NodeName, limits: &Limits) -> Result<LedgerShare, RejectReason> {
+pub fn decode_share(
+    bytes: &[u8],
+    topic_node: &NodeName,
+    limits: &Limits,
+) -> Result<LedgerShare, RejectReason> {
     decode_from(bytes, topic_node, limits, |share: &LedgerShare| &share.node)
 }
 
@@ -87,7 +106,11 @@ fn decode_from<T: Payload>(
     node: impl FnOnce(&T) -> &NodeName,
 ) -> Result<T, RejectReason> {
     let payload = decode(bytes, limits)?;
-    if node(&payload) == topic_node { Ok(payload) } else { Err(RejectReason::NodeMismatch) }
+    if node(&payload) == topic_node {
+        Ok(payload)
+    } else {
+        Err(RejectReason::NodeMismatch)
+    }
 }
 
 /// The version of a payload whose other fields cannot be read.
@@ -113,12 +136,19 @@ pub(super) fn read<T: Payload>(bytes: &[u8]) -> Result<T, RejectReason> {
 /// Reads JSON, or CBOR with names.
 fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     match bytes.first() {
-        Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => serde_json::from_slice(bytes).map_err(|error| {
-            // serde_json has no other way to distinguish 1e999 from a syntax error.
-            let overflow = error.to_string().starts_with("number out of range");
-            let not_finite = overflow || (error.is_syntax() && is_at_non_finite_word(bytes, &error));
-            if not_finite { RejectReason::NotFinite } else { RejectReason::Malformed }
-        }),
+        Some(b'{' | b' ' | b'\n' | b'\r' | b'\t') => {
+            serde_json::from_slice(bytes).map_err(|error| {
+                // serde_json has no other way to distinguish 1e999 from a syntax error.
+                let overflow = error.to_string().starts_with("number out of range");
+                let not_finite =
+                    overflow || (error.is_syntax() && is_at_non_finite_word(bytes, &error));
+                if not_finite {
+                    RejectReason::NotFinite
+                } else {
+                    RejectReason::Malformed
+                }
+            })
+        }
         Some(_) => ciborium::from_reader(bytes).map_err(|_| RejectReason::Malformed),
         None => Err(RejectReason::Malformed),
     }
@@ -126,11 +156,20 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
 
 /// True if the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not finite.
 fn is_at_non_finite_word(bytes: &[u8], error: &serde_json::Error) -> bool {
-    let line = bytes.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
+    let line = bytes
+        .split(|byte| *byte == b'\n')
+        .nth(error.line().saturating_sub(1))
+        .unwrap_or_default();
     // The column is at the first letter of the word or next to it.
-    let from = line.get(error.column().saturating_sub(3)..).unwrap_or_default();
+    let from = line
+        .get(error.column().saturating_sub(3)..)
+        .unwrap_or_default();
     let around = from.get(.."-Infinity".len() + 2).unwrap_or(from);
-    ["NaN", "Infinity"].iter().any(|word| around.windows(word.len()).any(|part| part == word.as_bytes()))
+    ["NaN", "Infinity"].iter().any(|word| {
+        around
+            .windows(word.len())
+            .any(|part| part == word.as_bytes())
+    })
 }
 
 #[cfg(test)]
@@ -161,15 +200,27 @@ mod tests {
 
     /// The reason for which a report is rejected, the same in all encodings.
     fn reason(report: &ObjectReport) -> Option<RejectReason> {
-        let cbor = decode_report(&encode(report, Encoding::Cbor), &node(), &Limits::default()).err();
-        let compact = decode_report(&encode(report, Encoding::Compact), &node(), &Limits::default()).err();
+        let cbor =
+            decode_report(&encode(report, Encoding::Cbor), &node(), &Limits::default()).err();
+        let compact = decode_report(
+            &encode(report, Encoding::Compact),
+            &node(),
+            &Limits::default(),
+        )
+        .err();
         assert_eq!(compact, cbor);
-        let finite = report.objects.iter().all(|o| o.x_m.is_finite() && o.confidence.is_finite());
+        let finite = report
+            .objects
+            .iter()
+            .all(|o| o.x_m.is_finite() && o.confidence.is_finite());
         // JSON has no word for a number that is none.
         if finite
-            && report.pose.is_none_or(|pose| pose.heading_rad.is_finite() && pose.pitch_rad.is_none_or(f64::is_finite))
+            && report.pose.is_none_or(|pose| {
+                pose.heading_rad.is_finite() && pose.pitch_rad.is_none_or(f64::is_finite)
+            })
         {
-            let json = decode_report(&encode(report, Encoding::Json), &node(), &Limits::default()).err();
+            let json =
+                decode_report(&encode(report, Encoding::Json), &node(), &Limits::default()).err();
             assert_eq!(json, cbor);
         }
         cbor
@@ -181,31 +232,110 @@ mod tests {
         let flaws: [Flaw; 27] = [
             (|r| r.schema = 2, RejectReason::UnknownSchema),
             (|r| r.schema = 0, RejectReason::UnknownSchema),
-            (|r| r.node = NodeName::new("gauss").unwrap(), RejectReason::NodeMismatch),
-            (|r| r.objects = vec![r.objects[0].clone(); 1025], RejectReason::TooManyObjects),
-            (|r| r.seen = Some(vec!["a".into(); 1025]), RejectReason::TooManyObjects),
+            (
+                |r| r.node = NodeName::new("gauss").unwrap(),
+                RejectReason::NodeMismatch,
+            ),
+            (
+                |r| r.objects = vec![r.objects[0].clone(); 1025],
+                RejectReason::TooManyObjects,
+            ),
+            (
+                |r| r.seen = Some(vec!["a".into(); 1025]),
+                RejectReason::TooManyObjects,
+            ),
             (|r| r.objects[0].x_m = f64::NAN, RejectReason::NotFinite),
-            (|r| r.objects[0].x_m = f64::INFINITY, RejectReason::NotFinite),
+            (
+                |r| r.objects[0].x_m = f64::INFINITY,
+                RejectReason::NotFinite,
+            ),
             (|r| r.objects[0].x_m = 1e9, RejectReason::NotFinite),
-            (|r| r.pose = Some(WirePose::new(0.0, 0.0, f64::NAN)), RejectReason::NotFinite),
-            (|r| r.pose.as_mut().unwrap().height_m = Some(-0.1), RejectReason::OutOfRange),
-            (|r| r.pose.as_mut().unwrap().pitch_rad = Some(f64::NAN), RejectReason::NotFinite),
-            (|r| r.pose.as_mut().unwrap().roll_rad = Some(1e9), RejectReason::OutOfRange),
-            (|r| r.objects[0].covariance_m2 = Some([-1.0, 0.0, 1.0]), RejectReason::NotFinite),
-            (|r| r.objects[0].covariance_m2 = Some([1.0, 2.0, 1.0]), RejectReason::NotFinite),
-            (|r| r.objects[0].confidence = 2.0, RejectReason::ConfidenceOutOfRange),
-            (|r| r.objects[0].confidence = -0.1, RejectReason::ConfidenceOutOfRange),
-            (|r| r.objects[0].confidence = f64::NAN, RejectReason::NotFinite),
-            (|r| r.objects[0].label = "".into(), RejectReason::InvalidLabel),
-            (|r| r.objects[0].label = "x".repeat(65).into(), RejectReason::InvalidLabel),
-            (|r| r.objects[0].landmark = Some("a\nb".into()), RejectReason::InvalidLabel),
-            (|r| r.seen = Some(vec!["".into()]), RejectReason::InvalidLabel),
-            (|r| r.objects[0].velocity_mps = Some([1e9, 0.0]), RejectReason::OutOfRange),
-            (|r| r.objects[0].heading_rad = Some(1e9), RejectReason::OutOfRange),
-            (|r| r.objects[0].size_m = Some([0.0, -1.0]), RejectReason::OutOfRange),
-            (|r| r.objects[0].scores = [("cup".into(), 2.0)].into(), RejectReason::ConfidenceOutOfRange),
-            (|r| r.view = Some(FieldOfView { range_m: -1.0, angle_rad: 1.0 }), RejectReason::OutOfRange),
-            (|r| r.view = Some(FieldOfView { range_m: 1.0, angle_rad: 1e9 }), RejectReason::OutOfRange),
+            (
+                |r| r.pose = Some(WirePose::new(0.0, 0.0, f64::NAN)),
+                RejectReason::NotFinite,
+            ),
+            (
+                |r| r.pose.as_mut().unwrap().height_m = Some(-0.1),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |r| r.pose.as_mut().unwrap().pitch_rad = Some(f64::NAN),
+                RejectReason::NotFinite,
+            ),
+            (
+                |r| r.pose.as_mut().unwrap().roll_rad = Some(1e9),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |r| r.objects[0].covariance_m2 = Some([-1.0, 0.0, 1.0]),
+                RejectReason::NotFinite,
+            ),
+            (
+                |r| r.objects[0].covariance_m2 = Some([1.0, 2.0, 1.0]),
+                RejectReason::NotFinite,
+            ),
+            (
+                |r| r.objects[0].confidence = 2.0,
+                RejectReason::ConfidenceOutOfRange,
+            ),
+            (
+                |r| r.objects[0].confidence = -0.1,
+                RejectReason::ConfidenceOutOfRange,
+            ),
+            (
+                |r| r.objects[0].confidence = f64::NAN,
+                RejectReason::NotFinite,
+            ),
+            (
+                |r| r.objects[0].label = "".into(),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |r| r.objects[0].label = "x".repeat(65).into(),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |r| r.objects[0].landmark = Some("a\nb".into()),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |r| r.seen = Some(vec!["".into()]),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |r| r.objects[0].velocity_mps = Some([1e9, 0.0]),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |r| r.objects[0].heading_rad = Some(1e9),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |r| r.objects[0].size_m = Some([0.0, -1.0]),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |r| r.objects[0].scores = [("cup".into(), 2.0)].into(),
+                RejectReason::ConfidenceOutOfRange,
+            ),
+            (
+                |r| {
+                    r.view = Some(FieldOfView {
+                        range_m: -1.0,
+                        angle_rad: 1.0,
+                    })
+                },
+                RejectReason::OutOfRange,
+            ),
+            (
+                |r| {
+                    r.view = Some(FieldOfView {
+                        range_m: 1.0,
+                        angle_rad: 1e9,
+                    })
+                },
+                RejectReason::OutOfRange,
+            ),
         ];
         assert_eq!(reason(&report()), None);
         for (index, (spoil, expected)) in flaws.into_iter().enumerate() {
@@ -224,28 +354,60 @@ mod tests {
         let compact = encode(&report(), Encoding::Compact);
         let table: Vec<(Vec<u8>, RejectReason)> = vec![
             (vec![], RejectReason::Malformed),
-            (json.as_bytes()[..json.len() - 1].to_vec(), RejectReason::Malformed),
+            (
+                json.as_bytes()[..json.len() - 1].to_vec(),
+                RejectReason::Malformed,
+            ),
             (cbor[..cbor.len() - 1].to_vec(), RejectReason::Malformed),
-            (compact[..compact.len() - 1].to_vec(), RejectReason::Malformed),
+            (
+                compact[..compact.len() - 1].to_vec(),
+                RejectReason::Malformed,
+            ),
             ([&*compact, &[0]].concat(), RejectReason::Malformed),
             (vec![0x80], RejectReason::Malformed),
             (vec![0x82, 2, 0xf6], RejectReason::UnknownSchema),
             (not_utf8, RejectReason::Malformed),
             (b"null".to_vec(), RejectReason::Malformed),
-            (json.replace("\"seq\":412,", "").into(), RejectReason::Malformed),
-            (json.replace("\"seq\":412", "\"seq\":-1").into(), RejectReason::Malformed),
-            (json.replace("\"euclid\"", "\"a/b\"").into(), RejectReason::Malformed),
-            (json.replace("0.25", "1e999").into(), RejectReason::NotFinite),
+            (
+                json.replace("\"seq\":412,", "").into(),
+                RejectReason::Malformed,
+            ),
+            (
+                json.replace("\"seq\":412", "\"seq\":-1").into(),
+                RejectReason::Malformed,
+            ),
+            (
+                json.replace("\"euclid\"", "\"a/b\"").into(),
+                RejectReason::Malformed,
+            ),
+            (
+                json.replace("0.25", "1e999").into(),
+                RejectReason::NotFinite,
+            ),
             (json.replace("0.25", "NaN").into(), RejectReason::NotFinite),
-            (json.replace("0.25", "\n -Infinity").into(), RejectReason::NotFinite),
-            (json.replace("0.25", " Infinity").into(), RejectReason::NotFinite),
+            (
+                json.replace("0.25", "\n -Infinity").into(),
+                RejectReason::NotFinite,
+            ),
+            (
+                json.replace("0.25", " Infinity").into(),
+                RejectReason::NotFinite,
+            ),
             (json.replace("0.25", "nan").into(), RejectReason::Malformed),
             (b"{\"schema\":2}".to_vec(), RejectReason::UnknownSchema),
-            (vec![b' '; Limits::default().payload_bytes + 1], RejectReason::TooLarge),
+            (
+                vec![b' '; Limits::default().payload_bytes + 1],
+                RejectReason::TooLarge,
+            ),
         ];
         for (payload, expected) in table {
             let decoded = decode_report(&payload, &node(), &Limits::default());
-            assert_eq!(decoded, Err(expected), "{:?}", String::from_utf8_lossy(&payload[..payload.len().min(99)]));
+            assert_eq!(
+                decoded,
+                Err(expected),
+                "{:?}",
+                String::from_utf8_lossy(&payload[..payload.len().min(99)])
+            );
         }
     }
 
@@ -257,9 +419,17 @@ mod tests {
             ..PerceivedObject::new("ABCD123", 0.931, x_m, y_m)
         };
         // A coordinate takes the same bytes from 65.536 m to 4,294 km.
-        for (x_m, y_m) in [(65.537, -65.538), (-48_211.007, 90_310.12), (4_294_967.0, -4_294_967.0)] {
-            let with = |objects| ObjectReport { objects: vec![object(x_m, y_m); objects], ..report() };
-            let [ten, eleven] = [10, 11].map(|objects| encode(&with(objects), Encoding::Compact).len());
+        for (x_m, y_m) in [
+            (65.537, -65.538),
+            (-48_211.007, 90_310.12),
+            (4_294_967.0, -4_294_967.0),
+        ] {
+            let with = |objects| ObjectReport {
+                objects: vec![object(x_m, y_m); objects],
+                ..report()
+            };
+            let [ten, eleven] =
+                [10, 11].map(|objects| encode(&with(objects), Encoding::Compact).len());
             assert!(eleven - ten <= 40, "{} bytes at {x_m}, {y_m}", eleven - ten);
         }
     }
@@ -274,7 +444,10 @@ mod tests {
     #[test]
     fn other_payloads_of_an_unknown_version_are_rejected_too() {
         let text = br#"{"schema":2,"epoch":1,"round":1,"reputations":{}}"#;
-        assert_eq!(decode::<Reputations>(text, &Limits::default()), Err(RejectReason::UnknownSchema));
+        assert_eq!(
+            decode::<Reputations>(text, &Limits::default()),
+            Err(RejectReason::UnknownSchema)
+        );
     }
 
     prop_compose! {

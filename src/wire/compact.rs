@@ -36,7 +36,11 @@ pub(super) fn write<T: Encode<()>>(payload: &T, bytes: &mut Vec<u8>) {
 pub(super) fn read<T: for<'b> Decode<'b, ()>>(bytes: &[u8]) -> Result<T, RejectReason> {
     let mut decoder = Decoder::new(bytes);
     let payload = decoder.decode().map_err(|_| RejectReason::Malformed)?;
-    if decoder.position() == bytes.len() { Ok(payload) } else { Err(RejectReason::Malformed) }
+    if decoder.position() == bytes.len() {
+        Ok(payload)
+    } else {
+        Err(RejectReason::Malformed)
+    }
 }
 
 /// The `schema` of a payload that may be of a later version: it stays the first.
@@ -48,7 +52,11 @@ pub(super) fn schema(bytes: &[u8]) -> Option<u32> {
 
 /// A written form of values of type `T`, for types with several forms or without one in minicbor.
 pub(crate) trait Form<T> {
-    fn encode<C, W: Write>(value: &T, e: &mut Encoder<W>, context: &mut C) -> Result<(), encode::Error<W::Error>>;
+    fn encode<C, W: Write>(
+        value: &T,
+        e: &mut Encoder<W>,
+        context: &mut C,
+    ) -> Result<(), encode::Error<W::Error>>;
 
     fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<T, decode::Error>;
 
@@ -67,7 +75,11 @@ pub(crate) trait Form<T> {
 pub(crate) struct Text;
 
 impl Form<SmolStr> for Text {
-    fn encode<C, W: Write>(value: &SmolStr, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+    fn encode<C, W: Write>(
+        value: &SmolStr,
+        e: &mut Encoder<W>,
+        _: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
         e.str(value)?.ok()
     }
 
@@ -80,7 +92,11 @@ impl Form<SmolStr> for Text {
 pub(crate) struct UuidBytes;
 
 impl Form<Uuid> for UuidBytes {
-    fn encode<C, W: Write>(value: &Uuid, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+    fn encode<C, W: Write>(
+        value: &Uuid,
+        e: &mut Encoder<W>,
+        _: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
         e.bytes(value.as_bytes())?.ok()
     }
 
@@ -155,7 +171,9 @@ impl<T, F: Form<T>> Form<Vec<T>> for F {
         context: &mut C,
     ) -> Result<(), encode::Error<W::Error>> {
         e.array(values.len() as u64)?;
-        values.iter().try_for_each(|value| F::encode(value, e, context))
+        values
+            .iter()
+            .try_for_each(|value| F::encode(value, e, context))
     }
 
     fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<Vec<T>, decode::Error> {
@@ -181,7 +199,10 @@ impl<F: Form<f64>> Form<BTreeMap<SmolStr, f64>> for F {
         })
     }
 
-    fn decode<C>(d: &mut Decoder<'_>, context: &mut C) -> Result<BTreeMap<SmolStr, f64>, decode::Error> {
+    fn decode<C>(
+        d: &mut Decoder<'_>,
+        context: &mut C,
+    ) -> Result<BTreeMap<SmolStr, f64>, decode::Error> {
         let count = d.map()?;
         let (mut values, mut read) = (BTreeMap::new(), 0);
         while has_more(d, count, read)? {
@@ -210,7 +231,11 @@ fn has_more(d: &mut Decoder<'_>, count: Option<u64>, read: usize) -> Result<bool
 }
 
 impl<C> Encode<C> for NodeName {
-    fn encode<W: Write>(&self, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+    fn encode<W: Write>(
+        &self,
+        e: &mut Encoder<W>,
+        _: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
         e.str(self.as_str())?.ok()
     }
 }
@@ -222,7 +247,11 @@ impl<C> Decode<'_, C> for NodeName {
 }
 
 impl<C> Encode<C> for Timestamp {
-    fn encode<W: Write>(&self, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+    fn encode<W: Write>(
+        &self,
+        e: &mut Encoder<W>,
+        _: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
         e.u64(self.micros())?.ok()
     }
 }

@@ -11,7 +11,19 @@ use crate::model::names::NodeName;
 
 /// SHA-256 of a description's content. As text: 64 hexadecimal digits.
 #[derive(
-    Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize, Encode, Decode, JsonSchema,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Hash,
+    Default,
+    Serialize,
+    Deserialize,
+    Encode,
+    Decode,
+    JsonSchema,
 )]
 #[serde(try_from = "String", into = "String")]
 #[cbor(transparent)]
@@ -26,7 +38,11 @@ pub struct InvalidHash;
 impl ContentHash {
     /// The first eight digits, for people.
     pub fn short(&self) -> String {
-        self.0.iter().take(4).map(|byte| format!("{byte:02x}")).collect()
+        self.0
+            .iter()
+            .take(4)
+            .map(|byte| format!("{byte:02x}"))
+            .collect()
     }
 }
 
@@ -125,7 +141,10 @@ pub struct CellDescription {
 impl CellDescription {
     /// Version and hash.
     pub fn stamp(&self) -> DescriptionStamp {
-        DescriptionStamp { version: self.version, hash: self.hash }
+        DescriptionStamp {
+            version: self.version,
+            hash: self.hash,
+        }
     }
 
     /// The bytes whose SHA-256 is [`Self::hash`].
@@ -152,7 +171,10 @@ pub struct DescriptionStatus {
 impl DescriptionStatus {
     /// Version and hash.
     pub fn stamp(&self) -> DescriptionStamp {
-        DescriptionStamp { version: self.version, hash: self.hash }
+        DescriptionStamp {
+            version: self.version,
+            hash: self.hash,
+        }
     }
 }
 
@@ -164,7 +186,14 @@ mod tests {
     fn a_hash_is_written_as_it_is_read_and_nothing_else_is_one() {
         let hash = ContentHash(std::array::from_fn(|byte| byte as u8 * 7));
         assert_eq!(hash.to_string().parse(), Ok(hash));
-        for wrong in ["", "0", &"0".repeat(63), &"0".repeat(66), &"g".repeat(64), &"é".repeat(32)] {
+        for wrong in [
+            "",
+            "0",
+            &"0".repeat(63),
+            &"0".repeat(66),
+            &"g".repeat(64),
+            &"é".repeat(32),
+        ] {
             assert_eq!(wrong.parse::<ContentHash>(), Err(InvalidHash), "{wrong}");
         }
     }

@@ -25,17 +25,24 @@ pub struct Flaw {
 impl Flaw {
     /// A flaw of a field; without fault where there is none to tell.
     pub fn new(reason: RejectReason, field: impl Into<String>, fault: impl Into<String>) -> Self {
-        Self { reason, field: field.into(), fault: fault.into() }
+        Self {
+            reason,
+            field: field.into(),
+            fault: fault.into(),
+        }
     }
 
     /// The flaw of a report in any encoding that was rejected for `reason` when it was decoded.
     pub fn of_report(bytes: &[u8], reason: RejectReason, limits: &Limits) -> Self {
         match (reason, bytes.trim_ascii_start().first()) {
-            (RejectReason::TooLarge, _) => {
-                Self::new(reason, "", format!("is longer than {} bytes", limits.payload_bytes))
-            }
+            (RejectReason::TooLarge, _) => Self::new(
+                reason,
+                "",
+                format!("is longer than {} bytes", limits.payload_bytes),
+            ),
             (RejectReason::NodeMismatch, _) => {
-                let named = read::<ObjectReport>(bytes).map(|report| format!("it names {}", report.node));
+                let named =
+                    read::<ObjectReport>(bytes).map(|report| format!("it names {}", report.node));
                 Self::new(reason, "", named.unwrap_or_default())
             }
             (_, first) if first == Some(&b'{') || bytes.is_ascii() => {
@@ -43,7 +50,9 @@ impl Flaw {
             }
             _ => {
                 let report = read::<ObjectReport>(bytes).ok();
-                let invalid = report.as_ref().and_then(|report| report.check_values(limits).err());
+                let invalid = report
+                    .as_ref()
+                    .and_then(|report| report.check_values(limits).err());
                 let shown = serde_json::to_value(&report).unwrap_or_default();
                 invalid.map_or_else(
                     || Self::new(reason, "", ""),
@@ -74,11 +83,17 @@ impl Flaw {
         let value = payload.pointer(&pointer);
         let shown = value.map_or_else(String::new, |value| format!(": {value}"));
         let fault = match reason {
-            RejectReason::UnknownSchema => format!("is {}, not {SCHEMA_VERSION}", value.unwrap_or(&Value::Null)),
+            RejectReason::UnknownSchema => {
+                format!("is {}, not {SCHEMA_VERSION}", value.unwrap_or(&Value::Null))
+            }
             RejectReason::ConfidenceOutOfRange => format!("is not within 0 to 1{shown}"),
-            RejectReason::NotFinite if field.ends_with("covariance_m2") => format!("is no covariance{shown}"),
+            RejectReason::NotFinite if field.ends_with("covariance_m2") => {
+                format!("is no covariance{shown}")
+            }
             // JSON has no such number; other encodings do.
-            RejectReason::NotFinite if value.is_none_or(Value::is_null) => "is not a finite number".into(),
+            RejectReason::NotFinite if value.is_none_or(Value::is_null) => {
+                "is not a finite number".into()
+            }
             RejectReason::TooManyObjects => "has too many entries".into(),
             RejectReason::InvalidLabel => {
                 format!("is empty, longer than {MAX_NAME_BYTES} bytes, or has control characters")
@@ -108,22 +123,41 @@ pub(crate) fn read_json<T: DeserializeOwned>(text: &[u8]) -> Result<T, (String, 
     let value = serde_path_to_error::deserialize(&mut source).map_err(|error| {
         // Beyond a broken name, the path is unknown.
         let path = error.path().to_string();
-        (path.trim_matches(['.', '?']).to_owned(), fault(text, error.inner()))
+        (
+            path.trim_matches(['.', '?']).to_owned(),
+            fault(text, error.inner()),
+        )
     })?;
-    source.end().map_err(|error| (String::new(), fault(text, &error)))?;
+    source
+        .end()
+        .map_err(|error| (String::new(), fault(text, &error)))?;
     Ok(value)
 }
 
 /// The fault that a reader of JSON found.
 fn fault(text: &[u8], error: &serde_json::Error) -> String {
-    let text = text.split(|byte| *byte == b'\n').nth(error.line().saturating_sub(1)).unwrap_or_default();
+    let text = text
+        .split(|byte| *byte == b'\n')
+        .nth(error.line().saturating_sub(1))
+        .unwrap_or_default();
     // The column is at the first letter of a word or next to it.
-    let around = text.get(error.column().saturating_sub(3)..).unwrap_or_default();
+    let around = text
+        .get(error.column().saturating_sub(3)..)
+        .unwrap_or_default();
     let around = around.get(.."-Infinity".len() + 2).unwrap_or(around);
-    let is_near = |word: &str| around.windows(word.len()).any(|part| part == word.as_bytes());
-    match ["NaN", "Infinity"].into_iter().find(|word| error.is_syntax() && is_near(word)) {
+    let is_near = |word: &str| {
+        around
+            .windows(word.len())
+            .any(|part| part == word.as_bytes())
+    };
+    match ["NaN", "Infinity"]
+        .into_iter()
+        .find(|word| error.is_syntax() && is_near(word))
+    {
         Some(word) => format!("is {word}"),
-        None => error.to_string().replace(" at line 1 column ", ", at column "),
+        None => error
+            .to_string()
+            .replace(" at line 1 column ", ", at column "),
     }
 }
 
@@ -143,17 +177,48 @@ mod tests {
         };
         let limits = Limits::default();
         for encoding in [Encoding::Cbor, Encoding::Compact] {
-            let flaw = Flaw::of_report(&encode(&report, encoding), RejectReason::NotFinite, &limits);
-            assert_eq!(flaw.to_string(), "objects[1].x_m: is not a finite number", "{encoding:?}");
+            let flaw =
+                Flaw::of_report(&encode(&report, encoding), RejectReason::NotFinite, &limits);
+            assert_eq!(
+                flaw.to_string(),
+                "objects[1].x_m: is not a finite number",
+                "{encoding:?}"
+            );
         }
         let json = br#"{"schema":1,"node":"watson","seq":1,"captured_at_us":5,"objects":[{"label":"cup","confidence":0.5,"x_m":NaN,"y_m":2}]}"#;
-        assert_eq!(Flaw::of_report(json, RejectReason::NotFinite, &limits).to_string(), "objects[0].x_m: is NaN");
-        for (junk, told) in [(&b"junk"[..], "expected value, at column 1"), (b"\xff\xfe", "malformed")] {
-            assert_eq!(Flaw::of_report(junk, RejectReason::Malformed, &limits).to_string(), told);
+        assert_eq!(
+            Flaw::of_report(json, RejectReason::NotFinite, &limits).to_string(),
+            "objects[0].x_m: is NaN"
+        );
+        for (junk, told) in [
+            (&b"junk"[..], "expected value, at column 1"),
+            (b"\xff\xfe", "malformed"),
+        ] {
+            assert_eq!(
+                Flaw::of_report(junk, RejectReason::Malformed, &limits).to_string(),
+                told
+            );
         }
-        let mismatch = Flaw::of_report(&encode(&report, Encoding::Json), RejectReason::NodeMismatch, &limits);
-        assert_eq!(mismatch.to_string(), "node_mismatch", "a report that cannot be read names nobody");
-        let readable = encode(&ObjectReport { objects: vec![object(1.0)], ..report }, Encoding::Json);
-        assert_eq!(Flaw::of_report(&readable, RejectReason::NodeMismatch, &limits).to_string(), "it names watson");
+        let mismatch = Flaw::of_report(
+            &encode(&report, Encoding::Json),
+            RejectReason::NodeMismatch,
+            &limits,
+        );
+        assert_eq!(
+            mismatch.to_string(),
+            "node_mismatch",
+            "a report that cannot be read names nobody"
+        );
+        let readable = encode(
+            &ObjectReport {
+                objects: vec![object(1.0)],
+                ..report
+            },
+            Encoding::Json,
+        );
+        assert_eq!(
+            Flaw::of_report(&readable, RejectReason::NodeMismatch, &limits).to_string(),
+            "it names watson"
+        );
     }
 }

@@ -55,10 +55,15 @@ impl LedgerShare {
 
     /// The leadership whose counts these are. `None` without counts and marks, and for those of several leaderships.
     pub fn lane(&self) -> Option<Epoch> {
-        let entries = self.entries.iter().map(|entry| (entry.epoch, &entry.aggregator));
+        let entries = self
+            .entries
+            .iter()
+            .map(|entry| (entry.epoch, &entry.aggregator));
         let mut lanes = entries.chain(self.marks.iter().map(|mark| (mark.epoch, &mark.aggregator)));
         let (term, aggregator) = lanes.next()?;
-        lanes.all(|lane| lane == (term, aggregator)).then(|| Epoch::new(term, aggregator.clone()))
+        lanes
+            .all(|lane| lane == (term, aggregator))
+            .then(|| Epoch::new(term, aggregator.clone()))
     }
 
     /// True if it has neither counts nor marks.

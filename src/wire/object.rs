@@ -56,7 +56,13 @@ pub struct PerceivedObject {
 impl PerceivedObject {
     /// An object with label, confidence and position only.
     pub fn new(label: impl Into<Label>, confidence: f64, x_m: f64, y_m: f64) -> Self {
-        Self { label: label.into(), confidence, x_m, y_m, ..Self::default() }
+        Self {
+            label: label.into(),
+            confidence,
+            x_m,
+            y_m,
+            ..Self::default()
+        }
     }
 
     /// The reported covariance, if any.
@@ -136,8 +142,23 @@ pub struct FusedObject {
 
 impl FusedObject {
     /// An object with label, confidence and position only.
-    pub fn new(id: Uuid, label: impl Into<Label>, confidence: f64, x_m: f64, y_m: f64, covariance: Covariance) -> Self {
-        Self { id, label: label.into(), confidence, x_m, y_m, covariance_m2: covariance.into(), ..Self::default() }
+    pub fn new(
+        id: Uuid,
+        label: impl Into<Label>,
+        confidence: f64,
+        x_m: f64,
+        y_m: f64,
+        covariance: Covariance,
+    ) -> Self {
+        Self {
+            id,
+            label: label.into(),
+            confidence,
+            x_m,
+            y_m,
+            covariance_m2: covariance.into(),
+            ..Self::default()
+        }
     }
 
     /// The position covariance.

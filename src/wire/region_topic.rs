@@ -78,12 +78,18 @@ impl RegionTopic {
         let rest = path.strip_prefix(ROOT)?.strip_prefix('/')?;
         let (rest, kind) = rest.rsplit_once('/')?;
         let (levels, cell) = rest.rsplit_once('/')?;
-        let kind = RegionTopicKind::ALL.into_iter().find(|known| known.level() == kind)?;
+        let kind = RegionTopicKind::ALL
+            .into_iter()
+            .find(|known| known.level() == kind)?;
         if levels.split('/').any(|level| level.len() != 1) {
             return None;
         }
         let tile = levels.replace('/', "").parse().ok()?;
-        Some(Self { tile, cell: NodeName::new(cell).ok()?, kind })
+        Some(Self {
+            tile,
+            cell: NodeName::new(cell).ok()?,
+            kind,
+        })
     }
 }
 
@@ -95,15 +101,31 @@ mod tests {
     fn topics_round_trip_and_strangers_are_none() {
         let tile: Quadkey = "120220011012000".parse().unwrap();
         for kind in RegionTopicKind::ALL {
-            let topic = RegionTopic { tile, cell: NodeName::from_static("lot-1"), kind };
+            let topic = RegionTopic {
+                tile,
+                cell: NodeName::from_static("lot-1"),
+                kind,
+            };
             assert_eq!(RegionTopic::parse(&topic.path()), Some(topic));
         }
-        assert_eq!(RegionTopic::filter(tile, RegionTopicKind::Map), "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/+/map");
-        assert_eq!(RegionTopic::filter_within("12".parse().unwrap()), "ecod/v1/geo/1/2/#");
-        assert_eq!(RegionTopic::filter_within("".parse().unwrap()), "ecod/v1/geo/#");
-        for stranger in
-            ["ecod/v1/geo/1/2/lot-1/maps", "ecod/v1/geo/12/lot-1/map", "ecod/v1/geo/4/a/map", "ecod/v1/geo/map"]
-        {
+        assert_eq!(
+            RegionTopic::filter(tile, RegionTopicKind::Map),
+            "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/+/map"
+        );
+        assert_eq!(
+            RegionTopic::filter_within("12".parse().unwrap()),
+            "ecod/v1/geo/1/2/#"
+        );
+        assert_eq!(
+            RegionTopic::filter_within("".parse().unwrap()),
+            "ecod/v1/geo/#"
+        );
+        for stranger in [
+            "ecod/v1/geo/1/2/lot-1/maps",
+            "ecod/v1/geo/12/lot-1/map",
+            "ecod/v1/geo/4/a/map",
+            "ecod/v1/geo/map",
+        ] {
             assert_eq!(RegionTopic::parse(stranger), None, "{stranger}");
         }
     }

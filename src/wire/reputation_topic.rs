@@ -37,8 +37,14 @@ impl ReputationTopic {
 
     /// Content of a full topic; `None` for others.
     pub fn parse(path: &str) -> Option<Self> {
-        let (vehicle, cell) = path.strip_prefix(ROOT)?.strip_prefix('/')?.split_once('/')?;
-        Some(Self { vehicle: NodeName::new(vehicle).ok()?, cell: NodeName::new(cell).ok()? })
+        let (vehicle, cell) = path
+            .strip_prefix(ROOT)?
+            .strip_prefix('/')?
+            .split_once('/')?;
+        Some(Self {
+            vehicle: NodeName::new(vehicle).ok()?,
+            cell: NodeName::new(cell).ok()?,
+        })
     }
 }
 
@@ -48,12 +54,18 @@ mod tests {
 
     #[test]
     fn topics_round_trip_and_strangers_are_none() {
-        let topic = ReputationTopic { vehicle: NodeName::from_static("euclid"), cell: NodeName::from_static("lot-1") };
+        let topic = ReputationTopic {
+            vehicle: NodeName::from_static("euclid"),
+            cell: NodeName::from_static("lot-1"),
+        };
         assert_eq!(topic.path(), "ecod/v1/rep/euclid/lot-1");
         assert_eq!(ReputationTopic::parse(&topic.path()), Some(topic));
-        for stranger in
-            ["ecod/v1/rep/euclid", "ecod/v1/rep/euclid/lot-1/map", "ecod/v1/rep//lot-1", "ecod/v1/reputation"]
-        {
+        for stranger in [
+            "ecod/v1/rep/euclid",
+            "ecod/v1/rep/euclid/lot-1/map",
+            "ecod/v1/rep//lot-1",
+            "ecod/v1/reputation",
+        ] {
             assert_eq!(ReputationTopic::parse(stranger), None, "{stranger}");
         }
     }

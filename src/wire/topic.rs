@@ -28,7 +28,9 @@ pub enum Topic {
 }
 
 /// Algorithm that a report is for, told by the topic that it came on.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(
+    Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum ReportKind {
     /// PACE, on `detections/<node>`.
@@ -63,7 +65,9 @@ pub struct Topics {
 impl Topics {
     /// The topics of a cell.
     pub fn new(cell: &NodeName) -> Self {
-        Self { root: format!("ecod/v1/{cell}") }
+        Self {
+            root: format!("ecod/v1/{cell}"),
+        }
     }
 
     /// The full topic, such as `ecod/v1/lot-1/detections/euclid`.
@@ -89,7 +93,9 @@ impl Topics {
     /// Content of a full topic; `None` for one that is not of this cell.
     pub fn parse(&self, path: &str) -> Option<Topic> {
         let level = path.strip_prefix(&self.root)?.strip_prefix('/')?;
-        let (kind, node) = level.split_once('/').map_or((level, None), |(kind, node)| (kind, Some(node)));
+        let (kind, node) = level
+            .split_once('/')
+            .map_or((level, None), |(kind, node)| (kind, Some(node)));
         match (kind, node) {
             ("detections", Some(node)) => NodeName::new(node).ok().map(Topic::Detections),
             ("vote_detections", Some(node)) => NodeName::new(node).ok().map(Topic::VoteDetections),
@@ -139,7 +145,12 @@ mod tests {
         ] {
             assert_eq!(topics.parse(&topics.path(&topic)), Some(topic));
         }
-        for stranger in ["ecod/v1/lot-2/reputations", "ecod/v1/lot-1", "ecod/v1/lot-1/detections/a/b", ""] {
+        for stranger in [
+            "ecod/v1/lot-2/reputations",
+            "ecod/v1/lot-1",
+            "ecod/v1/lot-1/detections/a/b",
+            "",
+        ] {
             assert_eq!(topics.parse(stranger), None, "{stranger}");
         }
     }

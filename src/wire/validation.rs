@@ -8,9 +8,10 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{
-    CellDescription, CellMap, CellReputation, FieldOfView, FusedObject, GlobalMap, LandmarkState, LedgerShare,
-    MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject, PoseCorrection, RejectReason,
-    Reputation, Reputations, SCHEMA_VERSION, Trouble, Verdict, Verdicts,
+    CellDescription, CellMap, CellReputation, FieldOfView, FusedObject, GlobalMap, LandmarkState,
+    LedgerShare, MAX_TROUBLE_TEXT, MAX_TROUBLES, NodeStatus, ObjectReport, PerceivedObject,
+    PoseCorrection, RejectReason, Reputation, Reputations, SCHEMA_VERSION, Trouble, Verdict,
+    Verdicts,
 };
 use crate::model::geometry::Covariance;
 use crate::model::names::{Label, NodeName, is_label, is_plain_text};
@@ -33,7 +34,11 @@ pub struct Limits {
 
 impl Default for Limits {
     fn default() -> Self {
-        Self { payload_bytes: 256 * 1024, map_bytes: 8 * 1024 * 1024, objects: 1024 }
+        Self {
+            payload_bytes: 256 * 1024,
+            map_bytes: 8 * 1024 * 1024,
+            objects: 1024,
+        }
     }
 }
 
@@ -170,7 +175,12 @@ impl ObjectReport {
     /// # Errors
     /// The first value that is not valid.
     pub fn check_values(&self, limits: &Limits) -> Result<(), InvalidValue> {
-        let of = |field: &'static str| move |reason| InvalidValue { field: field.to_owned(), reason };
+        let of = |field: &'static str| {
+            move |reason| InvalidValue {
+                field: field.to_owned(),
+                reason,
+            }
+        };
         if self.schema != SCHEMA_VERSION {
             return Err(of("schema")(RejectReason::UnknownSchema));
         }
@@ -184,19 +194,31 @@ impl ObjectReport {
             check_coordinate(pose.x_m).map_err(of("pose.x_m"))?;
             check_coordinate(pose.y_m).map_err(of("pose.y_m"))?;
             check_between(pose.heading_rad, f64::MIN, f64::MAX).map_err(of("pose.heading_rad"))?;
-            let check = |value: Option<f64>, low, high| value.map_or(Ok(()), |value| check_between(value, low, high));
+            let check = |value: Option<f64>, low, high| {
+                value.map_or(Ok(()), |value| check_between(value, low, high))
+            };
             check(pose.height_m, 0.0, SIZE_BOUND_M).map_err(of("pose.height_m"))?;
-            check(pose.pitch_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.pitch_rad"))?;
+            check(pose.pitch_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD)
+                .map_err(of("pose.pitch_rad"))?;
             check(pose.roll_rad, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD).map_err(of("pose.roll_rad"))?;
         }
         self.view.map_or(Ok(()), check_view).map_err(of("view"))?;
-        let check_yaw_rate = |rate| check_between(rate, -YAW_RATE_BOUND_RADPS, YAW_RATE_BOUND_RADPS);
-        self.frame_yaw_rate_radps.map_or(Ok(()), check_yaw_rate).map_err(of("frame_yaw_rate_radps"))?;
+        let check_yaw_rate =
+            |rate| check_between(rate, -YAW_RATE_BOUND_RADPS, YAW_RATE_BOUND_RADPS);
+        self.frame_yaw_rate_radps
+            .map_or(Ok(()), check_yaw_rate)
+            .map_err(of("frame_yaw_rate_radps"))?;
         for (index, id) in seen.iter().enumerate() {
-            check_labels([&**id]).map_err(|reason| InvalidValue { field: format!("seen[{index}]"), reason })?;
+            check_labels([&**id]).map_err(|reason| InvalidValue {
+                field: format!("seen[{index}]"),
+                reason,
+            })?;
         }
         for (index, object) in self.objects.iter().enumerate() {
-            let in_object = |(field, reason)| InvalidValue { field: format!("objects[{index}].{field}"), reason };
+            let in_object = |(field, reason)| InvalidValue {
+                field: format!("objects[{index}].{field}"),
+                reason,
+            };
             object.check_fields().map_err(in_object)?;
         }
         Ok(())
@@ -220,7 +242,9 @@ impl PerceivedObject {
         let of = |field| move |reason| (field, reason);
         check_coordinate(self.x_m).map_err(of("x_m"))?;
         check_coordinate(self.y_m).map_err(of("y_m"))?;
-        self.covariance().map_or(Ok(()), check_covariance).map_err(of("covariance_m2"))?;
+        self.covariance()
+            .map_or(Ok(()), check_covariance)
+            .map_err(of("covariance_m2"))?;
         check_confidence(self.confidence).map_err(of("confidence"))?;
         check_motion(self.velocity_mps, None, None).map_err(of("velocity_mps"))?;
         check_motion(None, self.heading_rad, None).map_err(of("heading_rad"))?;
@@ -237,18 +261,36 @@ impl PerceivedObject {
 /// [`RejectReason::FromTheFuture`].
 pub fn check_fused_at(fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
     let ahead = fused_at.since(received_at);
-    if ahead.as_secs() < MAX_FUSED_AHEAD_S { Ok(()) } else { Err(RejectReason::FromTheFuture) }
+    if ahead.as_secs() < MAX_FUSED_AHEAD_S {
+        Ok(())
+    } else {
+        Err(RejectReason::FromTheFuture)
+    }
 }
 
 fn check_map(map: &GlobalMap, _: &Limits) -> Result<(), RejectReason> {
     let times = [Some(map.fused_at_us), map.oldest_capture_us];
-    check_integers([map.epoch, map.round].into_iter().chain(times.into_iter().flatten().map(Timestamp::micros)))
+    check_integers(
+        [map.epoch, map.round]
+            .into_iter()
+            .chain(times.into_iter().flatten().map(Timestamp::micros)),
+    )
 }
 
 fn invalid_of_map(map: &mut GlobalMap) -> Vec<InvalidEntry> {
     let mut invalid = Vec::new();
-    remove_entries(&mut map.landmarks, check_landmark, |place| &place.contributors, &mut invalid);
-    remove_entries(&mut map.objects, FusedObject::validate, |object| &object.contributors, &mut invalid);
+    remove_entries(
+        &mut map.landmarks,
+        check_landmark,
+        |place| &place.contributors,
+        &mut invalid,
+    );
+    remove_entries(
+        &mut map.objects,
+        FusedObject::validate,
+        |object| &object.contributors,
+        &mut invalid,
+    );
     remove_entries(
         &mut map.neighbour_objects,
         |neighbour| {
@@ -268,7 +310,12 @@ fn invalid_of_cell_map(message: &mut CellMap) -> Vec<InvalidEntry> {
 
 fn invalid_verdicts(verdicts: &mut Verdicts) -> Vec<InvalidEntry> {
     let mut invalid = Vec::new();
-    remove_entries(&mut verdicts.verdicts, check_verdict, |verdict| &verdict.contributors, &mut invalid);
+    remove_entries(
+        &mut verdicts.verdicts,
+        check_verdict,
+        |verdict| &verdict.contributors,
+        &mut invalid,
+    );
     invalid
 }
 
@@ -288,7 +335,10 @@ fn remove_entries<T>(
     entries.retain(|entry| match check(entry) {
         Ok(()) => true,
         Err(reason) => {
-            invalid.push(InvalidEntry { reason, contributors: contributors(entry).to_vec() });
+            invalid.push(InvalidEntry {
+                reason,
+                contributors: contributors(entry).to_vec(),
+            });
             false
         }
     });
@@ -303,7 +353,10 @@ fn remove_named<T>(
     entries.retain(|node, entry| match check(entry) {
         Ok(()) => true,
         Err(reason) => {
-            invalid.push(InvalidEntry { reason, contributors: vec![node.clone()] });
+            invalid.push(InvalidEntry {
+                reason,
+                contributors: vec![node.clone()],
+            });
             false
         }
     });
@@ -314,16 +367,28 @@ fn check_cell_map(message: &CellMap, limits: &Limits) -> Result<(), RejectReason
         return Err(RejectReason::UnknownSchema);
     }
     check_integers([message.sent_at_us.micros()])?;
-    let GeographicOrigin { latitude_deg, longitude_deg, height_m, rotation_deg } = message.origin;
+    let GeographicOrigin {
+        latitude_deg,
+        longitude_deg,
+        height_m,
+        rotation_deg,
+    } = message.origin;
     for number in [latitude_deg, longitude_deg, height_m, rotation_deg] {
         check_between(number, f64::MIN, f64::MAX)?;
     }
-    message.origin.validate().map_err(|_| RejectReason::OutOfRange)?;
+    message
+        .origin
+        .validate()
+        .map_err(|_| RejectReason::OutOfRange)?;
     check_map(&message.map, limits)
 }
 
 fn check_verdicts(verdicts: &Verdicts, _: &Limits) -> Result<(), RejectReason> {
-    check_integers([verdicts.epoch, verdicts.round, verdicts.fused_at_us.micros()])
+    check_integers([
+        verdicts.epoch,
+        verdicts.round,
+        verdicts.fused_at_us.micros(),
+    ])
 }
 
 fn check_reputations(reputations: &Reputations, _: &Limits) -> Result<(), RejectReason> {
@@ -339,22 +404,48 @@ fn check_reputation(reputation: &Reputation) -> Result<(), RejectReason> {
 }
 
 fn check_cell_reputation(counts: &CellReputation, _: &Limits) -> Result<(), RejectReason> {
-    let CellReputation { correct, incorrect, old_correct, old_incorrect, reset_at_us, .. } = *counts;
-    check_integers([correct, incorrect].into_iter().chain(reset_at_us.map(Timestamp::micros)))?;
+    let CellReputation {
+        correct,
+        incorrect,
+        old_correct,
+        old_incorrect,
+        reset_at_us,
+        ..
+    } = *counts;
+    check_integers(
+        [correct, incorrect]
+            .into_iter()
+            .chain(reset_at_us.map(Timestamp::micros)),
+    )?;
     let is_possible = old_correct <= correct && old_incorrect <= incorrect;
-    if is_possible { Ok(()) } else { Err(RejectReason::Implausible) }
+    if is_possible {
+        Ok(())
+    } else {
+        Err(RejectReason::Implausible)
+    }
 }
 
 fn check_share(share: &LedgerShare, _: &Limits) -> Result<(), RejectReason> {
     if share.entries.len() > MAX_SHARE_ENTRIES || share.marks.len() > MAX_SHARE_ENTRIES {
         return Err(RejectReason::TooManyObjects);
     }
-    if share.signed.as_ref().is_some_and(|signed| signed.certificate.len().max(signed.signature.len()) > MAX_TEXT) {
+    if share
+        .signed
+        .as_ref()
+        .is_some_and(|signed| signed.certificate.len().max(signed.signature.len()) > MAX_TEXT)
+    {
         return Err(RejectReason::TooLarge);
     }
-    check_integers(share.epoch.into_iter().chain(share.reset_at_us.map(Timestamp::micros)))?;
+    check_integers(
+        share
+            .epoch
+            .into_iter()
+            .chain(share.reset_at_us.map(Timestamp::micros)),
+    )?;
     let mut marks = share.marks.iter();
-    marks.try_for_each(|mark| check_integers([mark.epoch, mark.number, mark.correct, mark.incorrect]))?;
+    marks.try_for_each(|mark| {
+        check_integers([mark.epoch, mark.number, mark.correct, mark.incorrect])
+    })?;
     share.entries.iter().try_for_each(|entry| {
         check_integers([entry.epoch, entry.correct, entry.incorrect])?;
         check_labels([&*entry.label])
@@ -377,7 +468,11 @@ fn check_status(status: &NodeStatus, _: &Limits) -> Result<(), RejectReason> {
         return Err(RejectReason::TooManyObjects);
     }
     status.troubles.iter().try_for_each(check_trouble)?;
-    if status.page.as_ref().is_some_and(|page| page.parse::<SocketAddr>().is_err()) {
+    if status
+        .page
+        .as_ref()
+        .is_some_and(|page| page.parse::<SocketAddr>().is_err())
+    {
         return Err(RejectReason::InvalidLabel);
     }
     check_labels([&*status.version])
@@ -405,7 +500,12 @@ fn check_landmark(state: &LandmarkState) -> Result<(), RejectReason> {
     check_place(state.x_m, state.y_m)?;
     check_confidence(state.confidence)?;
     let read = state.readings.iter().map(|reading| &*reading.label);
-    check_labels([&*state.id].into_iter().chain(state.label.as_deref()).chain(read))
+    check_labels(
+        [&*state.id]
+            .into_iter()
+            .chain(state.label.as_deref())
+            .chain(read),
+    )
 }
 
 impl FusedObject {
@@ -420,7 +520,8 @@ impl FusedObject {
         self.existence.map_or(Ok(()), check_confidence)?;
         check_motion(self.velocity_mps, self.heading_rad, self.size_m)?;
         check_scores(&self.scores)?;
-        self.age_s.map_or(Ok(()), |age_s| check_between(age_s, 0.0, COUNT_BOUND))?;
+        self.age_s
+            .map_or(Ok(()), |age_s| check_between(age_s, 0.0, COUNT_BOUND))?;
         check_integers(self.first_seen_us.map(Timestamp::micros))?;
         check_labels([&*self.label])
     }
@@ -446,8 +547,13 @@ fn check_motion(
 ) -> Result<(), RejectReason> {
     let mut speeds = velocity_mps.into_iter().flatten();
     speeds.try_for_each(|speed| check_between(speed, -SPEED_BOUND_MPS, SPEED_BOUND_MPS))?;
-    heading_rad.map_or(Ok(()), |heading| check_between(heading, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD))?;
-    size_m.into_iter().flatten().try_for_each(|size| check_between(size, 0.0, SIZE_BOUND_M))
+    heading_rad.map_or(Ok(()), |heading| {
+        check_between(heading, -ANGLE_BOUND_RAD, ANGLE_BOUND_RAD)
+    })?;
+    size_m
+        .into_iter()
+        .flatten()
+        .try_for_each(|size| check_between(size, 0.0, SIZE_BOUND_M))
 }
 
 fn check_scores(scores: &BTreeMap<Label, f64>) -> Result<(), RejectReason> {
@@ -467,11 +573,17 @@ fn check_between(value: f64, low: f64, high: f64) -> Result<(), RejectReason> {
 }
 
 fn check_verdict(verdict: &Verdict) -> Result<(), RejectReason> {
-    let mut scores = [verdict.score].into_iter().chain(verdict.votes.values().copied());
+    let mut scores = [verdict.score]
+        .into_iter()
+        .chain(verdict.votes.values().copied());
     scores.try_for_each(|score| check_between(score, -SCORE_BOUND, SCORE_BOUND))?;
     check_between(verdict.margin, 0.0, SCORE_BOUND)?;
     let labels = verdict.votes.keys().chain(&verdict.label);
-    check_labels([&*verdict.landmark].into_iter().chain(labels.map(|label| &**label)))
+    check_labels(
+        [&*verdict.landmark]
+            .into_iter()
+            .chain(labels.map(|label| &**label)),
+    )
 }
 
 fn check_place(x_m: f64, y_m: f64) -> Result<(), RejectReason> {
@@ -480,7 +592,11 @@ fn check_place(x_m: f64, y_m: f64) -> Result<(), RejectReason> {
 }
 
 fn check_coordinate(coordinate_m: f64) -> Result<(), RejectReason> {
-    if coordinate_m.abs() <= WORLD_BOUND_M { Ok(()) } else { Err(RejectReason::NotFinite) }
+    if coordinate_m.abs() <= WORLD_BOUND_M {
+        Ok(())
+    } else {
+        Err(RejectReason::NotFinite)
+    }
 }
 
 fn check_covariance(covariance: Covariance) -> Result<(), RejectReason> {
@@ -500,11 +616,19 @@ fn check_confidence(confidence: f64) -> Result<(), RejectReason> {
 }
 
 fn check_labels<'a>(labels: impl IntoIterator<Item = &'a str>) -> Result<(), RejectReason> {
-    if labels.into_iter().all(is_label) { Ok(()) } else { Err(RejectReason::InvalidLabel) }
+    if labels.into_iter().all(is_label) {
+        Ok(())
+    } else {
+        Err(RejectReason::InvalidLabel)
+    }
 }
 
 fn check_integers(values: impl IntoIterator<Item = u64>) -> Result<(), RejectReason> {
-    if values.into_iter().all(|value| value <= MAX_INTEGER) { Ok(()) } else { Err(RejectReason::OutOfRange) }
+    if values.into_iter().all(|value| value <= MAX_INTEGER) {
+        Ok(())
+    } else {
+        Err(RejectReason::OutOfRange)
+    }
 }
 
 #[cfg(test)]

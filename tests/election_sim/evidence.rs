@@ -32,26 +32,64 @@ pub(crate) struct Votes {
 impl Votes {
     /// Settles one more vote of a vehicle; returns it as evidence.
     fn settle(&mut self, lane: &Epoch, node: NodeName, correct: bool) -> Evidence {
-        let add = |counts: &mut Counts| if correct { counts.correct += 1 } else { counts.incorrect += 1 };
-        let course = self.courses.entry((lane.clone(), node.clone())).or_default();
+        let add = |counts: &mut Counts| {
+            if correct {
+                counts.correct += 1
+            } else {
+                counts.incorrect += 1
+            }
+        };
+        let course = self
+            .courses
+            .entry((lane.clone(), node.clone()))
+            .or_default();
         let label = Label::from(LABELS[course.len() % LABELS.len()]);
         let mut sum = course.last().copied().unwrap_or_default();
         add(&mut sum);
         course.push(sum);
-        add(self.counts.entry(EntryKey { lane: lane.clone(), node: node.clone(), label: label.clone() }).or_default());
-        Evidence { node, label, correct }
+        add(self
+            .counts
+            .entry(EntryKey {
+                lane: lane.clone(),
+                node: node.clone(),
+                label: label.clone(),
+            })
+            .or_default());
+        Evidence {
+            node,
+            label,
+            correct,
+        }
     }
 
     /// True if an entry counts no more votes than were settled.
     fn hold(&self, entry: &LedgerEntry) -> bool {
-        let LedgerEntry { epoch, aggregator, node, label, correct, incorrect } = entry.clone();
-        let settled = self.counts.get(&EntryKey { lane: Epoch::new(epoch, aggregator), node, label });
+        let LedgerEntry {
+            epoch,
+            aggregator,
+            node,
+            label,
+            correct,
+            incorrect,
+        } = entry.clone();
+        let settled = self.counts.get(&EntryKey {
+            lane: Epoch::new(epoch, aggregator),
+            node,
+            label,
+        });
         settled.is_some_and(|settled| correct <= settled.correct && incorrect <= settled.incorrect)
     }
 
     /// True if a mark holds the counts that a vehicle once had.
     fn passed(&self, mark: &LedgerMark) -> bool {
-        let LedgerMark { epoch, aggregator, node, correct, incorrect, .. } = mark.clone();
+        let LedgerMark {
+            epoch,
+            aggregator,
+            node,
+            correct,
+            incorrect,
+            ..
+        } = mark.clone();
         let course = self.courses.get(&(Epoch::new(epoch, aggregator), node));
         let votes = (correct + incorrect) as usize;
         let counts = course.and_then(|course| course.get(votes.checked_sub(1)?));
@@ -89,12 +127,24 @@ impl World {
         let candidates = self.candidates(to);
         let now = Timestamp(self.now).shifted(self.nodes[to].steady_clock);
         let node = &mut self.nodes[to];
-        if let Ok(merged) = node.resync.merge(share, &mut node.ledger, &candidates, &node.leadership, now, now) {
+        if let Ok(merged) = node.resync.merge(
+            share,
+            &mut node.ledger,
+            &candidates,
+            &node.leadership,
+            now,
+            now,
+        ) {
             if !self.nodes[to].signs {
                 self.judge_merge(to, share);
             }
             self.share(to, merged.shares);
-            self.handle(to, Input::EvidenceReceived { from: share.node.clone() });
+            self.handle(
+                to,
+                Input::EvidenceReceived {
+                    from: share.node.clone(),
+                },
+            );
         }
     }
 
@@ -106,15 +156,29 @@ impl World {
         let counts = |term: u64, aggregator: &NodeName| {
             let lane = Epoch::new(term, aggregator.clone());
             let is_of_leader = |now: &Epoch| now.leader == lane.leader && lane <= *now;
-            let is_told_by_another =
-                share.node != lane.leader && node.leadership.present_epoch().is_some_and(is_of_leader);
+            let is_told_by_another = share.node != lane.leader
+                && node.leadership.present_epoch().is_some_and(is_of_leader);
             node.leadership.knows_term(term) && !is_told_by_another
         };
-        let entries = share.entries.iter().filter(|entry| counts(entry.epoch, &entry.aggregator));
+        let entries = share
+            .entries
+            .iter()
+            .filter(|entry| counts(entry.epoch, &entry.aggregator));
         told.merge_entries(entries.cloned(), None);
-        told.merge_marks(share.marks.iter().filter(|mark| counts(mark.epoch, &mark.aggregator)).cloned(), None);
+        told.merge_marks(
+            share
+                .marks
+                .iter()
+                .filter(|mark| counts(mark.epoch, &mark.aggregator))
+                .cloned(),
+            None,
+        );
         let lacks = told.beyond(&node.ledger);
-        assert!(lacks.0.is_empty() && lacks.1.is_empty(), "{} was told {lacks:?} and does not know it", node.name);
+        assert!(
+            lacks.0.is_empty() && lacks.1.is_empty(),
+            "{} was told {lacks:?} and does not know it",
+            node.name
+        );
     }
 
     /// A publication period has passed.
@@ -122,26 +186,44 @@ impl World {
         let now = Timestamp(self.now).shifted(self.nodes[index].steady_clock);
         let node = &mut self.nodes[index];
         let lost = node.saved.beyond(&node.ledger);
-        assert!(lost.0.is_empty() && lost.1.is_empty(), "{} forgot {lost:?}", node.name);
+        assert!(
+            lost.0.is_empty() && lost.1.is_empty(),
+            "{} forgot {lost:?}",
+            node.name
+        );
         node.saved.clone_from(&node.ledger);
         node.saved.end_trials(now, |_| true);
-        let shares = node.resync.tick(&mut node.ledger, &node.leadership, now).shares;
+        let shares = node
+            .resync
+            .tick(&mut node.ledger, &node.leadership, now)
+            .shares;
         self.share(index, shares);
         self.push_to(index, PUBLISH_PERIOD, Arrival::Keep);
     }
 
     /// The other nodes that may lead, as a node's membership knows them.
     fn candidates(&self, of: usize) -> Vec<NodeName> {
-        let members = self.nodes[of].members.keys().map(|member| &self.nodes[*member]);
-        members.filter(|node| node.config.role != Role::Cav).map(|node| node.name.clone()).collect()
+        let members = self.nodes[of]
+            .members
+            .keys()
+            .map(|member| &self.nodes[*member]);
+        members
+            .filter(|node| node.config.role != Role::Cav)
+            .map(|node| node.name.clone())
+            .collect()
     }
 
     /// All that the living candidates know. Signed evidence counts if another than its aggregator passes it on.
     pub(crate) fn known_evidence(&self) -> ReputationLedger {
         let mut all = ReputationLedger::default();
-        for (_, node) in self.alive().filter(|(_, node)| node.config.role != Role::Cav) {
+        for (_, node) in self
+            .alive()
+            .filter(|(_, node)| node.config.role != Role::Cav)
+        {
             if node.signs {
-                node.ledger.statements().for_each(|share| _ = all.merge_share(share, None));
+                node.ledger
+                    .statements()
+                    .for_each(|share| _ = all.merge_share(share, None));
             } else {
                 all.merge(&node.ledger);
             }
@@ -151,7 +233,10 @@ impl World {
 
     /// Checks that every living candidate knows all of `known`.
     pub(crate) fn everyone_knows(&self, known: &ReputationLedger) -> Result<(), String> {
-        for (_, node) in self.alive().filter(|(_, node)| node.config.role != Role::Cav) {
+        for (_, node) in self
+            .alive()
+            .filter(|(_, node)| node.config.role != Role::Cav)
+        {
             let (entries, marks) = known.beyond(&node.ledger);
             if !entries.is_empty() || !marks.is_empty() {
                 return Err(format!("{} lacks {entries:?} {marks:?}", node.name));
@@ -164,19 +249,34 @@ impl World {
     pub(crate) fn nothing_is_counted_twice(&self) -> Result<(), String> {
         for (_, node) in self.alive() {
             if let Some(entry) = node.ledger.entries().find(|entry| !self.votes.hold(entry)) {
-                return Err(format!("{} counts votes that nobody settled: {entry:?}", node.name));
+                return Err(format!(
+                    "{} counts votes that nobody settled: {entry:?}",
+                    node.name
+                ));
             }
             if let Some(mark) = node.ledger.marks().find(|mark| !self.votes.passed(mark)) {
-                return Err(format!("{} has a mark that nobody reached: {mark:?}", node.name));
+                return Err(format!(
+                    "{} has a mark that nobody reached: {mark:?}",
+                    node.name
+                ));
             }
             let mut sums: BTreeMap<NodeName, (u64, u64)> = BTreeMap::new();
-            for LedgerEntry { node, correct, incorrect, .. } in node.ledger.entries() {
+            for LedgerEntry {
+                node,
+                correct,
+                incorrect,
+                ..
+            } in node.ledger.entries()
+            {
                 let sum = sums.entry(node).or_default();
                 *sum = (sum.0 + correct, sum.1 + incorrect);
             }
             let totals = node.ledger.totals();
             if totals != sums {
-                return Err(format!("{} has totals {totals:?} of counts {sums:?}", node.name));
+                return Err(format!(
+                    "{} has totals {totals:?} of counts {sums:?}",
+                    node.name
+                ));
             }
         }
         Ok(())

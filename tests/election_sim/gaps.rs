@@ -25,15 +25,38 @@ pub(super) fn failover_gap(seed: u64, seen: bool, victims: usize) -> Option<u64>
         world.plan(0, Fault::Kill { node: leader, seen });
         if victims > 1 {
             let standby = world.nodes[leader].standby().cloned();
-            let standby = world.nodes.iter().position(|node| Some(&node.name) == standby.as_ref());
-            world.plan(0, Fault::Kill { node: standby.ok_or("no standby")?, seen });
+            let standby = world
+                .nodes
+                .iter()
+                .position(|node| Some(&node.name) == standby.as_ref());
+            world.plan(
+                0,
+                Fault::Kill {
+                    node: standby.ok_or("no standby")?,
+                    seen,
+                },
+            );
         }
         world.run_for(2 * SECOND);
         ensure(world.led.len() == changes + 1, "not exactly one new leader")?;
         for (_, node) in world.alive() {
-            let times: Vec<u64> = node.accepted.iter().map(|map| map.at).filter(|at| at + SECOND > from).collect();
-            ensure(times.last().is_some_and(|at| at + SECOND > world.now), "a vehicle is not served")?;
-            gap = gap.max(times.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(0));
+            let times: Vec<u64> = node
+                .accepted
+                .iter()
+                .map(|map| map.at)
+                .filter(|at| at + SECOND > from)
+                .collect();
+            ensure(
+                times.last().is_some_and(|at| at + SECOND > world.now),
+                "a vehicle is not served",
+            )?;
+            gap = gap.max(
+                times
+                    .windows(2)
+                    .map(|pair| pair[1] - pair[0])
+                    .max()
+                    .unwrap_or(0),
+            );
         }
         Ok(())
     });
@@ -49,8 +72,12 @@ pub(super) fn split_gap(seed: u64) -> Option<u64> {
     check(&mut world, seed, |world| {
         let settle = world.random.between(0, 200 * MS);
         world.run_for(9 * SECOND + settle);
-        let Some(leader) = world.leaders().first().copied() else { return Ok(()) };
-        let away: Vec<bool> = (0..world.nodes.len()).map(|node| node != leader && world.random.chance(50)).collect();
+        let Some(leader) = world.leaders().first().copied() else {
+            return Ok(());
+        };
+        let away: Vec<bool> = (0..world.nodes.len())
+            .map(|node| node != leader && world.random.chance(50))
+            .collect();
         if !(0..away.len()).any(|node| away[node] && world.nodes[node].config.role != Role::Cav) {
             return Ok(());
         }
@@ -58,8 +85,16 @@ pub(super) fn split_gap(seed: u64) -> Option<u64> {
         let from = world.now;
         world.run_for(2 * SECOND);
         for (_, node) in world.alive().filter(|(index, _)| away[*index]) {
-            let times: Vec<u64> = node.accepted.iter().map(|map| map.at).filter(|at| at + SECOND > from).collect();
-            ensure(times.last().is_some_and(|at| at + SECOND > world.now), "a vehicle is not served")?;
+            let times: Vec<u64> = node
+                .accepted
+                .iter()
+                .map(|map| map.at)
+                .filter(|at| at + SECOND > from)
+                .collect();
+            ensure(
+                times.last().is_some_and(|at| at + SECOND > world.now),
+                "a vehicle is not served",
+            )?;
             gap = gap.max(times.windows(2).map(|pair| pair[1] - pair[0]).max());
         }
         let changes = world.led.len();
@@ -67,7 +102,10 @@ pub(super) fn split_gap(seed: u64) -> Option<u64> {
         world.run_for(13 * SECOND);
         one_best_leader(world)?;
         // The sides become one, and the best of both may have to be handed the lead.
-        ensure(world.led.len() <= changes + 2, "the lead moved more than twice when the split healed")
+        ensure(
+            world.led.len() <= changes + 2,
+            "the lead moved more than twice when the split healed",
+        )
     });
     gap
 }
@@ -86,6 +124,16 @@ pub(super) fn report(what: &str, gaps: &mut [(u64, u64)], bound: u64) {
     gaps.sort_unstable();
     let (longest, seed) = gaps.last().copied().expect("a cell that is large enough");
     let at = |percent: usize| gaps[(gaps.len() - 1) * percent / 100].0 as f64 / MS as f64;
-    println!("{what}: verdict gap p50 {} p99 {} max {} ms over {} cells", at(50), at(99), at(100), gaps.len());
-    assert!(longest <= bound, "{what}: a gap of {} ms, replay with SEED={seed}", at(100));
+    println!(
+        "{what}: verdict gap p50 {} p99 {} max {} ms over {} cells",
+        at(50),
+        at(99),
+        at(100),
+        gaps.len()
+    );
+    assert!(
+        longest <= bound,
+        "{what}: a gap of {} ms, replay with SEED={seed}",
+        at(100)
+    );
 }

@@ -12,20 +12,39 @@ use crate::world::{MS, World};
 #[test]
 fn a_leader_at_whose_broker_most_cannot_log_in_makes_way() {
     for_seeds(seeds() / 10, |seed| {
-        let Some((mut world, leader)) = settled(seed) else { return };
+        let Some((mut world, leader)) = settled(seed) else {
+            return;
+        };
         check(&mut world, seed, |world| {
             let changes = world.led.len();
             bar(world, leader);
             world.run_for(8 * SECOND);
-            ensure(!world.nodes[leader].leads(), "the leader that most cannot reach still leads")?;
+            ensure(
+                !world.nodes[leader].leads(),
+                "the leader that most cannot reach still leads",
+            )?;
             most_are_logged_in(world)?;
-            ensure(world.led.len() <= changes + 2, "the lead moved more than twice")?;
+            ensure(
+                world.led.len() <= changes + 2,
+                "the lead moved more than twice",
+            )?;
             // Leaders publish at their standby's broker, too, and hand the lead over while they publish.
             for (_, node) in world.alive() {
-                let times: Vec<u64> =
-                    node.accepted.iter().map(|map| map.at).filter(|at| at + 8 * SECOND > world.now).collect();
-                let gap = times.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(u64::MAX);
-                ensure(gap <= 250 * MS, &format!("{} got no round for {gap} µs", node.name))?;
+                let times: Vec<u64> = node
+                    .accepted
+                    .iter()
+                    .map(|map| map.at)
+                    .filter(|at| at + 8 * SECOND > world.now)
+                    .collect();
+                let gap = times
+                    .windows(2)
+                    .map(|pair| pair[1] - pair[0])
+                    .max()
+                    .unwrap_or(u64::MAX);
+                ensure(
+                    gap <= 250 * MS,
+                    &format!("{} got no round for {gap} µs", node.name),
+                )?;
             }
             let changes = world.led.len();
             world.run_for(20 * SECOND);
@@ -41,10 +60,20 @@ fn a_leader_at_whose_broker_most_cannot_log_in_makes_way() {
 #[test]
 fn followers_of_a_successor_that_they_cannot_reach_go_on_to_the_next() {
     for_seeds(seeds() / 10, |seed| {
-        let Some((mut world, leader)) = settled(seed) else { return };
-        let Some(standby) = standby_of(&world, leader).filter(|_| world.nodes.len() > 3) else { return };
+        let Some((mut world, leader)) = settled(seed) else {
+            return;
+        };
+        let Some(standby) = standby_of(&world, leader).filter(|_| world.nodes.len() > 3) else {
+            return;
+        };
         check(&mut world, seed, |world| {
-            world.plan(0, Fault::Kill { node: leader, seen: true });
+            world.plan(
+                0,
+                Fault::Kill {
+                    node: leader,
+                    seen: true,
+                },
+            );
             bar(world, standby);
             world.run_for(10 * SECOND);
             ensure(world.leaders().len() == 1, "not one leader")?;
@@ -57,15 +86,31 @@ fn followers_of_a_successor_that_they_cannot_reach_go_on_to_the_next() {
 #[test]
 fn nobody_waits_for_a_standby_that_most_cannot_reach() {
     for_seeds(seeds() / 10, |seed| {
-        let Some((mut world, leader)) = settled(seed) else { return };
-        let Some(standby) = standby_of(&world, leader).filter(|_| world.nodes.len() > 3) else { return };
+        let Some((mut world, leader)) = settled(seed) else {
+            return;
+        };
+        let Some(standby) = standby_of(&world, leader).filter(|_| world.nodes.len() > 3) else {
+            return;
+        };
         check(&mut world, seed, |world| {
             bar(world, standby);
             world.run_for(6 * SECOND);
-            ensure(standby_of(world, leader) != Some(standby), "it is still the standby")?;
-            world.plan(0, Fault::Kill { node: leader, seen: true });
+            ensure(
+                standby_of(world, leader) != Some(standby),
+                "it is still the standby",
+            )?;
+            world.plan(
+                0,
+                Fault::Kill {
+                    node: leader,
+                    seen: true,
+                },
+            );
             world.run_for(500 * MS);
-            ensure(world.leaders().len() == 1 && !world.nodes[standby].leads(), "it leads")?;
+            ensure(
+                world.leaders().len() == 1 && !world.nodes[standby].leads(),
+                "it leads",
+            )?;
             most_are_logged_in(world)
         });
     });
@@ -81,7 +126,12 @@ fn one_node_that_cannot_log_in_moves_no_lead() {
             world.run_for(9 * SECOND);
             let (leader, nodes) = (world.leaders()[0], world.nodes.len());
             let node = (leader + 1) % nodes;
-            let rank = |node: usize| (world.nodes[node].config.role, world.nodes[node].config.priority);
+            let rank = |node: usize| {
+                (
+                    world.nodes[node].config.role,
+                    world.nodes[node].config.priority,
+                )
+            };
             if nodes == 2 && rank(node) == rank(leader) {
                 return Ok(());
             }
@@ -98,7 +148,12 @@ fn one_node_that_cannot_log_in_moves_no_lead() {
 /// A cell in peace with a second candidate and three nodes at least, and its leader.
 fn settled(seed: u64) -> Option<(World, usize)> {
     let mut world = cell(seed);
-    for node in world.nodes.iter_mut().filter(|node| node.config.role == Role::Cav).take(2) {
+    for node in world
+        .nodes
+        .iter_mut()
+        .filter(|node| node.config.role == Role::Cav)
+        .take(2)
+    {
         node.config.role = Role::Auto;
     }
     if world.nodes.len() < 3 {
@@ -112,7 +167,9 @@ fn settled(seed: u64) -> Option<(World, usize)> {
 
 /// Bars more than half of the other nodes, two at least, from a broker.
 fn bar(world: &mut World, broker: usize) {
-    let mut others: Vec<_> = (0..world.nodes.len()).filter(|node| *node != broker).collect();
+    let mut others: Vec<_> = (0..world.nodes.len())
+        .filter(|node| *node != broker)
+        .collect();
     let least = (others.len() / 2 + 1).max(2);
     let barred = world.random.between(least as u64, others.len() as u64) as usize;
     for _ in 0..barred.min(others.len()) {
@@ -128,9 +185,16 @@ fn standby_of(world: &World, leader: usize) -> Option<usize> {
 
 /// At least half of the followers are logged in at the leader's broker, so that it gets their reports.
 fn most_are_logged_in(world: &World) -> Result<(), String> {
-    let [leader] = world.leaders()[..] else { return Err("not one leader".to_owned()) };
+    let [leader] = world.leaders()[..] else {
+        return Err("not one leader".to_owned());
+    };
     let followers = || world.alive().filter(|(index, _)| *index != leader);
-    let served = followers().filter(|(_, node)| node.links.get(&leader) == Some(&LinkState::Up)).count();
+    let served = followers()
+        .filter(|(_, node)| node.links.get(&leader) == Some(&LinkState::Up))
+        .count();
     let all = followers().count();
-    ensure(2 * served >= all, &format!("only {served} of {all} are logged in at the leader's broker"))
+    ensure(
+        2 * served >= all,
+        &format!("only {served} of {all} are logged in at the leader's broker"),
+    )
 }

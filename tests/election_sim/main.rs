@@ -53,7 +53,9 @@ fn a_cell_left_alone_has_the_best_leader() {
 #[test]
 fn a_killed_leader_is_replaced_in_200_ms() {
     let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| gaps.extend(failover_gap(seed, true, 1).map(|gap| (gap, seed))));
+    for_seeds(seeds() / 10, |seed| {
+        gaps.extend(failover_gap(seed, true, 1).map(|gap| (gap, seed)))
+    });
     report("killed", &mut gaps, 200 * MS);
 }
 
@@ -61,7 +63,9 @@ fn a_killed_leader_is_replaced_in_200_ms() {
 #[test]
 fn a_leader_killed_with_its_standby_is_replaced_in_200_ms() {
     let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| gaps.extend(failover_gap(seed, true, 2).map(|gap| (gap, seed))));
+    for_seeds(seeds() / 10, |seed| {
+        gaps.extend(failover_gap(seed, true, 2).map(|gap| (gap, seed)))
+    });
     report("killed with its standby", &mut gaps, 200 * MS);
 }
 
@@ -69,7 +73,9 @@ fn a_leader_killed_with_its_standby_is_replaced_in_200_ms() {
 #[test]
 fn a_silent_leader_is_replaced_in_400_ms() {
     let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| gaps.extend(failover_gap(seed, false, 1).map(|gap| (gap, seed))));
+    for_seeds(seeds() / 10, |seed| {
+        gaps.extend(failover_gap(seed, false, 1).map(|gap| (gap, seed)))
+    });
     report("silent", &mut gaps, 400 * MS);
 }
 
@@ -78,7 +84,9 @@ fn a_silent_leader_is_replaced_in_400_ms() {
 #[test]
 fn a_side_without_the_leader_has_its_own_in_400_ms() {
     let mut gaps = Vec::new();
-    for_seeds(seeds() / 10, |seed| gaps.extend(split_gap(seed).map(|gap| (gap, seed))));
+    for_seeds(seeds() / 10, |seed| {
+        gaps.extend(split_gap(seed).map(|gap| (gap, seed)))
+    });
     report("split", &mut gaps, 400 * MS);
 }
 
@@ -91,22 +99,42 @@ fn handing_back_misses_and_repeats_no_round() {
         world.nodes[0].config.priority = 200;
         world.nodes[1].config.role = Role::Auto;
         start_all(&mut world);
-        world.plan(9 * SECOND, Fault::Kill { node: 0, seen: true });
+        world.plan(
+            9 * SECOND,
+            Fault::Kill {
+                node: 0,
+                seen: true,
+            },
+        );
         world.plan(10 * SECOND, Fault::Start(0));
         world.plan(10 * SECOND, Fault::Loss(seed % 6));
         check(&mut world, seed, |world| {
             world.run_for(9 * SECOND - MS);
             ensure(world.leaders() == [0], "the edge does not lead")?;
             world.run_for(3 * SECOND);
-            ensure(!world.nodes[0].leads(), "the edge leads before it is stable")?;
+            ensure(
+                !world.nodes[0].leads(),
+                "the edge leads before it is stable",
+            )?;
             let (from, changes) = (world.now, world.led.len());
             world.run_for(4 * SECOND);
             ensure(world.leaders() == [0], "the edge was not handed the lead")?;
-            ensure(world.led.len() == changes + 1, "more than one change of leadership")?;
+            ensure(
+                world.led.len() == changes + 1,
+                "more than one change of leadership",
+            )?;
             for (_, node) in world.alive() {
-                let rounds: Vec<u64> = node.accepted.iter().filter(|map| map.at >= from).map(|map| map.round).collect();
+                let rounds: Vec<u64> = node
+                    .accepted
+                    .iter()
+                    .filter(|map| map.at >= from)
+                    .map(|map| map.round)
+                    .collect();
                 ensure(rounds.len() >= 38, "too few rounds")?;
-                ensure(rounds.windows(2).all(|pair| pair[1] == pair[0] + 1), &format!("{} got {rounds:?}", node.name))?;
+                ensure(
+                    rounds.windows(2).all(|pair| pair[1] == pair[0] + 1),
+                    &format!("{} got {rounds:?}", node.name),
+                )?;
             }
             Ok(())
         });
@@ -122,7 +150,9 @@ fn the_maps_of_a_leader_that_was_cut_off_do_not_go_back_in_epoch() {
         start_all(&mut world);
         check(&mut world, seed, |world| {
             world.run_for(9 * SECOND);
-            let Some(leader) = world.leaders().first().copied() else { return Ok(()) };
+            let Some(leader) = world.leaders().first().copied() else {
+                return Ok(());
+            };
             let mut sides = vec![false; world.nodes.len()];
             sides[leader] = true;
             split(world, 0, &sides);
@@ -132,9 +162,18 @@ fn the_maps_of_a_leader_that_was_cut_off_do_not_go_back_in_epoch() {
             let loss = world.random.between(0, 30);
             world.plan(0, Fault::Loss(loss));
             let micros = world.random.between(0, 1500 * MS);
-            world.plan(0, Fault::Mute { node: leader, micros });
+            world.plan(
+                0,
+                Fault::Mute {
+                    node: leader,
+                    micros,
+                },
+            );
             world.run_for(5 * SECOND);
-            let back = world.nodes[leader].accepted.windows(2).find(|pair| pair[1].epoch < pair[0].epoch);
+            let back = world.nodes[leader]
+                .accepted
+                .windows(2)
+                .find(|pair| pair[1].epoch < pair[0].epoch);
             ensure(back.is_none(), &format!("its maps are {back:?}"))
         });
     });
@@ -161,7 +200,10 @@ fn a_one_way_link_does_not_flap() {
             world.run_for(20 * SECOND);
             ensure(world.led.len() == after, "the lead still moves")?;
             let limit = if nodes == 2 { 2 } else { 1 };
-            ensure((1..=limit).contains(&world.leaders().len()), "not one leader")
+            ensure(
+                (1..=limit).contains(&world.leaders().len()),
+                "not one leader",
+            )
         });
     });
 }
@@ -204,12 +246,27 @@ fn a_leader_without_broker_abdicates() {
         check(&mut world, seed, |world| {
             world.run_for(9 * SECOND);
             let leader = world.leaders()[0];
-            world.plan(0, Fault::Broker { node: leader, works: false });
+            world.plan(
+                0,
+                Fault::Broker {
+                    node: leader,
+                    works: false,
+                },
+            );
             world.run_for(100 * MS);
-            ensure(world.leaders().len() == 1 && world.leaders()[0] != leader, "the lead did not move")?;
+            ensure(
+                world.leaders().len() == 1 && world.leaders()[0] != leader,
+                "the lead did not move",
+            )?;
             world.run_for(5 * SECOND);
             ensure(!world.leaders().contains(&leader), "a broken node leads")?;
-            world.plan(0, Fault::Broker { node: leader, works: true });
+            world.plan(
+                0,
+                Fault::Broker {
+                    node: leader,
+                    works: true,
+                },
+            );
             world.run_for(5 * SECOND);
             one_best_leader(world)
         });
@@ -220,7 +277,10 @@ fn a_leader_without_broker_abdicates() {
 #[test]
 fn a_leader_with_a_broken_part_makes_way() {
     for_seeds(seeds() / 10, |seed| {
-        for fault in [|node, works| Fault::Fuser { node, works }, |node, works| Fault::Gateway { node, works }] {
+        for fault in [
+            |node, works| Fault::Fuser { node, works },
+            |node, works| Fault::Gateway { node, works },
+        ] {
             let mut world = cell(seed);
             world.nodes[1].config.role = Role::Auto;
             start_all(&mut world);
@@ -230,7 +290,10 @@ fn a_leader_with_a_broken_part_makes_way() {
                 world.plan(0, fault(leader, false));
                 // Rounds are missed for 2.3 s, answers for 1 s; then a look finds it out.
                 world.run_for(3 * SECOND);
-                ensure(world.leaders().len() == 1 && world.leaders()[0] != leader, "the lead did not move")?;
+                ensure(
+                    world.leaders().len() == 1 && world.leaders()[0] != leader,
+                    "the lead did not move",
+                )?;
                 world.run_for(2 * SECOND);
                 everyone_is_served(world)?;
                 ensure(!world.leaders().contains(&leader), "a broken node leads")?;
@@ -259,7 +322,10 @@ fn evidence_survives(signed: bool) {
         let mut world = cell(seed);
         let nodes = world.nodes.len();
         let has_disks = world.random.chance(50);
-        world.nodes.iter_mut().for_each(|node| (node.has_disk, node.signs) = (has_disks, signed));
+        world
+            .nodes
+            .iter_mut()
+            .for_each(|node| (node.has_disk, node.signs) = (has_disks, signed));
         start_all(&mut world);
         for _ in 0..world.random.between(1, 6) {
             plan_fault(&mut world, nodes);
@@ -268,7 +334,13 @@ fn evidence_survives(signed: bool) {
         world.run_for(leaders_end);
         // Only some candidates have heard of their last counts.
         for leader in world.leaders() {
-            world.plan(0, Fault::Kill { node: leader, seen: true });
+            world.plan(
+                0,
+                Fault::Kill {
+                    node: leader,
+                    seen: true,
+                },
+            );
         }
         world.run_for(10 * SECOND - leaders_end + SECOND);
         end_faults(&mut world);
@@ -291,9 +363,10 @@ fn evidence_survives(signed: bool) {
 fn a_standby_that_is_gone_is_not_named() {
     for_seeds(seeds() / 10, |seed| {
         // Of an unseen one, from when the leader's membership has found out, and says so within 300 ms.
-        for (fault, is_unseen, patience) in
-            [(Fault::Leave as fn(usize) -> Fault, false, 60 * MS), (unseen_kill, true, 750 * MS)]
-        {
+        for (fault, is_unseen, patience) in [
+            (Fault::Leave as fn(usize) -> Fault, false, 60 * MS),
+            (unseen_kill, true, 750 * MS),
+        ] {
             let mut world = cell(seed);
             world.nodes[1].config.role = Role::Auto;
             start_all(&mut world);
@@ -304,7 +377,9 @@ fn a_standby_that_is_gone_is_not_named() {
                     let named = world.nodes[of].standby()?.clone();
                     world.nodes.iter().position(|node| node.name == named)
                 };
-                let Some(gone) = standby(world, leader) else { return Ok(()) };
+                let Some(gone) = standby(world, leader) else {
+                    return Ok(());
+                };
                 world.plan(0, fault(gone));
                 world.run_for(MS);
                 while is_unseen && world.nodes[leader].known.contains_key(&gone) {
@@ -312,7 +387,10 @@ fn a_standby_that_is_gone_is_not_named() {
                 }
                 world.run_for(patience);
                 for (index, node) in world.alive() {
-                    ensure(standby(world, index) != Some(gone), &format!("{} still names it", node.name))?;
+                    ensure(
+                        standby(world, index) != Some(gone),
+                        &format!("{} still names it", node.name),
+                    )?;
                 }
                 world.run_for(SECOND);
                 let sent = world.packets_to(gone);
@@ -357,7 +435,11 @@ fn cell(seed: u64) -> World {
             Role::Auto
         };
         let priority = if random.chance(20) { 120 } else { 100 };
-        ElectionConfig { role, priority, ..ElectionConfig::default() }
+        ElectionConfig {
+            role,
+            priority,
+            ..ElectionConfig::default()
+        }
     });
     World::new(seed, configs.collect())
 }
@@ -414,7 +496,13 @@ fn plan_fault(world: &mut World, nodes: usize) {
         9 => {
             for _ in 0..world.random.between(1, nodes as u64) {
                 let barred = world.random.index(nodes);
-                world.plan(at, Fault::NoLogin { node: barred, broker: node });
+                world.plan(
+                    at,
+                    Fault::NoLogin {
+                        node: barred,
+                        broker: node,
+                    },
+                );
             }
         }
         _ => {
@@ -431,9 +519,27 @@ fn end_faults(world: &mut World) {
     let missing = world.random.index(world.nodes.len() * 2);
     for index in (0..world.nodes.len()).filter(|index| *index != missing) {
         world.plan(0, Fault::Start(index));
-        world.plan(0, Fault::Broker { node: index, works: true });
-        world.plan(0, Fault::Fuser { node: index, works: true });
-        world.plan(0, Fault::Gateway { node: index, works: true });
+        world.plan(
+            0,
+            Fault::Broker {
+                node: index,
+                works: true,
+            },
+        );
+        world.plan(
+            0,
+            Fault::Fuser {
+                node: index,
+                works: true,
+            },
+        );
+        world.plan(
+            0,
+            Fault::Gateway {
+                node: index,
+                works: true,
+            },
+        );
     }
 }
 
@@ -443,9 +549,18 @@ fn one_best_leader(world: &World) -> Result<(), String> {
         return Ok(());
     }
     let is_best = leaders.len() == 1 && best.contains(&leaders[0]);
-    ensure(is_best, &format!("leaders are {leaders:?}, not one of {best:?}"))?;
-    let followed: BTreeSet<_> = world.alive().map(|(_, node)| node.leader().cloned()).collect();
-    ensure(followed.len() == 1, &format!("different leaders are followed: {followed:?}"))
+    ensure(
+        is_best,
+        &format!("leaders are {leaders:?}, not one of {best:?}"),
+    )?;
+    let followed: BTreeSet<_> = world
+        .alive()
+        .map(|(_, node)| node.leader().cloned())
+        .collect();
+    ensure(
+        followed.len() == 1,
+        &format!("different leaders are followed: {followed:?}"),
+    )
 }
 
 /// Every node took a round within the last 250 ms.
@@ -454,30 +569,50 @@ fn everyone_is_served(world: &World) -> Result<(), String> {
         return Ok(());
     }
     for (_, node) in world.alive() {
-        let served = node.accepted.last().is_some_and(|map| map.at + 250 * MS > world.now);
+        let served = node
+            .accepted
+            .last()
+            .is_some_and(|map| map.at + 250 * MS > world.now);
         ensure(served, &format!("{} gets no rounds", node.name))?;
     }
     Ok(())
 }
 
 fn ensure(holds: bool, otherwise: &str) -> Result<(), String> {
-    if holds { Ok(()) } else { Err(otherwise.to_owned()) }
+    if holds {
+        Ok(())
+    } else {
+        Err(otherwise.to_owned())
+    }
 }
 
 fn check(world: &mut World, seed: u64, body: impl FnOnce(&mut World) -> Result<(), String>) {
     if let Err(reason) = body(world) {
-        let roles: Vec<_> = world.nodes.iter().map(|node| (node.config.role, node.config.priority)).collect();
-        panic!("seed {seed}: {reason}\n{roles:?}\n{}", world.history.join("\n"));
+        let roles: Vec<_> = world
+            .nodes
+            .iter()
+            .map(|node| (node.config.role, node.config.priority))
+            .collect();
+        panic!(
+            "seed {seed}: {reason}\n{roles:?}\n{}",
+            world.history.join("\n")
+        );
     }
 }
 
 fn seeds() -> u64 {
-    std::env::var("SEEDS").ok().and_then(|text| text.parse().ok()).unwrap_or(1000)
+    std::env::var("SEEDS")
+        .ok()
+        .and_then(|text| text.parse().ok())
+        .unwrap_or(1000)
 }
 
 /// Runs one seed after the other, or the one to replay.
 fn for_seeds(count: u64, mut body: impl FnMut(u64)) {
-    if let Some(seed) = std::env::var("SEED").ok().and_then(|text| text.parse().ok()) {
+    if let Some(seed) = std::env::var("SEED")
+        .ok()
+        .and_then(|text| text.parse().ok())
+    {
         return body(seed);
     }
     for seed in 0..count.max(10) {

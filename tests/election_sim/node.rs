@@ -212,7 +212,10 @@ impl Node {
             publishing: None,
             lane: None,
             rounds: RoundTrigger::new(
-                RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() },
+                RoundConfig {
+                    close: RoundClose::Periodic,
+                    ..RoundConfig::default()
+                },
                 Timestamp(0),
             ),
             broker_works: true,
@@ -236,26 +239,44 @@ impl Node {
         self.closed = (0, now);
         self.publishers = PublisherFilter::default();
         self.lane = None;
-        let resync = if self.signs { LedgerResync::signed } else { LedgerResync::new };
+        let resync = if self.signs {
+            LedgerResync::signed
+        } else {
+            LedgerResync::new
+        };
         self.resync = resync(self.name.clone(), TICKS_PER_SNAPSHOT);
         if !self.has_disk {
             self.saved = ReputationLedger::default();
         }
         self.ledger = self.saved.clone();
-        self.resync.resume(&self.ledger, Timestamp(now).shifted(self.clock));
+        self.resync
+            .resume(&self.ledger, Timestamp(now).shifted(self.clock));
         (self.known, self.members, self.links) = Default::default();
         self.leadership = Leadership::default();
         self.filter = RoundFilter::new(self.persisted, Timestamp(now).shifted(self.clock));
-        let status = NodeStatus::starting(self.name.clone(), Uuid::from_u128(self.life.into()), self.config.role, "");
+        let status = NodeStatus::starting(
+            self.name.clone(),
+            Uuid::from_u128(self.life.into()),
+            self.config.role,
+            "",
+        );
         let settings = NodeSettings {
             election: self.config.clone(),
-            plane: DataPlane { external: None, embedded: true },
+            plane: DataPlane {
+                external: None,
+                embedded: true,
+            },
             round_period: Duration::from_millis(100),
             keeps_reputations: true,
             status,
         };
         let clock = Timestamp(now).shifted(self.clock);
-        self.machine = Some(LeadershipNode::new(settings, self.persisted, &self.leadership, clock));
+        self.machine = Some(LeadershipNode::new(
+            settings,
+            self.persisted,
+            &self.leadership,
+            clock,
+        ));
     }
 
     pub(crate) fn election(&self) -> Option<&Election> {
@@ -282,12 +303,21 @@ impl Node {
     /// Rounds that the fuser has closed by `now`, published or not.
     pub(crate) fn rounds_due(&self, now: u64) -> u64 {
         let (closed, since) = self.closed;
-        if self.fuser_works { closed + (now - since) / 100_000 } else { closed }
+        if self.fuser_works {
+            closed + (now - since) / 100_000
+        } else {
+            closed
+        }
     }
 
     /// Answers of broker, gateway and fuser.
     pub(crate) fn sample(&self) -> HealthSample {
-        let links = || self.links.iter().map(|(broker, state)| (address_of(*broker), *state)).collect();
+        let links = || {
+            self.links
+                .iter()
+                .map(|(broker, state)| (address_of(*broker), *state))
+                .collect()
+        };
         let links = self.gateway_works.then(links);
         HealthSample {
             broker_serves: self.broker_works,
@@ -304,7 +334,10 @@ const TICKS_PER_SNAPSHOT: u32 = 4;
 
 /// Where a node's broker listens.
 pub(crate) fn broker_of(index: usize) -> SocketAddr {
-    SocketAddr::from(([10, 0, 0, u8::try_from(index + 1).expect("a small cell")], 1883))
+    SocketAddr::from((
+        [10, 0, 0, u8::try_from(index + 1).expect("a small cell")],
+        1883,
+    ))
 }
 
 pub(crate) fn address_of(index: usize) -> BrokerAddress {

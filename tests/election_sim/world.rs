@@ -78,7 +78,11 @@ impl Ord for Planned {
 
 impl World {
     pub(crate) fn new(seed: u64, configs: Vec<ElectionConfig>) -> Self {
-        let nodes = configs.into_iter().enumerate().map(|(index, config)| Node::new(index, config)).collect();
+        let nodes = configs
+            .into_iter()
+            .enumerate()
+            .map(|(index, config)| Node::new(index, config))
+            .collect();
         let mut world = Self {
             now: START,
             nodes,
@@ -107,7 +111,9 @@ impl World {
     pub(crate) fn run_for(&mut self, micros: u64) {
         let end = self.now + micros;
         while self.queue.peek().is_some_and(|next| next.at <= end) {
-            let Some(Planned { at, event, .. }) = self.queue.pop() else { break };
+            let Some(Planned { at, event, .. }) = self.queue.pop() else {
+                break;
+            };
             self.now = at;
             self.happen(event);
         }
@@ -115,30 +121,58 @@ impl World {
     }
 
     pub(crate) fn alive(&self) -> impl Iterator<Item = (usize, &Node)> {
-        self.nodes.iter().enumerate().filter(|(_, node)| node.machine.is_some())
+        self.nodes
+            .iter()
+            .enumerate()
+            .filter(|(_, node)| node.machine.is_some())
     }
 
     pub(crate) fn leaders(&self) -> Vec<usize> {
-        self.alive().filter(|(_, node)| node.leads()).map(|(index, _)| index).collect()
+        self.alive()
+            .filter(|(_, node)| node.leads())
+            .map(|(index, _)| index)
+            .collect()
     }
 
     /// The nodes of which one should lead when all is well: candidates of the best role and priority.
     pub(crate) fn best(&self) -> Vec<usize> {
-        let rank = |node: &Node| (node.config.role != Role::Edge, Reverse(node.config.priority));
-        let candidates = || self.alive().filter(|(_, node)| node.config.role != Role::Cav);
+        let rank = |node: &Node| {
+            (
+                node.config.role != Role::Edge,
+                Reverse(node.config.priority),
+            )
+        };
+        let candidates = || {
+            self.alive()
+                .filter(|(_, node)| node.config.role != Role::Cav)
+        };
         let best = candidates().map(|(_, node)| rank(node)).min();
-        candidates().filter(|(_, node)| Some(rank(node)) == best).map(|(index, _)| index).collect()
+        candidates()
+            .filter(|(_, node)| Some(rank(node)) == best)
+            .map(|(index, _)| index)
+            .collect()
     }
 
     fn push(&mut self, after: u64, event: Event) {
         self.events += 1;
-        self.queue.push(Planned { at: self.now + after, number: self.events, event });
+        self.queue.push(Planned {
+            at: self.now + after,
+            number: self.events,
+            event,
+        });
     }
 
     /// Lets something reach the present run of a node `after` µs from now.
     pub(crate) fn push_to(&mut self, node: usize, after: u64, arrival: Arrival) {
         let life = self.nodes[node].life;
-        self.push(after, Event::At { node, life, arrival });
+        self.push(
+            after,
+            Event::At {
+                node,
+                life,
+                arrival,
+            },
+        );
     }
 
     fn happen(&mut self, event: Event) {
@@ -151,7 +185,11 @@ impl World {
                 }
                 self.arm(node);
             }
-            Event::At { node: index, life, arrival } => {
+            Event::At {
+                node: index,
+                life,
+                arrival,
+            } => {
                 let node = &mut self.nodes[index];
                 if node.life != life || node.machine.is_none() {
                     return;
@@ -168,23 +206,48 @@ impl World {
     fn reach(&mut self, to: usize, arrival: Arrival) {
         match arrival {
             Arrival::Packet { from, bytes } => {
-                let message = ElectionMessage::decode(&bytes).expect("nodes send what nodes can read");
+                let message =
+                    ElectionMessage::decode(&bytes).expect("nodes send what nodes can read");
                 let from = self.nodes[from].name.clone();
-                self.handle(to, Input::Receive { from, rights: Rights::ALL, message });
+                self.handle(
+                    to,
+                    Input::Receive {
+                        from,
+                        rights: Rights::ALL,
+                        message,
+                    },
+                );
             }
             Arrival::Relay { from, map } => self.relay(to, from, &map),
             Arrival::Map { map } => self.accept(to, &map),
             Arrival::Share { share } => self.take_share(to, &share),
             // A membership tells its news in order.
-            Arrival::Tell { about, about_life, is_there }
-                if self.nodes[to].known.get(&about) != is_there.then_some(&about_life) => {}
-            Arrival::Tell { about, about_life, is_there: true } => {
+            Arrival::Tell {
+                about,
+                about_life,
+                is_there,
+            } if self.nodes[to].known.get(&about) != is_there.then_some(&about_life) => {}
+            Arrival::Tell {
+                about,
+                about_life,
+                is_there: true,
+            } => {
                 self.nodes[to].members.insert(about, about_life);
-                self.handle(to, Input::MemberAlive { member: self.member(about, about_life) });
+                self.handle(
+                    to,
+                    Input::MemberAlive {
+                        member: self.member(about, about_life),
+                    },
+                );
             }
             Arrival::Tell { about, .. } => {
                 self.nodes[to].members.remove(&about);
-                self.handle(to, Input::MemberDown { name: self.nodes[about].name.clone() });
+                self.handle(
+                    to,
+                    Input::MemberDown {
+                        name: self.nodes[about].name.clone(),
+                    },
+                );
             }
             Arrival::Connect { broker } => self.connect(to, broker),
             Arrival::Refused { broker } => {
@@ -194,7 +257,12 @@ impl World {
                     self.plan_connect(to, broker, 80 * MS);
                 }
             }
-            Arrival::Answered => self.handle(to, Input::PartsAnswered { sample: self.nodes[to].sample() }),
+            Arrival::Answered => self.handle(
+                to,
+                Input::PartsAnswered {
+                    sample: self.nodes[to].sample(),
+                },
+            ),
             Arrival::Broker { works } => {
                 self.nodes[to].broker_works = works;
                 if !works && self.nodes[to].links.contains_key(&to) {
@@ -202,7 +270,9 @@ impl World {
                 }
                 self.plan_connect(to, to, 0);
             }
-            Arrival::Timer { armed } if armed == self.nodes[to].armed => self.handle(to, Input::Wake),
+            Arrival::Timer { armed } if armed == self.nodes[to].armed => {
+                self.handle(to, Input::Wake)
+            }
             Arrival::Timer { .. } => {}
             Arrival::Publish { term } => self.publish(to, term),
             Arrival::Keep => self.keep(to),
@@ -210,7 +280,8 @@ impl World {
     }
 
     fn strike(&mut self, fault: &Fault) {
-        self.history.push(format!("{:>10} µs {fault:?}", self.now - START));
+        self.history
+            .push(format!("{:>10} µs {fault:?}", self.now - START));
         match *fault {
             Fault::Start(index) => self.start(index),
             Fault::Kill { node, seen } => self.kill(node, seen),
@@ -252,7 +323,12 @@ impl World {
         self.nodes[index].start(self.now);
         let after = self.random.between(0, PUBLISH_PERIOD);
         self.push_to(index, after, Arrival::Keep);
-        self.handle(index, Input::OwnBroker { address: Some(broker_of(index)) });
+        self.handle(
+            index,
+            Input::OwnBroker {
+                address: Some(broker_of(index)),
+            },
+        );
         for to in 0..self.nodes.len() {
             if to != index && self.nodes[to].links.contains_key(&index) {
                 self.plan_connect(to, index, 0);
@@ -267,7 +343,9 @@ impl World {
         node.waiting.clear();
         if seen {
             for to in 0..self.nodes.len() {
-                if self.linked(to, index) && self.nodes[to].links.get(&index) == Some(&LinkState::Up) {
+                if self.linked(to, index)
+                    && self.nodes[to].links.get(&index) == Some(&LinkState::Up)
+                {
                     let after = self.random.between(MS, 6 * MS);
                     self.push_to(to, after, Arrival::Refused { broker: index });
                 }
@@ -284,8 +362,16 @@ impl World {
                     && self.linked(to, about);
                 let about_life = self.nodes[about].life;
                 let known = self.nodes[to].known.get(&about);
-                let is_news = if is_there { known != Some(&about_life) } else { known.is_some() };
-                if to == about || !is_news || self.nodes[to].machine.is_none() || self.random.chance(50) {
+                let is_news = if is_there {
+                    known != Some(&about_life)
+                } else {
+                    known.is_some()
+                };
+                if to == about
+                    || !is_news
+                    || self.nodes[to].machine.is_none()
+                    || self.random.chance(50)
+                {
                     continue;
                 }
                 let after = self.random.between(20 * MS, 300 * MS);
@@ -295,7 +381,15 @@ impl World {
                 } else {
                     node.known.remove(&about);
                 }
-                self.push_to(to, after, Arrival::Tell { about, about_life, is_there });
+                self.push_to(
+                    to,
+                    after,
+                    Arrival::Tell {
+                        about,
+                        about_life,
+                        is_there,
+                    },
+                );
             }
         }
         self.push(100 * MS, Event::Gossip);
@@ -317,7 +411,12 @@ impl World {
 
     fn member(&self, about: usize, run: u64) -> SeenMember {
         let name = self.nodes[about].name.clone();
-        SeenMember { name, run, broker: Some(address_of(about)), is_on_this_machine: false }
+        SeenMember {
+            name,
+            run,
+            broker: Some(address_of(about)),
+            is_on_this_machine: false,
+        }
     }
 
     /// Hands in what happened and carries out what comes of it, as the actors do.
@@ -325,7 +424,9 @@ impl World {
         let mut inputs = VecDeque::from([input]);
         while let Some(input) = inputs.pop_front() {
             let now = self.clock_of(index);
-            let Some(machine) = &mut self.nodes[index].machine else { return };
+            let Some(machine) = &mut self.nodes[index].machine else {
+                return;
+            };
             for effect in machine.handle(input, now) {
                 inputs.extend(self.carry_out(index, effect));
             }
@@ -339,17 +440,36 @@ impl World {
             Effect::PersistTerm { term } => self.nodes[index].persisted = term,
             Effect::Send { to, message } => self.send(index, &to, &message),
             Effect::TellLeadership { leadership } => {
-                let follows = matches!(leadership.position, Position::Following | Position::StandingBy);
-                assert!(!follows || self.nodes[index].publishing.is_none(), "follows and still publishes");
+                let follows = matches!(
+                    leadership.position,
+                    Position::Following | Position::StandingBy
+                );
+                assert!(
+                    !follows || self.nodes[index].publishing.is_none(),
+                    "follows and still publishes"
+                );
                 self.nodes[index].leadership = leadership;
             }
-            Effect::Lead { epoch, first_round, first } => {
-                assert!(epoch.term <= self.nodes[index].persisted, "led in a term that is not on disk");
-                assert!(self.nodes[index].leadership.is_leading(), "leads before it is told");
-                let owner = self.owners.insert(epoch.clone(), (index, self.nodes[index].life));
+            Effect::Lead {
+                epoch,
+                first_round,
+                first,
+            } => {
+                assert!(
+                    epoch.term <= self.nodes[index].persisted,
+                    "led in a term that is not on disk"
+                );
+                assert!(
+                    self.nodes[index].leadership.is_leading(),
+                    "leads before it is told"
+                );
+                let owner = self
+                    .owners
+                    .insert(epoch.clone(), (index, self.nodes[index].life));
                 assert_eq!(owner, None, "two leaderships share {epoch}");
                 self.led.push((self.now, epoch.clone()));
-                self.history.push(format!("{:>10} µs {epoch} leads", self.now - START));
+                self.history
+                    .push(format!("{:>10} µs {epoch} leads", self.now - START));
                 self.nodes[index].resync.lead(epoch.clone());
                 self.nodes[index].lane.get_or_insert_with(|| epoch.clone());
                 self.begin_to_publish(index, epoch, first_round, first);
@@ -364,16 +484,29 @@ impl World {
             Effect::SetLinks { links } => self.set_links(index, &links),
             Effect::Look => {
                 let node = &self.nodes[index];
-                let members = node.members.iter().map(|(about, run)| self.member(*about, *run)).collect();
+                let members = node
+                    .members
+                    .iter()
+                    .map(|(about, run)| self.member(*about, *run))
+                    .collect();
                 let rounds_due = node.rounds_due(self.now);
-                return Some(Input::Looked { rounds_due, load_percent: LOAD, members });
+                return Some(Input::Looked {
+                    rounds_due,
+                    load_percent: LOAD,
+                    members,
+                });
             }
             Effect::AskParts => {
                 let answers = self.nodes[index].gateway_works;
-                let after = if answers { self.random.between(MS, 20 * MS) } else { 1000 * MS };
+                let after = if answers {
+                    self.random.between(MS, 20 * MS)
+                } else {
+                    1000 * MS
+                };
                 self.push_to(index, after, Arrival::Answered);
             }
-            Effect::PublishStatus { .. } | Effect::CountImplausible { .. } | Effect::Log { .. } => {}
+            Effect::PublishStatus { .. } | Effect::CountImplausible { .. } | Effect::Log { .. } => {
+            }
         }
         None
     }
@@ -391,17 +524,34 @@ impl World {
 
     fn send(&mut self, from: usize, to: &NodeName, message: &ElectionMessage) {
         self.packets += 1;
-        let Some(to) = self.nodes.iter().position(|node| node.name == *to) else { return };
+        let Some(to) = self.nodes.iter().position(|node| node.name == *to) else {
+            return;
+        };
         self.nodes[to].packets += 1;
         let is_mute = |node: usize| self.nodes[node].mute_until > self.now;
-        if self.cuts.contains(&(from, to)) || is_mute(from) || is_mute(to) || self.random.chance(self.loss_percent) {
+        if self.cuts.contains(&(from, to))
+            || is_mute(from)
+            || is_mute(to)
+            || self.random.chance(self.loss_percent)
+        {
             return;
         }
         let bytes = message.encode(Encoding::Cbor);
-        let copies = if self.random.chance(self.loss_percent / 4) { 2 } else { 1 };
+        let copies = if self.random.chance(self.loss_percent / 4) {
+            2
+        } else {
+            1
+        };
         for _ in 0..copies {
             let after = self.random.between(200, 3 * MS);
-            self.push_to(to, after, Arrival::Packet { from, bytes: bytes.clone() });
+            self.push_to(
+                to,
+                after,
+                Arrival::Packet {
+                    from,
+                    bytes: bytes.clone(),
+                },
+            );
         }
     }
 }

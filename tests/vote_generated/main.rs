@@ -46,7 +46,11 @@ impl Difference {
     }
 
     fn standard_error(&self) -> f64 {
-        100.0 * (self.squares / self.items - (self.sum / self.items).powi(2)).max(0.0).sqrt() / self.items.sqrt()
+        100.0
+            * (self.squares / self.items - (self.sum / self.items).powi(2))
+                .max(0.0)
+                .sqrt()
+            / self.items.sqrt()
     }
 
     fn falls_short(&self) -> bool {
@@ -64,12 +68,16 @@ struct Score {
 
 impl Score {
     fn falls_short(&self) -> bool {
-        [self.online, self.passes, self.passes_beside_online].iter().any(Difference::falls_short)
+        [self.online, self.passes, self.passes_beside_online]
+            .iter()
+            .any(Difference::falls_short)
     }
 
     /// True if any difference is below the tolerance, by chance or not.
     fn is_below(&self) -> bool {
-        [self.online, self.passes, self.passes_beside_online].iter().any(|difference| difference.points() < -TOLERANCE)
+        [self.online, self.passes, self.passes_beside_online]
+            .iter()
+            .any(|difference| difference.points() < -TOLERANCE)
     }
 
     fn row(&self, number: u64, kind: &Kind) -> String {
@@ -85,10 +93,16 @@ impl Score {
 /// Chance that the most frequent label, drawn at random on a tie, is right.
 fn chance_of_majority(item: &Item) -> f64 {
     let mut votes: BTreeMap<usize, usize> = BTreeMap::new();
-    item.labels.iter().for_each(|label| *votes.entry(label.class).or_default() += 1);
+    item.labels
+        .iter()
+        .for_each(|label| *votes.entry(label.class).or_default() += 1);
     let most = votes.values().max().copied().unwrap_or(0);
     let first = votes.values().filter(|n| **n == most).count();
-    if votes.get(&item.truth) == Some(&most) { 1.0 / first as f64 } else { 0.0 }
+    if votes.get(&item.truth) == Some(&most) {
+        1.0 / first as f64
+    } else {
+        0.0
+    }
 }
 
 fn landmark(place: usize) -> String {
@@ -97,9 +111,17 @@ fn landmark(place: usize) -> String {
 
 /// As with annotators: an item after the other, none goes stale.
 fn vote_on(items: &[Item]) -> Vote {
-    let weighted =
-        WeightedConfig { freshness_s: 1e9, smoothing_share: 0.0, hysteresis: 0.0, ..WeightedConfig::default() };
-    let limits = VoteConfig { max_landmarks: 100_000, max_vehicles: 10_000, ..VoteConfig::default() };
+    let weighted = WeightedConfig {
+        freshness_s: 1e9,
+        smoothing_share: 0.0,
+        hysteresis: 0.0,
+        ..WeightedConfig::default()
+    };
+    let limits = VoteConfig {
+        max_landmarks: 100_000,
+        max_vehicles: 10_000,
+        ..VoteConfig::default()
+    };
     let mut vote = Vote::new(VoteConfig { weighted, ..limits }, Vec::new());
     for (place, item) in items.iter().enumerate() {
         let now = START + Duration::from_millis(100 * place as u64);
@@ -110,7 +132,10 @@ fn vote_on(items: &[Item]) -> Vote {
                 ..PerceivedObject::new(class.as_str(), label.confidence, 0.0, 0.0)
             };
             let node = NodeName::new(format!("annotator-{}", label.annotator)).unwrap();
-            let report = ObjectReport { objects: vec![object], ..ObjectReport::new(node, place as u64, now) };
+            let report = ObjectReport {
+                objects: vec![object],
+                ..ObjectReport::new(node, place as u64, now)
+            };
             vote.observe(&report, now).unwrap();
         }
         vote.close(now);
@@ -146,7 +171,12 @@ fn score(number: u64, items: usize) -> Score {
             passes_beside_online.add(refined - one_pass);
         }
     }
-    Score { majority: majority.points(), online, passes, passes_beside_online }
+    Score {
+        majority: majority.points(),
+        online,
+        passes,
+        passes_beside_online,
+    }
 }
 
 /// Scores sets on all processors; prints those that fall short and the means. Returns the numbers of the former.
@@ -154,25 +184,45 @@ fn short_of(numbers: &[u64], items: usize) -> Vec<u64> {
     let threads = thread::available_parallelism().map_or(1, usize::from);
     let of_thread = |thread: usize| {
         let numbers = numbers.iter().skip(thread).step_by(threads);
-        numbers.map(|&number| (number, score(number, items))).collect::<Vec<_>>()
+        numbers
+            .map(|&number| (number, score(number, items)))
+            .collect::<Vec<_>>()
     };
     let scores: BTreeMap<u64, Score> = thread::scope(|scope| {
-        let running: Vec<_> = (0..threads).map(|thread| scope.spawn(move || of_thread(thread))).collect();
-        running.into_iter().flat_map(|thread| thread.join().unwrap()).collect()
+        let running: Vec<_> = (0..threads)
+            .map(|thread| scope.spawn(move || of_thread(thread)))
+            .collect();
+        running
+            .into_iter()
+            .flat_map(|thread| thread.join().unwrap())
+            .collect()
     });
     let mean = |of: fn(&Score) -> Difference| {
         scores.values().map(|score| of(score).points()).sum::<f64>() / scores.len() as f64
     };
-    println!("{} sets: online {:+.2}, passes {:+.2} points", scores.len(), mean(|s| s.online), mean(|s| s.passes));
+    println!(
+        "{} sets: online {:+.2}, passes {:+.2} points",
+        scores.len(),
+        mean(|s| s.online),
+        mean(|s| s.passes)
+    );
     let below = scores.values().filter(|score| score.is_below()).count();
-    println!("{below} of {} sets are below by more than {TOLERANCE} points, chance included", scores.len());
+    println!(
+        "{below} of {} sets are below by more than {TOLERANCE} points, chance included",
+        scores.len()
+    );
     let short: Vec<_> = scores
         .iter()
         .filter(|(_, score)| score.falls_short())
         .map(|(&number, score)| (number, score.row(number, &sets::kind(number))))
         .collect();
     let rows: Vec<_> = short.iter().map(|(_, row)| row.as_str()).collect();
-    println!("{} of {} sets fall short:\n{}", short.len(), scores.len(), rows.join("\n"));
+    println!(
+        "{} of {} sets fall short:\n{}",
+        short.len(),
+        scores.len(),
+        rows.join("\n")
+    );
     short.into_iter().map(|(number, _)| number).collect()
 }
 
@@ -180,7 +230,10 @@ fn short_of(numbers: &[u64], items: usize) -> Vec<u64> {
 fn no_more_of_a_ninth_of_the_generated_sets_than_known_are_judged_worse_than_by_the_majority() {
     // Each balance meets each habit about once in 56; every ninth meets all of both.
     let numbers: Vec<u64> = (1..SETS).step_by(9).collect();
-    let unknown: Vec<_> = short_of(&numbers, 600).into_iter().filter(|n| !KNOWN_SHORT.contains(n)).collect();
+    let unknown: Vec<_> = short_of(&numbers, 600)
+        .into_iter()
+        .filter(|n| !KNOWN_SHORT.contains(n))
+        .collect();
     assert!(unknown.is_empty(), "{unknown:?}");
 }
 

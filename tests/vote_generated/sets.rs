@@ -35,8 +35,15 @@ pub(crate) enum Habit {
     Mixed,
 }
 
-pub(crate) const HABITS: [Habit; 7] =
-    [Habit::Equal, Habit::Spread, Habit::Lazy, Habit::Copying, Habit::Partial, Habit::HardItems, Habit::Mixed];
+pub(crate) const HABITS: [Habit; 7] = [
+    Habit::Equal,
+    Habit::Spread,
+    Habit::Lazy,
+    Habit::Copying,
+    Habit::Partial,
+    Habit::HardItems,
+    Habit::Mixed,
+];
 
 /// How many labels there are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -101,9 +108,14 @@ pub(crate) fn kind(number: u64) -> Kind {
         habit,
         coverage: *coverages.choose(&mut rng).unwrap(),
         annotators: *[50, 50, 50, 25, 200].choose(&mut rng).unwrap(),
-        confidence: *[Confidence::None, Confidence::None, Confidence::Telling, Confidence::Meaningless]
-            .choose(&mut rng)
-            .unwrap(),
+        confidence: *[
+            Confidence::None,
+            Confidence::None,
+            Confidence::Telling,
+            Confidence::Meaningless,
+        ]
+        .choose(&mut rng)
+        .unwrap(),
         accuracy: *[0.65, 0.75, 0.85].choose(&mut rng).unwrap(),
     }
 }
@@ -153,17 +165,30 @@ impl Kind {
                     _ => 0.1,
                 };
                 let own = self.accuracy + rng.random_range(-spread..=spread);
-                let partial = if self.habit == Habit::Partial || self.habit == Habit::Mixed { 0.2 } else { 0.0 };
+                let partial = if self.habit == Habit::Partial || self.habit == Habit::Mixed {
+                    0.2
+                } else {
+                    0.0
+                };
                 let accuracy = (0..classes)
-                    .map(|_| (own + rng.random_range(-partial..=partial)).clamp(1.0 / classes as f64, 0.98))
+                    .map(|_| {
+                        (own + rng.random_range(-partial..=partial))
+                            .clamp(1.0 / classes as f64, 0.98)
+                    })
                     .collect();
-                let class = if rng.random_bool(0.7) { 0 } else { rng.random_range(0..classes) };
+                let class = if rng.random_bool(0.7) {
+                    0
+                } else {
+                    rng.random_range(0..classes)
+                };
                 Annotator {
                     accuracy,
                     lazy: lazy.then_some(class),
                     copies: copying.then_some(self.annotators - 1),
                     activity: match self.coverage {
-                        Coverage::Skewed(_) => 1.0 / (1.0 + rng.random_range(0..self.annotators) as f64),
+                        Coverage::Skewed(_) => {
+                            1.0 / (1.0 + rng.random_range(0..self.annotators) as f64)
+                        }
                         _ => 1.0,
                     },
                 }
@@ -197,7 +222,13 @@ impl Kind {
                 .iter()
                 .enumerate()
                 .filter(|(n, _)| left[*n] > 0)
-                .map(|(n, a)| (-rng.random_range(1e-12..1.0f64).ln() / (a.activity * left[n].min(1000) as f64), n))
+                .map(|(n, a)| {
+                    (
+                        -rng.random_range(1e-12..1.0f64).ln()
+                            / (a.activity * left[n].min(1000) as f64),
+                        n,
+                    )
+                })
                 .collect();
             order.sort_by(|a, b| a.0.total_cmp(&b.0));
             order.truncate(each);
@@ -216,7 +247,8 @@ impl Kind {
             let mut said = std::collections::BTreeMap::new();
             let mut labels = Vec::new();
             for (_, annotator) in order {
-                left[annotator] = left[annotator].saturating_sub(usize::from(left[annotator] < usize::MAX));
+                left[annotator] =
+                    left[annotator].saturating_sub(usize::from(left[annotator] < usize::MAX));
                 let source = crowd[annotator].copies.unwrap_or(annotator);
                 let class = match crowd[annotator].lazy {
                     Some(class) => class,
@@ -228,7 +260,11 @@ impl Kind {
                     Confidence::Telling => rng.random_range(0.2..0.8),
                     Confidence::Meaningless => rng.random_range(0.2..1.0),
                 };
-                labels.push(Label { annotator, class, confidence });
+                labels.push(Label {
+                    annotator,
+                    class,
+                    confidence,
+                });
             }
             labels.shuffle(&mut rng);
             if !labels.is_empty() {

@@ -105,7 +105,10 @@ mod tests {
 
     #[tokio::test]
     async fn a_broker_that_ended_by_itself_ends_its_actor_so_that_it_is_started_anew() {
-        let (actor, ended) = Actor::spawn(None, Broker, Box::new(DeadBroker) as Box<dyn MqttBroker>).await.unwrap();
+        let (actor, ended) =
+            Actor::spawn(None, Broker, Box::new(DeadBroker) as Box<dyn MqttBroker>)
+                .await
+                .unwrap();
         let health = ractor::call!(actor, |reply| BrokerMessage::Health { reply }).unwrap();
         assert_eq!(health, BrokerHealth::Dead);
         ended.await.unwrap();

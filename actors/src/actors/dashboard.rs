@@ -48,7 +48,11 @@ impl Actor for Dashboard {
     async fn pre_start(
         &self,
         myself: ActorRef<Self::Msg>,
-        DashboardArguments { config, sources, bound }: Self::Arguments,
+        DashboardArguments {
+            config,
+            sources,
+            bound,
+        }: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         config.validate()?;
         let monitor = Arc::new(NodeMonitor::new(sources, config.max_rate_hz));
@@ -63,6 +67,10 @@ impl Actor for Dashboard {
         DashboardMessage::CheckServer: Self::Msg,
         server: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        if server.has_ended() { Err("the dashboard's thread ended".into()) } else { Ok(()) }
+        if server.has_ended() {
+            Err("the dashboard's thread ended".into())
+        } else {
+            Ok(())
+        }
     }
 }

@@ -12,7 +12,8 @@ use std::time::Duration;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use ecod::description::{
-    DescriptionEffect, DescriptionExchange, DescriptionHistory, DescriptionStatement, PUBLISH_INTERVAL,
+    DescriptionEffect, DescriptionExchange, DescriptionHistory, DescriptionStatement,
+    PUBLISH_INTERVAL,
 };
 use ecod::diagnostics::TroubleKind;
 use ecod::leadership::Leadership;
@@ -112,8 +113,13 @@ impl Actor for DescriptionKeeper {
         leadership.mark_changed();
         myself.send_interval(TICK, || DescriptionKeeperMessage::Tick);
         let stamp = held.as_ref().map(|held| held.stamp());
-        let is_of_held = |saved: &DescriptionHistory| saved.current.as_ref().map(|it| it.description.stamp()) == stamp;
-        let saved = file.as_ref().and_then(|file| file.load(|_: &DescriptionHistory| true)).filter(is_of_held);
+        let is_of_held = |saved: &DescriptionHistory| {
+            saved.current.as_ref().map(|it| it.description.stamp()) == stamp
+        };
+        let saved = file
+            .as_ref()
+            .and_then(|file| file.load(|_: &DescriptionHistory| true))
+            .filter(is_of_held);
         let history = saved.unwrap_or_else(|| DescriptionHistory::of(held.clone()));
         let mut writer = StateWriter::new(file, DESCRIPTION);
         if held.is_some() {
@@ -140,23 +146,32 @@ impl Actor for DescriptionKeeper {
         message: Self::Msg,
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
-        let (now, is_tick) = (clock::now(), matches!(message, DescriptionKeeperMessage::Tick));
+        let (now, is_tick) = (
+            clock::now(),
+            matches!(message, DescriptionKeeperMessage::Tick),
+        );
         if state.leadership.has_changed().unwrap_or(false) {
             let leadership = state.leadership.borrow_and_update().clone();
             let effects = state.exchange.lead(leadership.leader(), now);
             state.carry_out(effects);
         }
         let effects = match message {
-            DescriptionKeeperMessage::Hear { from, may_lead, may_describe, stamp } => {
-                state.hear(&from, may_lead, may_describe, stamp, now)
-            }
+            DescriptionKeeperMessage::Hear {
+                from,
+                may_lead,
+                may_describe,
+                stamp,
+            } => state.hear(&from, may_lead, may_describe, stamp, now),
             DescriptionKeeperMessage::Take { delivery } if is_intact(&delivery.message) => {
                 state.exchange.take(Arc::clone(&delivery.message), now)
             }
             DescriptionKeeperMessage::Take { delivery } => {
                 let broker = delivery.broker.as_ref().map_or(OTHERS, NodeName::as_str);
                 state.counters.reject(RejectReason::Malformed, broker);
-                tracing::debug!(broker, "description not used: its hash is not that of its content");
+                tracing::debug!(
+                    broker,
+                    "description not used: its hash is not that of its content"
+                );
                 Vec::new()
             }
             DescriptionKeeperMessage::Set { text } => {
@@ -166,7 +181,9 @@ impl Actor for DescriptionKeeper {
             DescriptionKeeperMessage::Connected => state.exchange.connect(now),
             DescriptionKeeperMessage::Tick => {
                 let members = state.members.borrow();
-                state.exchange.retain(|name| members.iter().any(|member| member.name == *name));
+                state
+                    .exchange
+                    .retain(|name| members.iter().any(|member| member.name == *name));
                 drop(members);
                 state.exchange.tick(now)
             }
@@ -195,25 +212,56 @@ impl DescriptionKeeperState {
     ) -> Vec<DescriptionEffect> {
         let members = self.members.borrow();
         let member = members.iter().find(|member| member.name == *from);
-        let certificate = member.and_then(|member| member.certificate.as_ref()).map(|it| BASE64.encode(it));
+        let certificate = member
+            .and_then(|member| member.certificate.as_ref())
+            .map(|it| BASE64.encode(it));
         drop(members);
         if self.credentials.is_some() && certificate.is_none() {
             return Vec::new();
         }
-        self.exchange.hear(from, DescriptionStatement { stamp, may_lead, may_describe, certificate }, now)
+        self.exchange.hear(
+            from,
+            DescriptionStatement {
+                stamp,
+                may_lead,
+                may_describe,
+                certificate,
+            },
+            now,
+        )
     }
 
     /// Goes back to the description before those of revoked nodes, when the list has changed. The last word of a node may
     /// also come after the list.
     fn drop_revoked(&mut self, has_adopted: bool, now: Timestamp) {
-        let Some(loaded) = self.credentials.as_ref().map(|credentials| credentials.current()) else { return };
-        let is_revoked = |certificate: &str| BASE64.decode(certificate).is_ok_and(|der| loaded.has_revoked(&der));
-        let is_new = self.applied.as_ref().is_none_or(|applied| !Arc::ptr_eq(applied, &loaded));
-        let current = self.exchange.history().current.as_ref().filter(|_| has_adopted);
+        let Some(loaded) = self
+            .credentials
+            .as_ref()
+            .map(|credentials| credentials.current())
+        else {
+            return;
+        };
+        let is_revoked = |certificate: &str| {
+            BASE64
+                .decode(certificate)
+                .is_ok_and(|der| loaded.has_revoked(&der))
+        };
+        let is_new = self
+            .applied
+            .as_ref()
+            .is_none_or(|applied| !Arc::ptr_eq(applied, &loaded));
+        let current = self
+            .exchange
+            .history()
+            .current
+            .as_ref()
+            .filter(|_| has_adopted);
         if !is_new && !current.is_some_and(|current| current.is_of_revoked(is_revoked)) {
             return;
         }
-        let effects = self.exchange.revoke(is_revoked, content_hash(&self.name, ""), now);
+        let effects = self
+            .exchange
+            .revoke(is_revoked, content_hash(&self.name, ""), now);
         if effects.iter().any(is_adoption) {
             tracing::warn!("the description was a revoked node's: the one before counts again");
         }
@@ -224,17 +272,22 @@ impl DescriptionKeeperState {
     fn carry_out(&mut self, effects: Vec<DescriptionEffect>) {
         for effect in effects {
             match effect {
-                DescriptionEffect::Adopt { description, stated_by } => {
+                DescriptionEffect::Adopt {
+                    description,
+                    stated_by,
+                } => {
                     let (stamp, set_by) = (description.stamp(), &description.set_by);
                     tracing::info!(%stamp, %set_by, %stated_by, "the cell has a new description");
                     self.writer.note_change();
                     (self.apply)(description);
                 }
                 DescriptionEffect::Publish { description } => {
-                    self.gateway.send(GatewayMessage::PublishDescription { description });
+                    self.gateway
+                        .send(GatewayMessage::PublishDescription { description });
                 }
                 DescriptionEffect::CountImplausible { from } => {
-                    self.counters.reject(RejectReason::OutOfRange, from.as_str());
+                    self.counters
+                        .reject(RejectReason::OutOfRange, from.as_str());
                 }
             }
         }
@@ -247,7 +300,8 @@ impl DescriptionKeeperState {
                 SaveOutcome::Unchanged => {}
                 SaveOutcome::Written => troubles.settle(TroubleKind::NotSaved, Some(DESCRIPTION)),
                 SaveOutcome::Failed => {
-                    let cause = "it cannot be saved, and is learnt anew from other nodes after a restart";
+                    let cause =
+                        "it cannot be saved, and is learnt anew from other nodes after a restart";
                     troubles.note_about(DESCRIPTION, TroubleKind::NotSaved, cause);
                 }
             }

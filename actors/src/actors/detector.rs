@@ -20,7 +20,9 @@ use tokio::task::{JoinSet, spawn_blocking};
 use tokio::time::timeout;
 
 use crate::camera::detect::Detect;
-use crate::camera::frame_source::capture::{Capture, CaptureConfig, CaptureStatus, Opener, Readers};
+use crate::camera::frame_source::capture::{
+    Capture, CaptureConfig, CaptureStatus, Opener, Readers,
+};
 use crate::camera::image_size::{ImageSize, SizeMismatch};
 use crate::camera::lens::Lens;
 use crate::messages::actor_slot::ActorSlot;
@@ -80,8 +82,7 @@ pub struct DetectorState {
 
 /// Time after which a detector is told to be slow.
 const SLOW_AFTER: Duration = Duration::from_secs(5);
-const SLOW_DETECTOR: &str =
-    "the detector has been busy with one frame for more than 5 s: use smaller frames or another model";
+const SLOW_DETECTOR: &str = "the detector has been busy with one frame for more than 5 s: use smaller frames or another model";
 
 /// Maximum time for the camera to end.
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
@@ -111,7 +112,12 @@ impl Actor for Detector {
         let capture = Capture::start(open, capture)?;
         let readers = capture.readers();
         let mut pumping = JoinSet::new();
-        pumping.spawn(pump(capture, myself, (troubles.clone(), Arc::clone(&counters)), spans));
+        pumping.spawn(pump(
+            capture,
+            myself,
+            (troubles.clone(), Arc::clone(&counters)),
+            spans,
+        ));
         let detect = Some(detect);
         Ok(DetectorState {
             detect,
@@ -128,7 +134,11 @@ impl Actor for Detector {
         })
     }
 
-    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
         state.pump.abort_all();
         let readers = state.readers.clone();
         spawn_blocking(move || readers.wait_for_end(STOP_TIMEOUT)).await?;
@@ -142,7 +152,9 @@ impl Actor for Detector {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let DetectorMessage::Detect { frame, permit } = message;
-        let Some(mut detect) = state.detect.take() else { return Err("the detector was lost".into()) };
+        let Some(mut detect) = state.detect.take() else {
+            return Err("the detector was lost".into());
+        };
         let (captured_at, size) = (frame.captured_at, ImageSize::of(&frame.image));
         let (mut images, lens) = (state.images.take(), state.lens);
         let span = tracing::info_span!("detect");
@@ -163,8 +175,17 @@ impl Actor for Detector {
                 }
                 if let Some(lens) = state.scale(size, &mut detections) {
                     state.counters.count(Event::FrameDetected);
-                    let shown = state.camera_feed.as_ref().is_some_and(|feed| feed.takes(captured_at)).then_some(frame);
-                    state.projector.send(ProjectorMessage::Report { detections, lens, captured_at, shown });
+                    let shown = state
+                        .camera_feed
+                        .as_ref()
+                        .is_some_and(|feed| feed.takes(captured_at))
+                        .then_some(frame);
+                    state.projector.send(ProjectorMessage::Report {
+                        detections,
+                        lens,
+                        captured_at,
+                        shown,
+                    });
                 } else {
                     state.counters.count(Event::FrameFailed);
                 }
@@ -238,7 +259,10 @@ async fn pump(
             }
             match &*status.borrow() {
                 CaptureStatus::Failed { error, .. } => {
-                    troubles.note(TroubleKind::Camera, &format!("the camera gives no frames: {error}"));
+                    troubles.note(
+                        TroubleKind::Camera,
+                        &format!("the camera gives no frames: {error}"),
+                    );
                 }
                 CaptureStatus::Ended => {}
                 _ => troubles.settle(TroubleKind::Camera),
@@ -252,7 +276,11 @@ async fn pump(
             return;
         };
         let span = spans.borrow().frame(frame.captured_at);
-        if span.in_scope(|| detector.cast(DetectorMessage::Detect { frame, permit }).is_err()) {
+        if span.in_scope(|| {
+            detector
+                .cast(DetectorMessage::Detect { frame, permit })
+                .is_err()
+        }) {
             return;
         }
     }
@@ -283,31 +311,52 @@ mod tests {
     #[tokio::test]
     async fn a_detector_that_does_not_finish_a_frame_is_a_trouble_until_it_does() {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/photos").into();
-        let source = SourceConfig::Images { path, fps: 10.0, looping: true };
+        let source = SourceConfig::Images {
+            path,
+            fps: 10.0,
+            looping: true,
+        };
         let (done, waits) = channel();
         let counters = Arc::<Counters>::default();
         let arguments = DetectorArguments {
             open: Arc::new(move || source.open(Duration::from_secs(5))),
             capture: CaptureConfig::default(),
             detect: Box::new(Slow(waits)),
-            lens: Lens { is_any_shape: true, ..Lens::ideal(Intrinsics::with_square_pixels(640, 480, 1.0)) },
+            lens: Lens {
+                is_any_shape: true,
+                ..Lens::ideal(Intrinsics::with_square_pixels(640, 480, 1.0))
+            },
             projector: ActorSlot::default(),
             images: None,
             camera_feed: None,
             troubles: CameraTroubles::new(Arc::clone(&counters), None),
             counters: Arc::clone(&counters),
-            spans: watch::channel(Spans::new(NodeName::from_static("cell"), NodeName::from_static("euclid"))).1,
+            spans: watch::channel(Spans::new(
+                NodeName::from_static("cell"),
+                NodeName::from_static("euclid"),
+            ))
+            .1,
         };
         let (detector, ended) = Actor::spawn(None, Detector, arguments).await.unwrap();
         let until = async |is_slow: bool| {
-            let is_told = || counters.troubles().present().iter().any(|trouble| trouble.cause == SLOW_DETECTOR);
+            let is_told = || {
+                counters
+                    .troubles()
+                    .present()
+                    .iter()
+                    .any(|trouble| trouble.cause == SLOW_DETECTOR)
+            };
             while is_told() != is_slow {
                 tokio::time::sleep(Duration::from_millis(20)).await;
             }
         };
-        timeout(Duration::from_secs(60), until(true)).await.expect("it is told");
+        timeout(Duration::from_secs(60), until(true))
+            .await
+            .expect("it is told");
         drop(done);
-        timeout(Duration::from_secs(60), until(false)).await.expect("it is over");
+        timeout(Duration::from_secs(60), until(false))
+            .await
+            .expect("it is over");
         detector.stop(None);
         ended.await.unwrap();
     }

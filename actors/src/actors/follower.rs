@@ -108,19 +108,24 @@ impl Actor for Follower {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let (taken, sender) = match message {
-            FollowerMessage::TakeMap { delivery } => {
-                (state.take_map(&delivery), Some(delivery.message.aggregator.clone()))
-            }
-            FollowerMessage::TakeVerdicts { delivery } => {
-                (state.take_verdicts(&delivery), Some(delivery.message.aggregator.clone()))
-            }
-            FollowerMessage::TakeReputations { delivery } => {
-                (state.take_reputations(&delivery), delivery.message.aggregator.clone())
-            }
+            FollowerMessage::TakeMap { delivery } => (
+                state.take_map(&delivery),
+                Some(delivery.message.aggregator.clone()),
+            ),
+            FollowerMessage::TakeVerdicts { delivery } => (
+                state.take_verdicts(&delivery),
+                Some(delivery.message.aggregator.clone()),
+            ),
+            FollowerMessage::TakeReputations { delivery } => (
+                state.take_reputations(&delivery),
+                delivery.message.aggregator.clone(),
+            ),
         };
         match taken.map_err(Refusal::reject_reason) {
             Ok(()) => {}
-            Err(Some(reason)) => state.counters.reject(reason, sender.as_ref().map_or(OTHERS, NodeName::as_str)),
+            Err(Some(reason)) => state
+                .counters
+                .reject(reason, sender.as_ref().map_or(OTHERS, NodeName::as_str)),
             Err(None) => state.counters.count(Event::Repeated),
         }
         Ok(())
@@ -146,58 +151,123 @@ impl FollowerState {
         } = arguments;
         let filter = RoundFilter::new(saved_term, clock::now());
         let log = log.map(|path| MapLog::new(path, cell, present_cell));
-        Self { newest, filter, log, recording, leadership, election, fuser, door, clock, counters, spans }
+        Self {
+            newest,
+            filter,
+            log,
+            recording,
+            leadership,
+            election,
+            fuser,
+            door,
+            clock,
+            counters,
+            spans,
+        }
     }
 
     fn take_map(&mut self, delivery: &Delivery<Arc<GlobalMap>>) -> Result<(), Refusal> {
-        let Delivery { message: map, origin, received_at, .. } = delivery;
+        let Delivery {
+            message: map,
+            origin,
+            received_at,
+            ..
+        } = delivery;
         let received_at = *received_at;
-        let accepted = self.filter.accept_map(map, *origin, received_at, &self.leadership.borrow())?;
+        let accepted =
+            self.filter
+                .accept_map(map, *origin, received_at, &self.leadership.borrow())?;
         let _accept = self.spans.accept("map", &**map, received_at);
         self.counters.count(Event::MapAccepted);
         if accepted.is_known_term {
-            self.fuser.send(FuserMessage::TakeMap { map: Arc::clone(map), received_at });
+            self.fuser.send(FuserMessage::TakeMap {
+                map: Arc::clone(map),
+                received_at,
+            });
         }
         self.tell_election(accepted);
-        let received = ReceivedMap { received_at, map: Arc::clone(map) };
+        let received = ReceivedMap {
+            received_at,
+            map: Arc::clone(map),
+        };
         if let Some(log) = &mut self.log {
-            log.append(&ReceivedMap { received_at: self.clock.date(received_at), map: Arc::clone(map) });
+            log.append(&ReceivedMap {
+                received_at: self.clock.date(received_at),
+                map: Arc::clone(map),
+            });
         }
-        self.recording.send(received_at, LogItem::Map(Arc::clone(map)));
+        self.recording
+            .send(received_at, LogItem::Map(Arc::clone(map)));
         self.newest.map.send_replace(Some(received));
         self.door.publish_round(&Topic::GlobalDetections, &**map);
-        self.door.request_reports(self.leadership.borrow().position == Position::Following);
+        self.door
+            .request_reports(self.leadership.borrow().position == Position::Following);
         Ok(())
     }
 
     fn take_verdicts(&mut self, delivery: &Delivery<Arc<Verdicts>>) -> Result<(), Refusal> {
-        let Delivery { message: verdicts, origin, received_at, .. } = delivery;
+        let Delivery {
+            message: verdicts,
+            origin,
+            received_at,
+            ..
+        } = delivery;
         let received_at = *received_at;
-        let accepted = self.filter.accept_verdicts(verdicts, *origin, received_at, &self.leadership.borrow())?;
+        let accepted = self.filter.accept_verdicts(
+            verdicts,
+            *origin,
+            received_at,
+            &self.leadership.borrow(),
+        )?;
         let _accept = self.spans.accept("verdicts", &**verdicts, received_at);
         self.counters.count(Event::VerdictsAccepted);
-        self.recording.send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
+        self.recording
+            .send(received_at, LogItem::Verdicts(Arc::clone(verdicts)));
         self.tell_election(accepted);
-        self.newest.verdicts.send_replace(Some(Received { received_at, message: Arc::clone(verdicts) }));
+        self.newest.verdicts.send_replace(Some(Received {
+            received_at,
+            message: Arc::clone(verdicts),
+        }));
         self.door.publish_round(&Topic::GlobalVerdicts, &**verdicts);
         Ok(())
     }
 
     fn take_reputations(&mut self, delivery: &Delivery<Arc<Reputations>>) -> Result<(), Refusal> {
-        let Delivery { message: reputations, origin, received_at, .. } = delivery;
+        let Delivery {
+            message: reputations,
+            origin,
+            received_at,
+            ..
+        } = delivery;
         let received_at = *received_at;
-        self.filter.accept_reputations(reputations, *origin, received_at, &self.leadership.borrow())?;
+        self.filter.accept_reputations(
+            reputations,
+            *origin,
+            received_at,
+            &self.leadership.borrow(),
+        )?;
         self.counters.count(Event::ReputationsAccepted);
-        self.recording.send(received_at, LogItem::Reputations(Arc::clone(reputations)));
-        self.newest.reputations.send_replace(Some(Received { received_at, message: Arc::clone(reputations) }));
+        self.recording
+            .send(received_at, LogItem::Reputations(Arc::clone(reputations)));
+        self.newest.reputations.send_replace(Some(Received {
+            received_at,
+            message: Arc::clone(reputations),
+        }));
         self.door.publish_reputations(reputations);
         Ok(())
     }
 
     fn tell_election(&self, accepted: AcceptedRound) {
-        let AcceptedRound { epoch, round, is_sign_of_life, .. } = accepted;
+        let AcceptedRound {
+            epoch,
+            round,
+            is_sign_of_life,
+            ..
+        } = accepted;
         if is_sign_of_life {
-            self.election.send(LeaderElectionMessage::Note { input: Input::RoundAccepted { epoch, round } });
+            self.election.send(LeaderElectionMessage::Note {
+                input: Input::RoundAccepted { epoch, round },
+            });
         }
     }
 }

@@ -131,7 +131,11 @@ impl Actor for Fuser {
                 state.take_reports();
                 state.tick();
             }
-            FuserMessage::Lead { epoch, first_round, first } => state.lead(epoch, first_round, first),
+            FuserMessage::Lead {
+                epoch,
+                first_round,
+                first,
+            } => state.lead(epoch, first_round, first),
             FuserMessage::HoldRound => {
                 state.command(Command::Hold);
                 state.alarm = Timestamp(u64::MAX);
@@ -140,16 +144,23 @@ impl Actor for Fuser {
                 state.command(Command::StepDown);
                 state.keeper.send(ReputationKeeperMessage::StepDown);
             }
-            FuserMessage::Configure { fusion, landmarks } => state.command(Command::Configure { fusion, landmarks }),
+            FuserMessage::Configure { fusion, landmarks } => {
+                state.command(Command::Configure { fusion, landmarks })
+            }
             FuserMessage::TakeNeighbours { objects, stated_at } => {
                 state.command(Command::TakeNeighbours { objects, stated_at });
             }
-            FuserMessage::TakeForeign { reputations } => state.command(Command::TakeForeign { reputations }),
+            FuserMessage::TakeForeign { reputations } => {
+                state.command(Command::TakeForeign { reputations })
+            }
             FuserMessage::TellUplink => state.present.clear(),
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),
             FuserMessage::Resume { reputations } => state.command(Command::Resume { reputations }),
             FuserMessage::Timeliness { reply } => {
-                if reply.send(state.aggregator.timeliness(clock::now())).is_err() {
+                if reply
+                    .send(state.aggregator.timeliness(clock::now()))
+                    .is_err()
+                {
                     tracing::debug!("caller did not wait for the timeliness of reports");
                 }
             }
@@ -168,16 +179,21 @@ const MIN_UNTIMELY: Duration = Duration::from_millis(500);
 const MAX_UNNOTED_LEAD_US: i64 = 1_500_000;
 
 /// Remedy where times seem to be in another unit.
-const OTHER_UNIT_REMEDY: &str =
-    "correct the program that sends them, or set its clock: `captured_at_us` counts microseconds since 1970";
+const OTHER_UNIT_REMEDY: &str = "correct the program that sends them, or set its clock: `captured_at_us` counts microseconds since 1970";
 
 /// The lead of a report's time in words.
 fn lead_in_words(report: &ObjectReport, lead_us: i64) -> String {
     if let Some(unit) = TimeUnit::of(report.captured_at_us) {
-        return format!("its `captured_at_us` looks like {unit} instead of microseconds, or its clock was never set");
+        return format!(
+            "its `captured_at_us` looks like {unit} instead of microseconds, or its clock was never set"
+        );
     }
     let seconds = lead_us.unsigned_abs() as f64 / 1e6;
-    let lead = if seconds < DAY_S { format!("{seconds:.1} s") } else { format!("{:.0} days", seconds / DAY_S) };
+    let lead = if seconds < DAY_S {
+        format!("{seconds:.1} s")
+    } else {
+        format!("{:.0} days", seconds / DAY_S)
+    };
     match lead_us {
         0.. => format!("its clock is {lead} ahead"),
         _ => format!("its clock is {lead} behind, or its reports take that long"),
@@ -237,7 +253,10 @@ impl FuserState {
 
     fn take(&mut self, delivery: &Delivery<QueuedReport>) {
         let QueuedReport { kind, report } = &delivery.message;
-        self.recording.send(delivery.received_at, LogItem::Report(*kind, Arc::clone(report)));
+        self.recording.send(
+            delivery.received_at,
+            LogItem::Report(*kind, Arc::clone(report)),
+        );
         self.compare_locations(*kind, report);
         let taken = self.aggregator.report(*kind, report, delivery.received_at);
         match taken {
@@ -245,7 +264,8 @@ impl FuserState {
                 self.note_clock(report, delivery.received_at);
                 self.note_doubts(*kind, report, delivery.received_at);
                 if self.aggregator.leads().is_some() {
-                    self.spans.note(report, delivery.received_at, &mut self.reports);
+                    self.spans
+                        .note(report, delivery.received_at, &mut self.reports);
                 }
                 self.publish(fused, delivery.received_at);
             }
@@ -267,18 +287,38 @@ impl FuserState {
         match reason {
             RejectReason::FromTheFuture | RejectReason::Stale => {
                 self.counters.count_reject(reason, node);
-                if self.aggregator.untimely_for(kind, &report.node, received_at) >= MIN_UNTIMELY {
-                    let cause = format!("refused, {}", lead_in_words(report, self.lead_us(report, received_at)));
-                    self.counters.troubles().settle(TroubleKind::ClockOff, Some(node));
+                if self
+                    .aggregator
+                    .untimely_for(kind, &report.node, received_at)
+                    >= MIN_UNTIMELY
+                {
+                    let cause = format!(
+                        "refused, {}",
+                        lead_in_words(report, self.lead_us(report, received_at))
+                    );
+                    self.counters
+                        .troubles()
+                        .settle(TroubleKind::ClockOff, Some(node));
                     let is_in_microseconds = TimeUnit::of(report.captured_at_us).is_none();
-                    let remedy = if is_in_microseconds { TroubleKind::Untimely.remedy() } else { OTHER_UNIT_REMEDY };
-                    self.counters.troubles().note_with_remedy(Some(node), TroubleKind::Untimely, &cause, remedy);
+                    let remedy = if is_in_microseconds {
+                        TroubleKind::Untimely.remedy()
+                    } else {
+                        OTHER_UNIT_REMEDY
+                    };
+                    self.counters.troubles().note_with_remedy(
+                        Some(node),
+                        TroubleKind::Untimely,
+                        &cause,
+                        remedy,
+                    );
                 }
             }
-            RejectReason::NotFused => self
-                .counters
-                .reject_report(reason, node, || "its reports are for an algorithm that the cell does not run".into()),
-            _ => self.counters.reject_report(reason, node, || format!("reports rejected: {}", reason.in_words())),
+            RejectReason::NotFused => self.counters.reject_report(reason, node, || {
+                "its reports are for an algorithm that the cell does not run".into()
+            }),
+            _ => self.counters.reject_report(reason, node, || {
+                format!("reports rejected: {}", reason.in_words())
+            }),
         }
     }
 
@@ -286,10 +326,17 @@ impl FuserState {
     fn note_clock(&self, report: &ObjectReport, received_at: Timestamp) {
         let lead_us = self.lead_us(report, received_at);
         if report.clock_error_us.is_none() && lead_us.saturating_abs() > MAX_UNNOTED_LEAD_US {
-            let cause = format!("{}; its reports are put right by that", lead_in_words(report, lead_us));
+            let cause = format!(
+                "{}; its reports are put right by that",
+                lead_in_words(report, lead_us)
+            );
             let node = report.node.as_str();
-            self.counters.troubles().settle(TroubleKind::Untimely, Some(node));
-            self.counters.troubles().note_about(node, TroubleKind::ClockOff, &cause);
+            self.counters
+                .troubles()
+                .settle(TroubleKind::Untimely, Some(node));
+            self.counters
+                .troubles()
+                .note_about(node, TroubleKind::ClockOff, &cause);
         }
     }
 
@@ -297,26 +344,35 @@ impl FuserState {
     fn note_doubts(&self, kind: ReportKind, report: &ObjectReport, received_at: Timestamp) {
         for doubt in self.aggregator.doubts(kind, report, received_at) {
             let trouble = match doubt {
-                ReportDoubt::FarObject { .. } | ReportDoubt::NoObjectAtLocation | ReportDoubt::Moves => {
-                    TroubleKind::Misplaced
-                }
+                ReportDoubt::FarObject { .. }
+                | ReportDoubt::NoObjectAtLocation
+                | ReportDoubt::Moves => TroubleKind::Misplaced,
                 ReportDoubt::SharedName => TroubleKind::NameTaken,
             };
-            self.counters.troubles().note_about(report.node.as_str(), trouble, &doubt.to_string());
+            self.counters
+                .troubles()
+                .note_about(report.node.as_str(), trouble, &doubt.to_string());
         }
     }
 
     /// Lead of a report's time of capture over the cell's time of its receipt, in microseconds.
     fn lead_us(&self, report: &ObjectReport, received_at: Timestamp) -> i64 {
-        report.captured_at_us.micros_from(self.clock.date(received_at))
+        report
+            .captured_at_us
+            .micros_from(self.clock.date(received_at))
     }
 
     /// Compares a location that a report names with the known ones; another one each time.
     fn compare_locations(&self, kind: ReportKind, report: &ObjectReport) {
-        let objects = report.objects.iter().filter_map(|object| object.landmark.as_ref());
+        let objects = report
+            .objects
+            .iter()
+            .filter_map(|object| object.landmark.as_ref());
         let mut named = objects.chain(report.seen.iter().flatten());
         let next = (report.seq as usize).checked_rem(named.clone().count());
-        let Some(id) = next.and_then(|place| named.nth(place)) else { return };
+        let Some(id) = next.and_then(|place| named.nth(place)) else {
+            return;
+        };
         let (node, troubles) = (report.node.as_str(), self.counters.troubles());
         match self.aggregator.knows_location(id) {
             Some(true) => {}
@@ -327,7 +383,8 @@ impl FuserState {
             // Votes name locations themselves where no list is configured.
             None if kind == ReportKind::VoteDetections => {}
             None => {
-                let cause = format!("{node} names known locations, such as {id}, and this node has none");
+                let cause =
+                    format!("{node} names known locations, such as {id}, and this node has none");
                 troubles.note(TroubleKind::NoLocations, &cause);
             }
         }
@@ -341,20 +398,29 @@ impl FuserState {
     }
 
     fn forget_map(&mut self, aggregator: &NodeName) {
-        self.last_map = self.last_map.take().filter(|(map, _)| map.aggregator != *aggregator);
+        self.last_map = self
+            .last_map
+            .take()
+            .filter(|(map, _)| map.aggregator != *aggregator);
     }
 
     fn lead(&mut self, epoch: Epoch, first_round: u64, first: FirstRound) {
         self.reports = RoundReports::default();
         self.present.clear();
-        self.keeper
-            .send(ReputationKeeperMessage::Lead { epoch: epoch.clone(), last_round: first_round.saturating_sub(1) });
+        self.keeper.send(ReputationKeeperMessage::Lead {
+            epoch: epoch.clone(),
+            last_round: first_round.saturating_sub(1),
+        });
         if let Some((map, received_at)) = self.last_map.take()
             && clock::now().since(received_at) < MAX_ADOPTED_MAP_AGE
         {
             self.command(Command::AdoptMap { map, received_at });
         }
-        self.command(Command::Lead { epoch, first_round, first });
+        self.command(Command::Lead {
+            epoch,
+            first_round,
+            first,
+        });
         self.tick();
     }
 
@@ -367,7 +433,8 @@ impl FuserState {
         let now = clock::now();
         if command != Command::Tick || now >= self.aggregator.deadline() {
             let fused = self.aggregator.command(&command, now);
-            self.recording.send(now, LogItem::Journal(JournalEvent::Command(command)));
+            self.recording
+                .send(now, LogItem::Journal(JournalEvent::Command(command)));
             self.publish(fused, now);
         }
     }
@@ -389,29 +456,53 @@ impl FuserState {
 
     fn publish(&mut self, fused: Option<Fused>, now: Timestamp) {
         let Some(fused) = fused else { return };
-        let _round = self.spans.round(&fused, &std::mem::take(&mut self.reports)).entered();
-        let Fused { epoch, round, map, verdicts, evidence, reputations, left_out } = fused;
+        let _round = self
+            .spans
+            .round(&fused, &std::mem::take(&mut self.reports))
+            .entered();
+        let Fused {
+            epoch,
+            round,
+            map,
+            verdicts,
+            evidence,
+            reputations,
+            left_out,
+        } = fused;
         self.report_left_out(&left_out);
         self.recording.send(now, LogItem::Round(round));
         let has_verdicts = verdicts.is_some();
         if let Some(map) = map {
-            self.gateway.send(GatewayMessage::PublishMap { map: Arc::new(map) });
+            self.gateway
+                .send(GatewayMessage::PublishMap { map: Arc::new(map) });
         }
         if let Some(verdicts) = verdicts {
-            self.gateway.send(GatewayMessage::PublishVerdicts { verdicts: Arc::new(verdicts) });
+            self.gateway.send(GatewayMessage::PublishVerdicts {
+                verdicts: Arc::new(verdicts),
+            });
         }
         if has_verdicts || !evidence.is_empty() {
-            self.keeper.send(ReputationKeeperMessage::Record { epoch, round, evidence, reputations });
+            self.keeper.send(ReputationKeeperMessage::Record {
+                epoch,
+                round,
+                evidence,
+                reputations,
+            });
         }
         if let Some(votes) = self.aggregator.take_foreign_news() {
-            self.keeper.send(ReputationKeeperMessage::SetForeign { round, votes });
+            self.keeper
+                .send(ReputationKeeperMessage::SetForeign { round, votes });
         }
         self.tell_uplink(now);
     }
 
     /// Counts entries that this node left out of its map or verdicts, by the vehicles whose statements are in them.
     fn report_left_out(&self, left_out: &[InvalidEntry]) {
-        for InvalidEntry { reason, contributors } in left_out {
+        for InvalidEntry {
+            reason,
+            contributors,
+        } in left_out
+        {
             self.counters.count(Event::EntryLeftOut);
             for vehicle in contributors {
                 self.counters.troubles().note_about_with(vehicle.as_str(), TroubleKind::Misplaced, || {
@@ -430,7 +521,11 @@ impl FuserState {
             return;
         }
         let present = self.aggregator.present(now);
-        if present != self.present && self.uplink.send(UplinkMessage::SetPresent { vehicles: present.clone() }) {
+        if present != self.present
+            && self.uplink.send(UplinkMessage::SetPresent {
+                vehicles: present.clone(),
+            })
+        {
             self.present = present;
         }
     }
@@ -440,7 +535,8 @@ impl FuserState {
         let deadline = self.aggregator.deadline();
         if deadline < self.alarm {
             self.alarm = deadline;
-            let timer = myself.send_after(deadline.since(clock::now()), || FuserMessage::CloseRound);
+            let timer =
+                myself.send_after(deadline.since(clock::now()), || FuserMessage::CloseRound);
             if let Some(superseded) = self.timer.replace(timer.abort_handle()) {
                 superseded.abort();
             }

@@ -39,7 +39,8 @@ use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink
 use crate::transport::mqtt::packet_sink::Via;
 use crate::transport::mqtt::subscription_role::REPORTS;
 use crate::transport::mqtt::{
-    BrokerAddress, Incoming, LinkEvent, LinkState, MqttConfig, Security, Subscriber, SubscriptionRole,
+    BrokerAddress, Incoming, LinkEvent, LinkState, MqttConfig, Security, Subscriber,
+    SubscriptionRole,
 };
 
 /// Arguments of a [`Gateway`].
@@ -118,21 +119,32 @@ impl Actor for Gateway {
         let inbox = Arc::clone(&state.inbox);
         match message {
             GatewayMessage::SetBrokers { addresses } => state.set_brokers(addresses, &myself),
-            GatewayMessage::SetReportBrokers { addresses } => state.report_brokers = Some(addresses),
+            GatewayMessage::SetReportBrokers { addresses } => {
+                state.report_brokers = Some(addresses)
+            }
             GatewayMessage::WatchReports { wanted } => state.watch_reports(wanted),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
             GatewayMessage::PublishReport { kind, report } => {
-                publishing()
-                    .in_scope(|| state.publish(&kind.topic(report.node.clone()), &*report, Retention::Transient));
+                publishing().in_scope(|| {
+                    state.publish(
+                        &kind.topic(report.node.clone()),
+                        &*report,
+                        Retention::Transient,
+                    )
+                });
                 inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {
-                publishing().in_scope(|| state.publish(&Topic::GlobalDetections, &*map, Retention::Transient));
+                publishing().in_scope(|| {
+                    state.publish(&Topic::GlobalDetections, &*map, Retention::Transient)
+                });
                 links_first().await;
                 inbox.deliver_local(Incoming::Map(map));
             }
             GatewayMessage::PublishVerdicts { verdicts } => {
-                publishing().in_scope(|| state.publish(&Topic::GlobalVerdicts, &*verdicts, Retention::Transient));
+                publishing().in_scope(|| {
+                    state.publish(&Topic::GlobalVerdicts, &*verdicts, Retention::Transient)
+                });
                 links_first().await;
                 inbox.deliver_local(Incoming::Verdicts(verdicts));
             }
@@ -144,11 +156,19 @@ impl Actor for Gateway {
                 state.publish(&Topic::Cell, &*description, Retention::Retained);
             }
             GatewayMessage::PublishShare { share } => {
-                state.publish(&Topic::Ledger(share.node.clone()), &share, Retention::Transient);
+                state.publish(
+                    &Topic::Ledger(share.node.clone()),
+                    &share,
+                    Retention::Transient,
+                );
             }
             GatewayMessage::PublishStatus { status } => state.set_status(status),
             GatewayMessage::Links { reply } => {
-                let links = state.links.values().map(|link| (link.broker.clone(), link.state)).collect();
+                let links = state
+                    .links
+                    .values()
+                    .map(|link| (link.broker.clone(), link.state))
+                    .collect();
                 if reply.send(links).is_err() {
                     tracing::debug!("caller did not wait for the state of the links");
                 }
@@ -158,8 +178,16 @@ impl Actor for Gateway {
         Ok(())
     }
 
-    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
-        let gone = NodeStatus { state: NodeState::Offline, troubles: Vec::new(), ..state.status.clone() };
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
+        let gone = NodeStatus {
+            state: NodeState::Offline,
+            troubles: Vec::new(),
+            ..state.status.clone()
+        };
         state.set_status(gone);
         if state.looks_on {
             state.send(&state.status_topic, &Bytes::new(), Retention::Retained);
@@ -184,24 +212,58 @@ async fn links_first() {
 
 impl GatewayState {
     fn new(arguments: GatewayArguments) -> Self {
-        let GatewayArguments { cell, role, status, mqtt, security, clock, counters, subscriber, seed, looks_on } =
-            arguments;
+        let GatewayArguments {
+            cell,
+            role,
+            status,
+            mqtt,
+            security,
+            clock,
+            counters,
+            subscriber,
+            seed,
+            looks_on,
+        } = arguments;
         let topics = Topics::new(&cell);
         let encoding = mqtt.encoding;
         let status_topic = topics.path(&Topic::Nodes(status.node.clone()));
-        let filters = role.filters().iter().map(|level| topics.filter(level)).collect();
+        let filters = role
+            .filters()
+            .iter()
+            .map(|level| topics.filter(level))
+            .collect();
         let seal = |payload| Bytes::from(security.seal(&status_topic, payload));
-        let will = LastWill { topic: status_topic.clone(), payload: seal(offline_payload(&status, encoding)) };
+        let will = LastWill {
+            topic: status_topic.clone(),
+            payload: seal(offline_payload(&status, encoding)),
+        };
         let status_payload = seal(encode(&status, encoding));
-        let inbox =
-            Inbox::new(&status, topics.clone(), &mqtt, security.clone(), clock, Arc::clone(&counters), subscriber);
+        let inbox = Inbox::new(
+            &status,
+            topics.clone(),
+            &mqtt,
+            security.clone(),
+            clock,
+            Arc::clone(&counters),
+            subscriber,
+        );
         // One client id for each run: a broker ends the old connection before it accepts the new one, so that the last
         // will comes before the new status.
         let client_id = format!("{}-{}", status.node, status.id.simple());
         let (will, inbox) = (Mutex::new(will), Arc::new(inbox));
         let sink = Arc::<Inbox>::clone(&inbox);
         let unreachable = TroubleKind::BrokerUnreachable;
-        let setup = LinkSetup { client_id, filters, will, config: mqtt, security, sink, unreachable, counters, seed };
+        let setup = LinkSetup {
+            client_id,
+            filters,
+            will,
+            config: mqtt,
+            security,
+            sink,
+            unreachable,
+            counters,
+            seed,
+        };
         Self {
             inbox,
             looks_on,
@@ -223,7 +285,10 @@ impl GatewayState {
 
     fn set_brokers(&mut self, addresses: Vec<BrokerAddress>, myself: &ActorRef<GatewayMessage>) {
         let mut wanted: BTreeSet<_> = addresses.into_iter().collect();
-        let gone: Vec<_> = self.links.extract_if(.., |_, link| !wanted.remove(&link.broker)).collect();
+        let gone: Vec<_> = self
+            .links
+            .extract_if(.., |_, link| !wanted.remove(&link.broker))
+            .collect();
         for (_, link) in gone {
             // Deletes the retained status: that broker would not learn of later changes.
             link.publish(&self.status_topic, &Bytes::new(), Retention::Retained);
@@ -232,20 +297,31 @@ impl GatewayState {
         for broker in wanted {
             let id = LinkId(self.next_link);
             self.next_link += 1;
-            self.links.insert(id, Link::spawn(id, broker, Arc::clone(&self.setup), events_to(myself)));
+            self.links.insert(
+                id,
+                Link::spawn(id, broker, Arc::clone(&self.setup), events_to(myself)),
+            );
         }
     }
 
     fn filters(&self, broker: &BrokerAddress) -> Vec<String> {
         let reports = self.watches_reports || self.takes_reports_of(broker);
         let wanted = |level: &&&str| reports || !REPORTS.contains(*level);
-        self.role.filters().iter().filter(wanted).map(|level| self.topics.filter(level)).collect()
+        self.role
+            .filters()
+            .iter()
+            .filter(wanted)
+            .map(|level| self.topics.filter(level))
+            .collect()
     }
 
     /// True if this node itself needs the reports on a broker.
     fn takes_reports_of(&self, broker: &BrokerAddress) -> bool {
         match self.role {
-            SubscriptionRole::Candidate => self.report_brokers.as_ref().is_none_or(|brokers| brokers.contains(broker)),
+            SubscriptionRole::Candidate => self
+                .report_brokers
+                .as_ref()
+                .is_none_or(|brokers| brokers.contains(broker)),
             SubscriptionRole::Observer => true,
             SubscriptionRole::Follower => false,
         }
@@ -257,7 +333,11 @@ impl GatewayState {
         }
         self.watches_reports = wanted;
         let reports = REPORTS.map(|level| self.topics.filter(level));
-        for link in self.links.values().filter(|link| !self.takes_reports_of(&link.broker)) {
+        for link in self
+            .links
+            .values()
+            .filter(|link| !self.takes_reports_of(&link.broker))
+        {
             let told = link.client.as_ref().map(|client| match wanted {
                 true => client.subscribe(&reports, MaxQos::AtLeastOnce),
                 false => client.unsubscribe(&reports),
@@ -270,14 +350,25 @@ impl GatewayState {
         let seal = |payload| Bytes::from(self.setup.security.seal(&self.status_topic, payload));
         self.status_payload = seal(encode(&status, self.encoding));
         let will = seal(offline_payload(&status, self.encoding));
-        self.setup.will.lock().unwrap_or_else(PoisonError::into_inner).payload = will;
+        self.setup
+            .will
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .payload = will;
         self.status = status;
-        self.send(&self.status_topic, &self.status_payload, Retention::Retained);
+        self.send(
+            &self.status_topic,
+            &self.status_payload,
+            Retention::Retained,
+        );
     }
 
     fn publish<T: Payload>(&mut self, topic: &Topic, payload: &T, retention: Retention) {
         let (path, mut payload) = (self.topics.path(topic), encode(payload, self.encoding));
-        if matches!(topic, Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations) {
+        if matches!(
+            topic,
+            Topic::GlobalDetections | Topic::GlobalVerdicts | Topic::Reputations
+        ) {
             payload = self.setup.security.sign_round(&path, payload);
         }
         if self.fits::<T>(&path, payload.len()) {
@@ -293,7 +384,11 @@ impl GatewayState {
         let of_all = matches!(topic, Topic::GlobalDetections | Topic::GlobalVerdicts);
         let of_one = matches!(topic, Topic::Detections(_) | Topic::VoteDetections(_))
             && self.role == SubscriptionRole::Candidate;
-        let reports: Vec<_> = self.links.values().map(|link| of_one && self.takes_reports_of(&link.broker)).collect();
+        let reports: Vec<_> = self
+            .links
+            .values()
+            .map(|link| of_one && self.takes_reports_of(&link.broker))
+            .collect();
         for (link, reports) in self.links.values_mut().zip(reports) {
             if (of_all || reports) && link.state == LinkState::Up && link.misses_echo(now) {
                 link.state = LinkState::Stalled;
@@ -312,7 +407,12 @@ impl GatewayState {
         }
         self.setup.counters.count(Event::PublishTooLarge);
         if self.too_large.insert(topic.to_owned()) {
-            tracing::warn!(topic, bytes, limit, "payload too large to be sent, raise the limit in [mqtt]");
+            tracing::warn!(
+                topic,
+                bytes,
+                limit,
+                "payload too large to be sent, raise the limit in [mqtt]"
+            );
         }
         false
     }
@@ -320,27 +420,44 @@ impl GatewayState {
     fn send(&self, topic: &str, payload: &Bytes, retention: Retention) {
         for link in self.links.values() {
             let sent = link.publish(topic, payload, retention);
-            self.setup.counters.count(if sent { Event::Published } else { Event::PublishRefused });
+            self.setup.counters.count(if sent {
+                Event::Published
+            } else {
+                Event::PublishRefused
+            });
         }
     }
 
     fn link_changed(&mut self, LinkEvent { link: id, change }: LinkEvent) {
         let filters = match &change {
-            LinkChange::Accepted { .. } => self.links.get(&id).map_or_else(Vec::new, |link| self.filters(&link.broker)),
+            LinkChange::Accepted { .. } => self
+                .links
+                .get(&id)
+                .map_or_else(Vec::new, |link| self.filters(&link.broker)),
             _ => Vec::new(),
         };
-        let Some(link) = self.links.get_mut(&id) else { return };
+        let Some(link) = self.links.get_mut(&id) else {
+            return;
+        };
         let state = match change {
             LinkChange::Accepted { client, node } => {
                 // The queue of a new connection is empty, so that both fit.
-                client.publish(&self.status_topic, &self.status_payload, Retention::Retained);
+                client.publish(
+                    &self.status_topic,
+                    &self.status_payload,
+                    Retention::Retained,
+                );
                 client.subscribe(&filters, MaxQos::AtLeastOnce);
                 (link.client, link.node) = (Some(client), node);
                 LinkState::Up
             }
             LinkChange::DeclaredOffline => {
                 tracing::warn!(broker = %link.broker, "broker published the last will of this node, which is alive");
-                link.publish(&self.status_topic, &self.status_payload, Retention::Retained);
+                link.publish(
+                    &self.status_topic,
+                    &self.status_payload,
+                    Retention::Retained,
+                );
                 return;
             }
             LinkChange::Namesake(run) => {
@@ -348,7 +465,11 @@ impl GatewayState {
                 if self.namesakes.len() < MAX_NAMESAKES && self.namesakes.insert(run) {
                     let node = &self.status.node;
                     tracing::warn!(broker = %link.broker, %node, %run, "another living node has this node's name, rename one");
-                    link.publish(&self.status_topic, &self.status_payload, Retention::Retained);
+                    link.publish(
+                        &self.status_topic,
+                        &self.status_payload,
+                        Retention::Retained,
+                    );
                 }
                 return;
             }
@@ -376,7 +497,13 @@ fn events_to(gateway: &ActorRef<GatewayMessage>) -> LinkSink {
 fn tell_state(inbox: &Inbox, link: &Link) {
     let (broker, state) = (link.broker.clone(), link.state);
     tracing::info!(%broker, ?state, "link changed");
-    inbox.deliver_link(Via { address: &broker, node: link.node.as_ref() }, state);
+    inbox.deliver_link(
+        Via {
+            address: &broker,
+            node: link.node.as_ref(),
+        },
+        state,
+    );
 }
 
 /// Maximum runs with this node's name that are logged.

@@ -31,7 +31,8 @@ use crate::transport::gossip::machine::{GossipMachine, GossipOutput, GossipSetup
 use crate::transport::gossip::node_id::NodeId;
 use crate::transport::gossip::socket::GossipSocket;
 use crate::transport::gossip::{
-    EventSink, FrameCounters, FrameEvent, MAX_PAYLOAD_BYTES, Member, MembershipConfig, MembershipEvent, MulticastConfig,
+    EventSink, FrameCounters, FrameEvent, MAX_PAYLOAD_BYTES, Member, MembershipConfig,
+    MembershipEvent, MulticastConfig,
 };
 use crate::transport::pki::{Credentials, Distrust};
 
@@ -88,8 +89,18 @@ impl Actor for Membership {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let MembershipArguments { name, cell, run, role, broker, credentials, config, events, members, counters } =
-            arguments;
+        let MembershipArguments {
+            name,
+            cell,
+            run,
+            role,
+            broker,
+            credentials,
+            config,
+            events,
+            members,
+            counters,
+        } = arguments;
         let key = CellKey::load(&config, &cell)?;
         let socket = Arc::new(GossipSocket::bind(&config)?);
         let address = socket.address();
@@ -98,14 +109,35 @@ impl Actor for Membership {
         let identity = certificates.as_mut().map(CertificateWatch::identity);
         let now = clock::now();
         let gossip = config.advertise.unwrap_or(address);
-        let own = NodeId { name, run, life: run.max(now.micros()), role, gossip, broker };
+        let own = NodeId {
+            name,
+            run,
+            life: run.max(now.micros()),
+            role,
+            gossip,
+            broker,
+        };
         let (session, secret, seed) = draw_secrets()?;
-        let setup = GossipSetup { own, cell, key, session, identity, secret, seed, counters: Arc::clone(&counters) };
+        let setup = GossipSetup {
+            own,
+            cell,
+            key,
+            session,
+            identity,
+            secret,
+            seed,
+            counters: Arc::clone(&counters),
+        };
         let machine = GossipMachine::new(setup, &config, now);
         let (deadline, deadlines) = watch::channel(machine.next_deadline());
         let handled = Arc::new(Notify::new());
         let mut tasks = JoinSet::new();
-        tasks.spawn(watch_socket(Arc::clone(&socket), deadlines, Arc::clone(&handled), myself.clone()));
+        tasks.spawn(watch_socket(
+            Arc::clone(&socket),
+            deadlines,
+            Arc::clone(&handled),
+            myself.clone(),
+        ));
         if let Some(credentials) = credentials {
             tasks.spawn(check_certificates(credentials, myself.clone()));
         }
@@ -116,10 +148,23 @@ impl Actor for Membership {
             let told = Arc::clone(&events);
             let trouble = move |seed: &str, error: &io::Error| {
                 let cause = format!("cannot be resolved: {error}");
-                told(MembershipEvent::Troubled { about: seed.to_owned(), kind: TroubleKind::Unresolved, cause });
+                told(MembershipEvent::Troubled {
+                    about: seed.to_owned(),
+                    kind: TroubleKind::Unresolved,
+                    cause,
+                });
             };
-            let tell = move |addresses| myself.cast(MembershipMessage::SetSeeds { addresses }).is_ok();
-            tasks.spawn(crate::transport::gossip::seeds::resolve(config.seeds, address.is_ipv4(), trouble, tell));
+            let tell = move |addresses| {
+                myself
+                    .cast(MembershipMessage::SetSeeds { addresses })
+                    .is_ok()
+            };
+            tasks.spawn(crate::transport::gossip::seeds::resolve(
+                config.seeds,
+                address.is_ipv4(),
+                trouble,
+                tell,
+            ));
         }
         members.send_replace(Vec::new());
         Ok(MembershipState {
@@ -135,7 +180,11 @@ impl Actor for Membership {
         })
     }
 
-    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
         state.machine.leave(clock::now());
         state.carry_out();
         Ok(())
@@ -153,7 +202,8 @@ impl Actor for Membership {
             MembershipMessage::SetSeeds { addresses } => state.machine.set_seeds(addresses),
             MembershipMessage::Address { reply } => drop(reply.send(state.socket.address())),
             MembershipMessage::CheckCertificates => {
-                if let Some(identity) = state.certificates.as_mut().map(CertificateWatch::identity) {
+                if let Some(identity) = state.certificates.as_mut().map(CertificateWatch::identity)
+                {
                     state.machine.set_identity(identity, now);
                     // Nodes may have shown renewed certificates, which is no event.
                     state.tell_members();
@@ -171,8 +221,11 @@ impl MembershipState {
     fn wake(&mut self) {
         let mut buffer = [0; 2 * MAX_PAYLOAD_BYTES];
         for _ in 0..MAX_DATAGRAMS_PER_WAKE {
-            let Some((length, from)) = self.socket.receive(&mut buffer) else { break };
-            self.machine.receive(buffer.get(..length).unwrap_or_default(), from, clock::now());
+            let Some((length, from)) = self.socket.receive(&mut buffer) else {
+                break;
+            };
+            self.machine
+                .receive(buffer.get(..length).unwrap_or_default(), from, clock::now());
             self.carry_out();
         }
         self.machine.tick(clock::now());
@@ -186,7 +239,10 @@ impl MembershipState {
                 GossipOutput::Send { to, frame } => Some(self.socket.send(&frame, to)),
                 GossipOutput::Multicast { frame } => self.socket.multicast(&frame),
                 GossipOutput::Tell(event) => {
-                    changed |= !matches!(event, MembershipEvent::Received { .. } | MembershipEvent::Troubled { .. });
+                    changed |= !matches!(
+                        event,
+                        MembershipEvent::Received { .. } | MembershipEvent::Troubled { .. }
+                    );
                     (self.events)(event);
                     None
                 }
@@ -224,14 +280,19 @@ struct CertificateWatch {
 
 impl CertificateWatch {
     fn new(credentials: Arc<Credentials>) -> Self {
-        Self { credentials, own: None }
+        Self {
+            credentials,
+            own: None,
+        }
     }
 
     /// The present certificates and time. Logs when the own certificate begins or ceases to be valid, such as when the
     /// clock is set.
     fn identity(&mut self) -> Identity {
         let (credentials, wall) = (self.credentials.current(), UnixTime::now());
-        let own = credentials.verify_node(credentials.certificate(), wall).err();
+        let own = credentials
+            .verify_node(credentials.certificate(), wall)
+            .err();
         match (&self.own, &own) {
             (None, Some(cause)) => tracing::warn!(
                 %cause,
@@ -249,11 +310,19 @@ impl CertificateWatch {
 /// Time between two checks of the certificates against the clock.
 const CERTIFICATE_PERIOD: Duration = Duration::from_millis(500);
 
-async fn check_certificates(credentials: Arc<Credentials>, membership: ActorRef<MembershipMessage>) {
+async fn check_certificates(
+    credentials: Arc<Credentials>,
+    membership: ActorRef<MembershipMessage>,
+) {
     let mut known = credentials.current();
     loop {
-        known = timeout(CERTIFICATE_PERIOD, credentials.changed(&known)).await.unwrap_or(known);
-        if membership.cast(MembershipMessage::CheckCertificates).is_err() {
+        known = timeout(CERTIFICATE_PERIOD, credentials.changed(&known))
+            .await
+            .unwrap_or(known);
+        if membership
+            .cast(MembershipMessage::CheckCertificates)
+            .is_err()
+        {
             return;
         }
     }
@@ -293,7 +362,9 @@ const REJOIN_PERIOD: Duration = Duration::from_secs(5);
 /// Joins the multicast group, if enabled; false when that does not work, or not yet.
 fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
     if config.enabled && socket.address().is_ipv6() {
-        tracing::warn!("key `membership.bind`: no discovery by multicast on IPv6, which takes `membership.seeds`");
+        tracing::warn!(
+            "key `membership.bind`: no discovery by multicast on IPv6, which takes `membership.seeds`"
+        );
     }
     match socket.join(config) {
         Ok(()) => true,
@@ -319,21 +390,30 @@ const MAX_SLEEP: Duration = Duration::from_secs(60);
 fn draw_secrets() -> Result<(SessionNonce, [u8; 32], u64), ActorProcessingErr> {
     let random = SystemRandom::new();
     let (mut session, mut secret, mut seed) = (SessionNonce::default(), [0; 32], [0; 8]);
-    let drawn = random.fill(&mut session).and_then(|()| random.fill(&mut secret)).and_then(|()| random.fill(&mut seed));
+    let drawn = random
+        .fill(&mut session)
+        .and_then(|()| random.fill(&mut secret))
+        .and_then(|()| random.fill(&mut seed));
     drawn.map_err(|_| "the system gives no random numbers")?;
     Ok((session, secret, u64::from_le_bytes(seed)))
 }
 
 fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: SocketAddr) {
     match (config.has_key(), address.ip().is_loopback()) {
-        (true, _) if proves => tracing::info!(%address, "looking for nodes that have the cell's key and a certificate"),
+        (true, _) if proves => {
+            tracing::info!(%address, "looking for nodes that have the cell's key and a certificate")
+        }
         (true, _) => {
             tracing::info!(%address, "looking for nodes that have the cell's key; certificates are not asked for");
         }
         (false, false) if proves => {
             tracing::warn!(%address, "looking for nodes that have a certificate; no cell key is set");
         }
-        (false, true) => tracing::info!(%address, "looking for nodes on this machine only: no cell key is set"),
-        (false, false) => tracing::warn!(%address, "looking for nodes of anyone: no cell key is set"),
+        (false, true) => {
+            tracing::info!(%address, "looking for nodes on this machine only: no cell key is set")
+        }
+        (false, false) => {
+            tracing::warn!(%address, "looking for nodes of anyone: no cell key is set")
+        }
     }
 }

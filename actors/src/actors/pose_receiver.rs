@@ -76,8 +76,15 @@ impl Actor for PoseReceiver {
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
         let mut listener = JoinSet::new();
-        listener.spawn(listen(arguments.address, myself, Arc::clone(&arguments.counters)));
-        Ok(PoseReceiverState { arguments, _listener: listener })
+        listener.spawn(listen(
+            arguments.address,
+            myself,
+            Arc::clone(&arguments.counters),
+        ));
+        Ok(PoseReceiverState {
+            arguments,
+            _listener: listener,
+        })
     }
 
     async fn handle(
@@ -101,7 +108,11 @@ impl Actor for PoseReceiver {
 }
 
 /// Takes poses until the receiver ends. An address that cannot be bound is tried again.
-async fn listen(address: SocketAddr, receiver: ActorRef<PoseReceiverMessage>, counters: Arc<Counters>) {
+async fn listen(
+    address: SocketAddr,
+    receiver: ActorRef<PoseReceiverMessage>,
+    counters: Arc<Counters>,
+) {
     let mut is_logged = false;
     loop {
         let Err(error) = receive(address, &receiver, &counters).await;
@@ -120,7 +131,11 @@ async fn receive(
     let socket = UdpSocket::bind(address).await?;
     tracing::info!(%address, "receiving poses");
     let mut datagram = [0; MAX_BYTES];
-    let mut bucket = TokenBucket::new(MAX_POSE_HZ, Duration::from_secs(1) / MAX_POSE_HZ, clock::now());
+    let mut bucket = TokenBucket::new(
+        MAX_POSE_HZ,
+        Duration::from_secs(1) / MAX_POSE_HZ,
+        clock::now(),
+    );
     let mut is_logged = false;
     loop {
         let length = socket.recv(&mut datagram).await?;

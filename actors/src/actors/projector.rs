@@ -134,16 +134,29 @@ impl Actor for Projector {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         match message {
-            ProjectorMessage::Report { detections, lens, captured_at, shown } => {
+            ProjectorMessage::Report {
+                detections,
+                lens,
+                captured_at,
+                shown,
+            } => {
                 let image = ImageSize::from(&lens.intrinsics);
                 let boxed = if shown.is_some() { &*detections } else { &[] };
-                let mut boxes: Vec<_> = boxed.iter().map(|detection| PictureBox::new(detection, image)).collect();
+                let mut boxes: Vec<_> = boxed
+                    .iter()
+                    .map(|detection| PictureBox::new(detection, image))
+                    .collect();
                 state.report(detections, &lens, captured_at, &mut boxes);
                 if let Some(frame) = shown {
                     state.show(frame, boxes);
                 }
             }
-            ProjectorMessage::Configure { perception, standing, origin, algorithms } => {
+            ProjectorMessage::Configure {
+                perception,
+                standing,
+                origin,
+                algorithms,
+            } => {
                 state.perception = perception.continuing(&state.perception);
                 (state.standing, state.algorithms) = (standing, algorithms);
                 state.move_to(origin);
@@ -181,10 +194,22 @@ impl ProjectorState {
     }
 
     /// Publishes the report of a frame. Boxes of its detections get the objects that these became.
-    fn report(&mut self, detections: Vec<Detection>, lens: &Lens, captured_at: Timestamp, boxes: &mut [PictureBox]) {
-        let pose = self.poses.as_ref().map_or(self.standing, |poses| poses.at(captured_at));
+    fn report(
+        &mut self,
+        detections: Vec<Detection>,
+        lens: &Lens,
+        captured_at: Timestamp,
+        boxes: &mut [PictureBox],
+    ) {
+        let pose = self
+            .poses
+            .as_ref()
+            .map_or(self.standing, |poses| poses.at(captured_at));
         let Some(pose) = pose else {
-            self.troubles.note(TroubleKind::NoPose, "no pose is known near the time of the camera's frames");
+            self.troubles.note(
+                TroubleKind::NoPose,
+                "no pose is known near the time of the camera's frames",
+            );
             return self.counters.count(Event::FrameWithoutPose);
         };
         self.perception.set_pose(pose);
@@ -198,10 +223,16 @@ impl ProjectorState {
                 shown.object = Some(object.clone());
             }
         }
-        let ClockReading { offset_us, error_us } = self.clock.reading();
+        let ClockReading {
+            offset_us,
+            error_us,
+        } = self.clock.reading();
         (report.captured_at_us, report.clock_error_us) = (captured_at.shifted(offset_us), error_us);
         report.moving = self.is_fixed.then_some(false);
-        self.counters.add(Event::DetectionUnplaced, (found - report.objects.len()) as u64);
+        self.counters.add(
+            Event::DetectionUnplaced,
+            (found - report.objects.len()) as u64,
+        );
         if let Some(cause) = self.perception.without_size() {
             self.troubles.note(TroubleKind::NoSize, &cause);
         }
@@ -221,7 +252,9 @@ impl ProjectorState {
 
     /// Shows the frame in browsers. The next report does not wait for that.
     fn show(&self, frame: CameraFrame, boxes: Vec<PictureBox>) {
-        let Some(feed) = self.camera_feed.clone() else { return };
+        let Some(feed) = self.camera_feed.clone() else {
+            return;
+        };
         let counters = Arc::clone(&self.counters);
         spawn_blocking(move || match camera_event(&frame, &boxes) {
             Ok(event) => {
@@ -233,14 +266,34 @@ impl ProjectorState {
     }
 
     fn publish(&self, kind: ReportKind, report: ObjectReport) {
-        self.gateway.send(GatewayMessage::PublishReport { kind, report: Arc::new(report) });
+        self.gateway.send(GatewayMessage::PublishReport {
+            kind,
+            report: Arc::new(report),
+        });
     }
 }
 
 /// The report as VOTE needs it: objects at known locations only.
 pub fn votes(report: &ObjectReport) -> ObjectReport {
-    let objects = report.objects.iter().filter(|object| object.landmark.is_some()).cloned().collect();
-    let ObjectReport { node, seq, captured_at_us, pose, clock_error_us, .. } = report;
+    let objects = report
+        .objects
+        .iter()
+        .filter(|object| object.landmark.is_some())
+        .cloned()
+        .collect();
+    let ObjectReport {
+        node,
+        seq,
+        captured_at_us,
+        pose,
+        clock_error_us,
+        ..
+    } = report;
     let empty = ObjectReport::new(node.clone(), *seq, *captured_at_us);
-    ObjectReport { pose: *pose, objects, clock_error_us: *clock_error_us, ..empty }
+    ObjectReport {
+        pose: *pose,
+        objects,
+        clock_error_us: *clock_error_us,
+        ..empty
+    }
 }

@@ -68,14 +68,27 @@ impl Actor for Recorder {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let RecorderArguments { config, identity, recording, leadership, counters } = arguments;
+        let RecorderArguments {
+            config,
+            identity,
+            recording,
+            leadership,
+            counters,
+        } = arguments;
         let (sender, queue) = sync_channel(config.queue);
         let writer = LogWriter::new(config, identity, recording.clone());
-        let writer = std::thread::Builder::new().name("recorder".into()).spawn(move || writer.run(&queue))?;
+        let writer = std::thread::Builder::new()
+            .name("recorder".into())
+            .spawn(move || writer.run(&queue))?;
         recording.connect(Some(sender));
         tokio::spawn(watch_leadership(leadership.clone(), myself.clone()));
         myself.send_interval(TICK, || RecorderMessage::Tick);
-        Ok(RecorderState { recording, leadership, counters, writer: Some(writer) })
+        Ok(RecorderState {
+            recording,
+            leadership,
+            counters,
+            writer: Some(writer),
+        })
     }
 
     async fn handle(
@@ -85,16 +98,28 @@ impl Actor for Recorder {
         state: &mut Self::State,
     ) -> Result<(), ActorProcessingErr> {
         let item = match message {
-            RecorderMessage::RecordLeadership => LogItem::Leadership(state.leadership.borrow().clone()),
+            RecorderMessage::RecordLeadership => {
+                LogItem::Leadership(state.leadership.borrow().clone())
+            }
             RecorderMessage::Tick => LogItem::Counters(state.counters.snapshot()),
         };
         state.recording.send(clock::now(), item);
-        if state.writer.as_ref().is_some_and(JoinHandle::is_finished) { Err("the writer ended".into()) } else { Ok(()) }
+        if state.writer.as_ref().is_some_and(JoinHandle::is_finished) {
+            Err("the writer ended".into())
+        } else {
+            Ok(())
+        }
     }
 
-    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
         state.recording.connect(None);
-        let Some(writer) = state.writer.take() else { return Ok(()) };
+        let Some(writer) = state.writer.take() else {
+            return Ok(());
+        };
         let ended = tokio::task::spawn_blocking(|| writer.join().is_ok());
         if tokio::time::timeout(STOP_PATIENCE, ended).await.is_err() {
             tracing::warn!("the last log entries are not yet on the disk");
@@ -104,6 +129,11 @@ impl Actor for Recorder {
 }
 
 /// Requests a record of the present leadership and of every change; ends with the recorder.
-async fn watch_leadership(mut leadership: watch::Receiver<Leadership>, recorder: ActorRef<RecorderMessage>) {
-    while recorder.cast(RecorderMessage::RecordLeadership).is_ok() && leadership.changed().await.is_ok() {}
+async fn watch_leadership(
+    mut leadership: watch::Receiver<Leadership>,
+    recorder: ActorRef<RecorderMessage>,
+) {
+    while recorder.cast(RecorderMessage::RecordLeadership).is_ok()
+        && leadership.changed().await.is_ok()
+    {}
 }

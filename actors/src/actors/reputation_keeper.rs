@@ -29,7 +29,9 @@ use ecod::leadership::node::Input;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::reputation::{Evidence, ReputationConfig};
-use ecod::wire::{LedgerShare, Payload, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION};
+use ecod::wire::{
+    LedgerShare, Payload, RejectReason, Reputation, Reputations, Role, SCHEMA_VERSION,
+};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
@@ -125,7 +127,9 @@ impl Actor for ReputationKeeper {
     ) -> Result<Self::State, ActorProcessingErr> {
         let mut state = ReputationKeeperState::new(arguments);
         state.restore();
-        myself.send_interval(state.arguments.config.publish_period(), || ReputationKeeperMessage::Tick);
+        myself.send_interval(state.arguments.config.publish_period(), || {
+            ReputationKeeperMessage::Tick
+        });
         if state.signer.is_some() {
             // Certificates may have been revoked while the actor did not run.
             state.drop_revoked();
@@ -152,10 +156,17 @@ impl Actor for ReputationKeeper {
             }
             ReputationKeeperMessage::SetForeign { round, votes } => state.set_foreign(round, votes),
             ReputationKeeperMessage::TellUplink => state.tell_all(),
-            ReputationKeeperMessage::Record { epoch, round, evidence, reputations } => {
+            ReputationKeeperMessage::Record {
+                epoch,
+                round,
+                evidence,
+                reputations,
+            } => {
                 state.record(&epoch, round, &evidence, reputations);
             }
-            ReputationKeeperMessage::Configure { reputation } => state.arguments.reputation = reputation,
+            ReputationKeeperMessage::Configure { reputation } => {
+                state.arguments.reputation = reputation
+            }
             ReputationKeeperMessage::StepDown => state.resync.step_down(),
             ReputationKeeperMessage::Merge { delivery } => state.merge(&delivery),
             ReputationKeeperMessage::SendSnapshot { to } => {
@@ -164,7 +175,8 @@ impl Actor for ReputationKeeper {
             }
             ReputationKeeperMessage::Tick => state.tick().await,
             ReputationKeeperMessage::CheckCertificates => {
-                if state.signer.as_mut().is_some_and(EvidenceSigner::reload) && state.drop_revoked() {
+                if state.signer.as_mut().is_some_and(EvidenceSigner::reload) && state.drop_revoked()
+                {
                     // Receivers drop reputations that repeat a round.
                     state.last_round += 1;
                     state.settle().await;
@@ -174,7 +186,11 @@ impl Actor for ReputationKeeper {
         Ok(())
     }
 
-    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
         state.save().await;
         Ok(())
     }
@@ -182,13 +198,21 @@ impl Actor for ReputationKeeper {
 
 impl ReputationKeeperState {
     fn new(arguments: ReputationKeeperArguments) -> Self {
-        let (name, ticks_per_snapshot) = (arguments.name.clone(), arguments.config.ticks_per_snapshot());
+        let (name, ticks_per_snapshot) = (
+            arguments.name.clone(),
+            arguments.config.ticks_per_snapshot(),
+        );
         let credentials = arguments.credentials.clone();
         let mut writer = StateWriter::new(arguments.file.clone(), "reputations");
         // A run before may have left something.
         writer.note_change();
-        let resync = if credentials.is_some() { LedgerResync::signed } else { LedgerResync::new };
-        let signer = credentials.map(|credentials| EvidenceSigner::new(arguments.cell.clone(), credentials));
+        let resync = if credentials.is_some() {
+            LedgerResync::signed
+        } else {
+            LedgerResync::new
+        };
+        let signer =
+            credentials.map(|credentials| EvidenceSigner::new(arguments.cell.clone(), credentials));
         Self {
             resync: resync(name, ticks_per_snapshot),
             certificate: signer.as_ref().map(EvidenceSigner::certificate),
@@ -206,18 +230,27 @@ impl ReputationKeeperState {
     /// Takes over what earlier runs knew, and what is saved.
     fn restore(&mut self) {
         store::restore(&self.arguments, self.signer.as_mut());
-        self.resync.resume(&self.arguments.reputations.open().ledger, clock::now());
+        self.resync
+            .resume(&self.arguments.reputations.open().ledger, clock::now());
     }
 
     fn lead(&mut self, epoch: Epoch, last_round: u64) {
-        let newest = self.arguments.newest.borrow().as_ref().map(|newest| Arc::clone(&newest.message));
+        let newest = self
+            .arguments
+            .newest
+            .borrow()
+            .as_ref()
+            .map(|newest| Arc::clone(&newest.message));
         let mut store = self.arguments.reputations.open();
         // Where evidence is counted, a false leader's reputations are not to stay when it is revoked.
-        let others = newest.filter(|newest| newest.aggregator.as_ref() != Some(&self.arguments.name));
+        let others =
+            newest.filter(|newest| newest.aggregator.as_ref() != Some(&self.arguments.name));
         if let Some(newest) = others.filter(|_| !store.by_evidence) {
             store.standing.clone_from(&newest.reputations);
         }
-        self.arguments.fuser.send(FuserMessage::Resume { reputations: store.standing.clone() });
+        self.arguments.fuser.send(FuserMessage::Resume {
+            reputations: store.standing.clone(),
+        });
         self.resync.lead(epoch);
         self.last_round = last_round;
     }
@@ -248,7 +281,12 @@ impl ReputationKeeperState {
         let candidates = self.candidates();
         let leadership = self.arguments.leadership.borrow().clone();
         let broker = delivery.broker.as_ref();
-        let way = self.resync.check_way(broker, share, &self.arguments.reputations.open().ledger, &leadership);
+        let way = self.resync.check_way(
+            broker,
+            share,
+            &self.arguments.reputations.open().ledger,
+            &leadership,
+        );
         if let Err(reason) = way {
             let broker = broker.map_or(OTHERS, NodeName::as_str);
             tracing::debug!(node = %share.node, broker, "evidence over this broker not used");
@@ -258,11 +296,19 @@ impl ReputationKeeperState {
             && let Err(error) = signer.verify(share)
         {
             tracing::debug!(node = %share.node, %error, "evidence not used");
-            return self.arguments.counters.reject(RejectReason::BadSignature, share.node.as_str());
+            return self
+                .arguments
+                .counters
+                .reject(RejectReason::BadSignature, share.node.as_str());
         }
         let mut store = self.arguments.reputations.open();
-        let (at, date) = (delivery.received_at, self.arguments.clock.date(delivery.received_at));
-        let merged = self.resync.merge(share, &mut store.ledger, &candidates, &leadership, at, date);
+        let (at, date) = (
+            delivery.received_at,
+            self.arguments.clock.date(delivery.received_at),
+        );
+        let merged =
+            self.resync
+                .merge(share, &mut store.ledger, &candidates, &leadership, at, date);
         drop(store);
         let merged = match merged {
             Ok(merged) => merged,
@@ -272,8 +318,12 @@ impl ReputationKeeperState {
             }
         };
         if self.resync.is_vouched_for(broker, share, &leadership) {
-            let input = Input::EvidenceReceived { from: share.node.clone() };
-            self.arguments.election.send(LeaderElectionMessage::Note { input });
+            let input = Input::EvidenceReceived {
+                from: share.node.clone(),
+            };
+            self.arguments
+                .election
+                .send(LeaderElectionMessage::Note { input });
         }
         for reason in merged.refused {
             tracing::debug!(node = %share.node, %reason, term = leadership.term, "part of the evidence not used");
@@ -290,12 +340,20 @@ impl ReputationKeeperState {
     /// The other nodes that may lead.
     fn candidates(&self) -> Vec<NodeName> {
         let members = self.arguments.members.borrow();
-        members.iter().filter(|member| member.role != Role::Cav).map(|member| member.name.clone()).collect()
+        members
+            .iter()
+            .filter(|member| member.role != Role::Cav)
+            .map(|member| member.name.clone())
+            .collect()
     }
 
     async fn tick(&mut self) {
         let leadership = self.arguments.leadership.borrow().clone();
-        let passed = self.resync.tick(&mut self.arguments.reputations.open().ledger, &leadership, clock::now());
+        let passed = self.resync.tick(
+            &mut self.arguments.reputations.open().ledger,
+            &leadership,
+            clock::now(),
+        );
         if passed.is_news {
             tracing::debug!("what a leader tells of itself is no longer on trial");
             self.writer.note_change();
@@ -319,7 +377,9 @@ impl ReputationKeeperState {
 
     /// Publishes what the store says, unless it did so after the same round.
     fn publish(&mut self) {
-        let Some(epoch) = self.resync.leads() else { return };
+        let Some(epoch) = self.resync.leads() else {
+            return;
+        };
         let now = Some((epoch.clone(), self.last_round));
         if self.published == now {
             return;
@@ -329,28 +389,43 @@ impl ReputationKeeperState {
             aggregator: Some(epoch.leader.clone()),
             epoch: epoch.term,
             round: self.last_round,
-            reputations: self.arguments.reputations.open().reputations(&self.arguments.reputation),
+            reputations: self
+                .arguments
+                .reputations
+                .open()
+                .reputations(&self.arguments.reputation),
         };
         reputations.remove_invalid();
         self.published = now;
-        self.arguments.gateway.send(GatewayMessage::PublishReputations { reputations: Arc::new(reputations) });
+        self.arguments
+            .gateway
+            .send(GatewayMessage::PublishReputations {
+                reputations: Arc::new(reputations),
+            });
     }
 
     fn send_snapshot(&mut self) {
-        let shares = self.resync.snapshot(&self.arguments.reputations.open().ledger);
+        let shares = self
+            .resync
+            .snapshot(&self.arguments.reputations.open().ledger);
         self.publish_shares(shares);
     }
 
     /// Publishes shares; those of the node's own counts are signed first.
     fn publish_shares(&mut self, shares: Vec<LedgerShare>) {
         for share in shares {
-            let signer = self.signer.as_ref().filter(|_| share.signed.is_none() && !share.is_empty());
+            let signer = self
+                .signer
+                .as_ref()
+                .filter(|_| share.signed.is_none() && !share.is_empty());
             let share = match signer {
                 Some(signer) => signer.sign(share),
                 None => Some(share),
             };
             if let Some(share) = share {
-                self.arguments.gateway.send(GatewayMessage::PublishShare { share });
+                self.arguments
+                    .gateway
+                    .send(GatewayMessage::PublishShare { share });
             }
         }
     }
@@ -358,15 +433,22 @@ impl ReputationKeeperState {
     /// Drops the evidence of aggregators whose certificate was revoked, and this node's own if it has a new certificate
     /// since; true if there was any.
     fn drop_revoked(&mut self) -> bool {
-        let Some(signer) = &mut self.signer else { return false };
+        let Some(signer) = &mut self.signer else {
+            return false;
+        };
         let counted_under = self.certificate.replace(signer.certificate());
         let mut store = self.arguments.reputations.open();
-        let mut has_dropped = store.ledger.retain_statements(|share| signer.is_trusted(share));
+        let mut has_dropped = store
+            .ledger
+            .retain_statements(|share| signer.is_trusted(share));
         if counted_under.is_some_and(|certificate| !signer.is_of_cell(&certificate)) {
             has_dropped |= store.ledger.forget_own(&self.arguments.name);
         }
         if has_dropped {
-            tracing::info!(lanes = store.ledger.lanes(), "evidence of revoked nodes dropped");
+            tracing::info!(
+                lanes = store.ledger.lanes(),
+                "evidence of revoked nodes dropped"
+            );
             self.writer.note_change();
             self.unadopted = true;
         }
@@ -375,8 +457,16 @@ impl ReputationKeeperState {
 
     async fn save(&mut self) {
         let arguments = &self.arguments;
-        let outcome =
-            self.writer.save(|| Saved::of(&arguments.reputations.open(), self.certificate.as_ref(), arguments)).await;
+        let outcome = self
+            .writer
+            .save(|| {
+                Saved::of(
+                    &arguments.reputations.open(),
+                    self.certificate.as_ref(),
+                    arguments,
+                )
+            })
+            .await;
         let (counters, troubles) = (&arguments.counters, arguments.counters.troubles());
         match outcome {
             SaveOutcome::Unchanged => {}
@@ -386,16 +476,25 @@ impl ReputationKeeperState {
             }
             SaveOutcome::Failed => {
                 counters.count(Event::ReputationsNotSaved);
-                troubles.note(TroubleKind::NotSaved, "reputations cannot be saved, and end with this node");
+                troubles.note(
+                    TroubleKind::NotSaved,
+                    "reputations cannot be saved, and end with this node",
+                );
             }
         }
     }
 }
 
 /// Tells the keeper of changed certificates and revocation lists.
-async fn watch_certificates(credentials: Arc<Credentials>, keeper: ActorRef<ReputationKeeperMessage>) {
+async fn watch_certificates(
+    credentials: Arc<Credentials>,
+    keeper: ActorRef<ReputationKeeperMessage>,
+) {
     let mut known = credentials.current();
-    while keeper.cast(ReputationKeeperMessage::CheckCertificates).is_ok() {
+    while keeper
+        .cast(ReputationKeeperMessage::CheckCertificates)
+        .is_ok()
+    {
         known = credentials.changed(&known).await;
     }
 }

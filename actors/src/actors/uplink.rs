@@ -28,7 +28,9 @@ use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::neighbours::{MAX_AGE, Neighbours, ReputationExchange};
-use ecod::wire::{CellDescription, CellMap, GlobalMap, NodeState, NodeStatus, RegionTopic, SCHEMA_VERSION};
+use ecod::wire::{
+    CellDescription, CellMap, GlobalMap, NodeState, NodeStatus, RegionTopic, SCHEMA_VERSION,
+};
 use ractor::{Actor, ActorProcessingErr, ActorRef};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -118,7 +120,11 @@ impl Actor for Uplink {
         myself: ActorRef<Self::Msg>,
         arguments: Self::Arguments,
     ) -> Result<Self::State, ActorProcessingErr> {
-        let watcher = tokio::spawn(watch_cell(arguments.leadership.clone(), arguments.newest.clone(), myself.clone()));
+        let watcher = tokio::spawn(watch_cell(
+            arguments.leadership.clone(),
+            arguments.newest.clone(),
+            myself.clone(),
+        ));
         myself.send_interval(EXCHANGE_PERIOD, || UplinkMessage::Exchange);
         let mut state = UplinkState::new(arguments, watcher);
         state.look(&myself);
@@ -137,11 +143,18 @@ impl Actor for Uplink {
                 state.setup.status = status;
                 state.publish_status();
             }
-            UplinkMessage::Configure { origin, description } => state.configure(origin, description, &myself),
+            UplinkMessage::Configure {
+                origin,
+                description,
+            } => state.configure(origin, description, &myself),
             UplinkMessage::Take { delivery } => match delivery.message {
-                FromRegion::Map { topic, map } => state.take_map(&topic, *map, delivery.received_at),
+                FromRegion::Map { topic, map } => {
+                    state.take_map(&topic, *map, delivery.received_at)
+                }
                 FromRegion::Status(status) => state.hear_status(&status),
-                FromRegion::Reputation(message) => state.take_reputation(&message, delivery.received_at, &myself),
+                FromRegion::Reputation(message) => {
+                    state.take_reputation(&message, delivery.received_at, &myself)
+                }
             },
             UplinkMessage::SetPresent { vehicles } => state.set_present(&vehicles),
             UplinkMessage::TellCounts { counts } => state.count_vehicles(counts),
@@ -156,10 +169,18 @@ impl Actor for Uplink {
         Ok(())
     }
 
-    async fn post_stop(&self, _myself: ActorRef<Self::Msg>, state: &mut Self::State) -> Result<(), ActorProcessingErr> {
+    async fn post_stop(
+        &self,
+        _myself: ActorRef<Self::Msg>,
+        state: &mut Self::State,
+    ) -> Result<(), ActorProcessingErr> {
         state.watcher.abort();
         if let Some(link) = state.link.take() {
-            link.close(state.farewell().as_ref(), state.exchange.farewell(clock::now())).await;
+            link.close(
+                state.farewell().as_ref(),
+                state.exchange.farewell(clock::now()),
+            )
+            .await;
         }
         Ok(())
     }
@@ -168,7 +189,9 @@ impl Actor for Uplink {
 impl UplinkState {
     fn new(setup: UplinkArguments, watcher: JoinHandle<()>) -> Self {
         Self {
-            neighbours: setup.origin.map(|origin| Neighbours::new(setup.cell.clone(), origin)),
+            neighbours: setup
+                .origin
+                .map(|origin| Neighbours::new(setup.cell.clone(), origin)),
             has_news: false,
             exchange: ReputationExchange::new(setup.cell.clone()),
             seen: None,
@@ -192,7 +215,9 @@ impl UplinkState {
         }
         match (self.setup.origin.filter(|_| leads), self.link.take()) {
             (None, Some(link)) => self.leave(link),
-            (Some(origin), None) => self.link = Some(self.connect(Quadkey::of_cell(&origin), myself)),
+            (Some(origin), None) => {
+                self.link = Some(self.connect(Quadkey::of_cell(&origin), myself))
+            }
             (Some(_), link) => self.link = link,
             (None, None) => {}
         }
@@ -202,7 +227,8 @@ impl UplinkState {
     fn connect(&mut self, tile: Quadkey, myself: &ActorRef<UplinkMessage>) -> RegionLink {
         let receiver = myself.clone();
         // An uplink that has ended needs nothing.
-        let subscriber = Box::new(move |delivery| _ = receiver.cast(UplinkMessage::Take { delivery }));
+        let subscriber =
+            Box::new(move |delivery| _ = receiver.cast(UplinkMessage::Take { delivery }));
         let (limits, counters) = (self.connection.limits(), Arc::clone(&self.setup.counters));
         let sink = RegionInbox::new(
             (self.setup.cell.clone(), tile),
@@ -225,7 +251,13 @@ impl UplinkState {
         let id = LinkId(self.next_link);
         self.next_link += 1;
         self.pace = MapPace::new(self.setup.config.max_hz);
-        RegionLink::open(id, self.setup.broker.clone(), setup, &self.own_status(), events_to(myself))
+        RegionLink::open(
+            id,
+            self.setup.broker.clone(),
+            setup,
+            &self.own_status(),
+            events_to(myself),
+        )
     }
 
     fn leave(&mut self, link: RegionLink) {
@@ -238,8 +270,14 @@ impl UplinkState {
     /// The last status of a node that leaves the region; none if another leads, which has told its own.
     fn farewell(&self) -> Option<NodeStatus> {
         let leadership = self.setup.leadership.borrow();
-        let is_succeeded = leadership.leader().is_some_and(|leader| *leader != self.setup.status.node);
-        let gone = || NodeStatus { state: NodeState::Offline, troubles: Vec::new(), ..self.setup.status.clone() };
+        let is_succeeded = leadership
+            .leader()
+            .is_some_and(|leader| *leader != self.setup.status.node);
+        let gone = || NodeStatus {
+            state: NodeState::Offline,
+            troubles: Vec::new(),
+            ..self.setup.status.clone()
+        };
         (!is_succeeded).then(gone)
     }
 
@@ -266,18 +304,28 @@ impl UplinkState {
     /// The status of the node as the leader.
     fn own_status(&self) -> NodeStatus {
         let leadership = self.setup.leadership.borrow();
-        let epoch = leadership.epoch.as_ref().map_or(self.setup.status.epoch, |epoch| epoch.term);
+        let epoch = leadership
+            .epoch
+            .as_ref()
+            .map_or(self.setup.status.epoch, |epoch| epoch.term);
         let aggregator = Some(self.setup.status.node.clone());
-        NodeStatus { state: NodeState::Aggregating, epoch, aggregator, ..self.setup.status.clone() }
+        NodeStatus {
+            state: NodeState::Aggregating,
+            epoch,
+            aggregator,
+            ..self.setup.status.clone()
+        }
     }
 
     /// Looks at the newest map, if it is of this leadership and not old, and publishes it if it is new and due.
     fn publish_map(&mut self) {
         let now = clock::now();
-        let Some(ReceivedMap { received_at, map }) = self.setup.newest.borrow().clone() else { return };
+        let Some(ReceivedMap { received_at, map }) = self.setup.newest.borrow().clone() else {
+            return;
+        };
         let epoch = Epoch::new(map.epoch, map.aggregator.clone());
-        let is_own =
-            map.aggregator == self.setup.status.node && self.setup.leadership.borrow().present_epoch() == Some(&epoch);
+        let is_own = map.aggregator == self.setup.status.node
+            && self.setup.leadership.borrow().present_epoch() == Some(&epoch);
         if self.link.is_none() || !is_own || now.since(received_at) > MAX_AGE {
             return;
         }
@@ -285,15 +333,29 @@ impl UplinkState {
         if order > std::mem::replace(&mut self.seen, order) {
             self.tell_neighbours(&map, now);
         }
-        let (Some(link), Some(origin)) = (&mut self.link, self.setup.origin) else { return };
+        let (Some(link), Some(origin)) = (&mut self.link, self.setup.origin) else {
+            return;
+        };
         if order <= self.published || !self.pace.is_due(now) {
             return;
         }
         self.pace.advance(now);
         // Objects of neighbours are theirs to tell.
-        let map = GlobalMap { neighbour_objects: Vec::new(), ..GlobalMap::clone(&map) };
+        let map = GlobalMap {
+            neighbour_objects: Vec::new(),
+            ..GlobalMap::clone(&map)
+        };
         let (schema, cell) = (SCHEMA_VERSION, self.setup.cell.clone());
-        if link.publish_map(&CellMap { schema, cell, sent_at_us: now, origin, map }, now) {
+        if link.publish_map(
+            &CellMap {
+                schema,
+                cell,
+                sent_at_us: now,
+                origin,
+                map,
+            },
+            now,
+        ) {
             self.published = order;
         }
     }
@@ -332,38 +394,60 @@ impl UplinkState {
 
     /// Takes the map of another cell; one that does not count is counted by its reason and cell.
     fn take_map(&mut self, topic: &RegionTopic, map: CellMap, received_at: Timestamp) {
-        let Some(neighbours) = &mut self.neighbours else { return };
+        let Some(neighbours) = &mut self.neighbours else {
+            return;
+        };
         let losses = |neighbours: &Neighbours| {
-            let losses = neighbours.losses().get(&topic.cell).copied().unwrap_or_default();
+            let losses = neighbours
+                .losses()
+                .get(&topic.cell)
+                .copied()
+                .unwrap_or_default();
             losses.outside + losses.refused
         };
         let before = losses(neighbours);
         match neighbours.accept(topic, map, received_at) {
             Ok(()) => {
                 self.setup.counters.count(Event::CellMapAccepted);
-                self.setup.counters.add(Event::NeighbourRefused, losses(neighbours).saturating_sub(before));
+                self.setup.counters.add(
+                    Event::NeighbourRefused,
+                    losses(neighbours).saturating_sub(before),
+                );
                 self.pace.note_neighbour(received_at);
                 self.has_news = true;
             }
-            Err(reason) => self.setup.counters.reject_message(reason, &source(&topic.cell), || {
-                format!("map of the cell {} not used: {}", topic.cell, reason.in_words())
-            }),
+            Err(reason) => self
+                .setup
+                .counters
+                .reject_message(reason, &source(&topic.cell), || {
+                    format!(
+                        "map of the cell {} not used: {}",
+                        topic.cell,
+                        reason.in_words()
+                    )
+                }),
         }
     }
 
     /// Tells the fuser of the objects of others, once for each own map: the next one has them.
     fn tell_neighbours(&mut self, map: &GlobalMap, now: Timestamp) {
-        let Some(neighbours) = &mut self.neighbours else { return };
+        let Some(neighbours) = &mut self.neighbours else {
+            return;
+        };
         neighbours.observe_own(map, now);
         if std::mem::take(&mut self.has_news) {
             let objects = neighbours.near(now).into();
-            self.setup.fuser.send(FuserMessage::TakeNeighbours { objects, stated_at: now });
+            self.setup.fuser.send(FuserMessage::TakeNeighbours {
+                objects,
+                stated_at: now,
+            });
         }
     }
 }
 
 /// The cause of [`TroubleKind::NoOrigin`].
-const NO_ORIGIN: &str = "`uplink.broker` is set, and the cell has no origin: the region cannot tell where it is";
+const NO_ORIGIN: &str =
+    "`uplink.broker` is set, and the cell has no origin: the region cannot tell where it is";
 
 /// Callback that sends a link's events to the uplink itself.
 fn events_to(uplink: &ActorRef<UplinkMessage>) -> LinkSink {

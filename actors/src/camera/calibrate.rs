@@ -6,7 +6,9 @@ pub mod mount;
 use std::path::{Path, PathBuf};
 
 use ecod::perception::camera::Intrinsics;
-use opencv::core::{Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, TermCriteria_Type, Vector};
+use opencv::core::{
+    Mat, MatTraitConst, Point2f, Point3f, Size, TermCriteria, TermCriteria_Type, Vector,
+};
 use opencv::{calib3d, imgproc};
 use serde::{Deserialize, Serialize};
 
@@ -84,7 +86,9 @@ pub enum CalibrationError {
         expected: ImageSize,
     },
     /// Too few photographs show the board.
-    #[error("the chessboard was found in {found} images, need {MIN_VIEWS}; not in {without_board:?}")]
+    #[error(
+        "the chessboard was found in {found} images, need {MIN_VIEWS}; not in {without_board:?}"
+    )]
     TooFewViews {
         /// Number of photographs with the board.
         found: usize,
@@ -114,7 +118,8 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
     for path in paths {
         if path.is_dir() {
             let listed = images::in_directory(path);
-            photographs.extend(listed.map_err(|error| CalibrationError::Directory(path.clone(), error))?);
+            photographs
+                .extend(listed.map_err(|error| CalibrationError::Directory(path.clone(), error))?);
         } else {
             photographs.push(path.clone());
         }
@@ -129,8 +134,12 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
 pub fn read_gray(path: &Path) -> Result<Mat, CalibrationError> {
     let unreadable = |_| CalibrationError::UnreadableImage(path.to_owned());
     let mut gray = Mat::default();
-    imgproc::cvt_color_def(&image_codec::read(path).map_err(unreadable)?, &mut gray, imgproc::COLOR_BGR2GRAY)
-        .map_err(|error| CalibrationError::OpenCv(format!("image {path:?}"), error))?;
+    imgproc::cvt_color_def(
+        &image_codec::read(path).map_err(unreadable)?,
+        &mut gray,
+        imgproc::COLOR_BGR2GRAY,
+    )
+    .map_err(|error| CalibrationError::OpenCv(format!("image {path:?}"), error))?;
     Ok(gray)
 }
 
@@ -138,8 +147,15 @@ pub fn read_gray(path: &Path) -> Result<Mat, CalibrationError> {
 ///
 /// # Errors
 /// [`CalibrationError`], naming the image it is about.
-pub fn calibrate(images: &[PathBuf], board: &Chessboard) -> Result<CalibrationReport, CalibrationError> {
-    let Chessboard { columns, rows, square_mm } = *board;
+pub fn calibrate(
+    images: &[PathBuf],
+    board: &Chessboard,
+) -> Result<CalibrationReport, CalibrationError> {
+    let Chessboard {
+        columns,
+        rows,
+        square_mm,
+    } = *board;
     if columns < 3 || rows < 3 || !(square_mm.is_finite() && square_mm > 0.0) {
         return Err(CalibrationError::InvalidBoard(*board));
     }
@@ -151,10 +167,14 @@ pub fn calibrate(images: &[PathBuf], board: &Chessboard) -> Result<CalibrationRe
         let found = ImageSize::of(&image);
         let expected = *size.get_or_insert(found);
         if found != expected {
-            return Err(CalibrationError::SizeDiffers { path: path.clone(), size: found, expected });
+            return Err(CalibrationError::SizeDiffers {
+                path: path.clone(),
+                size: found,
+                expected,
+            });
         }
-        let corners =
-            find_board(&image, board).map_err(|error| CalibrationError::OpenCv(format!("image {path:?}"), error))?;
+        let corners = find_board(&image, board)
+            .map_err(|error| CalibrationError::OpenCv(format!("image {path:?}"), error))?;
         match corners {
             Some(corners) => {
                 views.push(corners);
@@ -164,19 +184,44 @@ pub fn calibrate(images: &[PathBuf], board: &Chessboard) -> Result<CalibrationRe
         }
     }
     let Some(size) = size.filter(|_| used.len() >= MIN_VIEWS) else {
-        return Err(CalibrationError::TooFewViews { found: used.len(), without_board });
+        return Err(CalibrationError::TooFewViews {
+            found: used.len(),
+            without_board,
+        });
     };
-    let calibration =
-        solve(&views, size, board, used).map_err(|error| CalibrationError::OpenCv("calibration".into(), error))?;
-    Ok(CalibrationReport { calibration, without_board })
+    let calibration = solve(&views, size, board, used)
+        .map_err(|error| CalibrationError::OpenCv("calibration".into(), error))?;
+    Ok(CalibrationReport {
+        calibration,
+        without_board,
+    })
 }
 
 impl Calibration {
     /// The camera with its distortion.
     pub fn lens(&self) -> Lens {
-        let Self { image_width: width, image_height: height, fx, fy, cx, cy, distortion, .. } = *self;
+        let Self {
+            image_width: width,
+            image_height: height,
+            fx,
+            fy,
+            cx,
+            cy,
+            distortion,
+            ..
+        } = *self;
         let distorts = distortion.iter().any(|k| *k != 0.0);
-        Lens { distortion: distorts.then_some(distortion), ..Lens::ideal(Intrinsics { width, height, fx, fy, cx, cy }) }
+        Lens {
+            distortion: distorts.then_some(distortion),
+            ..Lens::ideal(Intrinsics {
+                width,
+                height,
+                fx,
+                fy,
+                cx,
+                cy,
+            })
+        }
     }
 
     /// Reads a calibration file.
@@ -184,13 +229,19 @@ impl Calibration {
     /// # Errors
     /// [`CalibrationError::File`] or [`CalibrationError::Malformed`].
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
-        let text = bounded_file::read_text(path).map_err(|error| CalibrationError::File(path.to_owned(), error))?;
+        let text = bounded_file::read_text(path)
+            .map_err(|error| CalibrationError::File(path.to_owned(), error))?;
         let malformed = |reason| CalibrationError::Malformed(path.to_owned(), reason);
         let read: Self = toml::from_str(&text).map_err(|e| malformed(e.to_string()))?;
         let focal = [read.fx, read.fy].iter().all(|f| f.is_finite() && *f > 0.0);
-        let rest = [read.cx, read.cy].iter().chain(&read.distortion).all(|v| v.is_finite());
+        let rest = [read.cx, read.cy]
+            .iter()
+            .chain(&read.distortion)
+            .all(|v| v.is_finite());
         if !focal || !rest || read.image_width == 0 || read.image_height == 0 {
-            return Err(malformed("image size and focal lengths must be positive, all numbers finite".into()));
+            return Err(malformed(
+                "image size and focal lengths must be positive, all numbers finite".into(),
+            ));
         }
         Ok(read)
     }
@@ -200,8 +251,8 @@ impl Calibration {
     /// # Errors
     /// [`CalibrationError::File`] when it cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), CalibrationError> {
-        let text =
-            toml::to_string(self).map_err(|error| CalibrationError::Malformed(path.to_owned(), error.to_string()))?;
+        let text = toml::to_string(self)
+            .map_err(|error| CalibrationError::Malformed(path.to_owned(), error.to_string()))?;
         std::fs::write(path, text).map_err(|error| CalibrationError::File(path.to_owned(), error))
     }
 }
@@ -214,7 +265,13 @@ fn find_board(image: &Mat, board: &Chessboard) -> opencv::Result<Option<Vector<P
         return Ok(None);
     }
     let none = Size::new(-1, -1);
-    imgproc::corner_sub_pix(image, &mut corners, Size::new(5, 5), none, stop_after(30, 1e-3)?)?;
+    imgproc::corner_sub_pix(
+        image,
+        &mut corners,
+        Size::new(5, 5),
+        none,
+        stop_after(30, 1e-3)?,
+    )?;
     Ok(Some(corners))
 }
 
@@ -261,7 +318,11 @@ fn solve(
 }
 
 fn stop_after(iterations: i32, change: f64) -> opencv::Result<TermCriteria> {
-    TermCriteria::new(TermCriteria_Type::COUNT as i32 | TermCriteria_Type::EPS as i32, iterations, change)
+    TermCriteria::new(
+        TermCriteria_Type::COUNT as i32 | TermCriteria_Type::EPS as i32,
+        iterations,
+        change,
+    )
 }
 
 #[cfg(test)]

@@ -95,14 +95,23 @@ pub struct MountConfig {
 
 impl Default for OpticsConfig {
     fn default() -> Self {
-        Self { calibration: None, width_px: None, height_px: None, horizontal_fov_deg: 62.2, vertical_fov_deg: None }
+        Self {
+            calibration: None,
+            width_px: None,
+            height_px: None,
+            horizontal_fov_deg: 62.2,
+            vertical_fov_deg: None,
+        }
     }
 }
 
 impl CameraConfig {
     /// Name under which the camera of a vehicle reports; that of the vehicle if the two make none together.
     pub fn reporter(&self, vehicle: &NodeName) -> NodeName {
-        let part = self.name.as_ref().and_then(|name| NodeName::new(format!("{vehicle}{PART_MARK}{name}")).ok());
+        let part = self
+            .name
+            .as_ref()
+            .and_then(|name| NodeName::new(format!("{vehicle}{PART_MARK}{name}")).ok());
         part.unwrap_or_else(|| vehicle.clone())
     }
 
@@ -111,29 +120,45 @@ impl CameraConfig {
     /// # Errors
     /// [`ConfigError`] naming the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        if let Some(name) =
-            self.name.as_ref().filter(|name| name.len() > MAX_CAMERA_NAME || NodeName::new(name).is_err())
+        if let Some(name) = self
+            .name
+            .as_ref()
+            .filter(|name| name.len() > MAX_CAMERA_NAME || NodeName::new(name).is_err())
         {
             let allowed = format!("1 to {MAX_CAMERA_NAME} characters of A-Z, a-z, 0-9, _ and -");
             return Err(ConfigError::new("name", name, allowed));
         }
-        self.source.validate().map_err(|error| error.within("source"))?;
-        self.capture.validate().map_err(|error| error.within("capture"))?;
+        self.source
+            .validate()
+            .map_err(|error| error.within("source"))?;
+        self.capture
+            .validate()
+            .map_err(|error| error.within("capture"))?;
         if let SourceConfig::Images { fps, .. } = self.source
             && fps * self.capture.stall_timeout_s <= 1.0
         {
-            let least = format!("above 1 / capture.stall_timeout_s, {}", 1.0 / self.capture.stall_timeout_s);
+            let least = format!(
+                "above 1 / capture.stall_timeout_s, {}",
+                1.0 / self.capture.stall_timeout_s
+            );
             return Err(ConfigError::new("source.fps", fps, least));
         }
-        self.optics.validate().map_err(|error| error.within("optics"))?;
-        self.mount.validate().map_err(|error| error.within("mount"))?;
+        self.optics
+            .validate()
+            .map_err(|error| error.within("optics"))?;
+        self.mount
+            .validate()
+            .map_err(|error| error.within("mount"))?;
         if self.projection.ranging == Ranging::Ground && self.mount.height_m.is_none() {
-            let allowed =
-                "the camera's height above the ground, by which `projection.ranging = \"ground\"` places objects";
+            let allowed = "the camera's height above the ground, by which `projection.ranging = \"ground\"` places objects";
             return Err(ConfigError::new("mount.height_m", "nothing", allowed));
         }
-        self.detector.validate().map_err(|error| error.within("detector"))?;
-        self.projection.validate().map_err(|error| error.within("projection"))?;
+        self.detector
+            .validate()
+            .map_err(|error| error.within("detector"))?;
+        self.projection
+            .validate()
+            .map_err(|error| error.within("projection"))?;
         self.view.validate().map_err(|error| error.within("view"))
     }
 }
@@ -141,15 +166,24 @@ impl CameraConfig {
 impl OpticsConfig {
     fn validate(&self) -> Result<(), ConfigError> {
         for (key, size_px) in [("width_px", self.width_px), ("height_px", self.height_px)] {
-            size_px.map_or(Ok(()), |size_px| check_range(key, f64::from(size_px), 16.0, 16_384.0))?;
+            size_px.map_or(Ok(()), |size_px| {
+                check_range(key, f64::from(size_px), 16.0, 16_384.0)
+            })?;
         }
         if self.width_px.is_some() != self.height_px.is_some() {
-            let size = |size: Option<u32>| size.map_or_else(|| "none".to_owned(), |px| px.to_string());
+            let size =
+                |size: Option<u32>| size.map_or_else(|| "none".to_owned(), |px| px.to_string());
             let given = format!("{}x{}", size(self.width_px), size(self.height_px));
-            return Err(ConfigError::new("width_px and height_px", given, "both or neither"));
+            return Err(ConfigError::new(
+                "width_px and height_px",
+                given,
+                "both or neither",
+            ));
         }
         check_range("horizontal_fov_deg", self.horizontal_fov_deg, 1.0, 175.0)?;
-        self.vertical_fov_deg.map_or(Ok(()), |angle_deg| check_range("vertical_fov_deg", angle_deg, 1.0, 175.0))
+        self.vertical_fov_deg.map_or(Ok(()), |angle_deg| {
+            check_range("vertical_fov_deg", angle_deg, 1.0, 175.0)
+        })
     }
 
     /// Intrinsics and distortion, from the calibration file if there is one. Without a size they are those of a frame of
@@ -164,11 +198,20 @@ impl OpticsConfig {
         let (width, height) = (self.width_px.unwrap_or(640), self.height_px.unwrap_or(480));
         let horizontal_rad = self.horizontal_fov_deg.to_radians();
         let intrinsics = match self.vertical_fov_deg {
-            Some(angle_deg) => Intrinsics::from_field_of_view(width, height, horizontal_rad, angle_deg.to_radians()),
+            Some(angle_deg) => Intrinsics::from_field_of_view(
+                width,
+                height,
+                horizontal_rad,
+                angle_deg.to_radians(),
+            ),
             None => Intrinsics::with_square_pixels(width, height, horizontal_rad),
         };
-        let is_any_shape = self.width_px.is_none() && self.height_px.is_none() && self.vertical_fov_deg.is_none();
-        Ok(Lens { is_any_shape, ..Lens::ideal(intrinsics) })
+        let is_any_shape =
+            self.width_px.is_none() && self.height_px.is_none() && self.vertical_fov_deg.is_none();
+        Ok(Lens {
+            is_any_shape,
+            ..Lens::ideal(intrinsics)
+        })
     }
 }
 
@@ -177,7 +220,9 @@ impl MountConfig {
         check_range("forward_m", self.forward_m, -100.0, 100.0)?;
         check_range("left_m", self.left_m, -100.0, 100.0)?;
         check_range("pan_deg", self.pan_deg, -360.0, 360.0)?;
-        self.height_m.map_or(Ok(()), |height_m| check_range("height_m", height_m, 0.01, 1000.0))?;
+        self.height_m.map_or(Ok(()), |height_m| {
+            check_range("height_m", height_m, 0.01, 1000.0)
+        })?;
         check_range("pitch_deg", self.pitch_deg, -90.0, 90.0)?;
         check_range("roll_deg", self.roll_deg, -180.0, 180.0)
     }
@@ -199,7 +244,12 @@ impl MountConfig {
     /// The height and tilt of `other` at this place on the vehicle.
     pub(crate) fn placed(&self, other: &Mount) -> Mount {
         let here = Mount::from(*self);
-        Mount { forward_m: here.forward_m, left_m: here.left_m, pan_rad: here.pan_rad, ..*other }
+        Mount {
+            forward_m: here.forward_m,
+            left_m: here.left_m,
+            pan_rad: here.pan_rad,
+            ..*other
+        }
     }
 }
 

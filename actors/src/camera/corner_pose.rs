@@ -41,17 +41,29 @@ pub fn locate_target(
 /// whole-pixel corners often form.
 fn perturbed(corners: &[Point2<f64>; 4]) -> [Point2<f64>; 4] {
     let [first, second, third, fourth] = *corners;
-    [Point2::new(first.x + 1e-3, first.y + 2e-3), second, third, fourth]
+    [
+        Point2::new(first.x + 1e-3, first.y + 2e-3),
+        second,
+        third,
+        fourth,
+    ]
 }
 
-fn solve(corners: &[Point2<f64>; 4], side_m: f64, intrinsics: &Intrinsics) -> Result<Point3<f64>, CornerPoseError> {
+fn solve(
+    corners: &[Point2<f64>; 4],
+    side_m: f64,
+    intrinsics: &Intrinsics,
+) -> Result<Point3<f64>, CornerPoseError> {
     let half = side_m / 2.0;
     // The target's frame: x right, y up, z out of its front.
     let target: Vector<Point3d> = [(-half, half), (half, half), (half, -half), (-half, -half)]
         .map(|(x, y)| Point3d::new(x, y, 0.0))
         .into_iter()
         .collect();
-    let image: Vector<Point2d> = corners.iter().map(|corner| Point2d::new(corner.x, corner.y)).collect();
+    let image: Vector<Point2d> = corners
+        .iter()
+        .map(|corner| Point2d::new(corner.x, corner.y))
+        .collect();
     let (mut rotations, mut translations) = (Vector::<Mat>::new(), Vector::<Mat>::new());
     calib3d::solve_pnp_generic(
         &target,
@@ -70,7 +82,9 @@ fn solve(corners: &[Point2<f64>; 4], side_m: f64, intrinsics: &Intrinsics) -> Re
     for (rotation, translation) in rotations.iter().zip(&translations) {
         let mut matrix = Matx33d::default();
         calib3d::rodrigues_def(&rotation, &mut matrix)?;
-        let &[x, y, z] = translation.data_typed::<f64>()? else { continue };
+        let &[x, y, z] = translation.data_typed::<f64>()? else {
+            continue;
+        };
         let towards_camera = -(matrix.val[2] * x + matrix.val[5] * y + matrix.val[8] * z);
         if z > 0.0 && towards_camera > 0.0 && [x, y, z].iter().all(|c| c.is_finite()) {
             return Ok(Point3::new(x, y, z));
@@ -93,17 +107,26 @@ mod tests {
         let half = side_m / 2.0;
         let turn = Rotation3::from_euler_angles(pitch_rad, yaw_rad, 0.0);
         [(-half, -half), (half, -half), (half, half), (-half, half)].map(|(right, down)| {
-            camera().project(&(middle + turn * Vector3::new(right, down, 0.0))).expect("before the camera")
+            camera()
+                .project(&(middle + turn * Vector3::new(right, down, 0.0)))
+                .expect("before the camera")
         })
     }
 
     #[test]
     fn a_projected_target_is_found_where_it_was_whatever_its_yaw() {
         for yaw_deg in [-60.0, -30.0, 0.0, 15.0, 45.0] {
-            for middle in [Point3::new(0.0, 0.0, 0.5), Point3::new(-0.2, 0.05, 0.6), Point3::new(0.15, -0.1, 0.3)] {
+            for middle in [
+                Point3::new(0.0, 0.0, 0.5),
+                Point3::new(-0.2, 0.05, 0.6),
+                Point3::new(0.15, -0.1, 0.3),
+            ] {
                 let seen = corners(middle, 0.05, f64::to_radians(yaw_deg), 0.1);
                 let found = locate_target(&seen, 0.05, &camera()).unwrap();
-                assert!((found - middle).norm() < 1e-4, "{yaw_deg}° {middle} {found}");
+                assert!(
+                    (found - middle).norm() < 1e-4,
+                    "{yaw_deg}° {middle} {found}"
+                );
             }
         }
     }
@@ -121,10 +144,21 @@ mod tests {
     #[test]
     fn corners_that_mirror_each_other_have_a_position() {
         for square in [
-            [(154.0, 210.0), (216.0, 210.0), (216.0, 270.0), (154.0, 270.0)],
-            [(326.0, 210.0), (380.0, 211.0), (380.0, 269.0), (326.0, 270.0)],
+            [
+                (154.0, 210.0),
+                (216.0, 210.0),
+                (216.0, 270.0),
+                (154.0, 270.0),
+            ],
+            [
+                (326.0, 210.0),
+                (380.0, 211.0),
+                (380.0, 269.0),
+                (326.0, 270.0),
+            ],
         ] {
-            let found = locate_target(&square.map(|(x, y)| Point2::new(x, y)), 0.05, &camera()).unwrap();
+            let found =
+                locate_target(&square.map(|(x, y)| Point2::new(x, y)), 0.05, &camera()).unwrap();
             assert!((0.4..0.5).contains(&found.z), "{found}");
         }
     }
@@ -132,10 +166,19 @@ mod tests {
     #[test]
     fn corners_without_a_square_have_no_position() {
         let at = Point2::new(300.0, 200.0);
-        assert!(locate_target(&[at; 4], 0.05, &camera()).is_err(), "a single point");
+        assert!(
+            locate_target(&[at; 4], 0.05, &camera()).is_err(),
+            "a single point"
+        );
         let mirrored = corners(Point3::new(0.0, 0.0, 0.5), 0.05, 0.2, 0.0);
         let mirrored = [mirrored[1], mirrored[0], mirrored[3], mirrored[2]];
-        assert!(locate_target(&mirrored, 0.05, &camera()).is_err(), "seen from behind");
-        assert!(locate_target(&[Point2::new(f64::NAN, 0.0); 4], 0.05, &camera()).is_err(), "not a number");
+        assert!(
+            locate_target(&mirrored, 0.05, &camera()).is_err(),
+            "seen from behind"
+        );
+        assert!(
+            locate_target(&[Point2::new(f64::NAN, 0.0); 4], 0.05, &camera()).is_err(),
+            "not a number"
+        );
     }
 }

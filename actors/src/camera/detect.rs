@@ -53,7 +53,9 @@ pub enum DetectError {
     #[error("the model failed: {0}")]
     Model(String),
     /// The model found an object of a class without a label.
-    #[error("the model found class {class}, but there are {labels} labels: list all of its classes in `labels`")]
+    #[error(
+        "the model found class {class}, but there are {labels} labels: list all of its classes in `labels`"
+    )]
     UnknownClass {
         /// The class's number.
         class: usize,
@@ -68,14 +70,21 @@ pub enum DetectError {
 /// The frame's pixels, blue, green and red.
 fn bgr(frame: &CameraFrame) -> Result<Cow<'_, Mat>, DetectError> {
     let image = &frame.image;
-    let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };
+    let unusable = |found: String| DetectError::UnusableImage {
+        seq: frame.seq,
+        found,
+    };
     match image.typ() {
         _ if image.empty() => Err(unusable("no pixels".into())),
         CV_8UC3 => Ok(Cow::Borrowed(image)),
         CV_8UC1 => {
             let mut coloured = Mat::default();
-            imgproc::cvt_color_def(image, &mut coloured, imgproc::COLOR_GRAY2BGR)
-                .map_err(|source| DetectError::OpenCv { step: "gray to colour", source })?;
+            imgproc::cvt_color_def(image, &mut coloured, imgproc::COLOR_GRAY2BGR).map_err(
+                |source| DetectError::OpenCv {
+                    step: "gray to colour",
+                    source,
+                },
+            )?;
             Ok(Cow::Owned(coloured))
         }
         other => Err(unusable(format!("pixels of opencv type {other}"))),

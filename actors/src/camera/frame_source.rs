@@ -120,10 +120,20 @@ impl SourceConfig {
     /// [`FrameError::Open`] naming the source and what is wrong.
     pub fn open(&self, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
         match self {
-            Self::V4l2 { device, width, height, fps } => {
-                Ok(Box::new(V4l2Camera::open(device, [*width, *height], *fps, timeout)?))
+            Self::V4l2 {
+                device,
+                width,
+                height,
+                fps,
+            } => Ok(Box::new(V4l2Camera::open(
+                device,
+                [*width, *height],
+                *fps,
+                timeout,
+            )?)),
+            Self::Images { path, fps, looping } => {
+                Ok(Box::new(ImageSequence::open(path, *fps, *looping)?))
             }
-            Self::Images { path, fps, looping } => Ok(Box::new(ImageSequence::open(path, *fps, *looping)?)),
             Self::Gstreamer { .. } | Self::Url { .. } | Self::Video { .. } => {
                 Ok(Box::new(VideoProcess::open(self, timeout)?))
             }
@@ -133,12 +143,14 @@ impl SourceConfig {
     /// Device, pipeline, address or path, as it may be shown: without user and password.
     fn origin(&self) -> String {
         match self {
-            Self::V4l2 { device: path, .. } | Self::Video { path, .. } | Self::Images { path, .. } => {
-                path.display().to_string()
-            }
+            Self::V4l2 { device: path, .. }
+            | Self::Video { path, .. }
+            | Self::Images { path, .. } => path.display().to_string(),
             Self::Gstreamer { pipeline } => video::without_credentials(pipeline),
             // Without a scheme it is refused, but its secret must not be shown with the error.
-            Self::Url { url } if !url.contains("://") => url.rsplit('@').next().unwrap_or_default().to_owned(),
+            Self::Url { url } if !url.contains("://") => {
+                url.rsplit('@').next().unwrap_or_default().to_owned()
+            }
             Self::Url { url } => video::without_credentials(url),
         }
     }
@@ -146,7 +158,9 @@ impl SourceConfig {
     /// Removes user and password from an address; true if there were any.
     pub(crate) fn forget_credentials(&mut self) -> bool {
         let bare = self.origin();
-        let Self::Url { url } = self else { return false };
+        let Self::Url { url } = self else {
+            return false;
+        };
         let had = bare != *url;
         *url = bare;
         had
@@ -158,16 +172,22 @@ impl SourceConfig {
     /// [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         match self {
-            Self::V4l2 { width, height, fps, .. } => {
+            Self::V4l2 {
+                width, height, fps, ..
+            } => {
                 for (key, wish) in [("width", width), ("height", height)] {
-                    wish.map_or(Ok(()), |pixels| check_range(key, f64::from(pixels), 1.0, 16_384.0))?;
+                    wish.map_or(Ok(()), |pixels| {
+                        check_range(key, f64::from(pixels), 1.0, 16_384.0)
+                    })?;
                 }
                 fps.map_or(Ok(()), |fps| check_range("fps", fps, 0.01, 1000.0))
             }
             Self::Images { fps, .. } => check_range("fps", *fps, 0.01, 1000.0),
-            Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => {
-                Err(ConfigError::new("pipeline", pipeline, "a pipeline that ends in appsink"))
-            }
+            Self::Gstreamer { pipeline } if !pipeline.contains("appsink") => Err(ConfigError::new(
+                "pipeline",
+                pipeline,
+                "a pipeline that ends in appsink",
+            )),
             Self::Url { url } if !has_known_scheme(url) => Err(ConfigError::new(
                 "url",
                 self.origin(),
@@ -195,7 +215,10 @@ struct FramePacer {
 
 impl FramePacer {
     fn new(fps: f64) -> Self {
-        Self { period: Duration::from_secs_f64(1.0 / fps), due: None }
+        Self {
+            period: Duration::from_secs_f64(1.0 / fps),
+            due: None,
+        }
     }
 
     /// Sleeps until the next frame is due.
@@ -208,7 +231,9 @@ impl FramePacer {
 }
 
 fn has_known_scheme(url: &str) -> bool {
-    let scheme = url.split_once("://").map(|(scheme, _)| scheme.to_ascii_lowercase());
+    let scheme = url
+        .split_once("://")
+        .map(|(scheme, _)| scheme.to_ascii_lowercase());
     scheme.is_some_and(|scheme| matches!(&*scheme, "rtsp" | "rtsps" | "http" | "https"))
 }
 

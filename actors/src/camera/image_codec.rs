@@ -53,7 +53,9 @@ pub fn read(path: &Path) -> Result<Mat, ImageError> {
 /// # Errors
 /// [`ImageError::Malformed`] or [`ImageError::OpenCv`].
 pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
-    let mut decoder = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.into_decoder()?;
+    let mut decoder = ImageReader::new(Cursor::new(bytes))
+        .with_guessed_format()?
+        .into_decoder()?;
     let mut limits = Limits::default();
     limits.max_alloc = Some(MAX_DECODED_BYTES);
     limits.reserve(decoder.total_bytes())?;
@@ -61,7 +63,11 @@ pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
     let mut image = DynamicImage::from_decoder(decoder)?;
     image.apply_orientation(orientation);
     let rgb = image.into_rgb8();
-    let pixels = Mat::new_rows_cols_with_bytes::<Vec3b>(rgb.height() as i32, rgb.width() as i32, rgb.as_raw())?;
+    let pixels = Mat::new_rows_cols_with_bytes::<Vec3b>(
+        rgb.height() as i32,
+        rgb.width() as i32,
+        rgb.as_raw(),
+    )?;
     let mut bgr = Mat::default();
     imgproc::cvt_color_def(&pixels, &mut bgr, imgproc::COLOR_RGB2BGR)?;
     Ok(bgr)
@@ -79,11 +85,20 @@ pub fn encode_jpeg(image: &Mat, quality: u8) -> Result<Vec<u8>, ImageError> {
     if !is_gray {
         imgproc::cvt_color_def(image, &mut colors, imgproc::COLOR_BGR2YCrCb)?;
     }
-    let pixels = if is_gray { image.data_bytes()? } else { colors.data_bytes()? };
+    let pixels = if is_gray {
+        image.data_bytes()?
+    } else {
+        colors.data_bytes()?
+    };
     let mut jpeg = Vec::new();
     let mut encoder = Encoder::new(&mut jpeg, quality);
     encoder.set_sampling_factor(SamplingFactor::F_2_2);
-    encoder.encode_image(Pixels { pixels, width: side(size.width)?, height: side(size.height)?, is_gray })?;
+    encoder.encode_image(Pixels {
+        pixels,
+        width: side(size.width)?,
+        height: side(size.height)?,
+        is_gray,
+    })?;
     Ok(jpeg)
 }
 
@@ -98,7 +113,11 @@ struct Pixels<'a> {
 
 impl ImageBuffer for Pixels<'_> {
     fn get_jpeg_color_type(&self) -> JpegColorType {
-        if self.is_gray { JpegColorType::Luma } else { JpegColorType::Ycbcr }
+        if self.is_gray {
+            JpegColorType::Luma
+        } else {
+            JpegColorType::Ycbcr
+        }
     }
 
     fn width(&self) -> u16 {

@@ -34,7 +34,10 @@ const ASPECT_TOLERANCE: f64 = 0.01;
 impl ImageSize {
     /// The size of an image.
     pub fn of(image: &Mat) -> Self {
-        Self { width: image.cols().unsigned_abs(), height: image.rows().unsigned_abs() }
+        Self {
+            width: image.cols().unsigned_abs(),
+            height: image.rows().unsigned_abs(),
+        }
     }
 
     /// Checks that a frame of this size can be scaled to this one.
@@ -44,11 +47,19 @@ impl ImageSize {
     pub fn check_shape(self, frame: Self) -> Result<(), SizeMismatch> {
         let [x, y] = self.scale(frame);
         let is_scaled = x.is_finite() && y.is_finite() && (x / y - 1.0).abs() <= ASPECT_TOLERANCE;
-        if is_scaled { Ok(()) } else { Err(SizeMismatch { frame, optics: self }) }
+        if is_scaled {
+            Ok(())
+        } else {
+            Err(SizeMismatch {
+                frame,
+                optics: self,
+            })
+        }
     }
 
     fn scale(self, frame: Self) -> [f64; 2] {
-        [(self.width, frame.width), (self.height, frame.height)].map(|(to, from)| f64::from(to) / f64::from(from))
+        [(self.width, frame.width), (self.height, frame.height)]
+            .map(|(to, from)| f64::from(to) / f64::from(from))
     }
 
     /// Scales detections from a frame's size to this one.
@@ -61,7 +72,12 @@ impl ImageSize {
             return Ok(());
         }
         let [x, y] = self.scale(frame);
-        for Detection { bounding_box, corners, .. } in detections {
+        for Detection {
+            bounding_box,
+            corners,
+            ..
+        } in detections
+        {
             bounding_box.x_min *= x;
             bounding_box.x_max *= x;
             bounding_box.y_min *= y;
@@ -77,7 +93,10 @@ impl ImageSize {
 
 impl From<&Intrinsics> for ImageSize {
     fn from(intrinsics: &Intrinsics) -> Self {
-        Self { width: intrinsics.width, height: intrinsics.height }
+        Self {
+            width: intrinsics.width,
+            height: intrinsics.height,
+        }
     }
 }
 
@@ -94,20 +113,54 @@ mod tests {
 
     use super::*;
 
-    const OPTICS: ImageSize = ImageSize { width: 640, height: 480 };
+    const OPTICS: ImageSize = ImageSize {
+        width: 640,
+        height: 480,
+    };
 
     fn seen() -> Vec<Detection> {
-        let bounding_box = BoundingBox { x_min: 100.0, y_min: 50.0, x_max: 300.0, y_max: 250.0 };
-        let corners = [(100.0, 50.0), (300.0, 50.0), (300.0, 250.0), (100.0, 250.0)].map(|(x, y)| Point2::new(x, y));
-        vec![Detection { label: "QR".into(), confidence: 1.0, bounding_box, corners: Some(corners) }]
+        let bounding_box = BoundingBox {
+            x_min: 100.0,
+            y_min: 50.0,
+            x_max: 300.0,
+            y_max: 250.0,
+        };
+        let corners = [(100.0, 50.0), (300.0, 50.0), (300.0, 250.0), (100.0, 250.0)]
+            .map(|(x, y)| Point2::new(x, y));
+        vec![Detection {
+            label: "QR".into(),
+            confidence: 1.0,
+            bounding_box,
+            corners: Some(corners),
+        }]
     }
 
     #[test]
     fn a_frame_of_the_same_shape_is_scaled() {
         let mut detections = seen();
-        OPTICS.fit(ImageSize { width: 1280, height: 960 }, &mut detections).unwrap();
-        let Detection { bounding_box, corners, .. } = &detections[0];
-        assert_eq!(*bounding_box, BoundingBox { x_min: 50.0, y_min: 25.0, x_max: 150.0, y_max: 125.0 });
+        OPTICS
+            .fit(
+                ImageSize {
+                    width: 1280,
+                    height: 960,
+                },
+                &mut detections,
+            )
+            .unwrap();
+        let Detection {
+            bounding_box,
+            corners,
+            ..
+        } = &detections[0];
+        assert_eq!(
+            *bounding_box,
+            BoundingBox {
+                x_min: 50.0,
+                y_min: 25.0,
+                x_max: 150.0,
+                y_max: 125.0
+            }
+        );
         assert_eq!(corners.unwrap()[2], Point2::new(150.0, 125.0));
     }
 
@@ -115,8 +168,14 @@ mod tests {
     fn a_frame_of_another_shape_is_an_error_that_names_both_sizes() {
         for (width, height) in [(1280, 720), (480, 640), (640, 0)] {
             let mut detections = seen();
-            let error = OPTICS.fit(ImageSize { width, height }, &mut detections).unwrap_err().to_string();
-            assert!(error.contains(&format!("{width}x{height}")) && error.contains("640x480"), "{error}");
+            let error = OPTICS
+                .fit(ImageSize { width, height }, &mut detections)
+                .unwrap_err()
+                .to_string();
+            assert!(
+                error.contains(&format!("{width}x{height}")) && error.contains("640x480"),
+                "{error}"
+            );
             assert_eq!(detections, seen());
         }
     }

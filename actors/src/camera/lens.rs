@@ -22,7 +22,11 @@ pub struct Lens {
 impl Lens {
     /// A lens without distortion.
     pub fn ideal(intrinsics: Intrinsics) -> Self {
-        Self { intrinsics, distortion: None, is_any_shape: false }
+        Self {
+            intrinsics,
+            distortion: None,
+            is_any_shape: false,
+        }
     }
 
     /// The lens for frames of this size: this one if they have its shape.
@@ -33,11 +37,18 @@ impl Lens {
         let size = ImageSize::from(&self.intrinsics);
         match size.check_shape(frame) {
             Err(_) if self.is_any_shape && frame.width > 0 && frame.height > 0 => {
-                let height = f64::from(frame.height) * f64::from(size.width) / f64::from(frame.width);
+                let height =
+                    f64::from(frame.height) * f64::from(size.width) / f64::from(frame.width);
                 let horizontal_rad = self.intrinsics.horizontal_field_of_view();
-                let intrinsics =
-                    Intrinsics::with_square_pixels(size.width, height.round().max(1.0) as u32, horizontal_rad);
-                Ok(Self { intrinsics, ..*self })
+                let intrinsics = Intrinsics::with_square_pixels(
+                    size.width,
+                    height.round().max(1.0) as u32,
+                    horizontal_rad,
+                );
+                Ok(Self {
+                    intrinsics,
+                    ..*self
+                })
             }
             outcome => outcome.map(|()| *self),
         }
@@ -47,7 +58,11 @@ impl Lens {
     ///
     /// # Errors
     /// [`SizeMismatch`] for frames of another shape, unless the lens takes any.
-    pub fn fitted(&self, frame: ImageSize, detections: &mut [Detection]) -> Result<Self, SizeMismatch> {
+    pub fn fitted(
+        &self,
+        frame: ImageSize,
+        detections: &mut [Detection],
+    ) -> Result<Self, SizeMismatch> {
         let lens = self.of_frames(frame)?;
         ImageSize::from(&lens.intrinsics).fit(frame, detections)?;
         Ok(lens)
@@ -59,10 +74,30 @@ impl Lens {
     /// As [`Self::of_frames`].
     pub fn in_pixels_of(&self, frame: ImageSize) -> Result<Self, SizeMismatch> {
         let lens = self.of_frames(frame)?;
-        let Intrinsics { width, height, fx, fy, cx, cy } = lens.intrinsics;
-        let (x, y) = (f64::from(frame.width) / f64::from(width), f64::from(frame.height) / f64::from(height));
+        let Intrinsics {
+            width,
+            height,
+            fx,
+            fy,
+            cx,
+            cy,
+        } = lens.intrinsics;
+        let (x, y) = (
+            f64::from(frame.width) / f64::from(width),
+            f64::from(frame.height) / f64::from(height),
+        );
         let (width, height) = (frame.width, frame.height);
-        Ok(Self { intrinsics: Intrinsics { width, height, fx: fx * x, fy: fy * y, cx: cx * x, cy: cy * y }, ..lens })
+        Ok(Self {
+            intrinsics: Intrinsics {
+                width,
+                height,
+                fx: fx * x,
+                fy: fy * y,
+                cx: cx * x,
+                cy: cy * y,
+            },
+            ..lens
+        })
     }
 
     /// Undistorts boxes and corners. A box is undistorted at the midpoints of its edges.
@@ -74,9 +109,19 @@ impl Lens {
             return Ok(());
         }
         let mut points = Vec::new();
-        for Detection { bounding_box: b, corners, .. } in detections.iter() {
+        for Detection {
+            bounding_box: b,
+            corners,
+            ..
+        } in detections.iter()
+        {
             let middle = b.center();
-            let edges = [(b.x_min, middle.y), (b.x_max, middle.y), (middle.x, b.y_min), (middle.x, b.y_max)];
+            let edges = [
+                (b.x_min, middle.y),
+                (b.x_max, middle.y),
+                (middle.x, b.y_min),
+                (middle.x, b.y_max),
+            ];
             points.extend(edges.map(|(x, y)| Point2::new(x, y)));
             points.extend(corners.iter().flatten());
         }
@@ -84,8 +129,17 @@ impl Lens {
         let mut next = || straight.next().unwrap_or_default();
         for detection in detections {
             let [left, right, upper, lower] = std::array::from_fn(|_| next());
-            detection.bounding_box = BoundingBox { x_min: left.x, y_min: upper.y, x_max: right.x, y_max: lower.y };
-            detection.corners.iter_mut().flatten().for_each(|corner| *corner = next());
+            detection.bounding_box = BoundingBox {
+                x_min: left.x,
+                y_min: upper.y,
+                x_max: right.x,
+                y_max: lower.y,
+            };
+            detection
+                .corners
+                .iter_mut()
+                .flatten()
+                .for_each(|corner| *corner = next());
         }
         Ok(())
     }
@@ -95,13 +149,28 @@ impl Lens {
     /// # Errors
     /// OpenCV's.
     pub fn undistorted(&self, points: &[Point2<f64>]) -> opencv::Result<Vec<Point2<f64>>> {
-        let Some(distortion) = self.distortion.filter(|_| !points.is_empty()) else { return Ok(points.to_vec()) };
-        let points: Vector<Point2d> = points.iter().map(|point| Point2d::new(point.x, point.y)).collect();
+        let Some(distortion) = self.distortion.filter(|_| !points.is_empty()) else {
+            return Ok(points.to_vec());
+        };
+        let points: Vector<Point2d> = points
+            .iter()
+            .map(|point| Point2d::new(point.x, point.y))
+            .collect();
         let camera = camera_matrix(&self.intrinsics);
         let mut straight = Vector::<Point2d>::new();
         let distortion = Vector::<f64>::from_slice(&distortion);
-        calib3d::undistort_points(&points, &mut straight, &camera, &distortion, &Mat::default(), &camera)?;
-        Ok(straight.iter().map(|point| Point2::new(point.x, point.y)).collect())
+        calib3d::undistort_points(
+            &points,
+            &mut straight,
+            &camera,
+            &distortion,
+            &Mat::default(),
+            &camera,
+        )?;
+        Ok(straight
+            .iter()
+            .map(|point| Point2::new(point.x, point.y))
+            .collect())
     }
 }
 
@@ -136,42 +205,100 @@ mod tests {
 
     #[test]
     fn corners_return_to_where_an_ideal_lens_draws_them() {
-        let ideal = [(500.0, 100.0), (560.0, 105.0), (555.0, 160.0), (495.0, 150.0)].map(|(x, y)| Point2::new(x, y));
+        let ideal = [
+            (500.0, 100.0),
+            (560.0, 105.0),
+            (555.0, 160.0),
+            (495.0, 150.0),
+        ]
+        .map(|(x, y)| Point2::new(x, y));
         let bent = ideal.map(distorted);
-        assert!((bent[1] - ideal[1]).norm() > 5.0, "the lens bends enough to be seen");
+        assert!(
+            (bent[1] - ideal[1]).norm() > 5.0,
+            "the lens bends enough to be seen"
+        );
         let seen = Detection {
             label: "QR".into(),
             confidence: 1.0,
             bounding_box: BoundingBox::around(&bent),
             corners: Some(bent),
         };
-        let mut detections = vec![Detection { corners: None, ..seen.clone() }, seen];
-        Lens { distortion: Some(DISTORTION), ..Lens::ideal(camera()) }.undistort(&mut detections).unwrap();
+        let mut detections = vec![
+            Detection {
+                corners: None,
+                ..seen.clone()
+            },
+            seen,
+        ];
+        Lens {
+            distortion: Some(DISTORTION),
+            ..Lens::ideal(camera())
+        }
+        .undistort(&mut detections)
+        .unwrap();
         for (straight, ideal) in detections[1].corners.unwrap().iter().zip(ideal) {
             assert!((straight - ideal).norm() < 0.05, "{straight} {ideal}");
         }
         assert_eq!(detections[0].bounding_box, detections[1].bounding_box);
-        assert!((detections[0].bounding_box.center() - BoundingBox::around(&ideal).center()).norm() < 1.0);
+        assert!(
+            (detections[0].bounding_box.center() - BoundingBox::around(&ideal).center()).norm()
+                < 1.0
+        );
     }
 
     #[test]
     fn a_field_of_view_alone_holds_for_frames_of_any_shape() {
         let horizontal_rad = 70f64.to_radians();
         let narrow = Lens::ideal(Intrinsics::with_square_pixels(640, 480, horizontal_rad));
-        let wide = ImageSize { width: 1920, height: 1080 };
+        let wide = ImageSize {
+            width: 1920,
+            height: 1080,
+        };
         assert!(narrow.of_frames(wide).is_err());
-        let any = Lens { is_any_shape: true, ..narrow };
-        assert_eq!(any.of_frames(ImageSize { width: 1280, height: 960 }), Ok(any));
-        let Intrinsics { width, height, fx, fy, cy, .. } = any.of_frames(wide).unwrap().intrinsics;
+        let any = Lens {
+            is_any_shape: true,
+            ..narrow
+        };
+        assert_eq!(
+            any.of_frames(ImageSize {
+                width: 1280,
+                height: 960
+            }),
+            Ok(any)
+        );
+        let Intrinsics {
+            width,
+            height,
+            fx,
+            fy,
+            cy,
+            ..
+        } = any.of_frames(wide).unwrap().intrinsics;
         assert_eq!((width, height, cy), (640, 360, 180.0));
         assert!((fx - 320.0 / (horizontal_rad / 2.0).tan()).abs() < 1e-9 && fx == fy);
-        assert!(any.of_frames(ImageSize { width: 640, height: 0 }).is_err());
+        assert!(
+            any.of_frames(ImageSize {
+                width: 640,
+                height: 0
+            })
+            .is_err()
+        );
     }
 
     #[test]
     fn an_ideal_lens_changes_nothing() {
-        let bounding_box = BoundingBox { x_min: 1.0, y_min: 2.0, x_max: 30.0, y_max: 40.0 };
-        let seen = vec![Detection { label: "cup".into(), confidence: 1.0, bounding_box, corners: None }];
+        let bounding_box = BoundingBox {
+            x_min: 1.0,
+            y_min: 2.0,
+            x_max: 30.0,
+            y_max: 40.0,
+        };
+        let seen = vec![Detection {
+            label: "cup".into(),
+            confidence: 1.0,
+            bounding_box,
+            corners: None,
+        }];
         let mut detections = seen.clone();
         Lens::ideal(camera()).undistort(&mut detections).unwrap();
         assert_eq!(detections, seen);

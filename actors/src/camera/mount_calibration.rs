@@ -48,32 +48,63 @@ pub fn fit_mount_to_points(
 ) -> Result<GroundFit, MeasuredPointsError> {
     let lens = lens.of_frames(picture)?;
     let scale = f64::from(lens.intrinsics.width) / f64::from(picture.width);
-    let pixels: Vec<_> = points.iter().map(|point| Point2::from(point.pixel) * scale).collect();
-    let places = points.iter().map(|point| vehicle.ahead_left(&point.position_m.into()).into());
+    let pixels: Vec<_> = points
+        .iter()
+        .map(|point| Point2::from(point.pixel) * scale)
+        .collect();
+    let places = points
+        .iter()
+        .map(|point| vehicle.ahead_left(&point.position_m.into()).into());
     let pixels = lens.undistorted(&pixels)?.into_iter();
-    let points: Vec<_> = pixels.zip(places).map(|(pixel, place)| GroundPoint { pixel, place }).collect();
+    let points: Vec<_> = pixels
+        .zip(places)
+        .map(|(pixel, place)| GroundPoint { pixel, place })
+        .collect();
     let mut fit = fit_ground_points(&points, &lens.intrinsics)?;
     let (on_vehicle, mount) = (fit.pose, &mut fit.estimate.mount);
-    (mount.forward_m, mount.left_m, mount.pan_rad) =
-        (on_vehicle.position.x, on_vehicle.position.y, on_vehicle.heading_rad);
-    fit.points.iter_mut().for_each(|point| point.error_px /= scale);
+    (mount.forward_m, mount.left_m, mount.pan_rad) = (
+        on_vehicle.position.x,
+        on_vehicle.position.y,
+        on_vehicle.heading_rad,
+    );
+    fit.points
+        .iter_mut()
+        .for_each(|point| point.error_px /= scale);
     Ok(fit)
 }
 
 /// The pose of the vehicle on which a camera with this mount has this pose.
 pub fn vehicle_of(camera: &Pose, mount: &Mount) -> Pose {
-    let vehicle = Pose { heading_rad: camera.heading_rad - mount.pan_rad, ..*camera };
-    Pose { position: vehicle.transform(-mount.forward_m, -mount.left_m), ..vehicle }
+    let vehicle = Pose {
+        heading_rad: camera.heading_rad - mount.pan_rad,
+        ..*camera
+    };
+    Pose {
+        position: vehicle.transform(-mount.forward_m, -mount.left_m),
+        ..vehicle
+    }
 }
 
 /// A mount as a table of the configuration, `camera.mount` or that of one of several, with its errors.
 ///
 /// # Errors
 /// TOML's.
-pub fn mount_table(estimate: &MountEstimate, is_one_of_several: bool) -> Result<String, toml::ser::Error> {
-    let MountEstimate { mount, pitch_sigma_rad, roll_sigma_rad, height_sigma_m } = estimate;
+pub fn mount_table(
+    estimate: &MountEstimate,
+    is_one_of_several: bool,
+) -> Result<String, toml::ser::Error> {
+    let MountEstimate {
+        mount,
+        pitch_sigma_rad,
+        roll_sigma_rad,
+        height_sigma_m,
+    } = estimate;
     let keys = toml::to_string(&MountConfig::rounded(mount))?;
-    let table = if is_one_of_several { "cameras" } else { "camera" };
+    let table = if is_one_of_several {
+        "cameras"
+    } else {
+        "camera"
+    };
     let [pitch_deg, roll_deg] = [pitch_sigma_rad, roll_sigma_rad].map(|sigma| sigma.to_degrees());
     Ok(format!(
         "[{table}.mount]\n{keys}# Errors: pitch ±{pitch_deg:.2}°, roll ±{roll_deg:.2}°, height ±{height_sigma_m:.3} m.\n# \
@@ -87,10 +118,18 @@ mod tests {
 
     #[test]
     fn the_vehicle_is_where_its_camera_says() {
-        let mount = Mount { forward_m: -2.0, left_m: 0.7, pan_rad: 2.5, ..Mount::default() };
+        let mount = Mount {
+            forward_m: -2.0,
+            left_m: 0.7,
+            pan_rad: 2.5,
+            ..Mount::default()
+        };
         let vehicle = Pose::new(12.0, -3.0, 0.8);
         let found = vehicle_of(&mount.camera_pose(&vehicle), &mount);
         let off_m = (found.position - vehicle.position).norm();
-        assert!(off_m < 1e-9 && (found.heading_rad - vehicle.heading_rad).abs() < 1e-9, "{found:?}");
+        assert!(
+            off_m < 1e-9 && (found.heading_rad - vehicle.heading_rad).abs() < 1e-9,
+            "{found:?}"
+        );
     }
 }

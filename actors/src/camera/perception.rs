@@ -11,7 +11,9 @@ use ecod::model::names::{Label, NodeName};
 use ecod::model::time::Timestamp;
 use ecod::perception::camera::Mount;
 use ecod::perception::landmark::{LandmarkGate, LandmarkIndex};
-use ecod::perception::projection::{Cut, MountCheck, Projection, ProjectionConfig, ProjectionError};
+use ecod::perception::projection::{
+    Cut, MountCheck, Projection, ProjectionConfig, ProjectionError,
+};
 use ecod::perception::view::{PosedCamera, ViewConfig, landmarks_in_view};
 use ecod::wire::{ObjectReport, PerceivedObject};
 use nalgebra::Point2;
@@ -105,7 +107,11 @@ impl Perception {
         gate: LandmarkGate,
     ) -> Self {
         let camera = vehicle_camera.mount.camera_pose(&vehicle_camera.pose);
-        let projection = Projection::new(projection, vehicle_camera.lens.intrinsics, vehicle_camera.mount);
+        let projection = Projection::new(
+            projection,
+            vehicle_camera.lens.intrinsics,
+            vehicle_camera.mount,
+        );
         Self {
             vehicle_camera,
             camera,
@@ -124,7 +130,11 @@ impl Perception {
     /// The same producer with the numbers of reports and the counts of an earlier one.
     #[must_use]
     pub fn continuing(self, earlier: &Self) -> Self {
-        Self { seq: earlier.seq, discarded: earlier.discarded.clone(), ..self }
+        Self {
+            seq: earlier.seq,
+            discarded: earlier.discarded.clone(),
+            ..self
+        }
     }
 
     /// Sets the pose of the vehicle.
@@ -144,27 +154,48 @@ impl Perception {
     }
 
     /// The report of one frame. Detections without a position are discarded and counted.
-    pub fn report(&mut self, mut detections: Vec<Detection>, captured_at: Timestamp) -> ObjectReport {
+    pub fn report(
+        &mut self,
+        mut detections: Vec<Detection>,
+        captured_at: Timestamp,
+    ) -> ObjectReport {
         (self.discarded.is_size_missing, self.discarded.last_reason) = (false, None);
-        let cuts: Vec<Cut> = detections.iter().map(|detection| self.projection.cut(detection)).collect();
+        let cuts: Vec<Cut> = detections
+            .iter()
+            .map(|detection| self.projection.cut(detection))
+            .collect();
         if let Err(error) = self.vehicle_camera.lens.undistort(&mut detections) {
             tracing::warn!(%error, "cannot remove distortion");
         }
         let boxes = detections.iter().zip(cuts.iter().copied());
         self.mount_off_rad = self.mount_check.take(boxes, captured_at, &self.projection);
         let all = detections.iter().zip(cuts).enumerate();
-        let placed = all.filter_map(|(index, (detection, cut))| Some((index, self.place(detection, cut)?)));
+        let placed =
+            all.filter_map(|(index, (detection, cut))| Some((index, self.place(detection, cut)?)));
         let (reported, objects): (Vec<_>, Vec<_>) = placed.unzip();
         self.reported = reported;
         if !objects.is_empty() {
             self.unplaced = None;
         } else if self.discarded.last_reason.is_some() {
             // An object that was seen long ago is another one.
-            let going_on = self.unplaced.filter(|[_, last]| captured_at.since(*last) < UNPLACED_PATIENCE);
-            self.unplaced = Some([going_on.map_or(captured_at, |[since, _]| since), captured_at]);
+            let going_on = self
+                .unplaced
+                .filter(|[_, last]| captured_at.since(*last) < UNPLACED_PATIENCE);
+            self.unplaced = Some([
+                going_on.map_or(captured_at, |[since, _]| since),
+                captured_at,
+            ]);
         }
-        let VehicleCamera { landmarks, mount, lens, .. } = &self.vehicle_camera;
-        let (camera, sizes) = (PosedCamera::new(self.camera, mount, lens.intrinsics), &self.projection.config().sizes);
+        let VehicleCamera {
+            landmarks,
+            mount,
+            lens,
+            ..
+        } = &self.vehicle_camera;
+        let (camera, sizes) = (
+            PosedCamera::new(self.camera, mount, lens.intrinsics),
+            &self.projection.config().sizes,
+        );
         let seen = landmarks_in_view(landmarks.landmarks(), &camera, &objects, sizes, &self.view);
         self.seq += 1;
         ObjectReport {
@@ -187,9 +218,15 @@ impl Perception {
 
     /// The labels that have no size, in words, if one was in the last frame.
     pub fn without_size(&self) -> Option<String> {
-        let labels = self.discarded.without_size.iter().map(|(label, times)| format!("{times} of {label}"));
+        let labels = self
+            .discarded
+            .without_size
+            .iter()
+            .map(|(label, times)| format!("{times} of {label}"));
         let labels = labels.collect::<Vec<_>>().join(", ");
-        self.discarded.is_size_missing.then(|| format!("detections have no size and are not reported: {labels}"))
+        self.discarded
+            .is_size_missing
+            .then(|| format!("detections have no size and are not reported: {labels}"))
     }
 
     /// The reason, in words, why the last discarded detection of the last report has no place.
@@ -201,7 +238,12 @@ impl Perception {
     pub fn nothing_placed(&self) -> Option<String> {
         let ([since, last], reason) = (self.unplaced?, self.last_discard()?);
         let time = last.since(since);
-        (time >= UNPLACED_PATIENCE).then(|| format!("no detection has had a place for {} s: {reason}", time.as_secs()))
+        (time >= UNPLACED_PATIENCE).then(|| {
+            format!(
+                "no detection has had a place for {} s: {reason}",
+                time.as_secs()
+            )
+        })
     }
 
     /// The angle between mount and reality in words, if the last frame has shown that it is too large.
@@ -215,9 +257,18 @@ impl Perception {
     }
 
     fn place(&mut self, detection: &Detection, cut: Cut) -> Option<PerceivedObject> {
-        let corners = detection.corners.filter(|_| self.projection.config().ranging.uses_corners());
-        let side_m = self.projection.config().sizes.of(&detection.label).map(|size| size.width_m);
-        let target = corners.zip(side_m).map(|(c, side)| locate_target(&c, side, &self.vehicle_camera.lens.intrinsics));
+        let corners = detection
+            .corners
+            .filter(|_| self.projection.config().ranging.uses_corners());
+        let side_m = self
+            .projection
+            .config()
+            .sizes
+            .of(&detection.label)
+            .map(|size| size.width_m);
+        let target = corners
+            .zip(side_m)
+            .map(|(c, side)| locate_target(&c, side, &self.vehicle_camera.lens.intrinsics));
         let target = match target.transpose() {
             Ok(target) => target,
             Err(error) => {
@@ -225,10 +276,17 @@ impl Perception {
                 None
             }
         };
-        let placed = self.projection.place(detection, cut, target.as_ref(), &self.camera);
-        let placed = placed.map_err(|error| self.discarded.count_unplaced(&error)).ok()?;
+        let placed = self
+            .projection
+            .place(detection, cut, target.as_ref(), &self.camera);
+        let placed = placed
+            .map_err(|error| self.discarded.count_unplaced(&error))
+            .ok()?;
         // Receivers reject a report with one invalid object, so this is checked per object.
-        placed.validate().map_err(|reason| self.discarded.count(reason.as_str(), &reason)).ok()?;
+        placed
+            .validate()
+            .map_err(|reason| self.discarded.count(reason.as_str(), &reason))
+            .ok()?;
         Some(self.with_landmark(placed))
     }
 
@@ -236,7 +294,9 @@ impl Perception {
     fn with_landmark(&self, object: PerceivedObject) -> PerceivedObject {
         let landmarks = &self.vehicle_camera.landmarks;
         let point = Point2::new(object.x_m, object.y_m);
-        let best = object.covariance().and_then(|c| landmarks.best(&object.label, &point, &c, &self.gate));
+        let best = object
+            .covariance()
+            .and_then(|c| landmarks.best(&object.label, &point, &c, &self.gate));
         let landmark = best.map(|best| landmarks.landmarks()[best.landmark].id.clone());
         PerceivedObject { landmark, ..object }
     }
@@ -260,23 +320,58 @@ mod tests {
             lens: Lens::ideal(camera),
             landmarks: Arc::new(LandmarkIndex::new(Vec::new(), 0.5)),
         };
-        let sizes = ObjectSizes { default: Some(ObjectSize::square(0.5)), ..ObjectSizes::default() };
-        let projection = ProjectionConfig { ranging: Ranging::BoxHeight, sizes, ..ProjectionConfig::default() };
-        let gate = LandmarkGate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
-        let mut perception = Perception::new(vehicle_camera, projection, ViewConfig::default(), gate);
+        let sizes = ObjectSizes {
+            default: Some(ObjectSize::square(0.5)),
+            ..ObjectSizes::default()
+        };
+        let projection = ProjectionConfig {
+            ranging: Ranging::BoxHeight,
+            sizes,
+            ..ProjectionConfig::default()
+        };
+        let gate = LandmarkGate {
+            radius_m: 0.5,
+            sigmas: 4.0,
+            floor_m: 0.05,
+        };
+        let mut perception =
+            Perception::new(vehicle_camera, projection, ViewConfig::default(), gate);
         let seen = |label: &str, confidence: f64, y_max: f64| Detection {
             label: label.into(),
             confidence,
-            bounding_box: BoundingBox { x_min: 300.0, y_min: 200.0, x_max: 340.0, y_max },
+            bounding_box: BoundingBox {
+                x_min: 300.0,
+                y_min: 200.0,
+                x_max: 340.0,
+                y_max,
+            },
             corners: None,
         };
-        let found =
-            vec![seen("", 0.9, 240.0), seen("cup", f64::NAN, 240.0), seen("cup", 0.9, 480.0), seen("car", 0.9, 240.0)];
+        let found = vec![
+            seen("", 0.9, 240.0),
+            seen("cup", f64::NAN, 240.0),
+            seen("cup", 0.9, 480.0),
+            seen("car", 0.9, 240.0),
+        ];
         let report = perception.report(found, Timestamp(1));
-        assert_eq!(report.objects.iter().map(|object| &*object.label).collect::<Vec<_>>(), ["car"]);
+        assert_eq!(
+            report
+                .objects
+                .iter()
+                .map(|object| &*object.label)
+                .collect::<Vec<_>>(),
+            ["car"]
+        );
         assert_eq!(perception.reported(), [3]);
-        let discarded: Vec<_> = perception.discarded().iter().map(|(reason, times)| (*reason, *times)).collect();
-        assert_eq!(discarded, [("clipped", 1), ("invalid_label", 1), ("not_finite", 1)]);
+        let discarded: Vec<_> = perception
+            .discarded()
+            .iter()
+            .map(|(reason, times)| (*reason, *times))
+            .collect();
+        assert_eq!(
+            discarded,
+            [("clipped", 1), ("invalid_label", 1), ("not_finite", 1)]
+        );
     }
 
     #[test]
@@ -289,14 +384,31 @@ mod tests {
             lens: Lens::ideal(camera),
             landmarks: Arc::new(LandmarkIndex::new(Vec::new(), 0.5)),
         };
-        let sizes = ObjectSizes { labels: [("car".into(), ObjectSize::square(1.5))].into(), default: None };
-        let projection = ProjectionConfig { ranging: Ranging::BoxHeight, sizes, ..ProjectionConfig::default() };
-        let gate = LandmarkGate { radius_m: 0.5, sigmas: 4.0, floor_m: 0.05 };
-        let mut perception = Perception::new(vehicle_camera, projection, ViewConfig::default(), gate);
+        let sizes = ObjectSizes {
+            labels: [("car".into(), ObjectSize::square(1.5))].into(),
+            default: None,
+        };
+        let projection = ProjectionConfig {
+            ranging: Ranging::BoxHeight,
+            sizes,
+            ..ProjectionConfig::default()
+        };
+        let gate = LandmarkGate {
+            radius_m: 0.5,
+            sigmas: 4.0,
+            floor_m: 0.05,
+        };
+        let mut perception =
+            Perception::new(vehicle_camera, projection, ViewConfig::default(), gate);
         let seen = |label: &str| Detection {
             label: label.into(),
             confidence: 0.9,
-            bounding_box: BoundingBox { x_min: 300.0, y_min: 200.0, x_max: 340.0, y_max: 240.0 },
+            bounding_box: BoundingBox {
+                x_min: 300.0,
+                y_min: 200.0,
+                x_max: 340.0,
+                y_max: 240.0,
+            },
             corners: None,
         };
         for _ in 0..3 {
@@ -308,6 +420,10 @@ mod tests {
         perception.report(vec![seen("car")], Timestamp(3));
         assert_eq!(perception.without_size(), None);
         (0..100).for_each(|n| drop(perception.report(vec![seen(&format!("QR{n}"))], Timestamp(4))));
-        assert!(perception.without_size().is_some_and(|words| words.len() < 200));
+        assert!(
+            perception
+                .without_size()
+                .is_some_and(|words| words.len() < 200)
+        );
     }
 }

@@ -57,8 +57,14 @@ impl PoseConfig {
         check_range("x_m", self.x_m, -1e8, 1e8)?;
         check_range("y_m", self.y_m, -1e8, 1e8)?;
         check_range("heading_deg", self.heading_deg, -360.0, 360.0)?;
-        let StatedPose::OnEarth(pose) = self.stated() else { return self.validate_in_map() };
-        for (key, value) in [("x_m", self.x_m), ("y_m", self.y_m), ("heading_deg", self.heading_deg)] {
+        let StatedPose::OnEarth(pose) = self.stated() else {
+            return self.validate_in_map();
+        };
+        for (key, value) in [
+            ("x_m", self.x_m),
+            ("y_m", self.y_m),
+            ("heading_deg", self.heading_deg),
+        ] {
             if value != 0.0 {
                 let allowed = "absent beside `latitude_deg` and `longitude_deg`: the heading is `azimuth_deg`, clockwise \
                                from true north";
@@ -77,7 +83,9 @@ impl PoseConfig {
         ];
         let missing = parts.iter().find(|(_, value)| value.is_none());
         match missing {
-            Some((key, _)) if self.height_m.is_some() || parts.iter().any(|(_, value)| value.is_some()) => {
+            Some((key, _))
+                if self.height_m.is_some() || parts.iter().any(|(_, value)| value.is_some()) =>
+            {
                 let allowed = "a number: a pose on Earth has `latitude_deg`, `longitude_deg` and `azimuth_deg`, its \
                                heading clockwise from true north";
                 Err(ConfigError::new(*key, "nothing", allowed))
@@ -94,12 +102,14 @@ impl PoseConfig {
     /// The constant pose.
     pub fn stated(&self) -> StatedPose {
         match (self.latitude_deg, self.longitude_deg, self.azimuth_deg) {
-            (Some(latitude_deg), Some(longitude_deg), Some(azimuth_deg)) => StatedPose::OnEarth(GeographicPose {
-                latitude_deg,
-                longitude_deg,
-                height_m: self.height_m,
-                azimuth_deg,
-            }),
+            (Some(latitude_deg), Some(longitude_deg), Some(azimuth_deg)) => {
+                StatedPose::OnEarth(GeographicPose {
+                    latitude_deg,
+                    longitude_deg,
+                    height_m: self.height_m,
+                    azimuth_deg,
+                })
+            }
             _ => StatedPose::InMap(Pose::new(self.x_m, self.y_m, self.heading_deg.to_radians())),
         }
     }
@@ -132,22 +142,38 @@ const WORLD_M: f64 = 1e8;
 ///
 /// # Errors
 /// The problem as text.
-pub fn read_pose(datagram: &[u8], now: Timestamp, wall_offset_us: i64) -> Result<(Timestamp, StatedPose), String> {
+pub fn read_pose(
+    datagram: &[u8],
+    now: Timestamp,
+    wall_offset_us: i64,
+) -> Result<(Timestamp, StatedPose), String> {
     let fix: Value = serde_json::from_slice(datagram).map_err(|error| error.to_string())?;
     let time = FixTime::deserialize(&fix).map_err(|error| error.to_string())?;
-    let captured_at = time.captured_at_us.map(|wall| wall.shifted(wall_offset_us.saturating_neg()));
+    let captured_at = time
+        .captured_at_us
+        .map(|wall| wall.shifted(wall_offset_us.saturating_neg()));
     let is_on_earth = fix.get("latitude_deg").is_some();
-    let pose = if is_on_earth { on_earth(&fix).map(StatedPose::OnEarth) } else { in_map(&fix).map(StatedPose::InMap) };
+    let pose = if is_on_earth {
+        on_earth(&fix).map(StatedPose::OnEarth)
+    } else {
+        in_map(&fix).map(StatedPose::InMap)
+    };
     Ok((captured_at.unwrap_or(now), pose?))
 }
 
 fn on_earth(fix: &Value) -> Result<GeographicPose, String> {
     let pose = GeographicPose::deserialize(fix).map_err(|error| error.to_string())?;
-    let ConfigError { key, value, allowed } = match pose.validate() {
+    let ConfigError {
+        key,
+        value,
+        allowed,
+    } = match pose.validate() {
         Ok(()) => return Ok(pose),
         Err(error) => error,
     };
-    Err(format!("`{key}`: {value} is not allowed, must be {allowed}"))
+    Err(format!(
+        "`{key}`: {value} is not allowed, must be {allowed}"
+    ))
 }
 
 fn in_map(fix: &Value) -> Result<Pose, String> {
@@ -166,10 +192,22 @@ mod tests {
     #[test]
     fn a_pose_has_its_own_time_or_that_of_its_receipt() {
         let now = Timestamp(7);
-        let told =
-            read_pose(br#"{"x_m":1,"y_m":-2.5,"heading_rad":3.1,"captured_at_us":5,"speed_mps":4}"#, now, 2).unwrap();
-        assert_eq!(told, (Timestamp(3), StatedPose::InMap(Pose::new(1.0, -2.5, 3.1))));
-        assert_eq!(read_pose(br#"{"x_m":1,"y_m":2,"heading_rad":0}"#, now, 2).unwrap().0, now);
+        let told = read_pose(
+            br#"{"x_m":1,"y_m":-2.5,"heading_rad":3.1,"captured_at_us":5,"speed_mps":4}"#,
+            now,
+            2,
+        )
+        .unwrap();
+        assert_eq!(
+            told,
+            (Timestamp(3), StatedPose::InMap(Pose::new(1.0, -2.5, 3.1)))
+        );
+        assert_eq!(
+            read_pose(br#"{"x_m":1,"y_m":2,"heading_rad":0}"#, now, 2)
+                .unwrap()
+                .0,
+            now
+        );
     }
 
     #[test]
@@ -179,7 +217,12 @@ mod tests {
             Timestamp(7),
             0,
         );
-        let pose = GeographicPose { latitude_deg: 52.2, longitude_deg: 21.0, height_m: None, azimuth_deg: 270.0 };
+        let pose = GeographicPose {
+            latitude_deg: 52.2,
+            longitude_deg: 21.0,
+            height_m: None,
+            azimuth_deg: 270.0,
+        };
         assert_eq!(told, Ok((Timestamp(5), StatedPose::OnEarth(pose))));
     }
 
@@ -188,10 +231,19 @@ mod tests {
         for (datagram, reason) in [
             (&b"{\"x_m\":1,\"y_m\":2}"[..], "heading_rad"),
             (b"{\"x_m\":1e12,\"y_m\":2,\"heading_rad\":0}", "world"),
-            (b"{\"x_m\":1,\"y_m\":2,\"heading_rad\":0,\"captured_at_us\":-1}", "invalid value"),
+            (
+                b"{\"x_m\":1,\"y_m\":2,\"heading_rad\":0,\"captured_at_us\":-1}",
+                "invalid value",
+            ),
             (b"\xff\xfe", "line 1"),
-            (b"{\"latitude_deg\":52,\"longitude_deg\":21,\"heading_rad\":0}", "azimuth_deg"),
-            (b"{\"latitude_deg\":152,\"longitude_deg\":21,\"azimuth_deg\":0}", "`latitude_deg`: 152"),
+            (
+                b"{\"latitude_deg\":52,\"longitude_deg\":21,\"heading_rad\":0}",
+                "azimuth_deg",
+            ),
+            (
+                b"{\"latitude_deg\":152,\"longitude_deg\":21,\"azimuth_deg\":0}",
+                "`latitude_deg`: 152",
+            ),
         ] {
             let error = read_pose(datagram, Timestamp(0), 0).unwrap_err();
             assert!(error.contains(reason), "{error}");
@@ -202,7 +254,9 @@ mod tests {
     fn a_configured_pose_is_all_in_the_frame_or_all_on_earth() {
         let pose = |toml: &str| {
             let pose: PoseConfig = toml::from_str(toml).unwrap();
-            pose.validate().map(|()| pose.stated()).map_err(|error| error.to_string())
+            pose.validate()
+                .map(|()| pose.stated())
+                .map_err(|error| error.to_string())
         };
         let on_earth = "latitude_deg = 52.2\nlongitude_deg = 21\n";
         assert_eq!(
@@ -210,16 +264,35 @@ mod tests {
             Ok(StatedPose::InMap(Pose::new(1.0, 0.0, std::f64::consts::PI)))
         );
         let stated = pose(&format!("{on_earth}height_m = 113\nazimuth_deg = 90"));
-        assert!(matches!(stated, Ok(StatedPose::OnEarth(GeographicPose { height_m: Some(113.0), .. }))), "{stated:?}");
+        assert!(
+            matches!(
+                stated,
+                Ok(StatedPose::OnEarth(GeographicPose {
+                    height_m: Some(113.0),
+                    ..
+                }))
+            ),
+            "{stated:?}"
+        );
         for (more, parts) in [
             ("", ["`azimuth_deg`", "nothing"]),
             ("azimuth_deg = 400", ["`azimuth_deg`", "400"]),
-            ("azimuth_deg = 90\nx_m = 2", ["`x_m`", "absent beside `latitude_deg`"]),
-            ("azimuth_deg = 90\nheading_deg = 2", ["`heading_deg`", "`azimuth_deg`, clockwise from true north"]),
+            (
+                "azimuth_deg = 90\nx_m = 2",
+                ["`x_m`", "absent beside `latitude_deg`"],
+            ),
+            (
+                "azimuth_deg = 90\nheading_deg = 2",
+                ["`heading_deg`", "`azimuth_deg`, clockwise from true north"],
+            ),
         ] {
             let error = pose(&format!("{on_earth}{more}")).unwrap_err();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
         }
-        assert!(pose("height_m = 113").unwrap_err().contains("`latitude_deg`"));
+        assert!(
+            pose("height_m = 113")
+                .unwrap_err()
+                .contains("`latitude_deg`")
+        );
     }
 }

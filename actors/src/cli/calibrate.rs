@@ -48,12 +48,24 @@ struct BoardArguments {
 }
 
 pub(super) fn run(arguments: &CalibrateArguments) -> Result<(), Failure> {
-    let CalibrateArguments { part, board, out, images } = arguments;
+    let CalibrateArguments {
+        part,
+        board,
+        out,
+        images,
+    } = arguments;
     if let Some(CalibrateCommand::Mount(command)) = part {
         return mount::run(command);
     }
-    let square_mm = board.square_mm.context("--square-mm is missing").map_err(Failure::usage)?;
-    let board = Chessboard { columns: board.columns, rows: board.rows, square_mm };
+    let square_mm = board
+        .square_mm
+        .context("--square-mm is missing")
+        .map_err(Failure::usage)?;
+    let board = Chessboard {
+        columns: board.columns,
+        rows: board.rows,
+        square_mm,
+    };
     let images = photographs(images).map_err(Failure::usage)?;
     let report = calibrate(&images, &board).context("cannot calibrate")?;
     for image in &report.without_board {
@@ -62,5 +74,7 @@ pub(super) fn run(arguments: &CalibrateArguments) -> Result<(), Failure> {
     let found = &report.calibration;
     found.write(out).context("cannot calibrate")?;
     let (out, rms_px, photographs) = (out.display(), found.rms_px, found.images.len());
-    Ok(print(&format!("{out}: {rms_px:.3} px rms over {photographs} photographs\n"))?)
+    Ok(print(&format!(
+        "{out}: {rms_px:.3} px rms over {photographs} photographs\n"
+    ))?)
 }

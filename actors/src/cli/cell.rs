@@ -10,7 +10,9 @@ use clap::{Args, Subcommand};
 use ecod::description::DescriptionHistory;
 use ecod::leadership::BrokerAddress;
 use ecod::model::names::NodeName;
-use ecod::wire::{CellDescription, ContentHash, Encoding, NodeState, NodeStatus, SCHEMA_VERSION, Topic, Topics};
+use ecod::wire::{
+    CellDescription, ContentHash, Encoding, NodeState, NodeStatus, SCHEMA_VERSION, Topic, Topics,
+};
 use ecod::wire::{MAX_DESCRIPTION_BYTES, decode, encode};
 use serde_json::{Map, Value, json};
 use uuid::Uuid;
@@ -76,7 +78,10 @@ const PATIENCE: Duration = Duration::from_secs(5);
 const SILENCE: Duration = Duration::from_millis(300);
 
 pub(super) fn run(command: &CellCommand) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().context("cannot start")?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .context("cannot start")?;
     runtime.block_on(carry_out(command))
 }
 
@@ -96,7 +101,10 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
             let text = read(file)?;
             let described = DoorClient::open(door).await?.present().await?;
             if described.version == 0 {
-                return Err(anyhow!("the cell has no description yet; `ecod-node cell set` gives it one").into());
+                return Err(anyhow!(
+                    "the cell has no description yet; `ecod-node cell set` gives it one"
+                )
+                .into());
             }
             let lines = differences(&settings(&described.text)?, &settings(&text)?);
             let (file, version) = (file.display(), described.version);
@@ -113,31 +121,53 @@ async fn carry_out(command: &CellCommand) -> Result<(), Failure> {
 async fn set(mut client: DoorClient, text: &str) -> Result<(), Failure> {
     let shared = SharedConfig::parse(text).map_err(Failure::usage)?;
     let (places, cost) = (shared.landmarks.len(), shared.cost());
-    let CellDescription { version, hash, set_by, .. } = client.set(text).await?;
-    let cost = format!("maps of up to {} bytes, {:.0} bytes/s", cost.map_bytes, cost.bytes_per_s);
-    Ok(print(&format!("version {version}, hash {hash}, known locations: {places} ({cost}), set by {set_by}\n"))?)
+    let CellDescription {
+        version,
+        hash,
+        set_by,
+        ..
+    } = client.set(text).await?;
+    let cost = format!(
+        "maps of up to {} bytes, {:.0} bytes/s",
+        cost.map_bytes, cost.bytes_per_s
+    );
+    Ok(print(&format!(
+        "version {version}, hash {hash}, known locations: {places} ({cost}), set by {set_by}\n"
+    ))?)
 }
 
 /// The text of the description that this machine's node had before the present one.
 fn text_before(config: &NodeConfig) -> Result<String, anyhow::Error> {
-    let file = description_file(config).context("this node keeps no earlier description: it has no `state_dir`")?;
-    let read = file.peek().with_context(|| format!("no earlier description in {}", file.path().display()));
+    let file = description_file(config)
+        .context("this node keeps no earlier description: it has no `state_dir`")?;
+    let read = file
+        .peek()
+        .with_context(|| format!("no earlier description in {}", file.path().display()));
     let DescriptionHistory { earlier, .. } = read?;
-    let before = earlier.last().context("this node has had no other description before")?;
+    let before = earlier
+        .last()
+        .context("this node has had no other description before")?;
     Ok(before.description.text.clone())
 }
 
 /// The text of a description, whose values are checked.
 fn read(file: &Path) -> Result<String, Failure> {
-    let text = read_bounded(file).with_context(|| format!("cannot read {}", file.display())).map_err(Failure::usage)?;
-    SharedConfig::parse(&text).with_context(|| file.display().to_string()).map_err(Failure::usage)?;
+    let text = read_bounded(file)
+        .with_context(|| format!("cannot read {}", file.display()))
+        .map_err(Failure::usage)?;
+    SharedConfig::parse(&text)
+        .with_context(|| file.display().to_string())
+        .map_err(Failure::usage)?;
     Ok(text)
 }
 
 /// The text of a file that is small enough for a description; no more of a larger one is read.
 fn read_bounded(file: &Path) -> anyhow::Result<String> {
     let text = bounded_file::read_text(file)?;
-    ensure!(text.len() <= MAX_DESCRIPTION_BYTES, "a description has at most {MAX_DESCRIPTION_BYTES} bytes");
+    ensure!(
+        text.len() <= MAX_DESCRIPTION_BYTES,
+        "a description has at most {MAX_DESCRIPTION_BYTES} bytes"
+    );
     Ok(text)
 }
 
@@ -152,32 +182,56 @@ struct DoorClient {
 impl DoorClient {
     async fn open(arguments: &DoorArguments) -> Result<Self, Failure> {
         let mut flags = Map::new();
-        flags.extend(arguments.cell.as_ref().map(|cell| ("cell".to_owned(), json!(cell))));
-        let mut config = NodeConfig::load(arguments.config.as_deref(), &flags).map_err(Failure::usage)?;
+        flags.extend(
+            arguments
+                .cell
+                .as_ref()
+                .map(|cell| ("cell".to_owned(), json!(cell))),
+        );
+        let mut config =
+            NodeConfig::load(arguments.config.as_deref(), &flags).map_err(Failure::usage)?;
         // Version 5 has reasons for refusals; the door asks for no password.
         config.mqtt.version = MqttVersion::V5;
         (config.mqtt.user, config.mqtt.password) = (None, None);
         let address = here(arguments.door.unwrap_or(config.broker_listen()));
         let credentials = config.security().map_err(Failure::usage)?.credentials;
-        let tls = credentials.as_ref().map(|credentials| BrokerTrust::of_door(credentials).client());
+        let tls = credentials
+            .as_ref()
+            .map(|credentials| BrokerTrust::of_door(credentials).client());
         let (process, run) = (std::process::id(), Uuid::new_v4().simple());
         let client_id = match config.name.as_ref().filter(|_| tls.is_some()) {
             Some(name) => format!("{name}{OBSERVER_MARK}cell-{process}-{run}"),
             None => format!("ecod-cell-{process}"),
         };
-        let (client, connection) = open(&BrokerAddress::from(address), &client_id, None, &config.mqtt, tls);
+        let (client, connection) = open(
+            &BrokerAddress::from(address),
+            &client_id,
+            None,
+            &config.mqtt,
+            tls,
+        );
         let topics = Topics::new(&config.cell);
-        let mut door = Self { client, connection, config, topics };
+        let mut door = Self {
+            client,
+            connection,
+            config,
+            topics,
+        };
         let accepted = door.connection.next(PATIENCE).await;
         accepted.with_context(|| {
             let unread = arguments.config.is_none() && Path::new(SERVICE_CONFIGURATION).exists();
             let remedy = match unread {
-                true => format!("`--config {SERVICE_CONFIGURATION}` reads that of this machine's node"),
+                true => {
+                    format!("`--config {SERVICE_CONFIGURATION}` reads that of this machine's node")
+                }
                 false => "`--door` names another address of it".to_owned(),
             };
             format!("no node at {address}: it must run on this machine; {remedy}")
         })?;
-        let filters = [door.topics.path(&Topic::Cell), door.topics.filter("nodes/+")];
+        let filters = [
+            door.topics.path(&Topic::Cell),
+            door.topics.filter("nodes/+"),
+        ];
         door.client.subscribe(&filters, MaxQos::AtLeastOnce);
         Ok(door)
     }
@@ -192,10 +246,16 @@ impl DoorClient {
                     Packet::PublishRefused(text) => return Err(anyhow!("refused: {text}")),
                     _ => continue,
                 };
-                let topic = std::str::from_utf8(&topic).ok().and_then(|topic| self.topics.parse(topic));
+                let topic = std::str::from_utf8(&topic)
+                    .ok()
+                    .and_then(|topic| self.topics.parse(topic));
                 let message = match topic {
-                    Some(Topic::Cell) => decode(&payload, &limits).ok().map(DoorMessage::Description),
-                    Some(Topic::Nodes(_)) => decode(&payload, &limits).ok().map(DoorMessage::Status),
+                    Some(Topic::Cell) => {
+                        decode(&payload, &limits).ok().map(DoorMessage::Description)
+                    }
+                    Some(Topic::Nodes(_)) => {
+                        decode(&payload, &limits).ok().map(DoorMessage::Status)
+                    }
                     _ => None,
                 };
                 if message.is_some() {
@@ -203,13 +263,19 @@ impl DoorClient {
                 }
             }
         };
-        tokio::time::timeout(patience, next).await.unwrap_or(Ok(None))
+        tokio::time::timeout(patience, next)
+            .await
+            .unwrap_or(Ok(None))
     }
 
     /// The next description or status; a node that has none to tell is none of this cell.
     async fn expect(&mut self) -> Result<DoorMessage, anyhow::Error> {
         let cell = self.config.cell.clone();
-        let silent = || anyhow!("no answer of a node of cell {cell}: check the cell's name, and the node's version");
+        let silent = || {
+            anyhow!(
+                "no answer of a node of cell {cell}: check the cell's name, and the node's version"
+            )
+        };
         self.next(PATIENCE - SILENCE).await?.ok_or_else(silent)
     }
 
@@ -227,12 +293,23 @@ impl DoorClient {
         let (node, text) = (NodeName::from_static("node"), text.to_owned());
         let set_by = self.config.name.clone().unwrap_or(node);
         let (schema, hash) = (SCHEMA_VERSION, ContentHash::default());
-        let request = CellDescription { schema, version: 0, hash, set_by, text };
+        let request = CellDescription {
+            schema,
+            version: 0,
+            hash,
+            set_by,
+            text,
+        };
         let payload = encode(&request, Encoding::Json).into();
         self.present().await?;
-        self.client.publish(&self.topics.path(&Topic::Cell), &payload, Retention::Acknowledged);
+        self.client.publish(
+            &self.topics.path(&Topic::Cell),
+            &payload,
+            Retention::Acknowledged,
+        );
         // One that is the present one already is not published anew.
-        self.client.subscribe(&[self.topics.path(&Topic::Cell)], MaxQos::AtLeastOnce);
+        self.client
+            .subscribe(&[self.topics.path(&Topic::Cell)], MaxQos::AtLeastOnce);
         loop {
             let description = self.present().await?;
             if description.version > 0 && description.text == request.text {
@@ -245,7 +322,11 @@ impl DoorClient {
     async fn show(&mut self) -> Result<String, anyhow::Error> {
         let (mut description, mut nodes) = (None, BTreeMap::new());
         loop {
-            let next = if description.is_none() { Some(self.expect().await?) } else { self.next(SILENCE).await? };
+            let next = if description.is_none() {
+                Some(self.expect().await?)
+            } else {
+                self.next(SILENCE).await?
+            };
             match next {
                 Some(DoorMessage::Description(present)) => description = Some(present),
                 Some(DoorMessage::Status(status)) => {
@@ -257,7 +338,12 @@ impl DoorClient {
         nodes.retain(|node, status| status.state != NodeState::Offline && node.vehicle() == *node);
         let cell = &self.config.cell;
         let mut shown = match &description {
-            Some(CellDescription { version: version @ 1.., hash, set_by, .. }) => {
+            Some(CellDescription {
+                version: version @ 1..,
+                hash,
+                set_by,
+                ..
+            }) => {
                 format!("# cell {cell}: version {version}, hash {hash}, set by {set_by}\n")
             }
             _ => format!("# cell {cell}: no description\n"),
@@ -265,8 +351,15 @@ impl DoorClient {
         for (node, status) in nodes {
             shown += &match status.description {
                 Some(held) => {
-                    let problem = held.problem.map_or_else(String::new, |problem| format!(", not used: {problem}"));
-                    format!("# {node}: version {}, hash {}{}\n", held.version, held.hash, problem.replace('\n', " "))
+                    let problem = held
+                        .problem
+                        .map_or_else(String::new, |problem| format!(", not used: {problem}"));
+                    format!(
+                        "# {node}: version {}, hash {}{}\n",
+                        held.version,
+                        held.hash,
+                        problem.replace('\n', " ")
+                    )
                 }
                 None => format!("# {node}: none\n"),
             };
@@ -300,8 +393,17 @@ fn settings(text: &str) -> Result<Value, anyhow::Error> {
     if let Some(landmarks) = settings.get_mut("landmarks")
         && let Value::Array(list) = landmarks.take()
     {
-        let id = |landmark: &Value| landmark.get("id").and_then(Value::as_str).unwrap_or_default().to_owned();
-        *landmarks = list.into_iter().map(|landmark| (id(&landmark), landmark)).collect();
+        let id = |landmark: &Value| {
+            landmark
+                .get("id")
+                .and_then(Value::as_str)
+                .unwrap_or_default()
+                .to_owned()
+        };
+        *landmarks = list
+            .into_iter()
+            .map(|landmark| (id(&landmark), landmark))
+            .collect();
     }
     Ok(settings)
 }
@@ -316,16 +418,27 @@ fn differences(cell: &Value, file: &Value) -> String {
 fn compare(key: &str, cell: &Value, file: &Value, lines: &mut String) {
     match (cell, file) {
         (Value::Object(in_cell), Value::Object(in_file)) => {
-            let keys: std::collections::BTreeSet<_> = in_cell.keys().chain(in_file.keys()).collect();
+            let keys: std::collections::BTreeSet<_> =
+                in_cell.keys().chain(in_file.keys()).collect();
             for name in keys {
-                let below = if key.is_empty() { name.clone() } else { format!("{key}.{name}") };
+                let below = if key.is_empty() {
+                    name.clone()
+                } else {
+                    format!("{key}.{name}")
+                };
                 let of = |table: &Map<String, Value>| table.get(name).cloned().unwrap_or_default();
                 compare(&below, &of(in_cell), &of(in_file), lines);
             }
         }
         _ if cell == file => {}
         _ => {
-            let text = |value: &Value| if value.is_null() { "nothing".to_owned() } else { value.to_string() };
+            let text = |value: &Value| {
+                if value.is_null() {
+                    "nothing".to_owned()
+                } else {
+                    value.to_string()
+                }
+            };
             *lines += &format!("{key}: cell {}, file {}\n", text(cell), text(file));
         }
     }
@@ -343,11 +456,16 @@ mod tests {
         let compared = |file| differences(&settings(cell).unwrap(), &settings(file).unwrap());
         assert_eq!(compared(same), "");
         let lines = compared(other);
-        for line in
-            ["fusion.pace.gate_m: cell 1.0, file 0.5", "landmarks.a.y_m: cell 0.0, file 2.0", "landmarks.b: cell {"]
-        {
+        for line in [
+            "fusion.pace.gate_m: cell 1.0, file 0.5",
+            "landmarks.a.y_m: cell 0.0, file 2.0",
+            "landmarks.b: cell {",
+        ] {
             assert!(lines.contains(line), "{lines}");
         }
-        assert!(lines.contains("landmarks.c: cell nothing, file {"), "{lines}");
+        assert!(
+            lines.contains("landmarks.c: cell nothing, file {"),
+            "{lines}"
+        );
     }
 }

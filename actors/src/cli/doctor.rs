@@ -24,8 +24,8 @@ pub(super) struct DoctorArguments {
 
 /// Prints one line per check; fails if one is broken.
 pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
-    let config =
-        NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new()).map_err(Failure::usage)?;
+    let config = NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new())
+        .map_err(Failure::usage)?;
     let runtime = tokio::runtime::Runtime::new().context("cannot start threads")?;
     let findings = runtime.block_on(examine(&config, &arguments.config));
     // A camera may block for good.
@@ -35,18 +35,31 @@ pub(super) fn run(arguments: &DoctorArguments) -> Result<(), Failure> {
     } else {
         print(&findings.iter().map(line).collect::<String>())?;
     }
-    match findings.iter().filter(|finding| finding.verdict == CheckResult::Broken).count() {
+    match findings
+        .iter()
+        .filter(|finding| finding.verdict == CheckResult::Broken)
+        .count()
+    {
         0 => Ok(()),
         broken => Err(anyhow::anyhow!("{broken} of {} checks failed", findings.len()).into()),
     }
 }
 
-fn line(Finding { check, verdict, seen, fix }: &Finding) -> String {
+fn line(
+    Finding {
+        check,
+        verdict,
+        seen,
+        fix,
+    }: &Finding,
+) -> String {
     let sign = match verdict {
         CheckResult::Fine => "ok  ",
         CheckResult::Doubtful => "warn",
         CheckResult::Broken => "FAIL",
     };
-    let fix = fix.as_ref().map_or_else(String::new, |fix| format!("  -> {fix}"));
+    let fix = fix
+        .as_ref()
+        .map_or_else(String::new, |fix| format!("  -> {fix}"));
     format!("{sign}  {check:<16}  {}{fix}\n", seen.replace('\n', " "))
 }

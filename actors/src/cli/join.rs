@@ -115,22 +115,35 @@ impl JoinArguments {
 
 /// Makes a cell's CA and key, and the files of its first node.
 pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
-    let InitArguments { cell, name, role, city, .. } = arguments;
+    let InitArguments {
+        cell,
+        name,
+        role,
+        city,
+        ..
+    } = arguments;
     // Before anything is written: a directory with a CA is no place for another.
     check_name(name).map_err(Failure::usage)?;
     let directory = arguments.node.directory.vacant()?;
     let (role, now) = (role_named(role), clock::now());
-    let mut city = city.as_deref().map(Authority::open).transpose().map_err(Failure::usage)?;
+    let mut city = city
+        .as_deref()
+        .map(Authority::open)
+        .transpose()
+        .map_err(Failure::usage)?;
     let authority = match &mut city {
         Some(city) => city.init_cell(&directory.pki(), cell, now),
         None => Authority::init(&directory.pki(), cell, now),
     };
     let mut authority = authority.map_err(|error| anyhow!(error))?;
     let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
-    authority.issue(name, Rights::from(role).of_operator(), valid, now).map_err(|error| anyhow!(error))?;
+    authority
+        .issue(name, Rights::from(role).of_operator(), valid, now)
+        .map_err(|error| anyhow!(error))?;
     let (certificate, key) = authority.files_of(name);
-    let read =
-        |path: PathBuf| bounded_file::read_text(&path).with_context(|| format!("cannot read {}", path.display()));
+    let read = |path: PathBuf| {
+        bounded_file::read_text(&path).with_context(|| format!("cannot read {}", path.display()))
+    };
     let key_text = read(key.clone())?;
     let welcome = Welcome {
         cell: cell.clone(),
@@ -141,7 +154,12 @@ pub(super) fn init(arguments: &InitArguments) -> Result<(), Failure> {
         cell_key: new_cell_key()?,
         seeds: Vec::new(),
         city: city
-            .map(|city| anyhow::Ok(CityFiles { ca: read(city.ca())?, revocation_list: read(city.revocation_list())? }))
+            .map(|city| {
+                anyhow::Ok(CityFiles {
+                    ca: read(city.ca())?,
+                    revocation_list: read(city.revocation_list())?,
+                })
+            })
             .transpose()?,
     };
     directory.write(name, &welcome, &key_text)?;
@@ -169,8 +187,14 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
         ),
         error => error.into(),
     })?;
-    for name in arguments.names.iter().filter(|name| authority.has_certificate(name, clock::now())) {
-        eprintln!("{name} has a certificate already, which stays valid; `ecod-node pki revoke` ends it");
+    for name in arguments
+        .names
+        .iter()
+        .filter(|name| authority.has_certificate(name, clock::now()))
+    {
+        eprintln!(
+            "{name} has a certificate already, which stays valid; `ecod-node pki revoke` ends it"
+        );
     }
     let city = directory.city(authority.is_of_city().map_err(|error| anyhow!(error))?)?;
     let unspecified = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
@@ -210,7 +234,12 @@ pub(super) fn invite(arguments: &InviteArguments) -> Result<(), Failure> {
         return Ok(());
     }
     let left: Vec<&str> = left.iter().map(NodeName::as_str).collect();
-    Err(anyhow!("not joined in {} h: {}; their tokens do not work any more", arguments.hours, left.join(", ")).into())
+    Err(anyhow!(
+        "not joined in {} h: {}; their tokens do not work any more",
+        arguments.hours,
+        left.join(", ")
+    )
+    .into())
 }
 
 /// Gets and keeps the files of an invited node.
@@ -229,7 +258,9 @@ pub(super) fn join(arguments: &JoinArguments) -> Result<(), Failure> {
         }
         anyhow::Ok(cell)
     })?;
-    print(&format!("{node} has joined the cell {cell}; its files are in {directory}\n"))?;
+    print(&format!(
+        "{node} has joined the cell {cell}; its files are in {directory}\n"
+    ))?;
     arguments.node.start(&directory)
 }
 
@@ -237,14 +268,20 @@ impl NodeArguments {
     /// Runs the node, has the system run it, or tells how to.
     fn start(&self, directory: &NodeDirectory) -> Result<(), Failure> {
         if self.run {
-            let config = NodeConfig::load(Some(&directory.configuration()), &json!({})).map_err(Failure::usage)?;
+            let config = NodeConfig::load(Some(&directory.configuration()), &json!({}))
+                .map_err(Failure::usage)?;
             return run::run_node(config, false);
         }
         if directory.enable_service()? {
-            return Ok(print("the service ecod-node is enabled and runs; `systemctl status ecod-node` tells more\n")?);
+            return Ok(print(
+                "the service ecod-node is enabled and runs; `systemctl status ecod-node` tells more\n",
+            )?);
         }
         let configuration = directory.configuration();
-        Ok(print(&format!("start it: ecod-node --config {}\n", configuration.display()))?)
+        Ok(print(&format!(
+            "start it: ecod-node --config {}\n",
+            configuration.display()
+        ))?)
     }
 }
 
@@ -274,7 +311,9 @@ fn read_token(argument: &str) -> anyhow::Result<Token> {
 /// A key of 64 hexadecimal digits.
 fn new_cell_key() -> anyhow::Result<String> {
     let mut key = [0; 32];
-    SystemRandom::new().fill(&mut key).map_err(|_| anyhow!("the system gives no random numbers"))?;
+    SystemRandom::new()
+        .fill(&mut key)
+        .map_err(|_| anyhow!("the system gives no random numbers"))?;
     Ok(hex::encode(key) + "\n")
 }
 
@@ -284,10 +323,17 @@ fn own_addresses(port: u16) -> anyhow::Result<Vec<SocketAddr>> {
         flags.contains(InterfaceFlags::IFF_UP | InterfaceFlags::IFF_RUNNING)
             && !flags.contains(InterfaceFlags::IFF_LOOPBACK)
     };
-    let interfaces = getifaddrs().context("cannot list this machine's addresses; give one by --listen IP:PORT")?;
+    let interfaces = getifaddrs()
+        .context("cannot list this machine's addresses; give one by --listen IP:PORT")?;
     let addresses = interfaces.filter(|interface| is_usable(interface.flags));
     let ips = addresses.filter_map(|interface| Some(interface.address?.as_sockaddr_in()?.ip()));
-    let found: Vec<_> = ips.map(|ip| SocketAddr::new(IpAddr::V4(ip), port)).take(MAX_ADDRESSES).collect();
-    anyhow::ensure!(!found.is_empty(), "this machine has no address on a network; give one by --listen IP:PORT");
+    let found: Vec<_> = ips
+        .map(|ip| SocketAddr::new(IpAddr::V4(ip), port))
+        .take(MAX_ADDRESSES)
+        .collect();
+    anyhow::ensure!(
+        !found.is_empty(),
+        "this machine has no address on a network; give one by --listen IP:PORT"
+    );
     Ok(found)
 }

@@ -22,7 +22,11 @@ pub enum LineRead {
 ///
 /// # Errors
 /// When the source cannot be read.
-pub fn read_line(source: &mut impl BufRead, limit: usize, line: &mut Vec<u8>) -> io::Result<LineRead> {
+pub fn read_line(
+    source: &mut impl BufRead,
+    limit: usize,
+    line: &mut Vec<u8>,
+) -> io::Result<LineRead> {
     line.clear();
     let bound = u64::try_from(limit).unwrap_or(u64::MAX).saturating_add(1);
     if source.by_ref().take(bound).read_until(b'\n', line)? == 0 {
@@ -49,7 +53,10 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
         return Ok(Box::new(io::stdin().lock()));
     }
     let file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let kind = file.metadata().with_context(|| format!("cannot read {}", path.display()))?.file_type();
+    let kind = file
+        .metadata()
+        .with_context(|| format!("cannot read {}", path.display()))?
+        .file_type();
     if kind.is_dir() {
         bail!("cannot read {}: it is a directory", path.display());
     }
@@ -58,7 +65,10 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
         bail!("cannot read {}: it is a device, not a file", path.display());
     }
     let mut source = BufReader::with_capacity(1 << 18, file);
-    if source.fill_buf().is_ok_and(|begin| begin.starts_with(BYTE_ORDER_MARK)) {
+    if source
+        .fill_buf()
+        .is_ok_and(|begin| begin.starts_with(BYTE_ORDER_MARK))
+    {
         source.consume(BYTE_ORDER_MARK.len());
     }
     Ok(Box::new(source))
@@ -70,7 +80,11 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
 /// Naming the file.
 pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<()> {
     // A file may have several names.
-    let file = |path: &Path| fs::metadata(path).ok().map(|metadata| (metadata.dev(), metadata.ino()));
+    let file = |path: &Path| {
+        fs::metadata(path)
+            .ok()
+            .map(|metadata| (metadata.dev(), metadata.ino()))
+    };
     let ours = file(path);
     if ours.is_some() && inputs.iter().any(|input| file(input.as_ref()) == ours) {
         bail!("{} is to be both read and written", path.display());
@@ -103,7 +117,10 @@ mod tests {
         std::os::unix::fs::symlink(&read, &linked).unwrap();
         fs::hard_link(&read, &hard).unwrap();
         for name in [&read, &linked, &hard] {
-            let error = create(name, std::slice::from_ref(&read)).err().unwrap().to_string();
+            let error = create(name, std::slice::from_ref(&read))
+                .err()
+                .unwrap()
+                .to_string();
             assert!(error.ends_with("is to be both read and written"), "{error}");
         }
         let mut line = String::new();
@@ -117,11 +134,24 @@ mod tests {
         let mut line = Vec::new();
         let mut next = || {
             let read = read_line(&mut source, 5, &mut line).unwrap();
-            (read, if read == LineRead::Whole { String::from_utf8(line.clone()).unwrap() } else { String::new() })
+            (
+                read,
+                if read == LineRead::Whole {
+                    String::from_utf8(line.clone()).unwrap()
+                } else {
+                    String::new()
+                },
+            )
         };
         use LineRead::{End, TooLarge, Whole};
-        for (read, text) in [(Whole, "12345"), (TooLarge, ""), (Whole, ""), (TooLarge, ""), (Whole, "last"), (End, "")]
-        {
+        for (read, text) in [
+            (Whole, "12345"),
+            (TooLarge, ""),
+            (Whole, ""),
+            (TooLarge, ""),
+            (Whole, "last"),
+            (End, ""),
+        ] {
             assert_eq!(next(), (read, text.to_owned()));
         }
     }

@@ -74,8 +74,16 @@ pub fn start(format: LogFormat, is_service: bool, level: &str) -> Option<Export>
         LogFormat::Text | LogFormat::Auto => (text(), None),
     };
     let events = filter_fn(|metadata| metadata.is_event()).with_max_level_hint(LevelFilter::TRACE);
-    let mut layers = vec![layer.with_filter(filter.and(events).and(LineThrottle::default())).boxed()];
-    let exported = if is_service { export(&mut layers) } else { Ok(None) };
+    let mut layers = vec![
+        layer
+            .with_filter(filter.and(events).and(LineThrottle::default()))
+            .boxed(),
+    ];
+    let exported = if is_service {
+        export(&mut layers)
+    } else {
+        Ok(None)
+    };
     tracing_subscriber::registry().with(layers).init();
     if let Some(error) = problem {
         tracing::warn!(%error, "cannot reach the journal, logging to standard error");
@@ -107,8 +115,11 @@ fn resolved(format: LogFormat, is_service: bool) -> LogFormat {
 
 /// True if standard error is connected to the journal. The variable alone may be inherited from another process.
 fn stderr_is_journal() -> bool {
-    let Some(stream) = std::env::var("JOURNAL_STREAM").ok() else { return false };
-    std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.dev(), file.ino()))
+    let Some(stream) = std::env::var("JOURNAL_STREAM").ok() else {
+        return false;
+    };
+    std::fs::metadata("/proc/self/fd/2")
+        .is_ok_and(|file| stream == format!("{}:{}", file.dev(), file.ino()))
 }
 
 /// An export that this program was built without.
@@ -125,11 +136,18 @@ impl Export {
 type AnyLayer = Box<dyn Layer<Registry> + Send + Sync>;
 
 fn text() -> AnyLayer {
-    tracing_subscriber::fmt::layer().with_writer(stderr).with_ansi(stderr().is_terminal()).boxed()
+    tracing_subscriber::fmt::layer()
+        .with_writer(stderr)
+        .with_ansi(stderr().is_terminal())
+        .boxed()
 }
 
 fn json() -> AnyLayer {
-    tracing_subscriber::fmt::layer().json().flatten_event(true).with_writer(stderr).boxed()
+    tracing_subscriber::fmt::layer()
+        .json()
+        .flatten_event(true)
+        .with_writer(stderr)
+        .boxed()
 }
 
 fn journal() -> std::io::Result<AnyLayer> {

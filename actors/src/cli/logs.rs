@@ -27,13 +27,18 @@ pub(super) struct Logs {
 
 impl Logs {
     /// Finds the log files of one node among files and directories. Files without a node's name belong to the only node.
-    pub(super) fn find(inputs: &[PathBuf], LogsNodeArguments { node }: &LogsNodeArguments) -> Result<Self, Failure> {
+    pub(super) fn find(
+        inputs: &[PathBuf],
+        LogsNodeArguments { node }: &LogsNodeArguments,
+    ) -> Result<Self, Failure> {
         let paths = log_files(inputs).map_err(Failure::usage)?;
         let (mut logs, mut nodes) = (Vec::new(), BTreeSet::new());
         for path in paths {
             let mut log = LogReader::open(&path).map_err(Failure::usage)?;
             let unusable = match log.next() {
-                Some(Err(error @ (LogError::Newer { .. } | LogError::Identity { .. }))) => Some(error),
+                Some(Err(error @ (LogError::Newer { .. } | LogError::Identity { .. }))) => {
+                    Some(error)
+                }
                 _ => None,
             };
             nodes.extend(log.node().cloned());
@@ -41,19 +46,30 @@ impl Logs {
                 logs.push((path, unusable));
             }
         }
-        let names = nodes.iter().map(NodeName::as_str).collect::<Vec<_>>().join(", ");
+        let names = nodes
+            .iter()
+            .map(NodeName::as_str)
+            .collect::<Vec<_>>()
+            .join(", ");
         match node {
             Some(node) if !nodes.contains(node) => {
                 let others = if nodes.is_empty() { "nobody" } else { &names };
-                return Err(Failure::usage(anyhow!("there is no log of {node} here, but of {others}")));
+                return Err(Failure::usage(anyhow!(
+                    "there is no log of {node} here, but of {others}"
+                )));
             }
             None if nodes.len() > 1 => {
-                return Err(Failure::usage(anyhow!("these are logs of several nodes, {names}: choose one by --node")));
+                return Err(Failure::usage(anyhow!(
+                    "these are logs of several nodes, {names}: choose one by --node"
+                )));
             }
             _ => {}
         }
         let (files, unusable): (Vec<_>, Vec<_>) = logs.into_iter().unzip();
-        Ok(Self { files, unusable: unusable.into_iter().flatten().next() })
+        Ok(Self {
+            files,
+            unusable: unusable.into_iter().flatten().next(),
+        })
     }
 }
 

@@ -114,23 +114,43 @@ pub(super) fn run(command: &PkiCommand) -> Result<(), Failure> {
     let message = match command {
         PkiCommand::Init { ca, cell, city } => {
             let authority = match city {
-                Some(city) => Authority::open(city).and_then(|mut city| city.init_cell(&ca.dir, cell, now)),
+                Some(city) => {
+                    Authority::open(city).and_then(|mut city| city.init_cell(&ca.dir, cell, now))
+                }
                 None => Authority::init(&ca.dir, cell, now),
             };
             let authority = authority.map_err(failure)?;
-            format!("made a CA for {cell}; copy its certificate to every node: {}\n", shown(&authority.ca()))
+            format!(
+                "made a CA for {cell}; copy its certificate to every node: {}\n",
+                shown(&authority.ca())
+            )
         }
-        PkiCommand::Issue { ca, node, role, priority, operator, days } => {
+        PkiCommand::Issue {
+            ca,
+            node,
+            role,
+            priority,
+            operator,
+            days,
+        } => {
             let mut authority = open(&ca.dir, false)?;
-            let rights = Rights { role: role_named(role), priority: *priority, may_describe: *operator };
-            authority.issue(node, rights, validity(*days), now).map_err(failure)?;
+            let rights = Rights {
+                role: role_named(role),
+                priority: *priority,
+                may_describe: *operator,
+            };
+            authority
+                .issue(node, rights, validity(*days), now)
+                .map_err(failure)?;
             configuration(&authority, node)
         }
         PkiCommand::Revoke { ca, node } => {
             let mut authority = open(&ca.dir, false)?;
             let count = authority.revoke(node, now).map_err(failure)?;
             let list = shown(&authority.revocation_list());
-            format!("revoked {count} of {node}; copy the list to every node (no restart needed): {list}\n")
+            format!(
+                "revoked {count} of {node}; copy the list to every node (no restart needed): {list}\n"
+            )
         }
         PkiCommand::City(command) => run_city(command, now)?,
     };
@@ -142,14 +162,23 @@ fn run_city(command: &CityCommand, now: Timestamp) -> Result<String, Failure> {
         CityCommand::Init { ca, city } => {
             let authority = Authority::init_city(&ca.dir, city, now).map_err(failure)?;
             let [ca, list] = [authority.ca(), authority.revocation_list()].map(|path| shown(&path));
-            format!("made a CA for {city}; copy its certificate and list to every node of its cells: {ca} {list}\n")
+            format!(
+                "made a CA for {city}; copy its certificate and list to every node of its cells: {ca} {list}\n"
+            )
         }
         CityCommand::Issue { ca, vehicle, days } => {
             let mut authority = open(&ca.dir, true)?;
-            authority.issue(vehicle, Role::Cav, validity(*days), now).map_err(failure)?;
+            authority
+                .issue(vehicle, Role::Cav, validity(*days), now)
+                .map_err(failure)?;
             let (certificate, key) = authority.files_of(vehicle);
-            let [ca, certificate, key, list] =
-                [authority.ca(), certificate, key, authority.revocation_list()].map(|path| shown(&path));
+            let [ca, certificate, key, list] = [
+                authority.ca(),
+                certificate,
+                key,
+                authority.revocation_list(),
+            ]
+            .map(|path| shown(&path));
             format!(
                 "role = \"cav\"\n\n# ca and revocation_list of the cell where it takes part\n\
                  [tls]\nca = \"ca.pem\"\nrevocation_list = \"revoked.pem\"\ncertificate = \"{certificate}\"\nkey = \"{key}\"\n\n\
@@ -159,12 +188,21 @@ fn run_city(command: &CityCommand, now: Timestamp) -> Result<String, Failure> {
         CityCommand::Revoke { ca, vehicle, cell } => {
             let mut authority = open(&ca.dir, true)?;
             let revoked = match (vehicle, cell) {
-                (Some(vehicle), _) => authority.revoke(vehicle, now).map(|count| format!("{count} of {vehicle}")),
-                (None, Some(cell)) => authority.revoke_cell(cell, now).map(|count| format!("{count} CAs of {cell}")),
+                (Some(vehicle), _) => authority
+                    .revoke(vehicle, now)
+                    .map(|count| format!("{count} of {vehicle}")),
+                (None, Some(cell)) => authority
+                    .revoke_cell(cell, now)
+                    .map(|count| format!("{count} CAs of {cell}")),
                 (None, None) => return Err(anyhow!("name a vehicle, or a cell by --cell").into()),
             };
-            let (revoked, list) = (revoked.map_err(failure)?, shown(&authority.revocation_list()));
-            format!("revoked {revoked}; copy the list to every node of the city's cells (no restart needed): {list}\n")
+            let (revoked, list) = (
+                revoked.map_err(failure)?,
+                shown(&authority.revocation_list()),
+            );
+            format!(
+                "revoked {revoked}; copy the list to every node of the city's cells (no restart needed): {list}\n"
+            )
         }
     })
 }
@@ -192,9 +230,16 @@ pub(super) fn role_named(name: &str) -> Role {
 /// Section of the node's configuration that names these files.
 fn configuration(authority: &Authority, node: &NodeName) -> String {
     let (certificate, key) = authority.files_of(node);
-    let [ca, certificate, key, list] =
-        [authority.ca(), certificate, key, authority.revocation_list()].map(|path| shown(&path));
-    format!("[tls]\nca = \"{ca}\"\ncertificate = \"{certificate}\"\nkey = \"{key}\"\nrevocation_list = \"{list}\"\n")
+    let [ca, certificate, key, list] = [
+        authority.ca(),
+        certificate,
+        key,
+        authority.revocation_list(),
+    ]
+    .map(|path| shown(&path));
+    format!(
+        "[tls]\nca = \"{ca}\"\ncertificate = \"{certificate}\"\nkey = \"{key}\"\nrevocation_list = \"{list}\"\n"
+    )
 }
 
 fn shown(path: &Path) -> String {

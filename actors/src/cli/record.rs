@@ -28,17 +28,27 @@ pub(super) fn run(arguments: &RecordArguments) -> Result<(), Failure> {
     let mut config = arguments.observer.load(NAME.as_str())?;
     let configured = config.record.take();
     let record = match (&arguments.dir, configured) {
-        (Some(dir), Some(record)) => RecordConfig { dir: dir.clone(), ..record },
+        (Some(dir), Some(record)) => RecordConfig {
+            dir: dir.clone(),
+            ..record
+        },
         (Some(dir), None) => RecordConfig::new(dir),
         (None, Some(record)) => record,
         (None, None) => {
-            return Err(Failure::usage(anyhow!("no directory to record to: give --dir, or [record] in --config")));
+            return Err(Failure::usage(anyhow!(
+                "no directory to record to: give --dir, or [record] in --config"
+            )));
         }
     };
     // A node runs on without its log, but a recorder has nothing else to do.
-    std::fs::create_dir_all(&record.dir).with_context(|| format!("cannot record to {}", record.dir.display()))?;
+    std::fs::create_dir_all(&record.dir)
+        .with_context(|| format!("cannot record to {}", record.dir.display()))?;
     // A name with the process id would start a new log in every run, which no later run continues or deletes.
     let name = Some(arguments.observer.name().cloned().unwrap_or(NAME));
-    config.record = Some(RecordConfig { name, reports: true, ..record });
+    config.record = Some(RecordConfig {
+        name,
+        reports: true,
+        ..record
+    });
     run_node(config, false)
 }

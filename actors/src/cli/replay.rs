@@ -47,17 +47,30 @@ pub(super) struct ReplayArguments {
 }
 
 pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
-    let ReplayArguments { config, input, node, output, passes, max_rejected } = arguments;
+    let ReplayArguments {
+        config,
+        input,
+        node,
+        output,
+        passes,
+        max_rejected,
+    } = arguments;
     let given = config.as_deref().map(|path| cell(Some(path))).transpose()?;
     let mut read: Vec<PathBuf> = input.iter().chain(config).cloned().collect();
     if let Some(lines) = input_of_lines(input, node)? {
-        let config = ReplayConfig { passes: *passes, ..given.unwrap_or_default() };
+        let config = ReplayConfig {
+            passes: *passes,
+            ..given.unwrap_or_default()
+        };
         let usable = replay_lines(config, lines, RoundWriter::create(output, &read)?)?;
         return usable.map_or(Ok(()), |usable| usable.check(*max_rejected));
     }
     let Logs { files, unusable } = Logs::find(input, node)?;
     if let (Some(unusable), None) = (unusable, &given) {
-        let why = anyhow!("{:#}: give the configuration of the fusion with --config", anyhow!(unusable));
+        let why = anyhow!(
+            "{:#}: give the configuration of the fusion with --config",
+            anyhow!(unusable)
+        );
         return Err(Failure::usage(why));
     }
     read.extend_from_slice(&files);
@@ -67,24 +80,38 @@ pub(super) fn run(arguments: &ReplayArguments) -> Result<(), Failure> {
 }
 
 /// The input, if it is a file of lines or standard input; none for logs.
-fn input_of_lines<'a>(inputs: &'a [PathBuf], node: &LogsNodeArguments) -> Result<Option<&'a Path>, Failure> {
+fn input_of_lines<'a>(
+    inputs: &'a [PathBuf],
+    node: &LogsNodeArguments,
+) -> Result<Option<&'a Path>, Failure> {
     let [input] = inputs else { return Ok(None) };
-    if input != Path::new("-") && (input.is_dir() || LogReader::recognises(input).map_err(Failure::usage)?) {
+    if input != Path::new("-")
+        && (input.is_dir() || LogReader::recognises(input).map_err(Failure::usage)?)
+    {
         return Ok(None);
     }
     if node.node.is_some() {
-        return Err(Failure::usage(anyhow!("{} is not a log: --node chooses among logs", input.display())));
+        return Err(Failure::usage(anyhow!(
+            "{} is not a log: --node chooses among logs",
+            input.display()
+        )));
     }
     Ok(Some(input))
 }
 
 /// Replays lines; gives nothing if the reader of the output closed it.
-fn replay_lines(config: ReplayConfig, input: &Path, mut rounds: RoundWriter) -> Result<Option<Usable>, Failure> {
+fn replay_lines(
+    config: ReplayConfig,
+    input: &Path,
+    mut rounds: RoundWriter,
+) -> Result<Option<Usable>, Failure> {
     let mut source = lines::open(input).map_err(Failure::usage)?;
     let limit = config.limits.payload_bytes;
     let (mut replay, mut line) = (Replay::new(config), Vec::new());
     loop {
-        match read_line(&mut source, limit, &mut line).with_context(|| format!("cannot read {}", input.display()))? {
+        match read_line(&mut source, limit, &mut line)
+            .with_context(|| format!("cannot read {}", input.display()))?
+        {
             LineRead::End => break,
             LineRead::TooLarge => replay.oversized_line(),
             LineRead::Whole => {
@@ -116,13 +143,35 @@ struct Usable {
 
 impl Usable {
     fn of(summary: &Summary, may_repeat: bool) -> Self {
-        let Summary { lines, votes, ignored_votes, placements: Placements { placed, misplaced }, .. } = *summary;
+        let Summary {
+            lines,
+            votes,
+            ignored_votes,
+            placements: Placements { placed, misplaced },
+            ..
+        } = *summary;
         let (used, faulty) = (summary.used(), summary.faulty(may_repeat));
-        Self { reports: lines, used, faulty, votes, ignored_votes, placed, misplaced }
+        Self {
+            reports: lines,
+            used,
+            faulty,
+            votes,
+            ignored_votes,
+            placed,
+            misplaced,
+        }
     }
 
     fn plus(self, other: Self) -> Self {
-        let Self { reports, used, faulty, votes, ignored_votes, placed, misplaced } = other;
+        let Self {
+            reports,
+            used,
+            faulty,
+            votes,
+            ignored_votes,
+            placed,
+            misplaced,
+        } = other;
         Self {
             reports: self.reports + reports,
             used: self.used + used,
@@ -136,21 +185,37 @@ impl Usable {
 
     /// Fails if no report was used, or none has an effect, or more than a share was rejected.
     fn check(self, max_rejected_pct: u64) -> Result<(), Failure> {
-        let Self { reports, used, faulty, votes, ignored_votes, placed, misplaced } = self;
+        let Self {
+            reports,
+            used,
+            faulty,
+            votes,
+            ignored_votes,
+            placed,
+            misplaced,
+        } = self;
         if used == 0 {
-            return Err(Failure::rejected(anyhow!("no report could be used: the input is no recording of reports")));
+            return Err(Failure::rejected(anyhow!(
+                "no report could be used: the input is no recording of reports"
+            )));
         }
         if 2 * ignored_votes > votes {
             let rule = "a vote has a `landmark`, one of the configuration's if that lists any, a `confidence` above 0, and \
                 a place within `fusion.vote.weighted.max_range_m` of the `pose`";
-            return Err(Failure::rejected(anyhow!("{ignored_votes} of {votes} votes do not count: {rule}")));
+            return Err(Failure::rejected(anyhow!(
+                "{ignored_votes} of {votes} votes do not count: {rule}"
+            )));
         }
         if placed == 0 && misplaced > 0 {
             let rule = "positions are in metres in the frame of the configuration's `landmarks`";
-            return Err(Failure::rejected(anyhow!("no report has an object at a known location, or near one: {rule}")));
+            return Err(Failure::rejected(anyhow!(
+                "no report has an object at a known location, or near one: {rule}"
+            )));
         }
         if faulty * 100 > max_rejected_pct * reports {
-            let share = format!("{faulty} of {reports} reports were rejected, more than {max_rejected_pct} %");
+            let share = format!(
+                "{faulty} of {reports} reports were rejected, more than {max_rejected_pct} %"
+            );
             return Err(Failure::rejected(anyhow!("{share} (--max-rejected)")));
         }
         Ok(())
@@ -162,12 +227,17 @@ impl Usable {
 /// # Errors
 /// When the file cannot be used.
 pub fn cell(path: Option<&Path>) -> Result<ReplayConfig, Failure> {
-    let Some(path) = path else { return Ok(ReplayConfig::default()) };
+    let Some(path) = path else {
+        return Ok(ReplayConfig::default());
+    };
     let node = NodeConfig::load_cell(path).map_err(Failure::usage)?;
     let default = ReplayConfig::default();
     Ok(ReplayConfig {
         // Only the length of a line is limited.
-        limits: Limits { objects: default.limits.objects, ..node.mqtt.limits() },
+        limits: Limits {
+            objects: default.limits.objects,
+            ..node.mqtt.limits()
+        },
         landmarks: node.landmarks(),
         aggregator: node.name.unwrap_or(default.aggregator),
         fusion: node.fusion,
@@ -184,7 +254,10 @@ struct RoundWriter {
 impl RoundWriter {
     fn create(path: &Path, inputs: &[PathBuf]) -> Result<Self, Failure> {
         let sink = lines::create(path, inputs).map_err(Failure::usage)?;
-        Ok(Self { sink, path: path.into() })
+        Ok(Self {
+            sink,
+            path: path.into(),
+        })
     }
 
     /// Writes rounds; false once the reader has closed the output.
@@ -207,13 +280,26 @@ impl RoundWriter {
     fn is_open(&self, written: io::Result<()>) -> Result<bool, Failure> {
         match written {
             Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
-            written => Ok(written.map(|()| true).with_context(|| format!("cannot write {}", self.path.display()))?),
+            written => Ok(written
+                .map(|()| true)
+                .with_context(|| format!("cannot write {}", self.path.display()))?),
         }
     }
 }
 
 fn print_summary(summary: &Summary) {
-    let Summary { lines, rejected, unit, late, ignored_votes, placements, overtaken, tracks, written, .. } = summary;
+    let Summary {
+        lines,
+        rejected,
+        unit,
+        late,
+        ignored_votes,
+        placements,
+        overtaken,
+        tracks,
+        written,
+        ..
+    } = summary;
     eprintln!("{lines} lines, {} used, {written} written", summary.used());
     for (reason, Rejections { lines, examples }) in rejected {
         eprintln!("rejected {reason} {lines}");
@@ -222,13 +308,24 @@ fn print_summary(summary: &Summary) {
         }
     }
     if let Some(unit) = unit {
-        eprintln!("times look like {unit}: captured_at_us and received_at_us are microseconds since 1970");
+        eprintln!(
+            "times look like {unit}: captured_at_us and received_at_us are microseconds since 1970"
+        );
     }
     for (what, number) in [
         ("reports used although older than an earlier line", *late),
-        ("votes ignored: no usable location, or too many labels", *ignored_votes),
-        ("reports of which no object is at a known location, or near one", placements.misplaced),
-        ("reports used for tracking only, since a later one of the vehicle came first", *overtaken),
+        (
+            "votes ignored: no usable location, or too many labels",
+            *ignored_votes,
+        ),
+        (
+            "reports of which no object is at a known location, or near one",
+            placements.misplaced,
+        ),
+        (
+            "reports used for tracking only, since a later one of the vehicle came first",
+            *overtaken,
+        ),
         ("reports too late for tracking", tracks.late),
         ("new objects not tracked: too many", tracks.refused),
     ] {

@@ -46,7 +46,12 @@ pub(super) fn run(arguments: &ReportArguments) -> Result<(), Failure> {
 ///
 /// # Errors
 /// When there is no log of one node, or the page cannot be written.
-pub fn page(arguments: &PageArguments, mut report: Report, read: Option<&Path>, program: &str) -> Result<(), Failure> {
+pub fn page(
+    arguments: &PageArguments,
+    mut report: Report,
+    read: Option<&Path>,
+    program: &str,
+) -> Result<(), Failure> {
     let PageArguments { logs, node, output } = arguments;
     let files = Logs::find(logs, node)?.files;
     let inputs: Vec<&Path> = files.iter().map(PathBuf::as_path).chain(read).collect();
@@ -60,5 +65,6 @@ pub fn page(arguments: &PageArguments, mut report: Report, read: Option<&Path>, 
     if report.is_empty() {
         return Err(anyhow!("the log is empty").into());
     }
-    Ok(fs::write(output, report.page()).with_context(|| format!("cannot write {}", output.display()))?)
+    Ok(fs::write(output, report.page())
+        .with_context(|| format!("cannot write {}", output.display()))?)
 }

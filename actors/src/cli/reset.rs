@@ -32,14 +32,21 @@ pub(super) struct ResetArguments {
 
 /// Resets the files; the node must not run.
 pub(super) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
-    let config =
-        NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new()).map_err(Failure::usage)?;
+    let config = NodeConfig::load(Some(&arguments.config), &BTreeMap::<String, String>::new())
+        .map_err(Failure::usage)?;
     let missing = |key: &str, what: &str| Failure::usage(anyhow!("key `{key}`: {what}"));
-    let directory = config.state_dir.as_deref().ok_or_else(|| missing("state_dir", "not set, so nothing is saved"))?;
-    let name = config.name.as_ref().ok_or_else(|| missing("name", "not set, so the node's files are not known"))?;
+    let directory = config
+        .state_dir
+        .as_deref()
+        .ok_or_else(|| missing("state_dir", "not set, so nothing is saved"))?;
+    let name = config
+        .name
+        .as_ref()
+        .ok_or_else(|| missing("name", "not set, so the node's files are not known"))?;
     let file = |what: &str| StateFile::new(directory, &config.cell, name, what);
-    let _lock = StateFile::lock(directory, &config.cell, name)
-        .with_context(|| format!("{name} runs and would write its state again; stop it, and repeat the command"))?;
+    let _lock = StateFile::lock(directory, &config.cell, name).with_context(|| {
+        format!("{name} runs and would write its state again; stop it, and repeat the command")
+    })?;
     let mut done = String::new();
     if arguments.reputations {
         if !config.may_lead() {
@@ -48,13 +55,18 @@ pub(super) fn run(arguments: &ResetArguments) -> Result<(), Failure> {
             )));
         }
         let file = file("reputations");
-        reset_saved(&file, &config.cell, name, clock::now()).with_context(|| file.path().display().to_string())?;
+        reset_saved(&file, &config.cell, name, clock::now())
+            .with_context(|| file.path().display().to_string())?;
         done += &format!("reset {}\n", file.path().display());
     }
-    let forgotten = [(arguments.term, "term"), (arguments.description, "description")];
+    let forgotten = [
+        (arguments.term, "term"),
+        (arguments.description, "description"),
+    ];
     for (_, what) in forgotten.into_iter().filter(|(is_asked, _)| *is_asked) {
         let file = file(what);
-        file.delete().with_context(|| file.path().display().to_string())?;
+        file.delete()
+            .with_context(|| file.path().display().to_string())?;
         done += &format!("removed {}\n", file.path().display());
     }
     Ok(print(&(done + "start the node again\n"))?)

@@ -91,14 +91,21 @@ struct SeedArguments {
 }
 
 pub(super) fn ip_and_port(text: &str) -> Result<SocketAddr, &'static str> {
-    text.parse().map_err(|_| "must be an IP address and a port, such as 0.0.0.0:1883")
+    text.parse()
+        .map_err(|_| "must be an IP address and a port, such as 0.0.0.0:1883")
 }
 
 pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
     let config = arguments.load()?;
     if arguments.print_config {
-        let text = if arguments.changed { config.to_toml_changed() } else { config.to_toml() };
-        return Ok(print(&text.context("the configuration cannot be written as TOML")?)?);
+        let text = if arguments.changed {
+            config.to_toml_changed()
+        } else {
+            config.to_toml()
+        };
+        return Ok(print(
+            &text.context("the configuration cannot be written as TOML")?,
+        )?);
     }
     #[cfg(feature = "camera")]
     if !config.has_camera() {
@@ -112,7 +119,9 @@ pub(super) fn run(arguments: &RunArguments) -> Result<(), Failure> {
 #[cfg(feature = "camera")]
 fn continue_without_opencv() {
     if let Some(program) = installed::path("lib/ecod-node/ecod-node") {
-        let error = Command::new(&program).args(std::env::args_os().skip(1)).exec();
+        let error = Command::new(&program)
+            .args(std::env::args_os().skip(1))
+            .exec();
         tracing::warn!(?program, %error, "cannot run the program without OpenCV; this one goes on, with more memory");
     }
 }
@@ -144,9 +153,24 @@ impl RunArguments {
 
     /// The flags that were given, as keys of the configuration.
     fn overrides(&self) -> Value {
-        let Self { role, join, listen, state_dir, description, map_log, dashboard, no_dashboard, record, .. } = self;
+        let Self {
+            role,
+            join,
+            listen,
+            state_dir,
+            description,
+            map_log,
+            dashboard,
+            no_dashboard,
+            record,
+            ..
+        } = self;
         let seeds = Some(&join.seeds).filter(|seeds| !seeds.is_empty());
-        let enabled = if *no_dashboard { Some(false) } else { dashboard.map(|_| true) };
+        let enabled = if *no_dashboard {
+            Some(false)
+        } else {
+            dashboard.map(|_| true)
+        };
         let mut keys = json!({
             "role": role,
             "name": join.name,
@@ -169,7 +193,9 @@ impl RunArguments {
 fn remove_nulls(value: &mut Value) {
     if let Value::Object(keys) = value {
         keys.values_mut().for_each(remove_nulls);
-        keys.retain(|_, value| !value.is_null() && value.as_object().is_none_or(|table| !table.is_empty()));
+        keys.retain(|_, value| {
+            !value.is_null() && value.as_object().is_none_or(|table| !table.is_empty())
+        });
     }
 }
 
@@ -178,10 +204,15 @@ const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Runs the node until SIGINT or SIGTERM.
 async fn serve(config: NodeConfig, stop_at_eof: bool) -> anyhow::Result<()> {
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let (mut interrupt, mut terminate) = (
+        signal(SignalKind::interrupt())?,
+        signal(SignalKind::terminate())?,
+    );
     #[cfg(feature = "camera")]
     if config.role == Role::Cav && !config.has_camera() && config.record.is_none() {
-        tracing::warn!("no [camera] is configured: of this vehicle, only programs beside it report");
+        tracing::warn!(
+            "no [camera] is configured: of this vehicle, only programs beside it report"
+        );
     }
     let mut vehicle = Roamer::start(config).await?;
     if let Some(manager) = ServiceManager::from_environment() {
@@ -215,14 +246,38 @@ impl ObserverArguments {
     /// in the file to their node. Its default name is made of `purpose` and the process id.
     pub(super) fn load(&self, purpose: &str) -> Result<NodeConfig, Failure> {
         let default_name = format!("{purpose}-{}", std::process::id());
-        let name = self.join.name.clone().or_else(|| NodeName::new(&default_name).ok());
-        let join = SeedArguments { name, ..self.join.clone() };
-        let mut config = RunArguments { role: Some("cav".into()), join, ..RunArguments::default() }.load()?;
+        let name = self
+            .join
+            .name
+            .clone()
+            .or_else(|| NodeName::new(&default_name).ok());
+        let join = SeedArguments {
+            name,
+            ..self.join.clone()
+        };
+        let mut config = RunArguments {
+            role: Some("cav".into()),
+            join,
+            ..RunArguments::default()
+        }
+        .load()?;
         // With a node's certificate, the observer needs a name below that node's.
         if config.tls.is_some() && self.join.name.is_none() {
-            let SeedArguments { config: file, cell, .. } = self.join.clone();
-            let join = SeedArguments { config: file, cell, ..SeedArguments::default() };
-            if let Some(holder) = (RunArguments { join, ..RunArguments::default() }).load()?.name {
+            let SeedArguments {
+                config: file, cell, ..
+            } = self.join.clone();
+            let join = SeedArguments {
+                config: file,
+                cell,
+                ..SeedArguments::default()
+            };
+            if let Some(holder) = (RunArguments {
+                join,
+                ..RunArguments::default()
+            })
+            .load()?
+            .name
+            {
                 let name = NodeName::new(format!("{holder}{OBSERVER_MARK}{default_name}"));
                 config.name = Some(name.map_err(Failure::usage)?);
             }
@@ -260,12 +315,16 @@ mod tests {
     fn an_observer_leaves_the_addresses_in_the_file_to_the_node_they_are_for() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("node.toml");
-        let text =
-            "name = \"euclid\"\n[dashboard]\nlisten = \"127.0.0.1:8080\"\n[membership]\nbind = \"127.0.0.1:17884\"\n";
+        let text = "name = \"euclid\"\n[dashboard]\nlisten = \"127.0.0.1:8080\"\n[membership]\nbind = \"127.0.0.1:17884\"\n";
         std::fs::write(&path, text).unwrap();
-        let join = SeedArguments { config: Some(path), ..SeedArguments::default() };
+        let join = SeedArguments {
+            config: Some(path),
+            ..SeedArguments::default()
+        };
         let arguments = ObserverArguments { join };
-        let Ok(config) = arguments.load("recorder") else { panic!("the configuration is valid") };
+        let Ok(config) = arguments.load("recorder") else {
+            panic!("the configuration is valid")
+        };
         assert!(!config.dashboard.enabled && !config.has_broker());
         assert_eq!(config.membership.bind.map(|bind| bind.port()), Some(0));
         assert!(config.name.unwrap().as_str().starts_with("recorder-"));

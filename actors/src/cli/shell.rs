@@ -24,7 +24,10 @@ pub(super) struct ManArguments {
 }
 
 /// Prints the completion script of a shell.
-pub(super) fn completions(arguments: &CompletionsArguments, mut program: clap::Command) -> Result<(), Failure> {
+pub(super) fn completions(
+    arguments: &CompletionsArguments,
+    mut program: clap::Command,
+) -> Result<(), Failure> {
     let mut script = Vec::new();
     clap_complete::generate(arguments.shell, &mut program, "ecod-node", &mut script);
     Ok(print(&String::from_utf8_lossy(&script))?)

@@ -43,7 +43,9 @@ pub(super) fn run(arguments: &TopArguments) -> Result<(), Failure> {
         let _context = runtime.enter();
         [SignalKind::hangup(), SignalKind::terminate()].map(signal)
     };
-    let node = runtime.block_on(node::start(config.clone())).map_err(|error| anyhow!(error))?;
+    let node = runtime
+        .block_on(node::start(config.clone()))
+        .map_err(|error| anyhow!(error))?;
     let node = Arc::new(Mutex::new(Some(node)));
     let shown_node = Arc::clone(&node);
     // Reading from a terminal that is gone never ends: this thread is not waited for then.
@@ -106,14 +108,17 @@ fn show(
 ) -> std::io::Result<()> {
     let mut before = None;
     loop {
-        let view = lock(node).as_ref().map(|node| CellView::of(node, config, before, clock::now()));
+        let view = lock(node)
+            .as_ref()
+            .map(|node| CellView::of(node, config, before, clock::now()));
         let Some(mut view) = view else { return Ok(()) };
         terminal.draw(|frame| draw(frame, &mut view))?;
         if event::poll(PERIOD)?
             && let Event::Key(key) = event::read()?
             && key.kind == KeyEventKind::Press
         {
-            let interrupted = key.modifiers.contains(KeyModifiers::CONTROL) && key.code == KeyCode::Char('c');
+            let interrupted =
+                key.modifiers.contains(KeyModifiers::CONTROL) && key.code == KeyCode::Char('c');
             if interrupted || matches!(key.code, KeyCode::Char('q') | KeyCode::Esc) {
                 return Ok(());
             }

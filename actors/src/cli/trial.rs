@@ -70,7 +70,11 @@ const PROGRESS_PERIOD: Duration = Duration::from_secs(1);
 
 pub(super) fn run(arguments: &TryArguments) -> Result<(), Failure> {
     let configs = arguments.configs()?;
-    run_to_end(serve(configs, arguments.save.as_deref(), arguments.stop_at_eof))
+    run_to_end(serve(
+        configs,
+        arguments.save.as_deref(),
+        arguments.stop_at_eof,
+    ))
 }
 
 impl TryArguments {
@@ -80,20 +84,42 @@ impl TryArguments {
         // A saved configuration is to be of use in every directory.
         let absolute = |path: &PathBuf| std::path::absolute(path).unwrap_or_else(|_| path.clone());
         let videos = self.video.iter().enumerate().map(|(index, path)| {
-            (numbered("video", index), SourceConfig::Video { path: absolute(path), looping: true })
+            (
+                numbered("video", index),
+                SourceConfig::Video {
+                    path: absolute(path),
+                    looping: true,
+                },
+            )
         });
         let images = self.images.iter().enumerate().map(|(index, path)| {
-            (numbered("images", index), SourceConfig::Images { path: absolute(path), fps: 5.0, looping: true })
+            (
+                numbered("images", index),
+                SourceConfig::Images {
+                    path: absolute(path),
+                    fps: 5.0,
+                    looping: true,
+                },
+            )
         });
         let cameras = self.camera.iter().map(|number| {
             let device = PathBuf::from(format!("/dev/video{number}"));
-            (format!("camera-{number}"), SourceConfig::V4l2 { device, width: None, height: None, fps: None })
+            (
+                format!("camera-{number}"),
+                SourceConfig::V4l2 {
+                    device,
+                    width: None,
+                    height: None,
+                    fps: None,
+                },
+            )
         });
-        let urls = self
-            .url
-            .iter()
-            .enumerate()
-            .map(|(index, url)| (numbered("url", index), SourceConfig::Url { url: url.clone() }));
+        let urls = self.url.iter().enumerate().map(|(index, url)| {
+            (
+                numbered("url", index),
+                SourceConfig::Url { url: url.clone() },
+            )
+        });
         videos.chain(images).chain(cameras).chain(urls).collect()
     }
 
@@ -103,7 +129,10 @@ impl TryArguments {
         let mut configs = Vec::new();
         for (index, (name, source)) in sources.into_iter().enumerate() {
             if let SourceConfig::Video { .. } | SourceConfig::Images { .. } = source {
-                source.open(PROGRESS_PERIOD).map(drop).map_err(Failure::usage)?;
+                source
+                    .open(PROGRESS_PERIOD)
+                    .map(drop)
+                    .map_err(Failure::usage)?;
             }
             let mut config = vehicle(NodeName::new(name).map_err(Failure::usage)?, source);
             config.pose.y_m -= SPACING_M * index as f64;
@@ -112,7 +141,9 @@ impl TryArguments {
         if let Some(page) = self.dashboard {
             let bound = TcpListener::bind(page).map(drop);
             let free = "give --dashboard another address, or leave it out for a free port";
-            bound.with_context(|| format!("no page at {page}: {free}")).map_err(Failure::usage)?;
+            bound
+                .with_context(|| format!("no page at {page}: {free}"))
+                .map_err(Failure::usage)?;
         }
         if configs.is_empty() {
             configs = street().map_err(Failure::usage)?;
@@ -131,15 +162,28 @@ impl TryArguments {
 
 /// Checks that a file can be made.
 fn check_absent(path: &Path) -> anyhow::Result<()> {
-    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    ensure!(directory.is_dir(), "cannot write {}: make the directory first", path.display());
-    ensure!(!path.exists(), "cannot write {}: it exists, choose another name for --save", path.display());
+    let directory = path
+        .parent()
+        .filter(|parent| !parent.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
+    ensure!(
+        directory.is_dir(),
+        "cannot write {}: make the directory first",
+        path.display()
+    );
+    ensure!(
+        !path.exists(),
+        "cannot write {}: it exists, choose another name for --save",
+        path.display()
+    );
     Ok(())
 }
 
 /// The nodes of the street that comes with the program: two cameras that stay where they are.
 fn street() -> anyhow::Result<Vec<NodeConfig>> {
-    let directory = std::path::absolute(installed::path(STREET_INSTALLED).unwrap_or_else(|| STREET_IN_SOURCES.into()))?;
+    let directory = std::path::absolute(
+        installed::path(STREET_INSTALLED).unwrap_or_else(|| STREET_IN_SOURCES.into()),
+    )?;
     let missing = || {
         format!(
             "no street in {}: run this in ecod's sources, or install the package ecod-node; or give --video FILE, --images DIR, \
@@ -151,12 +195,19 @@ fn street() -> anyhow::Result<Vec<NodeConfig>> {
     for entry in std::fs::read_dir(&directory).with_context(missing)? {
         files.push(entry?.path());
     }
-    files.retain(|file| file.extension().is_some_and(|extension| extension == "toml"));
+    files.retain(|file| {
+        file.extension()
+            .is_some_and(|extension| extension == "toml")
+    });
     files.sort();
     ensure!(!files.is_empty(), missing());
     let node = |file: &PathBuf| {
         let mut config = NodeConfig::load_cell(file)?;
-        if let Some(CameraConfig { source: SourceConfig::Video { path, .. }, .. }) = &mut config.camera {
+        if let Some(CameraConfig {
+            source: SourceConfig::Video { path, .. },
+            ..
+        }) = &mut config.camera
+        {
             *path = directory.join(&path);
         }
         Ok(config)
@@ -180,7 +231,10 @@ fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
         source,
         capture: CaptureConfig::default(),
         optics: OpticsConfig::default(),
-        mount: MountConfig { height_m: Some(CAMERA_HEIGHT_M), ..MountConfig::default() },
+        mount: MountConfig {
+            height_m: Some(CAMERA_HEIGHT_M),
+            ..MountConfig::default()
+        },
         detector: DetectorConfig::Coco(CocoConfig::default()),
         projection: ProjectionConfig {
             pixel_sigma_px: 4.0,
@@ -192,18 +246,28 @@ fn vehicle(name: NodeName, source: SourceConfig) -> NodeConfig {
         votes: false,
     };
     // A camera in a hand is no car, and things may be close to it.
-    let tracks =
-        TracksConfig { vehicle_radius_m: 0.1, vehicle_label: Label::new_static("camera"), ..TracksConfig::default() };
+    let tracks = TracksConfig {
+        vehicle_radius_m: 0.1,
+        vehicle_label: Label::new_static("camera"),
+        ..TracksConfig::default()
+    };
     NodeConfig {
         name: Some(name),
-        fusion: FusionConfig { tracks, ..FusionConfig::default() },
+        fusion: FusionConfig {
+            tracks,
+            ..FusionConfig::default()
+        },
         camera: Some(camera),
         ..NodeConfig::default()
     }
 }
 
 /// Runs the vehicles until SIGINT or SIGTERM, or until one gives up.
-async fn serve(configs: Vec<NodeConfig>, save: Option<&Path>, stop_at_eof: bool) -> anyhow::Result<()> {
+async fn serve(
+    configs: Vec<NodeConfig>,
+    save: Option<&Path>,
+    stop_at_eof: bool,
+) -> anyhow::Result<()> {
     let mut nodes = Vec::new();
     let outcome = tokio::select! {
         outcome = start_and_watch(configs, save, &mut nodes) => outcome,
@@ -220,7 +284,10 @@ async fn serve(configs: Vec<NodeConfig>, save: Option<&Path>, stop_at_eof: bool)
 }
 
 async fn stop_signal() -> anyhow::Result<()> {
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let (mut interrupt, mut terminate) = (
+        signal(SignalKind::interrupt())?,
+        signal(SignalKind::terminate())?,
+    );
     tokio::select! {
         _ = interrupt.recv() => {}
         _ = terminate.recv() => {}
@@ -234,22 +301,36 @@ async fn start_and_watch(
     nodes: &mut Vec<NodeHandle>,
 ) -> anyhow::Result<()> {
     for (index, mut config) in configs.into_iter().enumerate() {
-        config.membership.seeds =
-            nodes.first().and_then(NodeHandle::gossip_address).iter().map(ToString::to_string).collect();
+        config.membership.seeds = nodes
+            .first()
+            .and_then(NodeHandle::gossip_address)
+            .iter()
+            .map(ToString::to_string)
+            .collect();
         let node = node::start(config.clone()).await?;
         let mut address = node.dashboard_address();
-        let page = address.wait_for(Option::is_some).await.context("the page ended")?.unwrap_or(DEFAULT_ADDRESS);
+        let page = address
+            .wait_for(Option::is_some)
+            .await
+            .context("the page ended")?
+            .unwrap_or(DEFAULT_ADDRESS);
         if index == 0 {
             config.membership.bind = node.gossip_address();
             eprintln!("page: http://{page}/   (Ctrl-C ends)");
         } else {
-            eprintln!("page of {}: http://{page}/", config.name.as_ref().map_or("another", NodeName::as_str));
+            eprintln!(
+                "page of {}: http://{page}/",
+                config.name.as_ref().map_or("another", NodeName::as_str)
+            );
         }
         nodes.push(node);
         if let Some(path) = save {
             let path = numbered(path, index);
-            let text = config.to_toml_changed().context("the configuration cannot be written as TOML")?;
-            let written = std::fs::File::create_new(&path).and_then(|mut file| file.write_all(text.as_bytes()));
+            let text = config
+                .to_toml_changed()
+                .context("the configuration cannot be written as TOML")?;
+            let written = std::fs::File::create_new(&path)
+                .and_then(|mut file| file.write_all(text.as_bytes()));
             written.with_context(|| format!("cannot write {}", path.display()))?;
         }
     }
@@ -262,13 +343,21 @@ fn numbered(path: &Path, index: usize) -> PathBuf {
         return path.to_owned();
     }
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    let extension = path.extension().map(|extension| format!(".{}", extension.to_string_lossy())).unwrap_or_default();
+    let extension = path
+        .extension()
+        .map(|extension| format!(".{}", extension.to_string_lossy()))
+        .unwrap_or_default();
     path.with_file_name(format!("{stem}-{}{extension}", index + 1))
 }
 
 /// Tells of progress until a node gives up.
 async fn watch(nodes: &mut [NodeHandle]) -> anyhow::Result<()> {
-    let sum = |nodes: &[NodeHandle], event| nodes.iter().map(|node| node.counters().events(event)).sum::<u64>();
+    let sum = |nodes: &[NodeHandle], event| {
+        nodes
+            .iter()
+            .map(|node| node.counters().events(event))
+            .sum::<u64>()
+    };
     let mut ticks = tokio::time::interval(PROGRESS_PERIOD);
     let (mut frames, mut shown) = (0, String::new());
     loop {
@@ -277,9 +366,18 @@ async fn watch(nodes: &mut [NodeHandle]) -> anyhow::Result<()> {
             node.failed().now_or_never().unwrap_or(Ok(()))?;
         }
         let detected = sum(nodes, Event::FrameDetected);
-        let rate = (detected - std::mem::replace(&mut frames, detected)) as f64 / PROGRESS_PERIOD.as_secs_f64();
-        let map = nodes.first().and_then(|node| node.newest_map().borrow().as_ref().map(|map| map.map.objects.len()));
-        let objects = map.map_or_else(|| "no map yet".to_owned(), |objects| format!("{objects} objects on the map"));
+        let rate = (detected - std::mem::replace(&mut frames, detected)) as f64
+            / PROGRESS_PERIOD.as_secs_f64();
+        let map = nodes.first().and_then(|node| {
+            node.newest_map()
+                .borrow()
+                .as_ref()
+                .map(|map| map.map.objects.len())
+        });
+        let objects = map.map_or_else(
+            || "no map yet".to_owned(),
+            |objects| format!("{objects} objects on the map"),
+        );
         let line = format!(
             "{rate:.0} frames/s, {objects}, {} detections without a place",
             sum(nodes, Event::DetectionUnplaced)

@@ -26,7 +26,9 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
         let mut of_camera = vec![first, calibration(camera)];
         of_camera.extend(detections(config, camera, frame).await);
         if let Some(name) = &camera.name {
-            of_camera.iter_mut().for_each(|finding| finding.seen = format!("{name}: {}", finding.seen));
+            of_camera
+                .iter_mut()
+                .for_each(|finding| finding.seen = format!("{name}: {}", finding.seen));
         }
         findings.extend(of_camera);
     }
@@ -36,7 +38,9 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
 async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
     let check = "camera";
     let fix = match &camera.source {
-        SourceConfig::V4l2 { .. } => "plug it in, add the user to the group `video`, set `camera.source.device`",
+        SourceConfig::V4l2 { .. } => {
+            "plug it in, add the user to the group `video`, set `camera.source.device`"
+        }
         SourceConfig::Gstreamer { .. } => "try `camera.source.pipeline` with gst-launch-1.0",
         SourceConfig::Url { .. } => "try `camera.source.url` with a player",
         _ => "set `camera.source` to an existing source",
@@ -46,7 +50,11 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
     let (sender, answer) = tokio::sync::oneshot::channel();
     std::thread::spawn(move || {
         // The receiver is gone after the timeout.
-        let _ = sender.send(source.open(TIMEOUT).and_then(|mut source| source.next_frame()));
+        let _ = sender.send(
+            source
+                .open(TIMEOUT)
+                .and_then(|mut source| source.next_frame()),
+        );
     });
     let lens = camera.optics.lens().ok();
     match tokio::time::timeout(TIMEOUT, answer).await {
@@ -57,10 +65,16 @@ async fn frame(camera: &CameraConfig) -> (Finding, Option<CameraFrame>) {
                 let fix = "set `camera.optics` to the size of the frames, or calibrate";
                 return (Finding::broken(check, seen, fix), None);
             }
-            (Finding::fine(check, format!("frames of {size}")), Some(frame))
+            (
+                Finding::fine(check, format!("frames of {size}")),
+                Some(frame),
+            )
         }
         Ok(Ok(Err(error))) => (Finding::broken(check, error.to_string(), fix), None),
-        Ok(Err(_)) | Err(_) => (Finding::broken(check, format!("no frame within {TIMEOUT:?}"), fix), None),
+        Ok(Err(_)) | Err(_) => (
+            Finding::broken(check, format!("no frame within {TIMEOUT:?}"), fix),
+            None,
+        ),
     }
 }
 
@@ -68,9 +82,11 @@ fn calibration(camera: &CameraConfig) -> Finding {
     let check = "calibration";
     match (&camera.optics.calibration, camera.optics.lens()) {
         (Some(path), Ok(_)) => Finding::fine(check, path.display().to_string()),
-        (_, Err(error)) => {
-            Finding::broken(check, format!("{:#}", anyhow::Error::from(error)), "create one with `ecod-node calibrate`")
-        }
+        (_, Err(error)) => Finding::broken(
+            check,
+            format!("{:#}", anyhow::Error::from(error)),
+            "create one with `ecod-node calibrate`",
+        ),
         (None, Ok(_)) => Finding::doubtful(
             check,
             "none: distances are as inaccurate as the field of view from the data sheet",
@@ -80,37 +96,62 @@ fn calibration(camera: &CameraConfig) -> Finding {
 }
 
 /// Loads the detector, runs it on a frame, and places what it finds.
-async fn detections(config: &NodeConfig, camera: &CameraConfig, frame: Option<CameraFrame>) -> Vec<Finding> {
+async fn detections(
+    config: &NodeConfig,
+    camera: &CameraConfig,
+    frame: Option<CameraFrame>,
+) -> Vec<Finding> {
     let check = "detector";
     let (detector, lens) = (camera.detector.clone(), camera.optics.lens().ok());
     let perception = node::camera::perception(config, camera).ok();
     let detected = tokio::task::spawn_blocking(move || {
         let mut detector = detector.build()?;
-        frame.map(|frame| anyhow::Ok((ImageSize::of(&frame.image), detector.detect(&frame)?))).transpose()
+        frame
+            .map(|frame| anyhow::Ok((ImageSize::of(&frame.image), detector.detect(&frame)?)))
+            .transpose()
     });
     match detected.await {
         Ok(Ok(None)) => vec![Finding::fine(check, "loaded")],
         Ok(Ok(Some((size, found)))) => {
-            let loaded = Finding::fine(check, format!("loaded, finds {} objects in a frame", found.len()));
-            let placed = perception.zip(lens).and_then(|(perception, lens)| placed(perception, &lens, size, found));
+            let loaded = Finding::fine(
+                check,
+                format!("loaded, finds {} objects in a frame", found.len()),
+            );
+            let placed = perception
+                .zip(lens)
+                .and_then(|(perception, lens)| placed(perception, &lens, size, found));
             std::iter::once(loaded).chain(placed).collect()
         }
         Ok(Err(error)) => {
-            vec![Finding::broken(check, format!("{error:#}"), "correct `camera.detector` or its files")]
+            vec![Finding::broken(
+                check,
+                format!("{error:#}"),
+                "correct `camera.detector` or its files",
+            )]
         }
-        Err(error) => vec![Finding::broken(check, error.to_string(), "use another model")],
+        Err(error) => vec![Finding::broken(
+            check,
+            error.to_string(),
+            "use another model",
+        )],
     }
 }
 
 /// Places the detections of a frame, if there are any.
-fn placed(mut perception: Perception, lens: &Lens, size: ImageSize, mut found: Vec<Detection>) -> Option<Finding> {
+fn placed(
+    mut perception: Perception,
+    lens: &Lens,
+    size: ImageSize,
+    mut found: Vec<Detection>,
+) -> Option<Finding> {
     let (check, count) = ("places", found.len());
     perception.set_lens(&lens.fitted(size, &mut found).ok()?);
     let placed = perception.report(found, Timestamp::default()).objects.len();
     let seen = format!("{placed} of {count} objects have a place");
     match perception.last_discard() {
         Some(reason) => {
-            let fix = "correct `camera.mount` or `camera.projection`, unless the object does not matter";
+            let fix =
+                "correct `camera.mount` or `camera.projection`, unless the object does not matter";
             Some(Finding::doubtful(check, format!("{seen}: {reason}"), fix))
         }
         None => (count > 0).then(|| Finding::fine(check, seen)),

@@ -33,7 +33,13 @@ pub(super) async fn examine(config: &NodeConfig) -> Vec<Finding> {
     };
     let node = match node::start(observer).await {
         Ok(node) => node,
-        Err(error) => return vec![Finding::broken("cell", error.to_string(), "mend what the other checks name")],
+        Err(error) => {
+            return vec![Finding::broken(
+                "cell",
+                error.to_string(),
+                "mend what the other checks name",
+            )];
+        }
     };
     let until = Instant::now() + PATIENCE;
     while node.leadership().borrow().leader().is_none() && Instant::now() < until {
@@ -53,36 +59,72 @@ fn findings(config: &NodeConfig, node: &NodeHandle) -> Vec<Finding> {
     let fix = "start another node, or check that `cell` and the key are the same on all, `membership.seeds`, and that UDP 17884 \
         passes; the first node of a cell is alone";
     let found = match leader {
-        Some(leader) => Finding::fine("cell", format!("{cell} is led by {leader}, nodes that answer: {nodes}")),
-        None if nodes > 0 => {
-            Finding::doubtful("cell", format!("{cell} has no leader, nodes that answer: {nodes}"), "start an edge")
-        }
+        Some(leader) => Finding::fine(
+            "cell",
+            format!("{cell} is led by {leader}, nodes that answer: {nodes}"),
+        ),
+        None if nodes > 0 => Finding::doubtful(
+            "cell",
+            format!("{cell} has no leader, nodes that answer: {nodes}"),
+            "start an edge",
+        ),
         None => Finding::doubtful("cell", format!("no node of {cell} answers"), fix),
     };
     let own = node.counters().troubles().present().into_iter();
-    let own = own.filter(|trouble| !is_checked_elsewhere(trouble)).map(|Trouble { kind, about, cause, remedy }| {
-        let about = about.map_or_else(String::new, |about| format!("{about}: "));
-        let check = if kind == TroubleKind::ClockOff.as_str() { "cell's time" } else { "cell" };
-        Finding::doubtful(check, format!("{about}{cause}"), remedy)
-    });
-    let name = node.members().borrow().iter().find_map(|member| used_elsewhere(config, member));
+    let own = own.filter(|trouble| !is_checked_elsewhere(trouble)).map(
+        |Trouble {
+             kind,
+             about,
+             cause,
+             remedy,
+         }| {
+            let about = about.map_or_else(String::new, |about| format!("{about}: "));
+            let check = if kind == TroubleKind::ClockOff.as_str() {
+                "cell's time"
+            } else {
+                "cell"
+            };
+            Finding::doubtful(check, format!("{about}{cause}"), remedy)
+        },
+    );
+    let name = node
+        .members()
+        .borrow()
+        .iter()
+        .find_map(|member| used_elsewhere(config, member));
     [found].into_iter().chain(name).chain(own).collect()
 }
 
 /// A living node of another machine that has this node's name.
 fn used_elsewhere(config: &NodeConfig, member: &Member) -> Option<Finding> {
     let has_name = config.name.as_ref() == Some(&member.name);
-    let own_port = config.membership.bind.map(|bind| bind.port()).filter(|port| *port != 0);
+    let own_port = config
+        .membership
+        .bind
+        .map(|bind| bind.port())
+        .filter(|port| *port != 0);
     let is_on_other_port = own_port.is_some_and(|port| port != member.gossip.port());
-    let is_elsewhere = || UdpSocket::bind(member.gossip).is_err_and(|e| e.kind() == ErrorKind::AddrNotAvailable);
+    let is_elsewhere =
+        || UdpSocket::bind(member.gossip).is_err_and(|e| e.kind() == ErrorKind::AddrNotAvailable);
     (has_name && (is_on_other_port || is_elsewhere())).then(|| {
-        let seen = format!("{} is the name of a node that runs at {}", member.name, member.gossip);
-        Finding::broken("name", seen, "give this node another `name`: only the first node of a name takes part")
+        let seen = format!(
+            "{} is the name of a node that runs at {}",
+            member.name, member.gossip
+        );
+        Finding::broken(
+            "name",
+            seen,
+            "give this node another `name`: only the first node of a name takes part",
+        )
     })
 }
 
 fn is_checked_elsewhere(trouble: &Trouble) -> bool {
-    let elsewhere = [TroubleKind::Unresolved, TroubleKind::ImplausibleSize, TroubleKind::ImplausibleUnit];
+    let elsewhere = [
+        TroubleKind::Unresolved,
+        TroubleKind::ImplausibleSize,
+        TroubleKind::ImplausibleUnit,
+    ];
     elsewhere.iter().any(|kind| trouble.kind == kind.as_str())
 }
 
@@ -95,7 +137,10 @@ mod tests {
     #[test]
     fn a_name_that_runs_on_another_machine_is_named_with_its_address() {
         let own = UdpSocket::bind("127.0.0.1:0").unwrap();
-        let config = NodeConfig { name: Some(NodeName::from_static("euclid")), ..NodeConfig::default() };
+        let config = NodeConfig {
+            name: Some(NodeName::from_static("euclid")),
+            ..NodeConfig::default()
+        };
         let member = |name, gossip| Member {
             name: NodeName::from_static(name),
             run: 1,
@@ -106,12 +151,24 @@ mod tests {
         };
         let here = own.local_addr().unwrap();
         let there = "192.0.2.7:17884".parse().unwrap();
-        assert_eq!(used_elsewhere(&config, &member("euclid", here)), None, "the node itself, which runs");
+        assert_eq!(
+            used_elsewhere(&config, &member("euclid", here)),
+            None,
+            "the node itself, which runs"
+        );
         assert_eq!(used_elsewhere(&config, &member("gauss", there)), None);
         let mut beside = config.clone();
         beside.membership.bind = Some("127.0.0.1:1".parse().unwrap());
-        assert!(used_elsewhere(&beside, &member("euclid", here)).is_some(), "another run on this machine");
+        assert!(
+            used_elsewhere(&beside, &member("euclid", here)).is_some(),
+            "another run on this machine"
+        );
         let found = used_elsewhere(&config, &member("euclid", there)).unwrap();
-        assert!(found.seen.contains("euclid is the name of a node that runs at 192.0.2.7"), "{found:?}");
+        assert!(
+            found
+                .seen
+                .contains("euclid is the name of a node that runs at 192.0.2.7"),
+            "{found:?}"
+        );
     }
 }

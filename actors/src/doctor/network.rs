@@ -39,7 +39,11 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
         });
     }
     if config.has_broker() {
-        let port = Port { check: "broker port", address: config.broker_listen(), key: "listen" };
+        let port = Port {
+            check: "broker port",
+            address: config.broker_listen(),
+            key: "listen",
+        };
         let bound = TcpListener::bind(port.address);
         let free_one_will_do = config.may_listen_at_any_port();
         findings.push(if free_one_will_do {
@@ -53,14 +57,28 @@ pub(super) async fn broker(config: &NodeConfig) -> Vec<Finding> {
 
 /// Checks the connection to the region's broker.
 pub(super) async fn uplink(config: &NodeConfig) -> Option<Finding> {
-    let address = config.uplink.broker.as_ref().filter(|_| config.has_uplink())?;
+    let address = config
+        .uplink
+        .broker
+        .as_ref()
+        .filter(|_| config.has_uplink())?;
     let node = config.name.as_ref().map_or("node", NodeName::as_str);
     let security = config.security().map_err(|error| error.to_string());
     let security = security.and_then(|security| {
-        security.of_uplink(address.clone(), config.uplink.ca.clone()).map_err(|error| error.to_string())
+        security
+            .of_uplink(address.clone(), config.uplink.ca.clone())
+            .map_err(|error| error.to_string())
     });
     let answer = match security {
-        Ok(security) => probe(address, node, &config.uplink.connection(&config.mqtt), &security).await,
+        Ok(security) => {
+            probe(
+                address,
+                node,
+                &config.uplink.connection(&config.mqtt),
+                &security,
+            )
+            .await
+        }
         Err(error) => Err(error),
     };
     Some(match answer {
@@ -77,9 +95,19 @@ pub(super) async fn uplink(config: &NodeConfig) -> Option<Finding> {
 /// Checks the gossip port.
 pub(super) fn gossip(config: &NodeConfig) -> Finding {
     let membership = &config.membership;
-    let ip = if membership.has_key() { [0, 0, 0, 0] } else { [127, 0, 0, 1] };
-    let address = membership.bind.unwrap_or(SocketAddr::from((ip, DEFAULT_PORT)));
-    let port = Port { check: "gossip port", address, key: "membership.bind" };
+    let ip = if membership.has_key() {
+        [0, 0, 0, 0]
+    } else {
+        [127, 0, 0, 1]
+    };
+    let address = membership
+        .bind
+        .unwrap_or(SocketAddr::from((ip, DEFAULT_PORT)));
+    let port = Port {
+        check: "gossip port",
+        address,
+        key: "membership.bind",
+    };
     let bound = UdpSocket::bind(address);
     if membership.bind.is_some() {
         port.of(bound)
@@ -93,7 +121,11 @@ pub(super) async fn seeds(config: &NodeConfig) -> Vec<Finding> {
     let ipv4 = config.membership.bind.is_none_or(|bind| bind.is_ipv4());
     let mut findings = Vec::new();
     for seed in &config.membership.seeds {
-        let found = timeout(LOOKUP_TIMEOUT, crate::transport::gossip::look_up(seed, ipv4)).await;
+        let found = timeout(
+            LOOKUP_TIMEOUT,
+            crate::transport::gossip::look_up(seed, ipv4),
+        )
+        .await;
         let found = found.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
         findings.push(match found {
             Ok(addresses) => {
@@ -112,17 +144,29 @@ pub(super) async fn seeds(config: &NodeConfig) -> Vec<Finding> {
 /// Checks the port that receives the poses of a moving vehicle.
 #[cfg(feature = "camera")]
 pub(super) fn poses(config: &NodeConfig) -> Option<Finding> {
-    let port = Port { check: "pose port", address: config.pose.listen?, key: "pose.listen" };
+    let port = Port {
+        check: "pose port",
+        address: config.pose.listen?,
+        key: "pose.listen",
+    };
     Some(port.of(UdpSocket::bind(port.address)))
 }
 
 /// Checks the address of the dashboard, unless it is disabled.
 pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
     let listen = config.dashboard.listen;
-    let port = Port { check: "dashboard", address: listen.unwrap_or(DEFAULT_ADDRESS), key: "dashboard.listen" };
+    let port = Port {
+        check: "dashboard",
+        address: listen.unwrap_or(DEFAULT_ADDRESS),
+        key: "dashboard.listen",
+    };
     config.dashboard.enabled.then(|| {
         let bound = TcpListener::bind(port.address);
-        if listen.is_some() { port.of(bound) } else { port.or_another(bound, "its address must be fixed") }
+        if listen.is_some() {
+            port.of(bound)
+        } else {
+            port.or_another(bound, "its address must be fixed")
+        }
     })
 }
 
@@ -130,7 +174,11 @@ pub(super) fn dashboard(config: &NodeConfig) -> Option<Finding> {
 #[cfg(feature = "foxglove")]
 pub(super) fn live(config: &NodeConfig) -> Option<Finding> {
     let port = config.record.as_ref().and_then(|record| record.live_port)?;
-    let port = Port { check: "live port", address: SocketAddr::from(([127, 0, 0, 1], port)), key: "record.live_port" };
+    let port = Port {
+        check: "live port",
+        address: SocketAddr::from(([127, 0, 0, 1], port)),
+        key: "record.live_port",
+    };
     Some(port.of(TcpListener::bind(port.address)))
 }
 
@@ -145,22 +193,39 @@ struct Port {
 impl Port {
     /// Finding for an attempt to bind.
     fn of<T>(self, bound: io::Result<T>) -> Finding {
-        let Self { check, address, key } = self;
-        let Err(error) = bound else { return Finding::fine(check, format!("{address} is free")) };
+        let Self {
+            check,
+            address,
+            key,
+        } = self;
+        let Err(error) = bound else {
+            return Finding::fine(check, format!("{address} is free"));
+        };
         let fix = match error.kind() {
-            io::ErrorKind::AddrNotAvailable => format!("set `{key}` to an address of this machine, or 0.0.0.0 for all"),
+            io::ErrorKind::AddrNotAvailable => {
+                format!("set `{key}` to an address of this machine, or 0.0.0.0 for all")
+            }
             io::ErrorKind::PermissionDenied => format!("set `{key}` to port 1024 or higher"),
-            _ => format!("stop the program that uses it (this node, if it runs), or change `{key}`"),
+            _ => {
+                format!("stop the program that uses it (this node, if it runs), or change `{key}`")
+            }
         };
         Finding::broken(check, format!("{address}: {}", describe(&error)), fix)
     }
 
     /// The same where a free port will do, except for the reason `unless`.
     fn or_another<T>(self, bound: io::Result<T>, unless: &str) -> Finding {
-        let Self { check, address, key } = self;
+        let Self {
+            check,
+            address,
+            key,
+        } = self;
         match bound {
             Err(error) => {
-                let seen = format!("{address}: {}, the node will take a free one", describe(&error));
+                let seen = format!(
+                    "{address}: {}, the node will take a free one",
+                    describe(&error)
+                );
                 Finding::doubtful(check, seen, format!("set `{key}` if {unless}"))
             }
             Ok(_) => self.of(bound),
@@ -175,11 +240,18 @@ pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
         return None;
     }
     let ip = config.membership.bind.map(|bind| bind.ip());
-    let ip = ip.unwrap_or(IpAddr::from(if config.membership.has_key() { [0, 0, 0, 0] } else { [127, 0, 0, 1] }));
+    let ip = ip.unwrap_or(IpAddr::from(if config.membership.has_key() {
+        [0, 0, 0, 0]
+    } else {
+        [127, 0, 0, 1]
+    }));
     let IpAddr::V4(ip) = ip else { return None };
     let interface = multicast.interface.unwrap_or(ip);
     let returned = || -> io::Result<()> {
-        let (receiver, sender) = (UdpSocket::bind((multicast.group, 0))?, UdpSocket::bind((ip, 0))?);
+        let (receiver, sender) = (
+            UdpSocket::bind((multicast.group, 0))?,
+            UdpSocket::bind((ip, 0))?,
+        );
         receiver.join_multicast_v4(&multicast.group, &interface)?;
         receiver.set_read_timeout(Some(MULTICAST_TIMEOUT))?;
         if !interface.is_unspecified() {
@@ -190,7 +262,9 @@ pub(super) fn multicast(config: &NodeConfig) -> Option<Finding> {
     };
     let check = "multicast";
     Some(match returned() {
-        Ok(()) if interface.is_unspecified() => Finding::fine(check, format!("{} works", multicast.group)),
+        Ok(()) if interface.is_unspecified() => {
+            Finding::fine(check, format!("{} works", multicast.group))
+        }
         Ok(()) => Finding::fine(check, format!("{} works on {interface}", multicast.group)),
         Err(error) => Finding::doubtful(
             check,

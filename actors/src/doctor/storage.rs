@@ -23,18 +23,32 @@ pub(super) fn key(config: &NodeConfig) -> Finding {
     let membership = &config.membership;
     if !membership.has_key() {
         let fix = "for a cell of several machines, set `membership.key_file` to the same key on all nodes";
-        return Finding::doubtful(check, "none: the cell is limited to this machine, where any program can join", fix);
+        return Finding::doubtful(
+            check,
+            "none: the cell is limited to this machine, where any program can join",
+            fix,
+        );
     }
     match check_key(membership, &config.cell) {
         Ok(()) => {}
         Err(error @ KeyError::TooShort { .. }) => {
-            return Finding::broken(check, error.to_string(), "create one with `openssl rand -hex 32`");
+            return Finding::broken(
+                check,
+                error.to_string(),
+                "create one with `openssl rand -hex 32`",
+            );
         }
         Err(error) => {
-            return Finding::broken(check, error.to_string(), "set `membership.key_file` to a readable file");
+            return Finding::broken(
+                check,
+                error.to_string(),
+                "set `membership.key_file` to a readable file",
+            );
         }
     }
-    let Some(path) = &membership.key_file else { return Finding::fine(check, "set") };
+    let Some(path) = &membership.key_file else {
+        return Finding::fine(check, "set");
+    };
     match fs::metadata(path) {
         Ok(metadata) if metadata.permissions().mode() & 0o077 != 0 => {
             let seen = format!("{} is readable by other users", path.display());
@@ -50,7 +64,11 @@ pub(super) fn floor_plan(config: &NodeConfig) -> Option<Finding> {
     let plan = config.dashboard.floor_plan.as_ref()?;
     Some(match config.dashboard.load_floor_plan() {
         Ok(_) => Finding::fine(check, plan.image.display().to_string()),
-        Err(error) => Finding::broken(check, error.to_string(), "correct `dashboard.floor_plan`, or leave it out"),
+        Err(error) => Finding::broken(
+            check,
+            error.to_string(),
+            "correct `dashboard.floor_plan`, or leave it out",
+        ),
     })
 }
 
@@ -58,7 +76,12 @@ pub(super) fn floor_plan(config: &NodeConfig) -> Option<Finding> {
 pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
     let mut findings = Vec::new();
     match &config.state_dir {
-        Some(dir) => findings.push(directory("state directory", dir, MIN_FREE_BYTES, "state_dir")),
+        Some(dir) => findings.push(directory(
+            "state directory",
+            dir,
+            MIN_FREE_BYTES,
+            "state_dir",
+        )),
         None if config.may_lead() => findings.push(Finding::doubtful(
             "state directory",
             "none: a restart loses reputations and the terms in which this node led",
@@ -67,10 +90,18 @@ pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
         None => {}
     }
     if let Some(record) = &config.record {
-        findings.push(directory("log directory", &record.dir, record.min_free_mb * 1_000_000, "record.dir"));
+        findings.push(directory(
+            "log directory",
+            &record.dir,
+            record.min_free_mb * 1_000_000,
+            "record.dir",
+        ));
     }
     if let Some(log) = &config.map_log {
-        let dir = log.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let dir = log
+            .parent()
+            .filter(|dir| !dir.as_os_str().is_empty())
+            .unwrap_or(Path::new("."));
         findings.push(if dir.is_dir() {
             directory("map log", dir, MIN_FREE_BYTES, "map_log")
         } else {
@@ -89,10 +120,16 @@ pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     }
     let writable = [vec![PathBuf::from(SERVICE_STATE)], unit_paths()].concat();
     let record = config.record.as_ref().map(|record| &record.dir);
-    let written =
-        [("state_dir", config.state_dir.as_ref()), ("record.dir", record), ("map_log", config.map_log.as_ref())];
-    let written = written.into_iter().filter_map(|(key, path)| Some((key, absolute(path?))));
-    let outside = written.filter(|(_, path)| !writable.iter().any(|writable| path.starts_with(writable)));
+    let written = [
+        ("state_dir", config.state_dir.as_ref()),
+        ("record.dir", record),
+        ("map_log", config.map_log.as_ref()),
+    ];
+    let written = written
+        .into_iter()
+        .filter_map(|(key, path)| Some((key, absolute(path?))));
+    let outside =
+        written.filter(|(_, path)| !writable.iter().any(|writable| path.starts_with(writable)));
     let finding = |(key, path): (&str, PathBuf)| {
         let path = path.display();
         let seen = format!("the unit does not let the service write {path}");
@@ -107,10 +144,17 @@ pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
 /// Writable paths that the operator added to the unit, according to systemd.
 fn unit_paths() -> Vec<PathBuf> {
     let arguments = ["show", "--property=ReadWritePaths", "--value", "ecod-node"];
-    let answer = Command::new("systemctl").args(arguments).output().map(|answer| answer.stdout).unwrap_or_default();
+    let answer = Command::new("systemctl")
+        .args(arguments)
+        .output()
+        .map(|answer| answer.stdout)
+        .unwrap_or_default();
     // A prefix sets how systemd treats a missing path.
     let paths = String::from_utf8_lossy(&answer);
-    paths.split_whitespace().map(|path| path.trim_start_matches(['-', '+']).into()).collect()
+    paths
+        .split_whitespace()
+        .map(|path| path.trim_start_matches(['-', '+']).into())
+        .collect()
 }
 
 fn absolute(path: &Path) -> PathBuf {
@@ -118,12 +162,21 @@ fn absolute(path: &Path) -> PathBuf {
 }
 
 fn directory(check: &'static str, dir: &Path, needed: u64, key: &str) -> Finding {
-    let existing = dir.ancestors().find(|ancestor| ancestor.is_dir() || ancestor.as_os_str().is_empty());
-    let existing = existing.filter(|ancestor| !ancestor.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let existing = dir
+        .ancestors()
+        .find(|ancestor| ancestor.is_dir() || ancestor.as_os_str().is_empty());
+    let existing = existing
+        .filter(|ancestor| !ancestor.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
     // A file in the path prevents the directory.
-    let blocked = dir.ancestors().find(|ancestor| ancestor.exists() && !ancestor.is_dir());
+    let blocked = dir
+        .ancestors()
+        .find(|ancestor| ancestor.exists() && !ancestor.is_dir());
     let written = match blocked {
-        Some(path) => Err(io::Error::new(io::ErrorKind::NotADirectory, format!("{} is a file", path.display()))),
+        Some(path) => Err(io::Error::new(
+            io::ErrorKind::NotADirectory,
+            format!("{} is a file", path.display()),
+        )),
         None => write_test_file(existing),
     };
     let shown = dir.display();
@@ -133,8 +186,16 @@ fn directory(check: &'static str, dir: &Path, needed: u64, key: &str) -> Finding
             Finding::broken(check, format!("{shown}: {error}"), fix)
         }
         Ok(free) if free < needed => {
-            let seen = format!("{shown} has {} MB free of {} MB needed", free / 1_000_000, needed / 1_000_000);
-            let fix = if key == "record.dir" { "free space, or lower `record.min_free_mb`" } else { "free space" };
+            let seen = format!(
+                "{shown} has {} MB free of {} MB needed",
+                free / 1_000_000,
+                needed / 1_000_000
+            );
+            let fix = if key == "record.dir" {
+                "free space, or lower `record.min_free_mb`"
+            } else {
+                "free space"
+            };
             Finding::broken(check, seen, fix)
         }
         Ok(free) => Finding::fine(check, format!("{shown}, {} MB free", free / 1_000_000)),

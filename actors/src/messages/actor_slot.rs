@@ -22,7 +22,10 @@ impl<M: Message> ActorSlot<M> {
 
     /// The present run of the actor, if there is one.
     pub fn get(&self) -> Option<ActorRef<M>> {
-        self.actor.read().unwrap_or_else(PoisonError::into_inner).clone()
+        self.actor
+            .read()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 
     /// Sends to the present run; false when the slot is empty or the actor has just ended.
@@ -54,13 +57,17 @@ impl<M: Message> ActorSlot<M> {
 
 impl<M> Clone for ActorSlot<M> {
     fn clone(&self) -> Self {
-        Self { actor: Arc::clone(&self.actor) }
+        Self {
+            actor: Arc::clone(&self.actor),
+        }
     }
 }
 
 impl<M> Default for ActorSlot<M> {
     fn default() -> Self {
-        Self { actor: Arc::default() }
+        Self {
+            actor: Arc::default(),
+        }
     }
 }
 
@@ -110,7 +117,12 @@ pub(crate) mod listening {
     pub(crate) async fn slot<M: Message>() -> (ActorSlot<M>, UnboundedReceiver<M>) {
         let (sender, receiver) = unbounded_channel();
         let slot = ActorSlot::default();
-        slot.set(Actor::spawn(None, Listener(PhantomData), sender).await.unwrap().0);
+        slot.set(
+            Actor::spawn(None, Listener(PhantomData), sender)
+                .await
+                .unwrap()
+                .0,
+        );
         (slot, receiver)
     }
 }
@@ -134,7 +146,11 @@ mod tests {
         type State = ();
         type Arguments = ();
 
-        async fn pre_start(&self, _: ActorRef<BrokerMessage>, (): ()) -> Result<(), ActorProcessingErr> {
+        async fn pre_start(
+            &self,
+            _: ActorRef<BrokerMessage>,
+            (): (),
+        ) -> Result<(), ActorProcessingErr> {
             Ok(())
         }
 
@@ -144,7 +160,9 @@ mod tests {
             message: BrokerMessage,
             (): &mut (),
         ) -> Result<(), ActorProcessingErr> {
-            let BrokerMessage::Health { reply } = message else { return Ok(()) };
+            let BrokerMessage::Health { reply } = message else {
+                return Ok(());
+            };
             // On a runtime of one thread nothing else goes on either.
             std::thread::sleep(Duration::from_millis(1500));
             tokio::time::sleep(Duration::from_millis(20)).await;
@@ -158,7 +176,9 @@ mod tests {
         let slot = ActorSlot::default();
         let (actor, _) = Actor::spawn(None, Held, ()).await.unwrap();
         slot.set(actor);
-        let answer = slot.ask(|reply| BrokerMessage::Health { reply }, ANSWER_STEPS).await;
+        let answer = slot
+            .ask(|reply| BrokerMessage::Health { reply }, ANSWER_STEPS)
+            .await;
         assert_eq!(answer, Some(BrokerHealth::Stopped));
     }
 }

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ecod::wire::{
-    CellDescription, GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts,
+    CellDescription, GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations,
+    Verdicts,
 };
 use ractor::RpcReplyPort;
 

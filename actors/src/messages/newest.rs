@@ -31,7 +31,11 @@ pub struct Newest {
 impl Default for Newest {
     fn default() -> Self {
         let (map, verdicts) = (watch::Sender::new(None), watch::Sender::new(None));
-        Self { map, verdicts, reputations: watch::Sender::new(None) }
+        Self {
+            map,
+            verdicts,
+            reputations: watch::Sender::new(None),
+        }
     }
 }
 

@@ -97,7 +97,10 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 /// Locks the node's state. A directory that cannot be written is reported when something is saved.
 fn lock_state(directory: &Path, cell: &NodeName, name: &NodeName) -> Option<File> {
     let lock = StateFile::lock(directory, cell, name);
-    if lock.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
+    if lock
+        .as_ref()
+        .is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
+    {
         tracing::warn!(
             directory = %directory.display(),
             "another process uses the state of this node, and each overwrites the other's: stop one of them"
@@ -115,7 +118,9 @@ impl NodeBuilder {
         mut held: HeldDescription,
         failed: watch::Sender<Option<NodeError>>,
     ) -> Self {
-        let config = held.lay_over(&own_config).unwrap_or_else(|| own_config.clone());
+        let config = held
+            .lay_over(&own_config)
+            .unwrap_or_else(|| own_config.clone());
         let name = config.name.clone().unwrap_or(NodeName::from_static("node"));
         let directory = config.state_dir.as_deref();
         let mut builder = Self {
@@ -151,7 +156,9 @@ impl NodeBuilder {
             builder.take_frames();
         }
         builder.door = builder.new_door();
-        builder.door.publish_description(&builder.present_description());
+        builder
+            .door
+            .publish_description(&builder.present_description());
         builder
     }
 
@@ -196,7 +203,11 @@ impl NodeBuilder {
             set_by: self.name.clone(),
             text: String::new(),
         };
-        self.held.description.as_deref().cloned().unwrap_or_else(none)
+        self.held
+            .description
+            .as_deref()
+            .cloned()
+            .unwrap_or_else(none)
     }
 
     /// Has running detectors record to this node's log, and trace their frames in its cell.
@@ -260,14 +271,25 @@ impl NodeBuilder {
     /// The parts that this node has, in the order of starting.
     pub(super) fn parts(&self) -> Vec<ActorKind> {
         let leads = self.config.may_lead();
-        let (is_whole, reports) = (self.presence == Presence::Whole, self.presence >= Presence::Reporting);
+        let (is_whole, reports) = (
+            self.presence == Presence::Whole,
+            self.presence >= Presence::Reporting,
+        );
         let has_broker = self.config.has_broker() && (is_whole || self.config.serves_nodes());
         let mut parts = Vec::new();
         parts.extend((is_whole && self.config.record.is_some()).then_some(ActorKind::Recorder));
         parts.extend(has_broker.then_some(ActorKind::Broker));
-        parts.extend([ActorKind::Membership, ActorKind::DescriptionKeeper, ActorKind::Gateway, ActorKind::Follower]);
+        parts.extend([
+            ActorKind::Membership,
+            ActorKind::DescriptionKeeper,
+            ActorKind::Gateway,
+            ActorKind::Follower,
+        ]);
         if leads {
-            let rates = self.config.fusion.rates_vehicles(!self.config.landmarks.is_empty());
+            let rates = self
+                .config
+                .fusion
+                .rates_vehicles(!self.config.landmarks.is_empty());
             parts.extend(rates.then_some(ActorKind::ReputationKeeper));
             parts.push(ActorKind::Fuser);
         }
@@ -295,50 +317,77 @@ impl NodeBuilder {
             ActorKind::Membership => self.start_membership(supervisor).await,
             ActorKind::DescriptionKeeper => {
                 let arguments = self.description_arguments(supervisor.clone());
-                let started = Actor::spawn_linked(None, DescriptionKeeper, arguments, supervisor).await;
+                let started =
+                    Actor::spawn_linked(None, DescriptionKeeper, arguments, supervisor).await;
                 slot(&self.slots.description, started)
             }
             ActorKind::Gateway => {
-                let started = Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
+                let started =
+                    Actor::spawn_linked(None, Gateway, self.gateway_arguments(), supervisor).await;
                 let id = slot(&self.slots.gateway, started)?;
-                self.slots.election.send(LeaderElectionMessage::Note { input: Input::GatewayRestarted });
+                self.slots.election.send(LeaderElectionMessage::Note {
+                    input: Input::GatewayRestarted,
+                });
                 Ok(id)
             }
             ActorKind::Follower => {
-                let started = Actor::spawn_linked(None, Follower, self.follower_arguments(), supervisor).await;
+                let started =
+                    Actor::spawn_linked(None, Follower, self.follower_arguments(), supervisor)
+                        .await;
                 slot(&self.slots.follower, started)
             }
             ActorKind::ReputationKeeper => {
                 let arguments = self.keeper_arguments();
-                let started = Actor::spawn_linked(None, ReputationKeeper, arguments, supervisor).await;
+                let started =
+                    Actor::spawn_linked(None, ReputationKeeper, arguments, supervisor).await;
                 slot(&self.slots.keeper, started)
             }
             ActorKind::Fuser => {
-                let started = Actor::spawn_linked(None, Fuser, self.fuser_arguments(), supervisor).await;
+                let started =
+                    Actor::spawn_linked(None, Fuser, self.fuser_arguments(), supervisor).await;
                 let id = slot(&self.slots.fuser, started)?;
-                self.slots.election.send(LeaderElectionMessage::Note { input: Input::FuserRestarted });
+                self.slots.election.send(LeaderElectionMessage::Note {
+                    input: Input::FuserRestarted,
+                });
                 Ok(id)
             }
-            ActorKind::Uplink => {
-                slot(&self.slots.uplink, Actor::spawn_linked(None, Uplink, self.uplink_arguments()?, supervisor).await)
-            }
+            ActorKind::Uplink => slot(
+                &self.slots.uplink,
+                Actor::spawn_linked(None, Uplink, self.uplink_arguments()?, supervisor).await,
+            ),
             ActorKind::LeaderElection => {
-                let started = Actor::spawn_linked(None, LeaderElection, self.election_arguments(), supervisor).await;
+                let started = Actor::spawn_linked(
+                    None,
+                    LeaderElection,
+                    self.election_arguments(),
+                    supervisor,
+                )
+                .await;
                 slot(&self.slots.election, started)
             }
             ActorKind::Dashboard => {
                 let arguments = self.dashboard_arguments();
-                slot(&self.slots.dashboard, Actor::spawn_linked(None, Dashboard, arguments, supervisor).await)
+                slot(
+                    &self.slots.dashboard,
+                    Actor::spawn_linked(None, Dashboard, arguments, supervisor).await,
+                )
             }
             ActorKind::PoseReceiver => {
                 let arguments = PoseReceiverArguments {
-                    address: self.config.pose.listen.ok_or("no `pose.listen` is configured")?,
+                    address: self
+                        .config
+                        .pose
+                        .listen
+                        .ok_or("no `pose.listen` is configured")?,
                     #[cfg(feature = "camera")]
                     projectors: self.slots.projectors.clone(),
                     poses: self.vehicle.poses.clone(),
                     counters: self.counters(),
                 };
-                slot(&self.slots.pose_receiver, Actor::spawn_linked(None, PoseReceiver, arguments, supervisor).await)
+                slot(
+                    &self.slots.pose_receiver,
+                    Actor::spawn_linked(None, PoseReceiver, arguments, supervisor).await,
+                )
             }
             #[cfg(feature = "camera")]
             ActorKind::Projector(camera) => {
@@ -392,11 +441,18 @@ impl NodeBuilder {
     }
 
     async fn start_recorder(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let Some(arguments) = self.recorder_arguments() else { return Err("no [record] is configured".into()) };
+        let Some(arguments) = self.recorder_arguments() else {
+            return Err("no [record] is configured".into());
+        };
         if !self.config.may_lead() && !arguments.config.reports {
-            tracing::info!("reports of other vehicles are not recorded, key `record.reports` is false");
+            tracing::info!(
+                "reports of other vehicles are not recorded, key `record.reports` is false"
+            );
         }
-        slot(&self.slots.recorder, Actor::spawn_linked(None, Recorder, arguments, supervisor).await)
+        slot(
+            &self.slots.recorder,
+            Actor::spawn_linked(None, Recorder, arguments, supervisor).await,
+        )
     }
 }
 

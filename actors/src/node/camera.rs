@@ -21,7 +21,9 @@ use crate::observe::dashboard::{CameraSetup, ShownCamera};
 /// When it is on Earth, and has no place in the cell's frame.
 pub fn standing_pose(config: &NodeConfig) -> anyhow::Result<Option<Pose>> {
     let is_used = config.has_camera() && config.pose.listen.is_none();
-    let pose = is_used.then(|| config.pose.stated().in_map(config.origin.as_ref())).transpose();
+    let pose = is_used
+        .then(|| config.pose.stated().in_map(config.origin.as_ref()))
+        .transpose();
     pose.context("key `pose.latitude_deg`")
 }
 
@@ -32,13 +34,23 @@ pub fn standing_pose(config: &NodeConfig) -> anyhow::Result<Option<Pose>> {
 pub fn perception(config: &NodeConfig, camera: &CameraConfig) -> anyhow::Result<Perception> {
     let gate = config.fusion.pace.gate();
     let vehicle_camera = VehicleCamera {
-        node: camera.reporter(config.name.as_ref().unwrap_or(&NodeName::from_static("node"))),
+        node: camera.reporter(
+            config
+                .name
+                .as_ref()
+                .unwrap_or(&NodeName::from_static("node")),
+        ),
         pose: Pose::new(0.0, 0.0, 0.0),
         mount: camera.mount.into(),
         lens: lens(camera)?,
         landmarks: Arc::new(LandmarkIndex::new(config.landmarks(), gate.radius_m)),
     };
-    Ok(Perception::new(vehicle_camera, camera.projection.clone(), camera.view.clone(), gate))
+    Ok(Perception::new(
+        vehicle_camera,
+        camera.projection.clone(),
+        camera.view.clone(),
+        gate,
+    ))
 }
 
 /// A camera's lens.
@@ -46,7 +58,10 @@ pub fn perception(config: &NodeConfig, camera: &CameraConfig) -> anyhow::Result<
 /// # Errors
 /// When its calibration file cannot be used.
 pub fn lens(camera: &CameraConfig) -> anyhow::Result<Lens> {
-    camera.optics.lens().context("key `camera.optics.calibration`")
+    camera
+        .optics
+        .lens()
+        .context("key `camera.optics.calibration`")
 }
 
 /// The algorithms that a camera's reports are for. Without known locations there is nothing to vote on.

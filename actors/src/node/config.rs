@@ -166,15 +166,25 @@ pub(crate) const END_OF_CONFIGURATION: &str = "# end of node.toml";
 /// Checks that a configuration is a file with content, and not cut off: `init` and `join` say in the file how it ends.
 fn check_whole(path: &std::path::Path) -> Result<(), LoadError> {
     let text = bounded_file::read_text(path);
-    let text = text.map_err(|source| LoadError::Unreadable { path: path.into(), source })?;
+    let text = text.map_err(|source| LoadError::Unreadable {
+        path: path.into(),
+        source,
+    })?;
     let path = path.display();
     if text.trim().is_empty() {
         let remedy = "write its keys, or start the node without `--config`";
-        return Err(LoadError::Malformed(format!("the configuration {path} is empty: {remedy}")));
+        return Err(LoadError::Malformed(format!(
+            "the configuration {path} is empty: {remedy}"
+        )));
     }
-    let names_end =
-        text.lines().any(|line| line.starts_with('#') && line.contains(&format!("`{END_OF_CONFIGURATION}`")));
-    if names_end && !text.lines().any(|line| line.trim_end() == END_OF_CONFIGURATION) {
+    let names_end = text
+        .lines()
+        .any(|line| line.starts_with('#') && line.contains(&format!("`{END_OF_CONFIGURATION}`")));
+    if names_end
+        && !text
+            .lines()
+            .any(|line| line.trim_end() == END_OF_CONFIGURATION)
+    {
         let remedy = "restore the file, or run `ecod-node join` again with a new token";
         return Err(LoadError::Malformed(format!(
             "the configuration {path} is cut off: its line `{END_OF_CONFIGURATION}` is missing: {remedy}"
@@ -194,9 +204,14 @@ impl NodeConfig {
             check_whole(path)?;
             stated = stated.merge(Toml::file_exact(path));
         }
-        let stated = stated.merge(environment()).merge(Serialized::defaults(flags));
+        let stated = stated
+            .merge(environment())
+            .merge(Serialized::defaults(flags));
         let mut config = Self::of_keys(&stated)?;
-        config.stated = stated.extract().map(|stated| StatedKeys::of(&stated)).unwrap_or_default();
+        config.stated = stated
+            .extract()
+            .map(|stated| StatedKeys::of(&stated))
+            .unwrap_or_default();
         if config.name.is_none() {
             let edge = (config.role == Role::Edge).then_some(NodeName::from_static("edge"));
             config.name = edge.or_else(host_name);
@@ -215,14 +230,20 @@ impl NodeConfig {
     /// [`LoadError`] naming the file, or the key, the value and what is allowed.
     pub fn load_cell(file: &std::path::Path) -> Result<Self, LoadError> {
         let text = bounded_file::read_text(file);
-        let text = text.map_err(|source| LoadError::Unreadable { path: file.into(), source })?;
+        let text = text.map_err(|source| LoadError::Unreadable {
+            path: file.into(),
+            source,
+        })?;
         if let Ok(shared) = SharedConfig::parse(&text) {
             let mut config = Self::default();
             shared.put_into(&mut config);
             return Ok(config);
         }
         let config = Self::of_keys(&Figment::from(Toml::file_exact(file)))?;
-        config.fusion.validate().map_err(|error| error.within("fusion"))?;
+        config
+            .fusion
+            .validate()
+            .map_err(|error| error.within("fusion"))?;
         LandmarkConfig::validate_all(&config.landmarks)?;
         Ok(config)
     }
@@ -230,10 +251,19 @@ impl NodeConfig {
     /// The stated keys over the defaults, unchecked. Boxes of a neural detector have a default deviation of their own.
     fn of_keys(stated: &Figment) -> Result<Self, LoadError> {
         let mut defaults = Figment::from(Serialized::defaults(Self::default()));
-        if stated.extract_inner("camera.detector.kind").is_ok_and(|kind: String| kind == "coco") {
-            defaults = defaults.merge(Serialized::default("camera.projection.pixel_sigma_px", COCO_PIXEL_SIGMA_PX));
+        if stated
+            .extract_inner("camera.detector.kind")
+            .is_ok_and(|kind: String| kind == "coco")
+        {
+            defaults = defaults.merge(Serialized::default(
+                "camera.projection.pixel_sigma_px",
+                COCO_PIXEL_SIGMA_PX,
+            ));
         }
-        #[cfg_attr(not(feature = "camera"), expect(unused_mut, reason = "cameras have defaults of their own"))]
+        #[cfg_attr(
+            not(feature = "camera"),
+            expect(unused_mut, reason = "cameras have defaults of their own")
+        )]
         let mut config = extract(defaults.merge(stated))?;
         #[cfg(feature = "camera")]
         config.set_camera_defaults(stated);
@@ -254,15 +284,20 @@ impl NodeConfig {
         }
         self.pose.validate().map_err(|error| error.within("pose"))?;
         if self.cells.is_some() && self.pose.listen.is_none() {
-            let allowed =
-                "an address that receives the vehicle's poses, beside `cells`: it moves between them by its position";
+            let allowed = "an address that receives the vehicle's poses, beside `cells`: it moves between them by its position";
             return Err(ConfigError::new("pose.listen", "nothing", allowed));
         }
-        self.membership.validate().map_err(|error| error.within("membership"))?;
-        self.election.validate().map_err(|error| error.within("election"))?;
+        self.membership
+            .validate()
+            .map_err(|error| error.within("membership"))?;
+        self.election
+            .validate()
+            .map_err(|error| error.within("election"))?;
         let (hello, join) = (self.membership.hello_ms, self.election.join_ms);
         if hello.saturating_mul(2) > join {
-            let allowed = format!("at most half of `election.join_ms`, {join}: a leader that is there must be found");
+            let allowed = format!(
+                "at most half of `election.join_ms`, {join}: a leader that is there must be found"
+            );
             return Err(ConfigError::new("membership.hello_ms", hello, allowed));
         }
         self.mqtt.validate().map_err(|error| error.within("mqtt"))?;
@@ -276,19 +311,31 @@ impl NodeConfig {
         if let Some(tls) = &self.tls {
             tls.validate().map_err(|error| error.within("tls"))?;
         }
-        self.broker.validate().map_err(|error| error.within("broker"))?;
+        self.broker
+            .validate()
+            .map_err(|error| error.within("broker"))?;
         self.validate_listen()?;
-        self.uplink.validate().map_err(|error| error.within("uplink"))?;
+        self.uplink
+            .validate()
+            .map_err(|error| error.within("uplink"))?;
         let needed = self.mqtt.max_packet_bytes();
         if let Some(bytes) = self.broker.max_packet_bytes
             && (bytes as usize) < needed
         {
-            let allowed = format!("at least {needed}, so that `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` fit");
+            let allowed = format!(
+                "at least {needed}, so that `mqtt.max_map_bytes` and `mqtt.max_payload_bytes` fit"
+            );
             return Err(ConfigError::new("broker.max_packet_bytes", bytes, allowed));
         }
-        self.fusion.validate().map_err(|error| error.within("fusion"))?;
-        self.reputations.validate().map_err(|error| error.within("reputations"))?;
-        self.dashboard.validate().map_err(|error| error.within("dashboard"))?;
+        self.fusion
+            .validate()
+            .map_err(|error| error.within("fusion"))?;
+        self.reputations
+            .validate()
+            .map_err(|error| error.within("reputations"))?;
+        self.dashboard
+            .validate()
+            .map_err(|error| error.within("dashboard"))?;
         #[cfg(feature = "camera")]
         self.validate_cameras()?;
         if let Some(record) = &self.record {
@@ -305,8 +352,7 @@ impl NodeConfig {
         let listen = self.broker_listen();
         let open = self.tls.is_none() && !self.broker.allow_plaintext && !listen.ip().is_loopback();
         if open && self.has_broker() {
-            let allowed =
-                "a loopback address, unless there are certificates in `[tls]` or `broker.allow_plaintext` is true";
+            let allowed = "a loopback address, unless there are certificates in `[tls]` or `broker.allow_plaintext` is true";
             return Err(ConfigError::new("listen", listen, allowed));
         }
         Ok(())
@@ -315,7 +361,10 @@ impl NodeConfig {
     /// The embedded broker's limits; its packets hold the cell's maps.
     pub fn broker(&self) -> BrokerConfig {
         let needed = u32::try_from(self.mqtt.max_packet_bytes()).ok();
-        BrokerConfig { max_packet_bytes: self.broker.max_packet_bytes.or(needed), ..self.broker.clone() }
+        BrokerConfig {
+            max_packet_bytes: self.broker.max_packet_bytes.or(needed),
+            ..self.broker.clone()
+        }
     }
 
     /// Where the embedded broker listens.
@@ -333,7 +382,11 @@ impl NodeConfig {
     /// # Errors
     /// [`SecurityError`] naming the file.
     pub fn security(&self) -> Result<Security, SecurityError> {
-        Security::load(self.tls.as_ref().zip(self.name.as_ref()), &self.mqtt, (&self.membership, &self.cell))
+        Security::load(
+            self.tls.as_ref().zip(self.name.as_ref()),
+            &self.mqtt,
+            (&self.membership, &self.cell),
+        )
     }
 
     /// True if the node connects its cell to a region while it leads.
@@ -381,7 +434,13 @@ const COCO_PIXEL_SIGMA_PX: f64 = 3.0;
 fn host_name() -> Option<NodeName> {
     let system = rustix::system::uname();
     let host = system.nodename().to_str().ok()?.split('.').next()?;
-    let allowed = |c: char| if c.is_ascii_alphanumeric() || c == '_' { c } else { '-' };
+    let allowed = |c: char| {
+        if c.is_ascii_alphanumeric() || c == '_' {
+            c
+        } else {
+            '-'
+        }
+    };
     NodeName::new(host.chars().map(allowed).collect::<String>()).ok()
 }
 
@@ -412,32 +471,61 @@ mod tests {
         assert_eq!(keyed.broker_listen().to_string(), "127.0.0.1:1883");
         let open = load("[broker]\nallow_plaintext = true").unwrap();
         assert_eq!(open.broker_listen().to_string(), "0.0.0.0:1883");
-        let closed = load("[tls]\nca = \"ca.pem\"\ncertificate = \"edge.pem\"\nkey = \"edge.key\"").unwrap();
+        let closed =
+            load("[tls]\nca = \"ca.pem\"\ncertificate = \"edge.pem\"\nkey = \"edge.key\"").unwrap();
         assert_eq!(closed.broker_listen().to_string(), "0.0.0.0:8883");
     }
 
     #[test]
     fn errors_name_the_key_the_value_and_what_is_allowed() {
         for (toml, parts) in [
-            ("role = \"edge\"\n[fusion.pace]\ngate_m = -1", ["`fusion.pace.gate_m`", "-1", "0.001 to 1000"]),
-            ("role = \"edge\"\n[fusion.pace]\ngate = 1", ["`fusion.pace.gate`", "unknown field", "`gate_m`"]),
-            ("role = \"edge\"\n[mqtt]\nkeep_alive_s = \"x\"", ["`mqtt.keep_alive_s`", "\"x\"", "u16"]),
+            (
+                "role = \"edge\"\n[fusion.pace]\ngate_m = -1",
+                ["`fusion.pace.gate_m`", "-1", "0.001 to 1000"],
+            ),
+            (
+                "role = \"edge\"\n[fusion.pace]\ngate = 1",
+                ["`fusion.pace.gate`", "unknown field", "`gate_m`"],
+            ),
+            (
+                "role = \"edge\"\n[mqtt]\nkeep_alive_s = \"x\"",
+                ["`mqtt.keep_alive_s`", "\"x\"", "u16"],
+            ),
             ("role = \"king\"", ["`role`", "king", "`edge`"]),
-            ("listen = \"0.0.0.0:1883\"", ["`listen`", "0.0.0.0:1883", "allow_plaintext"]),
+            (
+                "listen = \"0.0.0.0:1883\"",
+                ["`listen`", "0.0.0.0:1883", "allow_plaintext"],
+            ),
             ("[mqtt]\nsign = true", ["`mqtt.sign`", "true", "key_file"]),
-            ("[tls]\nca = \"\"\ncertificate = \"a\"\nkey = \"b\"", ["`tls.ca`", "nothing", "PEM"]),
+            (
+                "[tls]\nca = \"\"\ncertificate = \"a\"\nkey = \"b\"",
+                ["`tls.ca`", "nothing", "PEM"],
+            ),
             (
                 "role = \"edge\"\n[broker]\nmax_packet_bytes = 1048576",
                 ["`broker.max_packet_bytes`", "1048576", "8392704"],
             ),
-            ("[election]\njoin_ms = 700", ["`membership.hello_ms`", "500", "half of `election.join_ms`, 700"]),
-            ("[election]\nbeat_ms = 1", ["`election.beat_ms`", "1", "5 to"]),
+            (
+                "[election]\njoin_ms = 700",
+                [
+                    "`membership.hello_ms`",
+                    "500",
+                    "half of `election.join_ms`, 700",
+                ],
+            ),
+            (
+                "[election]\nbeat_ms = 1",
+                ["`election.beat_ms`", "1", "5 to"],
+            ),
             (
                 "role = \"edge\"\n[[landmarks]]\nid = \"a\"\nx_m = 0\ny_m = 0\n[[landmarks]]\nid = \"a\"\nx_m = 1\ny_m = 0",
                 ["`landmarks[1].id`", "\"a\"", "unique"],
             ),
             ("role = ", ["TOML", "configuration", ""]),
-            ("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"***\"", ["`mqtt.password`", "not printed", "***"]),
+            (
+                "role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"***\"",
+                ["`mqtt.password`", "not printed", "***"],
+            ),
         ] {
             let error = load(toml).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
@@ -449,12 +537,30 @@ mod tests {
     fn errors_name_the_key_of_a_table_that_has_a_kind() {
         let source = "[camera.detector]\nkind = \"placard\"\n[camera.source]\n";
         for (toml, parts) in [
-            ("kind = \"v4l2\"\nwidth = \"wide\"\nheight = 480", ["`camera.source.width`", "\"wide\"", "u32"]),
-            ("kind = \"v4l2\"\nheight = 480\nwidht = 640", ["`camera.source.widht`", "unknown field", "`width`"]),
-            ("kind = \"url\"\nurl = 7", ["`camera.source.url`", "text", "quotes"]),
-            ("kind = \"testbed\"\nscenes = \"a\"", ["`camera.source.kind`", "testbed", "`images`"]),
-            ("kind = \"url\"", ["`camera.source`", "missing field", "`url`"]),
-            ("kind = \"eye\"\nwidth = 640", ["`camera.source.kind`", "eye", "`v4l2`"]),
+            (
+                "kind = \"v4l2\"\nwidth = \"wide\"\nheight = 480",
+                ["`camera.source.width`", "\"wide\"", "u32"],
+            ),
+            (
+                "kind = \"v4l2\"\nheight = 480\nwidht = 640",
+                ["`camera.source.widht`", "unknown field", "`width`"],
+            ),
+            (
+                "kind = \"url\"\nurl = 7",
+                ["`camera.source.url`", "text", "quotes"],
+            ),
+            (
+                "kind = \"testbed\"\nscenes = \"a\"",
+                ["`camera.source.kind`", "testbed", "`images`"],
+            ),
+            (
+                "kind = \"url\"",
+                ["`camera.source`", "missing field", "`url`"],
+            ),
+            (
+                "kind = \"eye\"\nwidth = 640",
+                ["`camera.source.kind`", "eye", "`v4l2`"],
+            ),
         ] {
             let error = load(&format!("{source}{toml}")).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
@@ -463,11 +569,16 @@ mod tests {
 
     #[test]
     fn a_configuration_that_is_cut_off_or_empty_stops_the_start() {
-        let written = format!("# Whole with `{END_OF_CONFIGURATION}`.\nname = \"n\"\n[tls]\nca = \"a\"\n");
+        let written =
+            format!("# Whole with `{END_OF_CONFIGURATION}`.\nname = \"n\"\n[tls]\nca = \"a\"\n");
         let cut = load(&written).unwrap_err().to_string();
-        assert!(cut.contains("cut off") && cut.contains(END_OF_CONFIGURATION), "{cut}");
-        let whole =
-            load(&format!("# Whole with `{END_OF_CONFIGURATION}`.\ncell = \"lot-9\"\n{END_OF_CONFIGURATION}\n"));
+        assert!(
+            cut.contains("cut off") && cut.contains(END_OF_CONFIGURATION),
+            "{cut}"
+        );
+        let whole = load(&format!(
+            "# Whole with `{END_OF_CONFIGURATION}`.\ncell = \"lot-9\"\n{END_OF_CONFIGURATION}\n"
+        ));
         assert_eq!(whole.unwrap().cell.as_str(), "lot-9");
         for empty in ["", "\n \n"] {
             let error = load(empty).unwrap_err().to_string();
@@ -477,7 +588,11 @@ mod tests {
 
     #[test]
     fn a_missing_file_is_named() {
-        let error = NodeConfig::load(Some(std::path::Path::new("/missing.toml")), &Flags { name: "x" }).unwrap_err();
+        let error = NodeConfig::load(
+            Some(std::path::Path::new("/missing.toml")),
+            &Flags { name: "x" },
+        )
+        .unwrap_err();
         assert!(error.to_string().contains("/missing.toml"));
     }
 
@@ -491,15 +606,23 @@ mod tests {
     fn a_printed_configuration_says_that_the_password_is_missing_and_has_no_other_in_its_place() {
         let config = load("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = \"hush\"").unwrap();
         let printed = config.to_toml().unwrap();
-        assert!(printed.contains("# `mqtt.password` is set but not shown") && !printed.contains("hush"), "{printed}");
+        assert!(
+            printed.contains("# `mqtt.password` is set but not shown") && !printed.contains("hush"),
+            "{printed}"
+        );
         let read = load(&printed).unwrap();
-        assert_eq!((read.mqtt.user.as_deref(), read.mqtt.password), (Some("u"), None));
+        assert_eq!(
+            (read.mqtt.user.as_deref(), read.mqtt.password),
+            (Some("u"), None)
+        );
     }
 
     #[test]
     fn no_error_shows_a_cell_key() {
         for key in ["4711471147114711", "\"4711471147114711"] {
-            let error = load(&format!("role = \"edge\"\n[membership]\nkey = {key}")).unwrap_err().to_string();
+            let error = load(&format!("role = \"edge\"\n[membership]\nkey = {key}"))
+                .unwrap_err()
+                .to_string();
             assert!(error.contains("key") && !error.contains("4711"), "{error}");
         }
     }
@@ -519,10 +642,22 @@ mod tests {
 
     #[test]
     fn no_error_shows_a_password() {
-        for password in ["4711", "hush4711", "\"hush4711", "[\"hush4711\"]", "{ a = \"hush4711\" }"] {
-            let error = load(&format!("role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = {password}")).unwrap_err();
+        for password in [
+            "4711",
+            "hush4711",
+            "\"hush4711",
+            "[\"hush4711\"]",
+            "{ a = \"hush4711\" }",
+        ] {
+            let error = load(&format!(
+                "role = \"edge\"\n[mqtt]\nuser = \"u\"\npassword = {password}"
+            ))
+            .unwrap_err();
             let error = format!("{error} {error:?}");
-            assert!(error.contains("password") && !error.contains("4711"), "{error}");
+            assert!(
+                error.contains("password") && !error.contains("4711"),
+                "{error}"
+            );
         }
     }
 }

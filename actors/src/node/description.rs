@@ -28,28 +28,48 @@ impl HeldDescription {
     pub(super) fn at_start(config: &NodeConfig) -> Result<Self, NodeError> {
         let saved = description_file(config).and_then(|file| {
             file.load(|saved: &CellDescription| {
-                saved.schema == SCHEMA_VERSION && saved.check(&Limits::default()).is_ok() && is_intact(saved)
+                saved.schema == SCHEMA_VERSION
+                    && saved.check(&Limits::default()).is_ok()
+                    && is_intact(saved)
             })
         });
         let Some(path) = config.description.as_ref().filter(|_| config.may_lead()) else {
-            return Ok(Self { description: saved.map(Arc::new), problem: None });
+            return Ok(Self {
+                description: saved.map(Arc::new),
+                problem: None,
+            });
         };
-        let text = bounded_file::read_text(path)
-            .map_err(|error| NodeError::Failed(format!("key `description`: {}: {error}", path.display())))?;
+        let text = bounded_file::read_text(path).map_err(|error| {
+            NodeError::Failed(format!("key `description`: {}: {error}", path.display()))
+        })?;
         if let Some(saved) = saved {
             if saved.text != text {
                 let (path, version) = (path.display(), saved.version);
                 tracing::info!(%path, version, "the cell has a description, and not that file's: see `ecod-node cell diff`");
             }
-            return Ok(Self { description: Some(Arc::new(saved)), problem: None });
+            return Ok(Self {
+                description: Some(Arc::new(saved)),
+                problem: None,
+            });
         }
-        let Some(set_by) = config.name.clone() else { return Ok(Self::default()) };
-        config
-            .described(&text)
-            .map_err(|error| NodeError::Failed(format!("key `description`: {}: {error}", path.display())))?;
+        let Some(set_by) = config.name.clone() else {
+            return Ok(Self::default());
+        };
+        config.described(&text).map_err(|error| {
+            NodeError::Failed(format!("key `description`: {}: {error}", path.display()))
+        })?;
         let hash = content_hash(&set_by, &text);
-        let description = CellDescription { schema: SCHEMA_VERSION, version: 1, hash, set_by, text };
-        Ok(Self { description: Some(Arc::new(description)), problem: None })
+        let description = CellDescription {
+            schema: SCHEMA_VERSION,
+            version: 1,
+            hash,
+            set_by,
+            text,
+        };
+        Ok(Self {
+            description: Some(Arc::new(description)),
+            problem: None,
+        })
     }
 
     /// The node's own configuration under the description. One that contradicts it, or that this version cannot read, is
@@ -61,8 +81,15 @@ impl HeldDescription {
             Ok(config) => return Some(config),
             Err(error) => error,
         };
-        let problem = format!("description {stamp} of the cell, set at {set_by}, is not used: {error}");
-        let shown = |character: char| if character.is_control() { ' ' } else { character };
+        let problem =
+            format!("description {stamp} of the cell, set at {set_by}, is not used: {error}");
+        let shown = |character: char| {
+            if character.is_control() {
+                ' '
+            } else {
+                character
+            }
+        };
         let problem: String = problem.chars().map(shown).take(MAX_PROBLEM).collect();
         tracing::error!("{problem}");
         self.problem = Some(problem);
@@ -72,7 +99,11 @@ impl HeldDescription {
     /// Its entry in the node's status.
     pub(super) fn status(&self) -> Option<DescriptionStatus> {
         let held = self.description.as_ref()?;
-        Some(DescriptionStatus { version: held.version, hash: held.hash, problem: self.problem.clone() })
+        Some(DescriptionStatus {
+            version: held.version,
+            hash: held.hash,
+            problem: self.problem.clone(),
+        })
     }
 }
 

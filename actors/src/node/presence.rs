@@ -106,12 +106,22 @@ impl VehicleParts {
 
     /// Running parts that go along with the vehicle.
     fn running(&self) -> Vec<(ActorKind, ActorCell)> {
-        let poses = self.pose_receiver.get().map(|actor| (ActorKind::PoseReceiver, actor.get_cell()));
-        #[cfg_attr(not(feature = "camera"), expect(unused_mut, reason = "there is no more without cameras"))]
+        let poses = self
+            .pose_receiver
+            .get()
+            .map(|actor| (ActorKind::PoseReceiver, actor.get_cell()));
+        #[cfg_attr(
+            not(feature = "camera"),
+            expect(unused_mut, reason = "there is no more without cameras")
+        )]
         let mut running = Vec::from_iter(poses);
         #[cfg(feature = "camera")]
         for (camera, detector) in self.detectors.iter().enumerate() {
-            running.extend(detector.get().map(|actor| (ActorKind::Detector(camera), actor.get_cell())));
+            running.extend(
+                detector
+                    .get()
+                    .map(|actor| (ActorKind::Detector(camera), actor.get_cell())),
+            );
         }
         running
     }
@@ -132,7 +142,11 @@ pub enum MoveStep {
 
 impl SupervisorState {
     /// Takes a step of the vehicle's way to another cell.
-    pub(super) async fn take_step(&mut self, step: MoveStep, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+    pub(super) async fn take_step(
+        &mut self,
+        step: MoveStep,
+        supervisor: &ActorCell,
+    ) -> Result<(), ActorProcessingErr> {
         let started = match step {
             MoveStep::CloseDoor => {
                 self.close_door().await;
@@ -149,13 +163,20 @@ impl SupervisorState {
     }
 
     /// Goes on to this presence: starts the parts that it adds.
-    async fn advance(&mut self, presence: Presence, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+    async fn advance(
+        &mut self,
+        presence: Presence,
+        supervisor: &ActorCell,
+    ) -> Result<(), ActorProcessingErr> {
         self.builder.set_presence(presence);
         self.start_missing(supervisor).await
     }
 
     /// Starts the parts that the node has by now and that do not run.
-    pub(super) async fn start_missing(&mut self, supervisor: &ActorCell) -> Result<(), ActorProcessingErr> {
+    pub(super) async fn start_missing(
+        &mut self,
+        supervisor: &ActorCell,
+    ) -> Result<(), ActorProcessingErr> {
         for part in self.builder.parts() {
             if !self.running.values().any(|running| *running == part) {
                 self.start(part, supervisor).await?;

@@ -36,7 +36,12 @@ mod tests {
     #[test]
     fn a_burst_is_too_much_and_a_trickle_is_not() {
         let mut burst = Restarts::default();
-        assert_eq!((0..20).filter(|s| burst.allow(Timestamp(s * 1_000_000))).count(), MAX_RESTARTS);
+        assert_eq!(
+            (0..20)
+                .filter(|s| burst.allow(Timestamp(s * 1_000_000)))
+                .count(),
+            MAX_RESTARTS
+        );
         let mut trickle = Restarts::default();
         assert!((0..100).all(|s| trickle.allow(Timestamp(s * 7_000_000))));
     }

@@ -56,20 +56,37 @@ impl Roamer {
     /// # Errors
     /// [`NodeError`] when a part cannot start, or the file of cells cannot be used.
     pub async fn start(config: NodeConfig) -> Result<Self, NodeError> {
-        let mut cells = config.load_cells().map_err(|error| NodeError::Failed(format!("key `cells`: {error}")))?;
+        let mut cells = config
+            .load_cells()
+            .map_err(|error| NodeError::Failed(format!("key `cells`: {error}")))?;
         let vehicle = VehicleParts::new(&config);
         // A mistake in a cell elsewhere keeps no vehicle from its own.
         cells.retain(|cell| match config.credentials_in(cell) {
             Ok(_) => true,
             Err(error) => {
                 let (about, cause) = (cell.name.as_str(), error.to_string());
-                vehicle.counters.troubles().note_about(about, TroubleKind::CellLeftOut, &cause);
+                vehicle
+                    .counters
+                    .troubles()
+                    .note_about(about, TroubleKind::CellLeftOut, &cause);
                 cell.name == config.cell
             }
         });
-        let choice = CellChoice::new(cells.iter().map(CellEntry::known).collect(), config.cell.clone());
+        let choice = CellChoice::new(
+            cells.iter().map(CellEntry::known).collect(),
+            config.cell.clone(),
+        );
         let present = start_with((vehicle.clone(), Presence::Whole), config.clone()).await?;
-        Ok(Self { config, cells, vehicle, choice, present, next: None, former: None, placed_at: clock::now() })
+        Ok(Self {
+            config,
+            cells,
+            vehicle,
+            choice,
+            present,
+            next: None,
+            former: None,
+            placed_at: clock::now(),
+        })
     }
 
     /// The node of the vehicle's present cell.
@@ -130,17 +147,27 @@ impl Roamer {
     /// Where the vehicle is, on Earth.
     fn place(&self) -> Option<GeographicPosition> {
         let (at, pose) = self.vehicle.poses.borrow().back().copied()?;
-        let StatedPose::OnEarth(pose) = pose else { return None };
+        let StatedPose::OnEarth(pose) = pose else {
+            return None;
+        };
         let now = clock::now();
         let is_fresh = now.since(at).max(at.since(now)) <= MAX_POSE_AGE;
         let (latitude_deg, longitude_deg) = (pose.latitude_deg, pose.longitude_deg);
-        is_fresh.then(|| GeographicPosition { latitude_deg, longitude_deg, height_m: pose.height_m.unwrap_or(0.0) })
+        is_fresh.then(|| GeographicPosition {
+            latitude_deg,
+            longitude_deg,
+            height_m: pose.height_m.unwrap_or(0.0),
+        })
     }
 
     /// Starts a node beside the present one.
     async fn join(&mut self, cell: NodeName) -> Result<(), NodeError> {
-        let Some(entry) = self.cells.iter().find(|entry| entry.name == cell) else { return Ok(()) };
-        let Ok(config) = self.config.in_cell(entry) else { return Ok(()) };
+        let Some(entry) = self.cells.iter().find(|entry| entry.name == cell) else {
+            return Ok(());
+        };
+        let Ok(config) = self.config.in_cell(entry) else {
+            return Ok(());
+        };
         tracing::info!(from = %self.choice.present(), %cell, "getting ready in the next cell");
         // Nodes of the cell, and no programs alone, will connect to it.
         if config.serves_nodes()
@@ -166,8 +193,12 @@ impl Roamer {
 
     /// Reports in the next cell from now on, and leaves the present one.
     async fn enter(&mut self, cell: &NodeName) -> Result<(), NodeError> {
-        let Some((_, next)) = self.next.take_if(|_| self.choice.enter(cell)) else { return Ok(()) };
-        let former = self.former.insert(std::mem::replace(&mut self.present, next));
+        let Some((_, next)) = self.next.take_if(|_| self.choice.enter(cell)) else {
+            return Ok(());
+        };
+        let former = self
+            .former
+            .insert(std::mem::replace(&mut self.present, next));
         step(former, MoveStep::HandOver).await?;
         self.vehicle.present_cell.send_replace(cell.clone());
         step(&self.present, MoveStep::TakeOver).await?;
@@ -209,8 +240,14 @@ enum Change {
 
 /// Waits for news of the next node; for ever if there is none.
 async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Change) {
-    let Some((cell, node)) = next else { return std::future::pending().await };
-    let (mut maps, mut verdicts, mut shared) = (node.newest_map(), node.newest_verdicts(), node.shared.clone());
+    let Some((cell, node)) = next else {
+        return std::future::pending().await;
+    };
+    let (mut maps, mut verdicts, mut shared) = (
+        node.newest_map(),
+        node.newest_verdicts(),
+        node.shared.clone(),
+    );
     let follows = async {
         let has_round = tokio::select! {
             map = maps.wait_for(Option::is_some) => map.is_ok(),
@@ -228,9 +265,13 @@ async fn next_change(next: &mut Option<(NodeName, NodeHandle)>) -> (NodeName, Ch
 
 /// Has a node take a step.
 async fn step(node: &NodeHandle, step: MoveStep) -> Result<(), NodeError> {
-    let taken = node.supervisor.call(|done| NodeMessage::Move { step, done }, Some(STEP_TIMEOUT));
+    let taken = node
+        .supervisor
+        .call(|done| NodeMessage::Move { step, done }, Some(STEP_TIMEOUT));
     match timeout(STEP_TIMEOUT, taken).await {
         Ok(Ok(ractor::rpc::CallResult::Success(()))) => Ok(()),
-        _ => Err(NodeError::Failed(format!("the node did not take the step {step:?} of its way to another cell"))),
+        _ => Err(NodeError::Failed(format!(
+            "the node did not take the step {step:?} of its way to another cell"
+        ))),
     }
 }

@@ -28,12 +28,18 @@ impl ServiceManager {
     /// The manager that the environment names; none where nobody waits to be told.
     pub fn from_environment() -> Option<Self> {
         std::env::var_os("NOTIFY_SOCKET")?;
-        Some(Self { watchdog: sd_notify::watchdog_enabled(), told: None, failing: false })
+        Some(Self {
+            watchdog: sd_notify::watchdog_enabled(),
+            told: None,
+            failing: false,
+        })
     }
 
     /// Time between two signs of life.
     pub fn period(&self) -> Duration {
-        self.watchdog.map_or(PERIOD, |watchdog| (watchdog / BEATS).clamp(Duration::from_millis(1), PERIOD))
+        self.watchdog.map_or(PERIOD, |watchdog| {
+            (watchdog / BEATS).clamp(Duration::from_millis(1), PERIOD)
+        })
     }
 
     /// All parts run.

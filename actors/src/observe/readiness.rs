@@ -85,14 +85,25 @@ pub struct Probe {
 
 /// Possible cause of the node's separation from its cell, in words.
 fn separating(troubles: &[Trouble]) -> Option<&str> {
-    let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
-    troubles.iter().find(kind).map(|trouble| trouble.cause.as_str())
+    let kind = |trouble: &&Trouble| {
+        TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating)
+    };
+    troubles
+        .iter()
+        .find(kind)
+        .map(|trouble| trouble.cause.as_str())
 }
 
 /// The node's own trouble for which it does not do its work, in words.
 fn disabling(troubles: &[Trouble]) -> Option<String> {
-    let kind = |trouble: &&Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_disabling);
-    troubles.iter().filter(|trouble| trouble.about.is_none()).find(kind).map(|trouble| trouble.cause.clone())
+    let kind = |trouble: &&Trouble| {
+        TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_disabling)
+    };
+    troubles
+        .iter()
+        .filter(|trouble| trouble.about.is_none())
+        .find(kind)
+        .map(|trouble| trouble.cause.clone())
 }
 
 /// Maximum age of the newest round of a live aggregator; none for VOTE's `paper` mode alone, which has a round whenever
@@ -106,12 +117,19 @@ impl Vitals {
     /// Asks the parts how they are.
     pub async fn probe(&self) -> Probe {
         let (health, links, timeliness) = tokio::join!(
-            self.broker.ask(|reply| BrokerMessage::Health { reply }, READINESS_STEPS),
-            self.gateway.ask(|reply| GatewayMessage::Links { reply }, READINESS_STEPS),
-            self.fuser.ask(|reply| FuserMessage::Timeliness { reply }, READINESS_STEPS),
+            self.broker
+                .ask(|reply| BrokerMessage::Health { reply }, READINESS_STEPS),
+            self.gateway
+                .ask(|reply| GatewayMessage::Links { reply }, READINESS_STEPS),
+            self.fuser
+                .ask(|reply| FuserMessage::Timeliness { reply }, READINESS_STEPS),
         );
         let broker_serves = matches!(health, Some(BrokerHealth::Serving(_)));
-        Probe { broker_serves, links, timeliness: timeliness.unwrap_or_default() }
+        Probe {
+            broker_serves,
+            links,
+            timeliness: timeliness.unwrap_or_default(),
+        }
     }
 
     /// Readiness of the node now, the parts being as they answered.
@@ -122,41 +140,68 @@ impl Vitals {
         }
         let Timeliness { timely, untimely } = probe.timeliness;
         let vehicles = timely + untimely;
-        let trouble = format!("leading, but the times of {untimely} of {vehicles} vehicles' reports are unusable");
+        let trouble = format!(
+            "leading, but the times of {untimely} of {vehicles} vehicles' reports are unusable"
+        );
         if leadership.is_leading() && !probe.timeliness.is_usable() {
             return Readiness::not(trouble);
         }
         // The reports of its only vehicle depose no leader.
         let lone = Some(trouble).filter(|_| leadership.is_leading() && timely == 0 && untimely > 0);
-        let SharedFacts { patience, problem, .. } = self.shared.borrow().clone();
+        let SharedFacts {
+            patience, problem, ..
+        } = self.shared.borrow().clone();
         let works = self.broker_works(probe);
         let troubles = self.counters.troubles().present();
-        Readiness::judge(&leadership, self.last_round().as_ref(), works, patience, clock::now())
-            .because(separating(&troubles))
-            .unless(problem.or(lone).or_else(|| disabling(&troubles)))
+        Readiness::judge(
+            &leadership,
+            self.last_round().as_ref(),
+            works,
+            patience,
+            clock::now(),
+        )
+        .because(separating(&troubles))
+        .unless(problem.or(lone).or_else(|| disabling(&troubles)))
     }
 
     /// True if a broker carries what this node publishes.
     fn broker_works(&self, probe: &Probe) -> bool {
-        let up = |broker| probe.links.as_ref().and_then(|links| links.get(broker)) == Some(&LinkState::Up);
+        let up = |broker| {
+            probe.links.as_ref().and_then(|links| links.get(broker)) == Some(&LinkState::Up)
+        };
         self.plane.external.as_ref().is_some_and(up) || (self.plane.embedded && probe.broker_serves)
     }
 
     /// The newest round accepted: its epoch and when it came.
     fn last_round(&self) -> Option<(Epoch, Timestamp)> {
-        newest_round(self.newest.map.borrow().as_ref(), self.newest.verdicts.borrow().as_ref())
+        newest_round(
+            self.newest.map.borrow().as_ref(),
+            self.newest.verdicts.borrow().as_ref(),
+        )
     }
 }
 
 /// The epoch of the newest round, be it a map or verdicts, and when it came.
-pub fn newest_round(map: Option<&ReceivedMap>, verdicts: Option<&Received<Verdicts>>) -> Option<(Epoch, Timestamp)> {
-    let map =
-        map.map(|received| (Epoch::new(received.map.epoch, received.map.aggregator.clone()), received.received_at));
+pub fn newest_round(
+    map: Option<&ReceivedMap>,
+    verdicts: Option<&Received<Verdicts>>,
+) -> Option<(Epoch, Timestamp)> {
+    let map = map.map(|received| {
+        (
+            Epoch::new(received.map.epoch, received.map.aggregator.clone()),
+            received.received_at,
+        )
+    });
     let verdicts = verdicts.map(|received| {
         let verdicts = &received.message;
-        (Epoch::new(verdicts.epoch, verdicts.aggregator.clone()), received.received_at)
+        (
+            Epoch::new(verdicts.epoch, verdicts.aggregator.clone()),
+            received.received_at,
+        )
     });
-    map.into_iter().chain(verdicts).max_by_key(|(_, received_at)| *received_at)
+    map.into_iter()
+        .chain(verdicts)
+        .max_by_key(|(_, received_at)| *received_at)
 }
 
 #[cfg(test)]

@@ -23,7 +23,8 @@ pub use page::{drawing, section, table};
 pub use plot::bars;
 
 use crate::observe::recorder::{
-    CounterReading, LeadershipChange, LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName,
+    CounterReading, LeadershipChange, LogError, LogEvent, LogIdentity, LogMessage, LogReader,
+    SchemaName,
 };
 use losses::Losses;
 use series::Samples;
@@ -105,7 +106,10 @@ impl Report {
     /// A report that begins with this section.
     #[must_use]
     pub fn with_section(section: impl Section + 'static) -> Self {
-        Self { sections: vec![Box::new(section)], ..Self::default() }
+        Self {
+            sections: vec![Box::new(section)],
+            ..Self::default()
+        }
     }
 
     /// Takes a file. The page lists what is unusable.
@@ -124,7 +128,8 @@ impl Report {
             }
         }
         for (schema, messages) in log.unknown() {
-            self.problems.push(format!("{messages} messages of {schema} are not known"));
+            self.problems
+                .push(format!("{messages} messages of {schema} are not known"));
         }
         Ok(())
     }
@@ -153,10 +158,15 @@ impl Report {
         if let Some(known) = self.identity.replace(identity.clone())
             && known.node != identity.node
         {
-            self.problems.push(format!("logs of {} and {} are mixed", known.node, identity.node));
+            self.problems.push(format!(
+                "logs of {} and {} are mixed",
+                known.node, identity.node
+            ));
         }
         self.timeline.identity(identity);
-        self.sections.iter_mut().for_each(|section| section.identity(identity));
+        self.sections
+            .iter_mut()
+            .for_each(|section| section.identity(identity));
     }
 
     fn message(&mut self, message: &LogMessage) {
@@ -166,39 +176,60 @@ impl Report {
         self.last = self.last.max(at);
         self.timeline.advance(at);
         let is_valid = match message.schema {
-            SchemaName::ObjectReport => self.with(message, |report, it| report.report(&message.topic, at, &it)),
+            SchemaName::ObjectReport => {
+                self.with(message, |report, it| report.report(&message.topic, at, &it))
+            }
             SchemaName::GlobalMap => self.with(message, |report, it| report.map(at, it)),
             SchemaName::Verdicts => self.with(message, |report, it| report.verdicts(at, it)),
             SchemaName::Reputations => self.with(message, |report, it| report.reputations(at, &it)),
-            SchemaName::Leadership => {
-                self.with(message, |report, it| report.changes.push(LeadershipChange { at_us: at, ..it }))
+            SchemaName::Leadership => self.with(message, |report, it| {
+                report.changes.push(LeadershipChange { at_us: at, ..it })
+            }),
+            SchemaName::Counters => self.with(message, |report, it| {
+                report.counters(CounterReading { at_us: at, ..it })
+            }),
+            SchemaName::NodeStatus => {
+                self.with(message, |report, it| report.timeline.status(it, at))
             }
-            SchemaName::Counters => {
-                self.with(message, |report, it| report.counters(CounterReading { at_us: at, ..it }))
-            }
-            SchemaName::NodeStatus => self.with(message, |report, it| report.timeline.status(it, at)),
             // Of several cameras, one is shown.
             SchemaName::CompressedImage
                 if *self.camera.get_or_insert_with(|| message.topic.clone()) == message.topic =>
             {
-                self.with(message, |report, it: RecordedPicture| report.timeline.picture(it, at))
+                self.with(message, |report, it: RecordedPicture| {
+                    report.timeline.picture(it, at)
+                })
             }
             _ => true,
         };
         if !is_valid && self.problems.len() < MAX_PROBLEMS {
-            self.problems.push(format!("a message of {} cannot be read", message.schema.as_str()));
+            self.problems.push(format!(
+                "a message of {} cannot be read",
+                message.schema.as_str()
+            ));
         }
     }
 
     /// False if the message does not match its schema.
-    fn with<T: serde::de::DeserializeOwned>(&mut self, message: &LogMessage, take: impl FnOnce(&mut Self, T)) -> bool {
-        serde_json::from_slice(&message.json).map(|it| take(self, it)).is_ok()
+    fn with<T: serde::de::DeserializeOwned>(
+        &mut self,
+        message: &LogMessage,
+        take: impl FnOnce(&mut Self, T),
+    ) -> bool {
+        serde_json::from_slice(&message.json)
+            .map(|it| take(self, it))
+            .is_ok()
     }
 
     fn report(&mut self, topic: &str, at: Timestamp, report: &ObjectReport) {
-        let kind = if topic.starts_with("vote_") { ReportKind::VoteDetections } else { ReportKind::Detections };
+        let kind = if topic.starts_with("vote_") {
+            ReportKind::VoteDetections
+        } else {
+            ReportKind::Detections
+        };
         self.timeline.report(kind, report, at);
-        self.sections.iter_mut().for_each(|section| section.report(kind, report));
+        self.sections
+            .iter_mut()
+            .for_each(|section| section.report(kind, report));
         let vehicle = self.vehicles.entry(report.node.clone()).or_default();
         vehicle.reports += 1;
         vehicle.objects += report.objects.len() as u64;
@@ -207,10 +238,15 @@ impl Report {
     }
 
     fn map(&mut self, at: Timestamp, map: GlobalMap) {
-        self.maps.add(at, map.oldest_capture_us, map.fused_at_us, self.offset_us);
+        self.maps
+            .add(at, map.oldest_capture_us, map.fused_at_us, self.offset_us);
         self.timeline.map(&map, at);
         self.leader(at, Epoch::new(map.epoch, map.aggregator.clone()));
-        let labelled = map.landmarks.iter().filter(|entry| entry.label.is_some()).map(|entry| &entry.contributors);
+        let labelled = map
+            .landmarks
+            .iter()
+            .filter(|entry| entry.label.is_some())
+            .map(|entry| &entry.contributors);
         for contributors in labelled.chain(map.objects.iter().map(|object| &object.contributors)) {
             self.entries += 1;
             for node in contributors {
@@ -221,7 +257,8 @@ impl Report {
     }
 
     fn verdicts(&mut self, at: Timestamp, verdicts: Verdicts) {
-        self.verdicts.add(at, None, verdicts.fused_at_us, self.offset_us);
+        self.verdicts
+            .add(at, None, verdicts.fused_at_us, self.offset_us);
         self.timeline.verdicts(&verdicts, self.maps.count > 0, at);
         if self.maps.count == 0 {
             self.leader(at, Epoch::new(verdicts.epoch, verdicts.aggregator.clone()));
@@ -230,18 +267,24 @@ impl Report {
     }
 
     fn round(&mut self, round: &FusedLine) {
-        self.sections.iter_mut().for_each(|section| section.round(round));
+        self.sections
+            .iter_mut()
+            .for_each(|section| section.round(round));
     }
 
     fn reputations(&mut self, at: Timestamp, reputations: &Reputations) {
         self.timeline.reputations(reputations, at);
         for (node, reputation) in &reputations.reputations {
-            self.reputations.entry(node.clone()).or_default().push(at, reputation.score);
+            self.reputations
+                .entry(node.clone())
+                .or_default()
+                .push(at, reputation.score);
         }
     }
 
     fn counters(&mut self, reading: CounterReading) {
-        self.losses.add(self.identity.as_ref().map(|identity| identity.run), reading);
+        self.losses
+            .add(self.identity.as_ref().map(|identity| identity.run), reading);
     }
 
     fn leader(&mut self, at: Timestamp, epoch: Epoch) {
@@ -249,7 +292,12 @@ impl Report {
             Some(leader) if leader.epoch == epoch && at.since(leader.last_at) < GAP => {
                 (leader.last_at, leader.rounds) = (at, leader.rounds + 1);
             }
-            _ => self.leaders.push(LeaderRounds { epoch, first_at: at, last_at: at, rounds: 1 }),
+            _ => self.leaders.push(LeaderRounds {
+                epoch,
+                first_at: at,
+                last_at: at,
+                rounds: 1,
+            }),
         }
     }
 }
@@ -259,12 +307,23 @@ const MAX_PROBLEMS: usize = 20;
 
 impl RoundTimes {
     /// Adds a round; `offset_us` is from the recording node's clock to the cell's time, in which `at` is.
-    fn add(&mut self, at: Timestamp, oldest_capture: Option<Timestamp>, fused_at: Timestamp, offset_us: i64) {
+    fn add(
+        &mut self,
+        at: Timestamp,
+        oldest_capture: Option<Timestamp>,
+        fused_at: Timestamp,
+        offset_us: i64,
+    ) {
         self.count += 1;
         if let Some(last) = self.last_at.replace(at) {
             self.gaps.push(at, at.since(last).as_secs_f64());
         }
-        self.capture_to_fused.extend(oldest_capture.map(|capture| fused_at.since(capture).as_secs_f64()));
-        self.fused_to_received.push(at.shifted(offset_us.saturating_neg()).since(fused_at).as_secs_f64());
+        self.capture_to_fused
+            .extend(oldest_capture.map(|capture| fused_at.since(capture).as_secs_f64()));
+        self.fused_to_received.push(
+            at.shifted(offset_us.saturating_neg())
+                .since(fused_at)
+                .as_secs_f64(),
+        );
     }
 }

@@ -18,10 +18,16 @@ const BYTE_ORDER_MARK: char = '\u{feff}';
 /// # Errors
 /// Those of the operating system; [`io::ErrorKind::InvalidInput`] for what is no regular file.
 pub fn open(path: &Path) -> io::Result<File> {
-    let file = OpenOptions::new().read(true).custom_flags(OFlags::NONBLOCK.bits() as i32).open(path)?;
+    let file = OpenOptions::new()
+        .read(true)
+        .custom_flags(OFlags::NONBLOCK.bits() as i32)
+        .open(path)?;
     let metadata = file.metadata()?;
     if metadata.is_dir() {
-        return Err(io::Error::new(io::ErrorKind::IsADirectory, "it is a directory"));
+        return Err(io::Error::new(
+            io::ErrorKind::IsADirectory,
+            "it is a directory",
+        ));
     }
     if !metadata.is_file() {
         let reason = "it is a pipe, socket or device, not a regular file";
@@ -38,7 +44,10 @@ pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(max_bytes + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > max_bytes {
-        return Err(io::Error::new(io::ErrorKind::FileTooLarge, format!("it has more than {max_bytes} bytes")));
+        return Err(io::Error::new(
+            io::ErrorKind::FileTooLarge,
+            format!("it has more than {max_bytes} bytes"),
+        ));
     }
     Ok(bytes)
 }
@@ -51,9 +60,15 @@ pub fn read_text(path: &Path) -> io::Result<String> {
     let bytes = read(path, MAX_TEXT_BYTES)?;
     let text = String::from_utf8(bytes).map_err(|error| {
         let place = error.utf8_error().valid_up_to();
-        io::Error::new(io::ErrorKind::InvalidData, format!("it is no text in UTF-8, from byte {place} on"))
+        io::Error::new(
+            io::ErrorKind::InvalidData,
+            format!("it is no text in UTF-8, from byte {place} on"),
+        )
     })?;
-    Ok(text.strip_prefix(BYTE_ORDER_MARK).map(str::to_owned).unwrap_or(text))
+    Ok(text
+        .strip_prefix(BYTE_ORDER_MARK)
+        .map(str::to_owned)
+        .unwrap_or(text))
 }
 
 #[cfg(test)]
@@ -64,14 +79,34 @@ mod tests {
     fn pipes_devices_and_directories_are_refused_at_once() {
         let folder = tempfile::tempdir().unwrap();
         let pipe = folder.path().join("pipe");
-        rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::RUSR, 0).unwrap();
+        rustix::fs::mknodat(
+            rustix::fs::CWD,
+            &pipe,
+            rustix::fs::FileType::Fifo,
+            rustix::fs::Mode::RUSR,
+            0,
+        )
+        .unwrap();
         for path in [pipe.as_path(), Path::new("/dev/zero")] {
             let error = read_text(path).unwrap_err();
-            assert_eq!(error.kind(), io::ErrorKind::InvalidInput, "{}", path.display());
+            assert_eq!(
+                error.kind(),
+                io::ErrorKind::InvalidInput,
+                "{}",
+                path.display()
+            );
             assert!(error.to_string().contains("not a regular file"), "{error}");
         }
-        assert_eq!(read_text(folder.path()).unwrap_err().kind(), io::ErrorKind::IsADirectory);
-        assert_eq!(read_text(&folder.path().join("missing")).unwrap_err().kind(), io::ErrorKind::NotFound);
+        assert_eq!(
+            read_text(folder.path()).unwrap_err().kind(),
+            io::ErrorKind::IsADirectory
+        );
+        assert_eq!(
+            read_text(&folder.path().join("missing"))
+                .unwrap_err()
+                .kind(),
+            io::ErrorKind::NotFound
+        );
     }
 
     #[test]
@@ -81,7 +116,10 @@ mod tests {
         std::fs::write(&path, "\u{feff}car\nperson\n").unwrap();
         assert_eq!(read_text(&path).unwrap(), "car\nperson\n");
         assert_eq!(read(&path, 14).unwrap().len(), 14);
-        assert_eq!(read(&path, 13).unwrap_err().kind(), io::ErrorKind::FileTooLarge);
+        assert_eq!(
+            read(&path, 13).unwrap_err().kind(),
+            io::ErrorKind::FileTooLarge
+        );
         std::fs::write(&path, b"car\n\xff").unwrap();
         let error = read_text(&path).unwrap_err().to_string();
         assert!(error.contains("from byte 4 on"), "{error}");

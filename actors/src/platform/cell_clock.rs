@@ -18,9 +18,19 @@ impl CellClock {
     /// Shows a reading. One that differs by less than a millisecond is noise, which nobody need follow.
     pub fn show(&self, reading: ClockReading) {
         let mut shown = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let moved_us = reading.offset_us.saturating_sub(shown.offset_us).saturating_abs();
-        let offset_us = if moved_us >= NOISE_US { reading.offset_us } else { shown.offset_us };
-        *shown = ClockReading { offset_us, ..reading };
+        let moved_us = reading
+            .offset_us
+            .saturating_sub(shown.offset_us)
+            .saturating_abs();
+        let offset_us = if moved_us >= NOISE_US {
+            reading.offset_us
+        } else {
+            shown.offset_us
+        };
+        *shown = ClockReading {
+            offset_us,
+            ..reading
+        };
     }
 
     /// A time of [`clock::now`](super::clock::now) in the cell's time.

@@ -29,13 +29,19 @@ pub fn wall_offset_us() -> i64 {
 
 /// The wall clock in Unix microseconds, as right or wrong as the machine has it.
 pub fn wall() -> Timestamp {
-    Timestamp::default() + SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
+    Timestamp::default()
+        + SystemTime::now()
+            .duration_since(UNIX_EPOCH)
+            .unwrap_or_default()
 }
 
 /// Time since the machine started, including suspension.
 pub fn since_boot() -> Duration {
     let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Boottime);
-    Duration::new(u64::try_from(tv_sec).unwrap_or_default(), u32::try_from(tv_nsec).unwrap_or_default())
+    Duration::new(
+        u64::try_from(tv_sec).unwrap_or_default(),
+        u32::try_from(tv_nsec).unwrap_or_default(),
+    )
 }
 
 #[cfg(test)]
@@ -46,7 +52,12 @@ mod tests {
     fn time_is_unix_time_and_never_goes_back() {
         let first = now();
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap();
-        assert!(first.micros().abs_diff(u64::try_from(wall.as_micros()).unwrap()) < 1_000_000);
+        assert!(
+            first
+                .micros()
+                .abs_diff(u64::try_from(wall.as_micros()).unwrap())
+                < 1_000_000
+        );
         let mut last = first;
         for _ in 0..1000 {
             let next = now();

@@ -8,7 +8,10 @@ use ring::digest::{SHA256, digest};
 pub fn content_hash(set_by: &NodeName, text: &str) -> ContentHash {
     let mut hash = ContentHash::default();
     let digest = digest(&SHA256, &CellDescription::content(set_by, text));
-    hash.0.iter_mut().zip(digest.as_ref()).for_each(|(byte, digest)| *byte = *digest);
+    hash.0
+        .iter_mut()
+        .zip(digest.as_ref())
+        .for_each(|(byte, digest)| *byte = *digest);
     hash
 }
 

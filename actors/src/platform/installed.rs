@@ -16,5 +16,7 @@ pub(crate) fn program(name: &str) -> Option<PathBuf> {
     if directory.ends_with("deps") || directory.ends_with("examples") {
         directory = directory.parent()?;
     }
-    Some(directory.join(name)).filter(|path| path.is_file()).or_else(|| path(&format!("lib/ecod-node/{name}")))
+    Some(directory.join(name))
+        .filter(|path| path.is_file())
+        .or_else(|| path(&format!("lib/ecod-node/{name}")))
 }

@@ -20,7 +20,14 @@ struct State<T> {
 
 impl<T> Default for LatestSlot<T> {
     fn default() -> Self {
-        Self { state: Mutex::new(State { value: None, skipped: 0, closed: false }), changed: Notify::new() }
+        Self {
+            state: Mutex::new(State {
+                value: None,
+                skipped: 0,
+                closed: false,
+            }),
+            changed: Notify::new(),
+        }
     }
 }
 
@@ -93,7 +100,9 @@ mod tests {
             async move { slot.take().await }
         });
         tokio::task::yield_now().await;
-        std::thread::spawn(move || slot.put("frame")).join().unwrap();
+        std::thread::spawn(move || slot.put("frame"))
+            .join()
+            .unwrap();
         assert_eq!(waiting.await.unwrap(), Some("frame"));
     }
 }

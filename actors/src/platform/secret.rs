@@ -21,7 +21,11 @@ impl TryFrom<String> for Secret {
     type Error = HiddenSecret;
 
     fn try_from(text: String) -> Result<Self, HiddenSecret> {
-        if text == HIDDEN { Err(HiddenSecret) } else { Ok(Self(text)) }
+        if text == HIDDEN {
+            Err(HiddenSecret)
+        } else {
+            Ok(Self(text))
+        }
     }
 }
 

@@ -35,7 +35,9 @@ const HEADER: &str = "ecod-state 1 ";
 impl StateFile {
     /// The file `<cell>.<node>.<what>.json` in `directory`, so that the nodes of a machine can share a directory.
     pub fn new(directory: &Path, cell: &NodeName, node: &NodeName, what: &str) -> Self {
-        Self { path: directory.join(format!("{cell}.{node}.{what}.json")) }
+        Self {
+            path: directory.join(format!("{cell}.{node}.{what}.json")),
+        }
     }
 
     /// Lock on the state of a node, which its process holds as long as it runs.
@@ -114,7 +116,11 @@ impl StateFile {
     /// When the directory or disk refuses it; the state before is then still there.
     pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
         fs::create_dir_all(self.path.parent().unwrap_or(Path::new(".")))?;
-        replace_file(&self.path, &with_checksum(&serde_json::to_vec(state)?), 0o666)
+        replace_file(
+            &self.path,
+            &with_checksum(&serde_json::to_vec(state)?),
+            0o666,
+        )
     }
 }
 
@@ -133,9 +139,13 @@ pub(crate) fn with_checksum(state: &[u8]) -> Vec<u8> {
 /// # Errors
 /// The flaw, if the checksum is wrong.
 pub(crate) fn content(bytes: &[u8]) -> Result<&[u8], String> {
-    let Some(rest) = bytes.strip_prefix(HEADER.as_bytes()) else { return Ok(bytes) };
+    let Some(rest) = bytes.strip_prefix(HEADER.as_bytes()) else {
+        return Ok(bytes);
+    };
     let (found, rest) = rest.split_at(rest.len().min(2 * SHA256.output_len()));
-    let state = rest.strip_prefix(b"\n").filter(|state| found == checksum(state).as_bytes());
+    let state = rest
+        .strip_prefix(b"\n")
+        .filter(|state| found == checksum(state).as_bytes());
     state.ok_or_else(|| "it is damaged: its checksum differs".into())
 }
 
@@ -154,7 +164,11 @@ pub(crate) fn replace_file(path: &Path, bytes: &[u8], mode: u32) -> io::Result<(
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
         _ => {}
     }
-    let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&temporary)?;
+    let mut file = OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(mode)
+        .open(&temporary)?;
     file.write_all(bytes)?;
     file.sync_all()?;
     fs::rename(&temporary, path)?;
@@ -166,7 +180,12 @@ mod tests {
     use super::*;
 
     fn file(directory: &Path) -> StateFile {
-        StateFile::new(directory, &NodeName::from_static("lot-1"), &NodeName::from_static("edge"), "numbers")
+        StateFile::new(
+            directory,
+            &NodeName::from_static("lot-1"),
+            &NodeName::from_static("edge"),
+            "numbers",
+        )
     }
 
     #[test]
@@ -188,7 +207,10 @@ mod tests {
             fs::write(file.path(), content).unwrap();
             assert_eq!(file.load::<Vec<u32>>(|_| true), None);
             assert!(!file.path().exists());
-            assert_eq!(fs::read(file.path().with_extension("set-aside")).unwrap(), content);
+            assert_eq!(
+                fs::read(file.path().with_extension("set-aside")).unwrap(),
+                content
+            );
         }
         file.save(&[7]).unwrap();
         assert_eq!(file.load::<Vec<u32>>(|_| false), None, "not ours");
@@ -217,10 +239,15 @@ mod tests {
                 for change in 1..=u8::MAX {
                     let mut damaged = bytes.clone();
                     damaged[place] ^= change;
-                    assert_eq!(parse::<u64>(&damaged).ok(), None, "byte {place} ^ {change:#x}");
+                    assert_eq!(
+                        parse::<u64>(&damaged).ok(),
+                        None,
+                        "byte {place} ^ {change:#x}"
+                    );
                 }
             }
-            (0..bytes.len()).for_each(|end| assert_eq!(parse::<u64>(&bytes[..end]).ok(), None, "{end} bytes"));
+            (0..bytes.len())
+                .for_each(|end| assert_eq!(parse::<u64>(&bytes[..end]).ok(), None, "{end} bytes"));
             fs::write(file.path(), &bytes[..bytes.len() - 1]).unwrap();
             assert_eq!(file.load::<u64>(|_| true), None);
             assert!(!file.path().exists(), "set aside");
@@ -239,10 +266,16 @@ mod tests {
         use std::os::unix::fs::PermissionsExt;
 
         let directory = tempfile::tempdir().unwrap();
-        let (key, left_over) = (directory.path().join("edge.key"), directory.path().join("edge.tmp"));
+        let (key, left_over) = (
+            directory.path().join("edge.key"),
+            directory.path().join("edge.tmp"),
+        );
         fs::write(&left_over, "half a certificate").unwrap();
         fs::set_permissions(&left_over, PermissionsExt::from_mode(0o644)).unwrap();
         replace_file(&key, b"secret", 0o600).unwrap();
-        assert_eq!(fs::metadata(&key).unwrap().permissions().mode() & 0o777, 0o600);
+        assert_eq!(
+            fs::metadata(&key).unwrap().permissions().mode() & 0o777,
+            0o600
+        );
     }
 }

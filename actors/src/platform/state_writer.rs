@@ -34,7 +34,13 @@ pub enum SaveOutcome {
 impl StateWriter {
     /// A writer of `file`, if there is one.
     pub fn new(file: Option<StateFile>, what: &'static str) -> Self {
-        Self { file, what, is_unsaved: false, writing: None, has_failed: false }
+        Self {
+            file,
+            what,
+            is_unsaved: false,
+            writing: None,
+            has_failed: false,
+        }
     }
 
     /// Has the next save write.
@@ -43,10 +49,19 @@ impl StateWriter {
     }
 
     /// Writes `state()` if it has changed. A failure is logged when it begins.
-    pub async fn save<T: Serialize + Send + 'static>(&mut self, state: impl FnOnce() -> T) -> SaveOutcome {
-        let Some(file) = &self.file else { return SaveOutcome::Unchanged };
+    pub async fn save<T: Serialize + Send + 'static>(
+        &mut self,
+        state: impl FnOnce() -> T,
+    ) -> SaveOutcome {
+        let Some(file) = &self.file else {
+            return SaveOutcome::Unchanged;
+        };
         // A write that is still under way was waited for before.
-        let patience = if self.writing.is_some() { Duration::ZERO } else { DISK_TIMEOUT };
+        let patience = if self.writing.is_some() {
+            Duration::ZERO
+        } else {
+            DISK_TIMEOUT
+        };
         if self.writing.is_none() {
             if !std::mem::take(&mut self.is_unsaved) {
                 return SaveOutcome::Unchanged;
@@ -54,7 +69,9 @@ impl StateWriter {
             let (file, state) = (file.clone(), state());
             self.writing = Some(tokio::task::spawn_blocking(move || file.save(&state)));
         }
-        let Some(writing) = &mut self.writing else { return SaveOutcome::Unchanged };
+        let Some(writing) = &mut self.writing else {
+            return SaveOutcome::Unchanged;
+        };
         let written = match tokio::time::timeout(patience, writing).await {
             Ok(written) => {
                 self.writing = None;
@@ -65,7 +82,9 @@ impl StateWriter {
         // After a late answer too: the state may have changed since.
         self.is_unsaved |= written.is_err();
         let had_failed = std::mem::replace(&mut self.has_failed, written.is_err());
-        let Err(error) = written else { return SaveOutcome::Written };
+        let Err(error) = written else {
+            return SaveOutcome::Written;
+        };
         if !had_failed {
             tracing::warn!(path = %file.path().display(), %error, "{} not saved, tried again", self.what);
         }
@@ -97,7 +116,10 @@ mod tests {
     #[tokio::test]
     async fn a_disk_that_hangs_is_waited_for_once_and_what_changed_meanwhile_is_written() {
         let directory = tempfile::tempdir().unwrap();
-        let (lot, euclid) = (NodeName::from_static("lot-1"), NodeName::from_static("euclid"));
+        let (lot, euclid) = (
+            NodeName::from_static("lot-1"),
+            NodeName::from_static("euclid"),
+        );
         let file = StateFile::new(directory.path(), &lot, &euclid, "counts");
         let mut writer = StateWriter::new(Some(file.clone()), "counts");
         assert_eq!(writer.save(|| 1).await, SaveOutcome::Unchanged);
@@ -105,14 +127,19 @@ mod tests {
         let (release, hang) = channel();
         writer.note_change();
         let begun = Instant::now();
-        assert_eq!(writer.save(|| Hanging(Mutex::new(hang))).await, SaveOutcome::Failed);
+        assert_eq!(
+            writer.save(|| Hanging(Mutex::new(hang))).await,
+            SaveOutcome::Failed
+        );
         assert!(begun.elapsed() >= DISK_TIMEOUT);
         let again = tokio::time::timeout(DISK_TIMEOUT / 2, writer.save(|| 8)).await;
         assert_eq!(again, Ok(SaveOutcome::Failed));
 
         drop::<Sender<()>>(release);
         while file.load(|_| true) != Some(8) {
-            tokio::time::timeout(10 * DISK_TIMEOUT, writer.save(|| 8)).await.unwrap();
+            tokio::time::timeout(10 * DISK_TIMEOUT, writer.save(|| 8))
+                .await
+                .unwrap();
             tokio::task::yield_now().await;
         }
         assert_eq!(writer.save(|| 9).await, SaveOutcome::Unchanged);

@@ -17,7 +17,12 @@ pub(crate) struct TokenBucket {
 
 impl TokenBucket {
     pub(crate) fn new(burst: u32, interval: Duration, now: Timestamp) -> Self {
-        Self { tokens: burst, burst, interval, refilled_at: now }
+        Self {
+            tokens: burst,
+            burst,
+            interval,
+            refilled_at: now,
+        }
     }
 
     /// True if a whole burst is allowed now.
@@ -62,7 +67,12 @@ const MAX_SOURCES: usize = 8192;
 
 impl<K: Ord + Clone> KeyedThrottle<K> {
     pub(crate) fn new(burst: u32, interval: Duration) -> Self {
-        Self { burst, interval, max_sources: MAX_SOURCES, sources: BTreeMap::new() }
+        Self {
+            burst,
+            interval,
+            max_sources: MAX_SOURCES,
+            sources: BTreeMap::new(),
+        }
     }
 
     /// As many messages per second as in a burst.
@@ -73,7 +83,10 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
     /// The same with buckets for so many sources.
     #[must_use]
     pub fn with_max_sources(self, max_sources: usize) -> Self {
-        Self { max_sources, ..self }
+        Self {
+            max_sources,
+            ..self
+        }
     }
 
     /// Takes a token of a source; false when there is none.
@@ -115,9 +128,20 @@ mod tests {
     #[test]
     fn one_source_does_not_use_up_what_another_has() {
         let mut throttles = KeyedThrottle::per_second(10);
-        let mut allowed =
-            |source, ms: u64| (0..1000).filter(|_| throttles.allow(&source, Timestamp(ms * 1000))).count();
-        assert_eq!([allowed("a", 0), allowed("b", 0), allowed("a", 500), allowed("b", 5000)], [10, 10, 5, 10]);
+        let mut allowed = |source, ms: u64| {
+            (0..1000)
+                .filter(|_| throttles.allow(&source, Timestamp(ms * 1000)))
+                .count()
+        };
+        assert_eq!(
+            [
+                allowed("a", 0),
+                allowed("b", 0),
+                allowed("a", 500),
+                allowed("b", 5000)
+            ],
+            [10, 10, 5, 10]
+        );
     }
 
     #[test]
@@ -131,7 +155,20 @@ mod tests {
     #[test]
     fn a_burst_is_allowed_then_a_rate() {
         let mut throttle = TokenBucket::new(3, Duration::from_millis(10), Timestamp(0));
-        let mut allowed = |ms: u64| (0..100).filter(|_| throttle.allow(Timestamp(ms * 1000))).count();
-        assert_eq!([allowed(0), allowed(5), allowed(10), allowed(35), allowed(10_000)], [3, 0, 1, 2, 3]);
+        let mut allowed = |ms: u64| {
+            (0..100)
+                .filter(|_| throttle.allow(Timestamp(ms * 1000)))
+                .count()
+        };
+        assert_eq!(
+            [
+                allowed(0),
+                allowed(5),
+                allowed(10),
+                allowed(35),
+                allowed(10_000)
+            ],
+            [3, 0, 1, 2, 3]
+        );
     }
 }

@@ -23,13 +23,18 @@ impl CameraTroubles {
     /// Notes a trouble.
     pub fn note(&self, kind: TroubleKind, cause: &str) {
         match &self.part {
-            Some(part) => self.counters.troubles().note_about(part.as_str(), kind, cause),
+            Some(part) => self
+                .counters
+                .troubles()
+                .note_about(part.as_str(), kind, cause),
             None => self.counters.troubles().note(kind, cause),
         }
     }
 
     /// Notes that a trouble is over.
     pub fn settle(&self, kind: TroubleKind) {
-        self.counters.troubles().settle(kind, self.part.as_ref().map(NodeName::as_str));
+        self.counters
+            .troubles()
+            .settle(kind, self.part.as_ref().map(NodeName::as_str));
     }
 }

@@ -177,19 +177,32 @@ impl Counters {
     /// Counts a rejected payload, other than a report, of a node, or of a broker where the sender is not known. It is a
     /// trouble, unless elections and re-ordering explain it.
     pub fn reject(&self, reason: RejectReason, source: &str) {
-        self.reject_message(reason, source, || format!("message rejected: {}", reason.in_words()));
+        self.reject_message(reason, source, || {
+            format!("message rejected: {}", reason.in_words())
+        });
     }
 
     /// Counts a rejected payload as [`Self::reject`] does, with the cause in words.
-    pub fn reject_message(&self, reason: RejectReason, source: &str, cause: impl FnOnce() -> String) {
+    pub fn reject_message(
+        &self,
+        reason: RejectReason,
+        source: &str,
+        cause: impl FnOnce() -> String,
+    ) {
         self.count_reject(reason, source);
         if trouble_of(reason).is_some() {
-            self.troubles.note_about_with(source, TroubleKind::MessageRefused, cause);
+            self.troubles
+                .note_about_with(source, TroubleKind::MessageRefused, cause);
         }
     }
 
     /// Counts a rejected report, with the cause in words.
-    pub fn reject_report(&self, reason: RejectReason, source: &str, cause: impl FnOnce() -> String) {
+    pub fn reject_report(
+        &self,
+        reason: RejectReason,
+        source: &str,
+        cause: impl FnOnce() -> String,
+    ) {
         self.count_reject(reason, source);
         if let Some(kind) = trouble_of(reason) {
             self.troubles.note_about_with(source, kind, cause);
@@ -221,7 +234,11 @@ impl Counters {
             ShedReason::ReportReplaced => return,
             _ => "sends more than is taken, the rest is not used",
         };
-        self.troubles.note_about(source, TroubleKind::Overload, &format!("{cause} ({})", reason.as_str()));
+        self.troubles.note_about(
+            source,
+            TroubleKind::Overload,
+            &format!("{cause} ({})", reason.as_str()),
+        );
     }
 
     /// Shed messages so far, by reason and source.
@@ -241,13 +258,21 @@ impl Counters {
 
     /// All counts by label, zeros included: a metric exists before its first event.
     pub fn snapshot(&self) -> CounterSnapshot {
-        let mut shed: BTreeMap<_, _> = ShedReason::ALL.iter().map(|reason| (reason.as_str(), 0)).collect();
+        let mut shed: BTreeMap<_, _> = ShedReason::ALL
+            .iter()
+            .map(|reason| (reason.as_str(), 0))
+            .collect();
         for Shed { reason, times, .. } in self.all_shed() {
             *shed.entry(reason.as_str()).or_default() += times;
         }
         CounterSnapshot {
-            events: Event::ALL.iter().map(|event| (event.as_str(), self.events(*event))).collect(),
-            rejects: RejectReason::ALL.map(|reason| (reason.as_str(), self.rejects(reason))).into(),
+            events: Event::ALL
+                .iter()
+                .map(|event| (event.as_str(), self.events(*event)))
+                .collect(),
+            rejects: RejectReason::ALL
+                .map(|reason| (reason.as_str(), self.rejects(reason)))
+                .into(),
             shed,
         }
     }
@@ -304,7 +329,10 @@ mod tests {
         counters.reject(RejectReason::Unattested, "euclid");
         counters.reject(RejectReason::Superseded, "gauss");
         let present = counters.troubles().present();
-        let shown: Vec<_> = present.iter().map(|trouble| (&*trouble.kind, trouble.about.as_deref())).collect();
+        let shown: Vec<_> = present
+            .iter()
+            .map(|trouble| (&*trouble.kind, trouble.about.as_deref()))
+            .collect();
         assert_eq!(shown, [("message_refused", Some("euclid"))]);
         assert!(!TroubleKind::MessageRefused.refuses_reports());
     }
@@ -325,9 +353,17 @@ mod tests {
             assert_eq!(counters.events(*event), times as u64, "{event:?}");
         }
         let named = counters.rejects_by_source();
-        assert!(named.iter().all(|count| count.source == "euclid" && count.times == counters.rejects(count.reason)));
+        assert!(
+            named
+                .iter()
+                .all(|count| count.source == "euclid"
+                    && count.times == counters.rejects(count.reason))
+        );
         assert_eq!(named.len(), RejectReason::ALL.len() - 1);
         let snapshot = counters.snapshot();
-        assert_eq!((snapshot.events.len(), snapshot.rejects.len()), (Event::ALL.len(), RejectReason::ALL.len()));
+        assert_eq!(
+            (snapshot.events.len(), snapshot.rejects.len()),
+            (Event::ALL.len(), RejectReason::ALL.len())
+        );
     }
 }

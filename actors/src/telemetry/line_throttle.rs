@@ -44,10 +44,15 @@ type CodePlace = (String, u64);
 
 impl LineThrottle {
     fn allows(&self, target: &str, line: u64, now: Timestamp) -> bool {
-        let (burst, interval) =
-            if target.starts_with(OWN_TARGETS) { (OWN_BURST, OWN_INTERVAL) } else { (LIBRARY_BURST, LIBRARY_INTERVAL) };
+        let (burst, interval) = if target.starts_with(OWN_TARGETS) {
+            (OWN_BURST, OWN_INTERVAL)
+        } else {
+            (LIBRARY_BURST, LIBRARY_INTERVAL)
+        };
         let mut places = self.places.lock().unwrap_or_else(PoisonError::into_inner);
-        let bucket = places.entry((target.to_owned(), line)).or_insert_with(|| TokenBucket::new(burst, interval, now));
+        let bucket = places
+            .entry((target.to_owned(), line))
+            .or_insert_with(|| TokenBucket::new(burst, interval, now));
         let is_allowed = bucket.allow(now);
         if !is_allowed {
             LEFT_OUT.fetch_add(1, Ordering::Relaxed);
@@ -69,7 +74,10 @@ impl<S: Subscriber> Filter<S> for LineThrottle {
         let mut origin = LogRecordOrigin::default();
         event.record(&mut origin);
         let target = origin.target.as_deref().unwrap_or(metadata.target());
-        let line = origin.line.or(metadata.line().map(u64::from)).unwrap_or_default();
+        let line = origin
+            .line
+            .or(metadata.line().map(u64::from))
+            .unwrap_or_default();
         self.allows(target, line, clock::now())
     }
 }
@@ -119,7 +127,8 @@ mod tests {
     #[test]
     fn a_library_that_logs_every_packet_writes_few_lines() {
         let lines = Counter::default();
-        let subscriber = Registry::default().with(lines.clone().with_filter(LineThrottle::default()));
+        let subscriber =
+            Registry::default().with(lines.clone().with_filter(LineThrottle::default()));
         tracing::subscriber::with_default(subscriber, || {
             for _ in 0..10_000 {
                 tracing::warn!(target: "rmqtt::session", "Subscribe failed");
@@ -142,7 +151,9 @@ mod tests {
         let throttle = LineThrottle::default();
         let written = |second: u64| {
             let at = Timestamp(second * 1_000_000);
-            (0..100).filter(|_| throttle.allows("rmqtt::session", 1, at)).count()
+            (0..100)
+                .filter(|_| throttle.allows("rmqtt::session", 1, at))
+                .count()
         };
         assert_eq!([written(1), written(2), written(31)], [10, 0, 3]);
     }

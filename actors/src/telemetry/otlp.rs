@@ -9,7 +9,8 @@ use std::time::{Duration, SystemTime};
 
 use ecod::model::time::Timestamp;
 use opentelemetry::trace::{
-    Link, SpanBuilder, SpanContext, SpanId, TraceContextExt, TraceFlags, TraceId, TraceState, Tracer, TracerProvider,
+    Link, SpanBuilder, SpanContext, SpanId, TraceContextExt, TraceFlags, TraceId, TraceState,
+    Tracer, TracerProvider,
 };
 use opentelemetry::{Context, KeyValue};
 use opentelemetry_otlp::SpanExporter;
@@ -83,18 +84,28 @@ impl Tracer for NamingTracer {
                 }
                 "ecod.parent" => remote = Some(context(&value)),
                 "ecod.links" => {
-                    builder.links =
-                        Some(value.split_whitespace().map(|name| Link::with_context(context(name))).collect());
+                    builder.links = Some(
+                        value
+                            .split_whitespace()
+                            .map(|name| Link::with_context(context(name)))
+                            .collect(),
+                    );
                 }
                 "ecod.since_us" => {
-                    builder.start_time = value.parse().ok().and_then(|since| on_this_clock(Timestamp(since)));
+                    builder.start_time = value
+                        .parse()
+                        .ok()
+                        .and_then(|since| on_this_clock(Timestamp(since)));
                 }
                 _ => return true,
             }
             false
         });
         builder.attributes = Some(attributes);
-        let parent = remote.map_or_else(|| parent.clone(), |remote| parent.with_remote_span_context(remote));
+        let parent = remote.map_or_else(
+            || parent.clone(),
+            |remote| parent.with_remote_span_context(remote),
+        );
         NAMED.set(name);
         let span = self.0.build_with_context(builder, &parent);
         NAMED.set(None);
@@ -123,7 +134,13 @@ impl IdGenerator for NamedIds {
 
 fn context(name: &str) -> SpanContext {
     let id = id(name);
-    SpanContext::new(trace_id(id), span_id(id), TraceFlags::SAMPLED, true, TraceState::default())
+    SpanContext::new(
+        trace_id(id),
+        span_id(id),
+        TraceFlags::SAMPLED,
+        true,
+        TraceState::default(),
+    )
 }
 
 fn id(name: &str) -> Uuid {

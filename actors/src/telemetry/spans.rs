@@ -51,7 +51,11 @@ pub struct RoundId<'a> {
 impl Spans {
     /// Spans of a node of a cell.
     pub fn new(cell: NodeName, node: NodeName) -> Self {
-        Self { cell, node, clock: CellClock::default() }
+        Self {
+            cell,
+            node,
+            clock: CellClock::default(),
+        }
     }
 
     /// The same for a node that dates its messages by this clock.
@@ -73,7 +77,10 @@ impl Spans {
     /// Notes a report that the present round has taken.
     pub fn note(&self, report: &ObjectReport, received_at: Timestamp, reports: &mut RoundReports) {
         if span_enabled!(Level::INFO) {
-            reports.0.entry((report.node.clone(), report.captured_at_us)).or_insert(received_at);
+            reports
+                .0
+                .entry((report.node.clone(), report.captured_at_us))
+                .or_insert(received_at);
         }
     }
 
@@ -81,7 +88,9 @@ impl Spans {
     /// span in the trace of its frame.
     pub fn round(&self, fused: &Fused, reports: &RoundReports) -> Span {
         let of_map = fused.map.as_ref().map(RoundId::from);
-        let Some(round) = of_map.or_else(|| fused.verdicts.as_ref().map(RoundId::from)) else { return Span::none() };
+        let Some(round) = of_map.or_else(|| fused.verdicts.as_ref().map(RoundId::from)) else {
+            return Span::none();
+        };
         if !span_enabled!(Level::INFO) {
             return Span::none();
         }
@@ -117,7 +126,12 @@ impl Spans {
     }
 
     /// Acceptance of a map or verdicts, in the trace of the round.
-    pub fn accept<'a>(&self, payload: &'static str, round: impl Into<RoundId<'a>>, received_at: Timestamp) -> Span {
+    pub fn accept<'a>(
+        &self,
+        payload: &'static str,
+        round: impl Into<RoundId<'a>>,
+        received_at: Timestamp,
+    ) -> Span {
         let round = round.into();
         info_span!(
             parent: None,
@@ -136,20 +150,48 @@ impl Spans {
     }
 
     fn round_name(&self, round: RoundId<'_>) -> impl fmt::Display {
-        let RoundId { aggregator, epoch, round, fused_at } = round;
-        fmt::from_fn(move |f| write!(f, "{}/{aggregator}/{epoch}/{round}/{}", self.cell, fused_at.micros()))
+        let RoundId {
+            aggregator,
+            epoch,
+            round,
+            fused_at,
+        } = round;
+        fmt::from_fn(move |f| {
+            write!(
+                f,
+                "{}/{aggregator}/{epoch}/{round}/{}",
+                self.cell,
+                fused_at.micros()
+            )
+        })
     }
 }
 
 impl<'a> From<&'a GlobalMap> for RoundId<'a> {
     fn from(map: &'a GlobalMap) -> Self {
-        Self { aggregator: &map.aggregator, epoch: map.epoch, round: map.round, fused_at: map.fused_at_us }
+        Self {
+            aggregator: &map.aggregator,
+            epoch: map.epoch,
+            round: map.round,
+            fused_at: map.fused_at_us,
+        }
     }
 }
 
 impl<'a> From<&'a Verdicts> for RoundId<'a> {
     fn from(verdicts: &'a Verdicts) -> Self {
-        let Verdicts { aggregator, epoch, round, fused_at_us, .. } = verdicts;
-        Self { aggregator, epoch: *epoch, round: *round, fused_at: *fused_at_us }
+        let Verdicts {
+            aggregator,
+            epoch,
+            round,
+            fused_at_us,
+            ..
+        } = verdicts;
+        Self {
+            aggregator,
+            epoch: *epoch,
+            round: *round,
+            fused_at: *fused_at_us,
+        }
     }
 }

@@ -26,13 +26,23 @@ impl Troubles {
 
     /// The same with a cause that is put into words only if they are needed.
     pub fn note_about_with(&self, about: &str, kind: TroubleKind, cause: impl FnOnce() -> String) {
-        let news = self.register().note_with(kind, Some(about), cause, kind.remedy(), clock::now());
+        let news = self
+            .register()
+            .note_with(kind, Some(about), cause, kind.remedy(), clock::now());
         log(news);
     }
 
     /// Notes a trouble of this node itself, or about another, with a remedy of its own.
-    pub fn note_with_remedy(&self, about: Option<&str>, kind: TroubleKind, cause: &str, remedy: &str) {
-        let news = self.register().note_with(kind, about, || cause.to_owned(), remedy, clock::now());
+    pub fn note_with_remedy(
+        &self,
+        about: Option<&str>,
+        kind: TroubleKind,
+        cause: &str,
+        remedy: &str,
+    ) {
+        let news =
+            self.register()
+                .note_with(kind, about, || cause.to_owned(), remedy, clock::now());
         log(news);
     }
 
@@ -45,7 +55,9 @@ impl Troubles {
     pub fn leave_cell(&self) {
         use TroubleKind::{BrokerRefuses, Description, NoOrigin};
         let mut register = self.register();
-        [BrokerRefuses, Description, NoOrigin].into_iter().for_each(|kind| register.settle_all(kind));
+        [BrokerRefuses, Description, NoOrigin]
+            .into_iter()
+            .for_each(|kind| register.settle_all(kind));
     }
 
     /// The present troubles, the node's own first.
@@ -59,7 +71,15 @@ impl Troubles {
 }
 
 fn log(news: Option<Trouble>) {
-    let Some(Trouble { kind, about, cause, remedy }) = news else { return };
+    let Some(Trouble {
+        kind,
+        about,
+        cause,
+        remedy,
+    }) = news
+    else {
+        return;
+    };
     match about {
         Some(about) => tracing::warn!(kind, about, remedy, "{cause}"),
         None => tracing::warn!(kind, remedy, "{cause}"),

@@ -98,7 +98,10 @@ pub struct CityFiles {
 }
 
 /// Writes one message, a line of JSON.
-async fn write_line(stream: &mut (impl AsyncWrite + Unpin), message: &impl Serialize) -> std::io::Result<()> {
+async fn write_line(
+    stream: &mut (impl AsyncWrite + Unpin),
+    message: &impl Serialize,
+) -> std::io::Result<()> {
     let line = serde_json::to_string(message)? + "\n";
     stream.write_all(line.as_bytes()).await?;
     stream.flush().await
@@ -145,65 +148,124 @@ mod tests {
     /// The same for others, too.
     async fn host_for(wait: Duration, others: &[&'static str]) -> Scene {
         let directory = tempfile::tempdir().unwrap();
-        let authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
+        let authority = Authority::init(
+            directory.path(),
+            &NodeName::from_static("lot"),
+            clock::now(),
+        )
+        .unwrap();
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
         let addresses = vec![listener.local_addr().unwrap()];
-        let mut host = Host::new(authority, "a key of the cell".into(), vec!["10.0.0.1:1".into()], None).unwrap();
+        let mut host = Host::new(
+            authority,
+            "a key of the cell".into(),
+            vec!["10.0.0.1:1".into()],
+            None,
+        )
+        .unwrap();
         for other in others {
-            host.invite(&NodeName::from_static(other), Role::Cav, addresses.clone()).unwrap();
+            host.invite(&NodeName::from_static(other), Role::Cav, addresses.clone())
+                .unwrap();
         }
-        let token = host.invite(&NodeName::from_static("gauss"), Role::Cav, addresses).unwrap();
+        let token = host
+            .invite(&NodeName::from_static("gauss"), Role::Cav, addresses)
+            .unwrap();
         let visits = Arc::<Mutex<Vec<String>>>::default();
         let noted = Arc::clone(&visits);
         let tell = move |visit| noted.lock().unwrap().push(format!("{visit:?}"));
         let serving = tokio::spawn(host.serve(listener, Instant::now() + wait, tell));
-        Scene { directory, token, visits, serving }
+        Scene {
+            directory,
+            token,
+            visits,
+            serving,
+        }
     }
 
     fn revoked(directory: &TempDir) -> usize {
-        std::fs::read_to_string(directory.path().join("issued.json")).unwrap().matches("revoked_at_us").count()
+        std::fs::read_to_string(directory.path().join("issued.json"))
+            .unwrap()
+            .matches("revoked_at_us")
+            .count()
     }
 
     #[tokio::test]
     async fn a_guest_that_loses_what_it_got_comes_again_and_then_no_more() {
-        let Scene { directory, token, serving, .. } = host(SOON).await;
+        let Scene {
+            directory,
+            token,
+            serving,
+            ..
+        } = host(SOON).await;
         let lost = redeem(&token).await.unwrap();
         drop(lost);
         assert_eq!(revoked(&directory), 0);
         let joined = redeem(&token).await.unwrap();
         assert_eq!(revoked(&directory), 1, "the certificate that was lost");
         let welcome = &joined.welcome;
-        assert_eq!((welcome.cell.as_str(), welcome.role, &*welcome.cell_key), ("lot", Role::Cav, "a key of the cell"));
+        assert_eq!(
+            (welcome.cell.as_str(), welcome.role, &*welcome.cell_key),
+            ("lot", Role::Cav, "a key of the cell")
+        );
         let certificate = <rustls::pki_types::CertificateDer<'_> as rustls::pki_types::pem::PemObject>::from_pem_slice(
             welcome.certificate.as_bytes(),
         );
         let subject = CertificateSubject::of(&certificate.unwrap()).unwrap();
         assert!(subject.name().as_str() == "gauss" && !subject.may_serve());
         joined.keep().await.unwrap();
-        assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), [], "nobody is waited for");
-        assert!(matches!(redeem(&token).await, Err(JoinError::Unreachable { .. })));
+        assert_eq!(
+            timeout(SOON, serving).await.unwrap().unwrap(),
+            [],
+            "nobody is waited for"
+        );
+        assert!(matches!(
+            redeem(&token).await,
+            Err(JoinError::Unreachable { .. })
+        ));
     }
 
     #[tokio::test]
     async fn guests_that_have_not_joined_in_time_are_named_and_find_nobody() {
         let (wait, began) = (Duration::from_secs(2), Instant::now());
-        let Scene { token, mut serving, directory: _kept, .. } = host_for(wait, &["euclid", "noether"]).await;
+        let Scene {
+            token,
+            mut serving,
+            directory: _kept,
+            ..
+        } = host_for(wait, &["euclid", "noether"]).await;
         redeem(&token).await.unwrap().keep().await.unwrap();
-        assert!(timeout(wait / 2, &mut serving).await.is_err(), "the others have time");
+        assert!(
+            timeout(wait / 2, &mut serving).await.is_err(),
+            "the others have time"
+        );
         let left = timeout(SOON, serving).await.unwrap().unwrap();
         assert_eq!(left, ["euclid", "noether"].map(NodeName::from_static));
         assert!(began.elapsed() >= wait);
-        assert!(matches!(redeem(&token).await, Err(JoinError::Unreachable { .. })));
+        assert!(matches!(
+            redeem(&token).await,
+            Err(JoinError::Unreachable { .. })
+        ));
     }
 
     #[tokio::test]
     async fn of_two_with_one_token_the_later_joins_and_both_are_told_of() {
-        let Scene { directory, token, visits, serving } = host(SOON).await;
+        let Scene {
+            directory,
+            token,
+            visits,
+            serving,
+        } = host(SOON).await;
         let first = redeem(&token).await.unwrap();
         let second = redeem(&token).await.unwrap();
         // It is revoked already, so its word is not the node's.
         first.keep().await.unwrap();
-        let told = |text: &str| visits.lock().unwrap().iter().any(|visit| visit.contains(text));
+        let told = |text: &str| {
+            visits
+                .lock()
+                .unwrap()
+                .iter()
+                .any(|visit| visit.contains(text))
+        };
         let deadline = Instant::now() + SOON;
         while !told("used again") {
             assert!(Instant::now() < deadline, "{:?}", visits.lock().unwrap());
@@ -218,46 +280,103 @@ mod tests {
     #[tokio::test]
     async fn strangers_that_say_nothing_hold_a_guest_up_for_as_long_as_a_conversation_may_last() {
         const STRANGERS: usize = host::MAX_VISITS + 6;
-        let Scene { token, serving, directory: _directory, .. } = host(CONVERSATION_TIME + SOON).await;
+        let Scene {
+            token,
+            serving,
+            directory: _directory,
+            ..
+        } = host(CONVERSATION_TIME + SOON).await;
         let mut silent = Vec::new();
         for _ in 0..STRANGERS {
-            silent.push(tokio::net::TcpStream::connect(token.addresses[0]).await.unwrap());
+            silent.push(
+                tokio::net::TcpStream::connect(token.addresses[0])
+                    .await
+                    .unwrap(),
+            );
         }
         let began = Instant::now();
         let refused = redeem(&token).await.err();
-        assert!(matches!(refused, Some(JoinError::Unreachable { .. })), "{refused:?}");
+        assert!(
+            matches!(refused, Some(JoinError::Unreachable { .. })),
+            "{refused:?}"
+        );
         let joined = loop {
             if let Ok(joined) = redeem(&token).await {
                 break joined;
             }
-            assert!(began.elapsed() < CONVERSATION_TIME + SOON, "held up for ever");
+            assert!(
+                began.elapsed() < CONVERSATION_TIME + SOON,
+                "held up for ever"
+            );
         };
-        assert!(began.elapsed() < CONVERSATION_TIME + Duration::from_secs(5), "{:?}", began.elapsed());
+        assert!(
+            began.elapsed() < CONVERSATION_TIME + Duration::from_secs(5),
+            "{:?}",
+            began.elapsed()
+        );
         joined.keep().await.unwrap();
         assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), []);
     }
 
     #[tokio::test]
     async fn other_names_secrets_and_hosts_get_nothing() {
-        let Scene { token, visits, serving, directory } = host(Duration::from_secs(3)).await;
-        let secret = Token { secret: [0; 16], ..token.clone() };
-        let name = Token { node: NodeName::from_static("edge"), ..token.clone() };
+        let Scene {
+            token,
+            visits,
+            serving,
+            directory,
+        } = host(Duration::from_secs(3)).await;
+        let secret = Token {
+            secret: [0; 16],
+            ..token.clone()
+        };
+        let name = Token {
+            node: NodeName::from_static("edge"),
+            ..token.clone()
+        };
         for token in [secret, name] {
             let refused = redeem(&token).await.err();
-            assert!(matches!(refused, Some(JoinError::Refused(_))), "{refused:?}");
+            assert!(
+                matches!(refused, Some(JoinError::Refused(_))),
+                "{refused:?}"
+            );
         }
-        let other_host = Token { fingerprint: [0; 32], ..token.clone() };
+        let other_host = Token {
+            fingerprint: [0; 32],
+            ..token.clone()
+        };
         let refused = redeem(&other_host).await.err();
-        assert!(matches!(refused, Some(JoinError::Unreachable { .. })), "{refused:?}");
+        assert!(
+            matches!(refused, Some(JoinError::Unreachable { .. })),
+            "{refused:?}"
+        );
         // Strangers that say nothing take no guest's place.
         let mut silent = Vec::new();
         for _ in 0..20 {
-            silent.push(tokio::net::TcpStream::connect(token.addresses[0]).await.unwrap());
+            silent.push(
+                tokio::net::TcpStream::connect(token.addresses[0])
+                    .await
+                    .unwrap(),
+            );
         }
         drop(redeem(&token).await.unwrap());
-        assert_eq!(timeout(SOON, serving).await.unwrap().unwrap(), [token.node], "it has not kept it");
+        assert_eq!(
+            timeout(SOON, serving).await.unwrap().unwrap(),
+            [token.node],
+            "it has not kept it"
+        );
         assert_eq!(revoked(&directory), 1, "what was not kept is not valid");
-        assert!(visits.lock().unwrap().iter().all(|visit| visit.starts_with("Failed")));
-        assert!(!std::fs::read_to_string(directory.path().join("issued.json")).unwrap().contains("\"edge\""));
+        assert!(
+            visits
+                .lock()
+                .unwrap()
+                .iter()
+                .all(|visit| visit.starts_with("Failed"))
+        );
+        assert!(
+            !std::fs::read_to_string(directory.path().join("issued.json"))
+                .unwrap()
+                .contains("\"edge\"")
+        );
     }
 }

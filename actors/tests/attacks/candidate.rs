@@ -93,13 +93,24 @@ const PAUSE: Duration = Duration::from_millis(20);
 pub(crate) const TERMS: [u64; 3] = [1, 2, 3];
 
 async fn flood(target: Target) -> anyhow::Result<()> {
-    let map = publish(&format!("ecod/v1/{CELL}/global_detections"), &vec![b'x'; 8_000_000]);
-    join_all((0..30).map(|_| send_for_ever(&target, (&target.candidate, CANDIDATE), &[], &map))).await;
+    let map = publish(
+        &format!("ecod/v1/{CELL}/global_detections"),
+        &vec![b'x'; 8_000_000],
+    );
+    join_all((0..30).map(|_| send_for_ever(&target, (&target.candidate, CANDIDATE), &[], &map)))
+        .await;
     Ok(())
 }
 
 pub(crate) async fn join(target: &Target, role: Role) -> anyhow::Result<Insider> {
-    Insider::join(target, (CANDIDATE, role), Some(Arc::clone(&target.credentials))).await?.admitted().await
+    Insider::join(
+        target,
+        (CANDIDATE, role),
+        Some(Arc::clone(&target.credentials)),
+    )
+    .await?
+    .admitted()
+    .await
 }
 
 /// Claims a lead that its certificate does not allow.
@@ -117,14 +128,28 @@ async fn beats(target: Target, round: u64) -> anyhow::Result<()> {
 }
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {
-    join(&target, Role::Auto).await?.repeat(MAX_TERM, None, Body::Status { over: None, no_login: Vec::new() }).await
+    join(&target, Role::Auto)
+        .await?
+        .repeat(
+            MAX_TERM,
+            None,
+            Body::Status {
+                over: None,
+                no_login: Vec::new(),
+            },
+        )
+        .await
 }
 
 async fn largest_round(target: Target) -> anyhow::Result<()> {
     let epoch = |term| Epoch::new(term, NodeName::from_static(LEADER));
     let map = |term| GlobalMap::new(&epoch(term), MAX_INTEGER, clock::now());
-    let maps =
-        TERMS.map(|term| publish(&format!("ecod/v1/{CELL}/global_detections"), &encode(&map(term), Encoding::Json)));
+    let maps = TERMS.map(|term| {
+        publish(
+            &format!("ecod/v1/{CELL}/global_detections"),
+            &encode(&map(term), Encoding::Json),
+        )
+    });
     publish_for_ever(&target, &maps).await
 }
 
@@ -145,11 +170,18 @@ pub(crate) async fn publish_for_ever(target: &Target, packets: &[Vec<u8>]) -> an
 async fn forged_evidence(target: Target) -> anyhow::Result<()> {
     let _member = join(&target, Role::Auto).await?;
     let signer = EvidenceSigner::new(NodeName::from_static(CELL), Arc::clone(&target.credentials));
-    let shares =
-        TERMS.into_iter().flat_map(|term| [(term, LEADER), (term, CANDIDATE)]).flat_map(|(term, aggregator)| {
+    let shares = TERMS
+        .into_iter()
+        .flat_map(|term| [(term, LEADER), (term, CANDIDATE)])
+        .flat_map(|(term, aggregator)| {
             let share = inverted(CANDIDATE, term, aggregator);
             [Some(share.clone()), signer.sign(share)]
         });
-    let packet = |share| publish(&format!("ecod/v1/{CELL}/ledger/{CANDIDATE}"), &encode(&share, Encoding::Json));
+    let packet = |share| {
+        publish(
+            &format!("ecod/v1/{CELL}/ledger/{CANDIDATE}"),
+            &encode(&share, Encoding::Json),
+        )
+    };
     publish_for_ever(&target, &shares.flatten().map(packet).collect::<Vec<_>>()).await
 }

@@ -33,7 +33,11 @@ pub(crate) const CELL: &str = "lot";
 const KEY: &str = "5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e5e";
 
 /// The nodes: the edge, a candidate, and the vehicle whose map log is read.
-pub(crate) const NODES: [(&str, Role); 3] = [("edge", Role::Edge), ("v01", Role::Auto), ("v02", Role::Cav)];
+pub(crate) const NODES: [(&str, Role); 3] = [
+    ("edge", Role::Edge),
+    ("v01", Role::Auto),
+    ("v02", Role::Cav),
+];
 
 /// The vehicle, and the node that may lead, whose certificates the attackers hold. Some rows take more vehicles than follow
 /// the leader honestly.
@@ -91,7 +95,11 @@ pub(crate) enum Victim {
 
 impl Victim {
     pub(crate) fn name(self) -> &'static str {
-        if self == Self::Leader { "leader" } else { "standby" }
+        if self == Self::Leader {
+            "leader"
+        } else {
+            "standby"
+        }
     }
 }
 
@@ -138,25 +146,41 @@ impl Cell {
         fs::create_dir(home.join("frames"))?;
         fs::write(home.join("frames/0.ppm"), grey_frame())?;
         fs::write(home.join("detections.jsonl"), DETECTIONS)?;
-        let mut authority = Authority::init(&home.join("pki"), &NodeName::new(CELL)?, clock::now())?;
+        let mut authority =
+            Authority::init(&home.join("pki"), &NodeName::new(CELL)?, clock::now())?;
         let [gauss, noether, hopper] = VEHICLES.map(|name| issue(&mut authority, name, Role::Cav));
         let vehicles = [gauss?, noether?, hopper?];
         let candidate = issue(&mut authority, CANDIDATE, Role::Auto)?;
-        let mut elsewhere = Authority::init(&home.join("elsewhere"), &NodeName::new(CELL)?, clock::now())?;
+        let mut elsewhere =
+            Authority::init(&home.join("elsewhere"), &NodeName::new(CELL)?, clock::now())?;
         let foreign = issue(&mut elsewhere, key_holder::NAME, Role::Edge)?;
-        let foreign = TlsConfig { ca: authority.ca(), revocation_list: None, ..foreign };
-        let network = network::has_namespaces().then(|| Bridged::new(NODES.len())).transpose()?;
+        let foreign = TlsConfig {
+            ca: authority.ca(),
+            revocation_list: None,
+            ..foreign
+        };
+        let network = network::has_namespaces()
+            .then(|| Bridged::new(NODES.len()))
+            .transpose()?;
         let mut ports = Ports::new();
         let mut addresses = Vec::new();
         for index in 0..NODES.len() {
-            let ip = network.as_ref().map_or(Ipv4Addr::LOCALHOST, |_| network::address(index));
-            let [broker, gossip] = [ports.free()?, ports.free()?].map(|port| SocketAddr::from((ip, port)));
+            let ip = network
+                .as_ref()
+                .map_or(Ipv4Addr::LOCALHOST, |_| network::address(index));
+            let [broker, gossip] =
+                [ports.free()?, ports.free()?].map(|port| SocketAddr::from((ip, port)));
             addresses.push((broker, gossip));
         }
         let seeds: Vec<SocketAddr> = addresses.iter().map(|(_, gossip)| *gossip).collect();
         let mut nodes = Vec::new();
-        for (index, ((name, role), (broker, gossip))) in NODES.into_iter().zip(addresses).enumerate() {
-            let rights = Rights { may_describe: name == LEADER, ..Rights::from(role) };
+        for (index, ((name, role), (broker, gossip))) in
+            NODES.into_iter().zip(addresses).enumerate()
+        {
+            let rights = Rights {
+                may_describe: name == LEADER,
+                ..Rights::from(role)
+            };
             let mut tls = issue(&mut authority, name, rights)?;
             let directory = home.join(name);
             fs::create_dir(&directory)?;
@@ -170,14 +194,35 @@ impl Cell {
             fs::write(directory.join("node.toml"), text)?;
             let namespace = network.as_ref().map(|_| network::namespace(index));
             let mut command = command(&program(), namespace.as_deref());
+            command.env_clear().envs(
+                std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")),
+            );
+            command.args([
+                "--log-format",
+                "text",
+                "--config",
+                "node.toml",
+                "--map-log",
+                "maps.jsonl",
+            ]);
             command
-                .env_clear()
-                .envs(std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")));
-            command.args(["--log-format", "text", "--config", "node.toml", "--map-log", "maps.jsonl"]);
-            command.stderr(File::create(directory.join("node.log"))?).current_dir(&directory);
-            nodes.push(Node { name, broker, gossip, process: Process::start(&mut command)? });
+                .stderr(File::create(directory.join("node.log"))?)
+                .current_dir(&directory);
+            nodes.push(Node {
+                name,
+                broker,
+                gossip,
+                process: Process::start(&mut command)?,
+            });
         }
-        Ok(Self { nodes, network, vehicles, candidate, foreign, directory })
+        Ok(Self {
+            nodes,
+            network,
+            vehicles,
+            candidate,
+            foreign,
+            directory,
+        })
     }
 
     /// Waits until maps hold the reports of all honest vehicles, and have done so for a while.
@@ -186,7 +231,12 @@ impl Cell {
         loop {
             tokio::time::sleep(Duration::from_millis(250)).await;
             let ended = self.ended()?;
-            ensure!(ended.is_empty(), "ended at once: {}, files in {:?}", ended.join(", "), self.keep());
+            ensure!(
+                ended.is_empty(),
+                "ended at once: {}, files in {:?}",
+                ended.join(", "),
+                self.keep()
+            );
             let since = Timestamp(clock::now().micros() - SETTLED.as_micros() as u64);
             let maps = self.maps(since)?;
             let is_whole = |line: &Line| line.map.reporters().is_superset(&honest());
@@ -202,14 +252,19 @@ impl Cell {
 
     /// Knowledge and secrets for an attacker.
     pub(crate) fn target(&self, victim: Victim) -> anyhow::Result<Target> {
-        let load = |files, name| Credentials::load(files, &NodeName::from_static(name)).map(Arc::new);
-        let client = |files, name| load(files, name).map(|loaded| Arc::clone(&loaded.current().client));
+        let load =
+            |files, name| Credentials::load(files, &NodeName::from_static(name)).map(Arc::new);
+        let client =
+            |files, name| load(files, name).map(|loaded| Arc::clone(&loaded.current().client));
         Ok(Target {
             deeds: Arc::default(),
             broker: self.nodes[usize::from(victim == Victim::Standby)].broker,
             standby: self.nodes[1].broker,
             gossip: self.nodes.iter().map(|node| node.gossip).collect(),
-            from: self.network.as_ref().map_or(ELSEWHERE, |_| network::HARNESS),
+            from: self
+                .network
+                .as_ref()
+                .map_or(ELSEWHERE, |_| network::HARNESS),
             key: KEY,
             vehicle: client(&self.vehicles[0], VEHICLE)?,
             candidate: client(&self.candidate, CANDIDATE)?,
@@ -229,7 +284,8 @@ impl Cell {
     pub(crate) fn mark(&self) -> anyhow::Result<Timestamp> {
         // Writing 5 sets the peak of memory back to what is used now.
         for node in &self.nodes[..2] {
-            fs::write(format!("/proc/{}/clear_refs", node.process.id()), "5").context("peak memory of a broker")?;
+            fs::write(format!("/proc/{}/clear_refs", node.process.id()), "5")
+                .context("peak memory of a broker")?;
         }
         Ok(clock::now())
     }
@@ -242,11 +298,21 @@ impl Cell {
         Ok(Outcome {
             maps: maps.len(),
             expected: (time.as_millis() / ROUND.as_millis()) as usize,
-            honest: maps.iter().filter(|line| line.map.reporters().is_superset(&honest())).count(),
+            honest: maps
+                .iter()
+                .filter(|line| line.map.reporters().is_superset(&honest()))
+                .count(),
             longest_gap_ms: longest_gap_ms(&maps, from),
-            is_replaced: maps.last().is_some_and(|line| line.map.aggregator != LEADER),
-            rss_mb: if ended.is_empty() { self.peak_memory_mb()? } else { 0 },
-            believed_lies: maps.iter().filter(|line| !line.map.is_true()).count() + self.believers(means)?,
+            is_replaced: maps
+                .last()
+                .is_some_and(|line| line.map.aggregator != LEADER),
+            rss_mb: if ended.is_empty() {
+                self.peak_memory_mb()?
+            } else {
+                0
+            },
+            believed_lies: maps.iter().filter(|line| !line.map.is_true()).count()
+                + self.believers(means)?,
             ended,
             deeds: 0,
             fault: None,
@@ -259,16 +325,27 @@ impl Cell {
         let text = fs::read_to_string(&file).unwrap_or_default();
         let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
         let lines = whole.lines().map(serde_json::from_str::<Line>);
-        let lines = lines.collect::<Result<Vec<_>, _>>().with_context(|| file.display().to_string())?;
-        Ok(lines.into_iter().filter(|line| line.received_at_us >= since).collect())
+        let lines = lines
+            .collect::<Result<Vec<_>, _>>()
+            .with_context(|| file.display().to_string())?;
+        Ok(lines
+            .into_iter()
+            .filter(|line| line.received_at_us >= since)
+            .collect())
     }
 
     /// Number of honest nodes that keep evidence about the vehicles of [`inverted`](crate::shares::inverted).
     fn believers(&self, means: Means) -> anyhow::Result<usize> {
         let mut believers = 0;
-        for node in self.nodes.iter().filter(|node| means != Means::Leader || node.name != LEADER) {
+        for node in self
+            .nodes
+            .iter()
+            .filter(|node| means != Means::Leader || node.name != LEADER)
+        {
             let files = fs::read_dir(self.directory.path().join(node.name).join("state"))?;
-            let states = files.map(|file| Ok(fs::read(file?.path())?)).collect::<anyhow::Result<Vec<_>>>()?;
+            let states = files
+                .map(|file| Ok(fs::read(file?.path())?))
+                .collect::<anyhow::Result<Vec<_>>>()?;
             let is_forged = |state: &Vec<u8>| state.windows(6).any(|text| text == b"\"liar\"");
             believers += usize::from(states.iter().any(is_forged));
         }
@@ -288,7 +365,10 @@ impl Cell {
     fn peak_memory_mb(&self) -> anyhow::Result<u64> {
         let peak = |node: &Node| {
             let text = fs::read_to_string(format!("/proc/{}/status", node.process.id()))?;
-            let peak = text.lines().find_map(|line| line.strip_prefix("VmHWM:")).context("no peak of memory")?;
+            let peak = text
+                .lines()
+                .find_map(|line| line.strip_prefix("VmHWM:"))
+                .context("no peak of memory")?;
             anyhow::Ok(peak.trim().trim_end_matches(" kB").parse::<u64>()? * 1024 / 1_000_000)
         };
         Ok(peak(&self.nodes[0])?.max(peak(&self.nodes[1])?))
@@ -330,15 +410,27 @@ impl Map {
     /// True if the cell made it of the reports of honest vehicles: the object that is there, or none. Beside the location there
     /// may be what members report in their own names.
     fn is_true(&self) -> bool {
-        let [landmark] = &self.landmarks[..] else { return false };
-        NODES.iter().any(|(name, role)| *name == self.aggregator && *role != Role::Cav)
+        let [landmark] = &self.landmarks[..] else {
+            return false;
+        };
+        NODES
+            .iter()
+            .any(|(name, role)| *name == self.aggregator && *role != Role::Cav)
             && landmark.label.as_deref().is_none_or(|label| label == LABEL)
             && self.reporters().is_subset(&honest())
-            && self.objects.iter().flat_map(|object| &object.contributors).all(|name| is_member(name))
+            && self
+                .objects
+                .iter()
+                .flat_map(|object| &object.contributors)
+                .all(|name| is_member(name))
     }
 
     fn reporters(&self) -> BTreeSet<&str> {
-        self.landmarks.iter().flat_map(|landmark| &landmark.contributors).map(String::as_str).collect()
+        self.landmarks
+            .iter()
+            .flat_map(|landmark| &landmark.contributors)
+            .map(String::as_str)
+            .collect()
     }
 }
 
@@ -349,20 +441,33 @@ fn is_member(name: &str) -> bool {
 
 /// Longest time without a map since `from`, up to now.
 fn longest_gap_ms(maps: &[Line], from: Timestamp) -> u64 {
-    let times = [from].into_iter().chain(maps.iter().map(|line| line.received_at_us)).chain([clock::now()]);
+    let times = [from]
+        .into_iter()
+        .chain(maps.iter().map(|line| line.received_at_us))
+        .chain([clock::now()]);
     let times: Vec<_> = times.collect();
-    let longest = times.windows(2).map(|pair| pair[1].since(pair[0])).max().unwrap_or_default();
+    let longest = times
+        .windows(2)
+        .map(|pair| pair[1].since(pair[0]))
+        .max()
+        .unwrap_or_default();
     longest.as_millis() as u64
 }
 
 /// The honest vehicles.
 fn honest() -> BTreeSet<&'static str> {
-    NODES.into_iter().filter(|(_, role)| *role != Role::Edge).map(|(name, _)| name).collect()
+    NODES
+        .into_iter()
+        .filter(|(_, role)| *role != Role::Edge)
+        .map(|(name, _)| name)
+        .collect()
 }
 
 /// The program under test.
 pub(crate) fn program() -> PathBuf {
-    std::env::var("PROGRAM").unwrap_or_else(|_| PROGRAM.to_owned()).into()
+    std::env::var("PROGRAM")
+        .unwrap_or_else(|_| PROGRAM.to_owned())
+        .into()
 }
 
 /// A picture: the vehicles see by recorded detections, but all else is as with a camera.
@@ -372,7 +477,11 @@ fn grey_frame() -> Vec<u8> {
     [header.as_bytes(), &vec![128; width * height * 3]].concat()
 }
 
-fn issue(authority: &mut Authority, name: &str, rights: impl Into<Rights>) -> anyhow::Result<TlsConfig> {
+fn issue(
+    authority: &mut Authority,
+    name: &str,
+    rights: impl Into<Rights>,
+) -> anyhow::Result<TlsConfig> {
     let name = NodeName::new(name)?;
     authority.issue(&name, rights, Duration::from_secs(86_400), clock::now())?;
     let (certificate, key) = authority.files_of(&name);
@@ -401,8 +510,17 @@ fn configuration(
         Role::Cav => "cav",
         Role::Edge => "edge",
     };
-    let TlsConfig { ca, certificate, key, revocation_list, city: _ } = tls;
-    let list = revocation_list.as_ref().map(|list| format!("revocation_list = {list:?}\n")).unwrap_or_default();
+    let TlsConfig {
+        ca,
+        certificate,
+        key,
+        revocation_list,
+        city: _,
+    } = tls;
+    let list = revocation_list
+        .as_ref()
+        .map(|list| format!("revocation_list = {list:?}\n"))
+        .unwrap_or_default();
     let mut text = format!(
         "name = \"{name}\"\ncell = \"{CELL}\"\nrole = \"{role}\"\nlisten = \"{broker}\"\nstate_dir = \"state\"\n\n\
          [membership]\nkey = \"{KEY}\"\nbind = \"{gossip}\"\nseeds = [{seeds}]\n\n\
@@ -432,8 +550,31 @@ fn a_map_is_false_that_says_more_than_honest_vehicles_have_seen() {
     assert!(map("edge", r#""car""#, r#""v01","v02""#, "") && map("v01", "null", "", ""));
     assert!(!map("gauss", r#""car""#, r#""v01""#, ""), "made by another");
     assert!(!map("edge", r#""bus""#, r#""v01""#, ""), "another object");
-    assert!(!map("edge", r#""car""#, r#""gauss""#, ""), "seen by another");
-    assert!(map("edge", r#""car""#, r#""v01""#, r#"{"contributors":["gauss"]}"#), "a member may see something else");
-    assert!(!map("edge", r#""car""#, r#""v01""#, r#"{"contributors":["zeno"]}"#), "of nobody in the cell");
-    assert!(!serde_json::from_str::<Map>(r#"{"aggregator":"edge","landmarks":[],"objects":[]}"#).unwrap().is_true());
+    assert!(
+        !map("edge", r#""car""#, r#""gauss""#, ""),
+        "seen by another"
+    );
+    assert!(
+        map(
+            "edge",
+            r#""car""#,
+            r#""v01""#,
+            r#"{"contributors":["gauss"]}"#
+        ),
+        "a member may see something else"
+    );
+    assert!(
+        !map(
+            "edge",
+            r#""car""#,
+            r#""v01""#,
+            r#"{"contributors":["zeno"]}"#
+        ),
+        "of nobody in the cell"
+    );
+    assert!(
+        !serde_json::from_str::<Map>(r#"{"aggregator":"edge","landmarks":[],"objects":[]}"#)
+            .unwrap()
+            .is_true()
+    );
 }

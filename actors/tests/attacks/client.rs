@@ -28,10 +28,15 @@ pub(crate) async fn knock(target: &Target) -> anyhow::Result<TcpStream> {
 }
 
 /// A connection with a certificate and without a login.
-pub(crate) async fn secure(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Result<TlsStream<TcpStream>> {
+pub(crate) async fn secure(
+    target: &Target,
+    tls: &Arc<ClientConfig>,
+) -> anyhow::Result<TlsStream<TcpStream>> {
     let stream = knock(target).await?;
     let server = ServerName::try_from(BROKER_NAME)?;
-    Ok(TlsConnector::from(Arc::clone(tls)).connect(server, stream).await?)
+    Ok(TlsConnector::from(Arc::clone(tls))
+        .connect(server, stream)
+        .await?)
 }
 
 /// A connection that has logged in under a node's name.
@@ -51,9 +56,17 @@ pub(crate) async fn log_in_as(
     client_id: &str,
 ) -> anyhow::Result<TlsStream<TcpStream>> {
     let mut stream = secure(target, tls).await?;
-    stream.write_all(&packet(0x10, &[b"\0\x04MQTT\x04\x02\0\0", &text(client_id)])).await?;
+    stream
+        .write_all(&packet(
+            0x10,
+            &[b"\0\x04MQTT\x04\x02\0\0", &text(client_id)],
+        ))
+        .await?;
     let mut answer = [0; 4];
-    stream.read_exact(&mut answer).await.context("no answer to the login")?;
+    stream
+        .read_exact(&mut answer)
+        .await
+        .context("no answer to the login")?;
     if answer != [0x20, 2, 0, 0] {
         bail!("the login was refused: {answer:?}");
     }

@@ -32,7 +32,13 @@ pub(crate) async fn set_without_right(target: Target) -> anyhow::Result<()> {
     let text = format!("{LANDMARK}\n[fusion.pace]\ngate_m = 0.6\n");
     let set_by = NodeName::from_static(LEADER);
     let hash = content_hash(&set_by, &text);
-    let forged = CellDescription { schema: SCHEMA_VERSION, version: 1 + MAX_VERSION_STEP, hash, set_by, text };
+    let forged = CellDescription {
+        schema: SCHEMA_VERSION,
+        version: 1 + MAX_VERSION_STEP,
+        hash,
+        set_by,
+        text,
+    };
     tokio::select! {
         ended = set_for_ever(target.clone(), &forged) => ended,
         changed = watch(&target, &right) => changed,
@@ -42,16 +48,29 @@ pub(crate) async fn set_without_right(target: Target) -> anyhow::Result<()> {
 /// States the description as a candidate, and publishes it at the broker.
 async fn set_for_ever(target: Target, forged: &CellDescription) -> anyhow::Result<()> {
     let member = join(&target, Role::Auto).await?.stating(forged.stamp());
-    let packet = [publish(&format!("ecod/v1/{CELL}/cell"), &encode(forged, Encoding::Json))];
-    let status = Body::Status { over: None, no_login: Vec::new() };
-    tokio::try_join!(member.repeat(1, None, status), publish_for_ever(&target, &packet)).map(drop)
+    let packet = [publish(
+        &format!("ecod/v1/{CELL}/cell"),
+        &encode(forged, Encoding::Json),
+    )];
+    let status = Body::Status {
+        over: None,
+        no_login: Vec::new(),
+    };
+    tokio::try_join!(
+        member.repeat(1, None, status),
+        publish_for_ever(&target, &packet)
+    )
+    .map(drop)
 }
 
 /// Fails as soon as a node does not use the right description.
 async fn watch(target: &Target, right: &str) -> anyhow::Result<()> {
     loop {
         let shown = cell(target, OBSERVED, &["show".as_ref()]).await?;
-        ensure!(is_used_by_all(&shown, right), "the right description does not count: {shown}");
+        ensure!(
+            is_used_by_all(&shown, right),
+            "the right description does not count: {shown}"
+        );
         sleep(Duration::from_millis(500)).await;
     }
 }
@@ -72,7 +91,9 @@ async fn used_by_all(target: &Target, hash: &str) -> anyhow::Result<()> {
 /// True if the observed vehicle has the description, and says that all nodes use it.
 fn is_used_by_all(shown: &str, hash: &str) -> bool {
     let states = |name: &str| {
-        let line = shown.lines().find(|line| line.starts_with(&format!("# {name}: ")));
+        let line = shown
+            .lines()
+            .find(|line| line.starts_with(&format!("# {name}: ")));
         line.is_some_and(|line| line.contains(hash) && !line.contains("not used"))
     };
     NODES.iter().all(|(name, _)| states(name)) && states(&format!("cell {CELL}"))
@@ -81,8 +102,16 @@ fn is_used_by_all(shown: &str, hash: &str) -> bool {
 /// Output of `ecod-node cell` at the door of a node.
 async fn cell(target: &Target, node: &str, arguments: &[&Path]) -> anyhow::Result<String> {
     let mut command = Command::new(program());
-    command.arg("cell").args(arguments).args(["--config", "node.toml"]).current_dir(target.home.join(node));
+    command
+        .arg("cell")
+        .args(arguments)
+        .args(["--config", "node.toml"])
+        .current_dir(target.home.join(node));
     let output = spawn_blocking(move || command.output()).await??;
-    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    ensure!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     Ok(String::from_utf8(output.stdout)?)
 }

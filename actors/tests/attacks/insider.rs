@@ -68,25 +68,42 @@ impl Insider {
         };
         let (membership, _) = Actor::spawn(None, Membership, arguments).await?;
         sleep(ADMISSION).await;
-        Ok(Self { name, role, run, membership, counters, target: target.clone(), members, description: None })
+        Ok(Self {
+            name,
+            role,
+            run,
+            membership,
+            counters,
+            target: target.clone(),
+            members,
+            description: None,
+        })
     }
 
     /// The same, once all nodes have admitted it.
     pub(crate) async fn admitted(self) -> anyhow::Result<Self> {
         let known = self.members.borrow().len();
-        anyhow::ensure!(known == self.target.gossip.len(), "admitted by {known} nodes only");
+        anyhow::ensure!(
+            known == self.target.gossip.len(),
+            "admitted by {known} nodes only"
+        );
         Ok(self)
     }
 
     /// The same, with this description of the cell.
     pub(crate) fn stating(self, description: DescriptionStamp) -> Self {
-        Self { description: Some(description), ..self }
+        Self {
+            description: Some(description),
+            ..self
+        }
     }
 
     /// Knocks for ever, and is admitted by nobody.
     pub(crate) async fn knock(&self) -> anyhow::Result<()> {
         loop {
-            self.target.deeds.store(self.counters.get(FrameEvent::Sent), Ordering::Relaxed);
+            self.target
+                .deeds
+                .store(self.counters.get(FrameEvent::Sent), Ordering::Relaxed);
             anyhow::ensure!(self.members.borrow().is_empty(), "admitted");
             sleep(Duration::from_millis(100)).await;
         }
@@ -98,7 +115,12 @@ impl Insider {
     }
 
     /// Says the same to all members, ten times a second.
-    pub(crate) async fn repeat(&self, term: u64, epoch: Option<Epoch>, body: Body) -> anyhow::Result<()> {
+    pub(crate) async fn repeat(
+        &self,
+        term: u64,
+        epoch: Option<Epoch>,
+        body: Body,
+    ) -> anyhow::Result<()> {
         for seq in 1.. {
             // It seems to be fit where it claims to lead.
             let fit = matches!(body, Body::Beat { .. });
@@ -107,7 +129,12 @@ impl Insider {
                 from: self.name.clone(),
                 run: self.run,
                 seq,
-                candidacy: Candidacy { role: self.role, priority: u8::MAX, load: 0, fit },
+                candidacy: Candidacy {
+                    role: self.role,
+                    priority: u8::MAX,
+                    load: 0,
+                    fit,
+                },
                 term,
                 epoch: epoch.clone(),
                 hears_you: true,
@@ -116,9 +143,17 @@ impl Insider {
                 body: body.clone(),
             };
             let payload = Bytes::from(message.encode(Encoding::Cbor));
-            let names: Vec<_> = self.members.borrow().iter().map(|member| member.name.clone()).collect();
+            let names: Vec<_> = self
+                .members
+                .borrow()
+                .iter()
+                .map(|member| member.name.clone())
+                .collect();
             for to in names {
-                self.membership.cast(MembershipMessage::Send { to, payload: payload.clone() })?;
+                self.membership.cast(MembershipMessage::Send {
+                    to,
+                    payload: payload.clone(),
+                })?;
                 self.target.did(1);
             }
             sleep(Duration::from_millis(100)).await;

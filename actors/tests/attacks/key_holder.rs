@@ -47,12 +47,27 @@ pub(crate) const NAME: &str = "mallory";
 
 async fn largest_term(target: Target) -> anyhow::Result<()> {
     let insider = Insider::join(&target, (NAME, Role::Cav), None).await?;
-    tokio::try_join!(insider.repeat(MAX_TERM, None, Body::Status { over: None, no_login: Vec::new() }), insider.knock())
-        .map(drop)
+    tokio::try_join!(
+        insider.repeat(
+            MAX_TERM,
+            None,
+            Body::Status {
+                over: None,
+                no_login: Vec::new()
+            }
+        ),
+        insider.knock()
+    )
+    .map(drop)
 }
 
 async fn claims(target: Target) -> anyhow::Result<()> {
-    let insider = Insider::join(&target, (NAME, Role::Edge), Some(Arc::clone(&target.foreign))).await?;
+    let insider = Insider::join(
+        &target,
+        (NAME, Role::Edge),
+        Some(Arc::clone(&target.foreign)),
+    )
+    .await?;
     let beat = Body::Beat {
         every_ms: 50,
         round: 1,
@@ -61,7 +76,11 @@ async fn claims(target: Target) -> anyhow::Result<()> {
         successors: Vec::new(),
         life: LifeSign::default(),
     };
-    tokio::try_join!(insider.repeat(1 << 20, Some(insider.epoch(1 << 20)), beat), insider.knock()).map(drop)
+    tokio::try_join!(
+        insider.repeat(1 << 20, Some(insider.epoch(1 << 20)), beat),
+        insider.knock()
+    )
+    .map(drop)
 }
 
 /// Largest datagram, and the places of kind and counter in a frame.
@@ -78,13 +97,28 @@ async fn largest_counter(target: Target) -> anyhow::Result<()> {
     for node in &target.gossip {
         taps.push((UdpSocket::bind((target.from, 0)).await?, *node));
     }
-    let gossip = taps.iter().map(|(socket, _)| socket.local_addr()).collect::<Result<_, _>>()?;
-    let through = Target { gossip, deeds: Arc::default(), ..target.clone() };
+    let gossip = taps
+        .iter()
+        .map(|(socket, _)| socket.local_addr())
+        .collect::<Result<_, _>>()?;
+    let through = Target {
+        gossip,
+        deeds: Arc::default(),
+        ..target.clone()
+    };
     let greet = async {
-        let insider = Insider::join(&through, (NAME, Role::Edge), Some(Arc::clone(&target.foreign))).await?;
+        let insider = Insider::join(
+            &through,
+            (NAME, Role::Edge),
+            Some(Arc::clone(&target.foreign)),
+        )
+        .await?;
         insider.knock().await
     };
-    let inject = try_join_all(taps.iter().map(|(socket, node)| tap(socket, *node, &target)));
+    let inject = try_join_all(
+        taps.iter()
+            .map(|(socket, node)| tap(socket, *node, &target)),
+    );
     tokio::try_join!(greet, inject).map(drop)
 }
 

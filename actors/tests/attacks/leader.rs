@@ -17,7 +17,11 @@ use crate::row::{Bar, Means, Row, UNHARMED};
 use crate::shares::inverted;
 
 /// Half a second passes until the list is read, and a second until the next leader's first map.
-const REVOKED: Bar = Bar { longest_gap_ms: Some(1500), is_replaced: Some(true), ..UNHARMED };
+const REVOKED: Bar = Bar {
+    longest_gap_ms: Some(1500),
+    is_replaced: Some(true),
+    ..UNHARMED
+};
 
 pub(crate) const ROWS: &[Row] = &[
     Row {
@@ -45,7 +49,8 @@ const BEFORE: Duration = Duration::from_secs(1);
 
 /// Its own list stays as it was.
 async fn revoked(target: Target) -> anyhow::Result<()> {
-    Authority::open(&target.home.join("pki"))?.revoke(&NodeName::from_static(LEADER), clock::now())?;
+    Authority::open(&target.home.join("pki"))?
+        .revoke(&NodeName::from_static(LEADER), clock::now())?;
     target.did(1);
     Ok(())
 }
@@ -55,14 +60,33 @@ async fn evidence_of_the_revoked(target: Target) -> anyhow::Result<()> {
     let (pki, leader) = (target.home.join("pki"), NodeName::from_static(LEADER));
     let mut authority = Authority::open(&pki)?;
     let (certificate, key) = authority.files_of(&leader);
-    let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
-    let signer = EvidenceSigner::new(NodeName::from_static(CELL), Arc::new(Credentials::load(&files, &leader)?));
+    let files = TlsConfig {
+        ca: authority.ca(),
+        certificate,
+        key,
+        revocation_list: None,
+        city: None,
+    };
+    let signer = EvidenceSigner::new(
+        NodeName::from_static(CELL),
+        Arc::new(Credentials::load(&files, &leader)?),
+    );
     let _member = join(&target, Role::Auto).await?;
-    let shares = TERMS.into_iter().filter_map(|term| signer.sign(inverted(CANDIDATE, term, LEADER)));
-    let packet = |share| publish(&format!("ecod/v1/{CELL}/ledger/{CANDIDATE}"), &encode(&share, Encoding::Json));
+    let shares = TERMS
+        .into_iter()
+        .filter_map(|term| signer.sign(inverted(CANDIDATE, term, LEADER)));
+    let packet = |share| {
+        publish(
+            &format!("ecod/v1/{CELL}/ledger/{CANDIDATE}"),
+            &encode(&share, Encoding::Json),
+        )
+    };
     let packets: Vec<_> = shares.map(packet).collect();
     // The leader's machine is the attacker's: the standby's broker is asked.
-    let standby = Target { broker: target.standby, ..target.clone() };
+    let standby = Target {
+        broker: target.standby,
+        ..target.clone()
+    };
     let revoke = async {
         sleep(BEFORE).await;
         authority.revoke(&leader, clock::now())?;

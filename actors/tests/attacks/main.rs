@@ -53,8 +53,14 @@ use crate::machine::Machine;
 use crate::row::{Outcome, Row, table};
 
 /// Kinds of attackers.
-const ATTACKERS: [&[Row]; 6] =
-    [stranger::ROWS, key_holder::ROWS, vehicle::ROWS, reports::ROWS, candidate::ROWS, leader::ROWS];
+const ATTACKERS: [&[Row]; 6] = [
+    stranger::ROWS,
+    key_holder::ROWS,
+    vehicle::ROWS,
+    reports::ROWS,
+    candidate::ROWS,
+    leader::ROWS,
+];
 
 /// Duration of an attack, and of a quick one.
 const ATTACK_TIME: Duration = Duration::from_secs(20);
@@ -80,7 +86,9 @@ async fn run_all() -> anyhow::Result<()> {
     let is_quick = std::env::var("ATTACK").is_ok_and(|mode| mode == "quick");
     let wanted = std::env::var("ROWS").unwrap_or_default();
     let is_wanted = |row: &&Row| {
-        let is_named = wanted.split(',').any(|part| row.attack.contains(part.trim()));
+        let is_named = wanted
+            .split(',')
+            .any(|part| row.attack.contains(part.trim()));
         is_named && (row.quick || !is_quick)
     };
     let time = if is_quick { QUICK_TIME } else { ATTACK_TIME };
@@ -91,17 +99,33 @@ async fn run_all() -> anyhow::Result<()> {
     for row in ATTACKERS.into_iter().flatten().filter(is_wanted) {
         for victim in [Victim::Leader, Victim::Standby] {
             if victim == Victim::Leader || (row.on_brokers && !is_quick) {
-                lines.push((row, victim, attempt(row, victim, time).await.with_context(|| row.attack)?));
+                lines.push((
+                    row,
+                    victim,
+                    attempt(row, victim, time)
+                        .await
+                        .with_context(|| row.attack)?,
+                ));
             }
         }
     }
     println!("\n{}", table(&lines));
-    let misses: Vec<_> = lines.iter().filter(|(row, _, outcome)| !row.is_met(outcome)).collect();
+    let misses: Vec<_> = lines
+        .iter()
+        .filter(|(row, _, outcome)| !row.is_met(outcome))
+        .collect();
     if lines.is_empty() {
         bail!("no row's name contains any of ROWS={wanted}");
     }
     if !misses.is_empty() {
-        bail!("bars missed: {}", misses.iter().map(|(row, ..)| row.attack).collect::<Vec<_>>().join(", "));
+        bail!(
+            "bars missed: {}",
+            misses
+                .iter()
+                .map(|(row, ..)| row.attack)
+                .collect::<Vec<_>>()
+                .join(", ")
+        );
     }
     Ok(())
 }
@@ -115,12 +139,20 @@ async fn attempt(row: &Row, victim: Victim, time: Duration) -> anyhow::Result<Ou
         if row.is_met(&outcome) || left == 0 || !machine.is_starved() {
             return Ok(outcome);
         }
-        println!("    repeated, the machine stood still: {}", machine.account());
+        println!(
+            "    repeated, the machine stood still: {}",
+            machine.account()
+        );
     }
     bail!("no attempt")
 }
 
-async fn run(row: &Row, victim: Victim, time: Duration, machine: &mut Machine) -> anyhow::Result<Outcome> {
+async fn run(
+    row: &Row,
+    victim: Victim,
+    time: Duration,
+    machine: &mut Machine,
+) -> anyhow::Result<Outcome> {
     let mut cell = Cell::start()?;
     cell.settle().await?;
     let target = cell.target(victim)?;
@@ -130,7 +162,11 @@ async fn run(row: &Row, victim: Victim, time: Duration, machine: &mut Machine) -
     machine.sleep(time).await?;
     let fault = attacker.stop().map(|error| format!("{error:#}"));
     machine.sleep(AFTERMATH).await?;
-    Ok(Outcome { deeds: deeds.load(Ordering::Relaxed), fault, ..cell.outcome(from, row.means)? })
+    Ok(Outcome {
+        deeds: deeds.load(Ordering::Relaxed),
+        fault,
+        ..cell.outcome(from, row.means)?
+    })
 }
 
 /// An attack under way, on threads of its own.
@@ -141,7 +177,10 @@ struct Attacker {
 
 impl Attacker {
     fn start(row: &Row, target: Target) -> anyhow::Result<Self> {
-        let runtime = Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(2)
+            .enable_all()
+            .build()?;
         let task = runtime.spawn((row.run)(target));
         Ok(Self { runtime, task })
     }

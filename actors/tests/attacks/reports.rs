@@ -22,14 +22,24 @@ pub(crate) const ROWS: &[Row] = &[
         deeds: (30, "reports"),
         bar: UNHARMED,
         quick: true,
-        run: |target| Box::pin(report_for_ever(target, 1, Duration::from_millis(100), leaving_the_world)),
+        run: |target| {
+            Box::pin(report_for_ever(
+                target,
+                1,
+                Duration::from_millis(100),
+                leaving_the_world,
+            ))
+        },
     },
     Row {
         attack: "a crowd of 1000 objects within 20 m, by a vehicle and 8 parts",
         means: Means::Vehicle,
         on_brokers: true,
         deeds: (100_000, "objects"),
-        bar: Bar { longest_gap_ms: Some(200), ..UNHARMED },
+        bar: Bar {
+            longest_gap_ms: Some(200),
+            ..UNHARMED
+        },
         quick: false,
         run: |target| Box::pin(report_for_ever(target, 9, Duration::from_millis(40), crowd)),
     },
@@ -48,20 +58,36 @@ pub(crate) const ROWS: &[Row] = &[
 type Objects = fn(u64) -> Vec<PerceivedObject>;
 
 fn leaving_the_world(_: u64) -> Vec<PerceivedObject> {
-    vec![PerceivedObject { velocity_mps: Some([70.0, 0.0]), ..PerceivedObject::new("car", 0.9, 1e8, 0.0) }]
+    vec![PerceivedObject {
+        velocity_mps: Some([70.0, 0.0]),
+        ..PerceivedObject::new("car", 0.9, 1e8, 0.0)
+    }]
 }
 
 fn crowd(number: u64) -> Vec<PerceivedObject> {
     let place = |index: u64| {
-        let (turn, range_m) = (TAU * (index * 89 % 1000) as f64 / 1000.0, (index % 20) as f64);
+        let (turn, range_m) = (
+            TAU * (index * 89 % 1000) as f64 / 1000.0,
+            (index % 20) as f64,
+        );
         let shift = 0.3 * (number % 7) as f64;
-        PerceivedObject::new("person", 0.9, 40.0 + shift + range_m * turn.cos(), 40.0 + range_m * turn.sin())
+        PerceivedObject::new(
+            "person",
+            0.9,
+            40.0 + shift + range_m * turn.cos(),
+            40.0 + range_m * turn.sin(),
+        )
     };
     (0..1000).map(place).collect()
 }
 
 /// Reports in the vehicle's name and those of its parts, each at this period.
-async fn report_for_ever(target: Target, senders: u64, period: Duration, objects: Objects) -> anyhow::Result<()> {
+async fn report_for_ever(
+    target: Target,
+    senders: u64,
+    period: Duration,
+    objects: Objects,
+) -> anyhow::Result<()> {
     let names = (0..senders).map(|sender| match sender {
         0 => VEHICLE.to_owned(),
         part => format!("{VEHICLE}--{part}"),
@@ -70,7 +96,12 @@ async fn report_for_ever(target: Target, senders: u64, period: Duration, objects
     join_all(reporting).await.into_iter().collect()
 }
 
-async fn report_in_name(target: &Target, name: String, period: Duration, objects: Objects) -> anyhow::Result<()> {
+async fn report_in_name(
+    target: &Target,
+    name: String,
+    period: Duration,
+    objects: Objects,
+) -> anyhow::Result<()> {
     let node = NodeName::new(&name)?;
     let topic = format!("ecod/v1/{CELL}/detections/{name}");
     let mut seq = 0;
@@ -80,7 +111,10 @@ async fn report_in_name(target: &Target, name: String, period: Duration, objects
                 seq += 1;
                 let objects = objects(seq);
                 let count = objects.len();
-                let report = ObjectReport { objects, ..ObjectReport::new(node.clone(), seq, clock::now()) };
+                let report = ObjectReport {
+                    objects,
+                    ..ObjectReport::new(node.clone(), seq, clock::now())
+                };
                 let packet = publish(&topic, &encode(&report, Encoding::Json));
                 if stream.write_all(&packet).await.is_err() {
                     break;
@@ -104,7 +138,9 @@ async fn subscribe_for_ever(target: Target) -> anyhow::Result<()> {
             };
             let write = async {
                 for number in 0_u64.. {
-                    let batch: Vec<u8> = (0..100).flat_map(|part| subscribe(&format!("a/{number}/{part}"))).collect();
+                    let batch: Vec<u8> = (0..100)
+                        .flat_map(|part| subscribe(&format!("a/{number}/{part}")))
+                        .collect();
                     if requests.write_all(&batch).await.is_err() {
                         break;
                     }

@@ -68,8 +68,13 @@ pub(crate) struct Bar {
 }
 
 /// The bar of attacks that may cost a cell nothing.
-pub(crate) const UNHARMED: Bar =
-    Bar { maps: 0.95, honest: 0.95, rss_mb: 200, longest_gap_ms: None, is_replaced: Some(false) };
+pub(crate) const UNHARMED: Bar = Bar {
+    maps: 0.95,
+    honest: 0.95,
+    rss_mb: 200,
+    longest_gap_ms: None,
+    is_replaced: Some(false),
+};
 
 /// Measurements of a row.
 #[derive(Debug, Clone)]
@@ -110,13 +115,19 @@ impl Row {
 impl Bar {
     fn is_met(&self, outcome: &Outcome) -> bool {
         let part = |count: usize, of: usize| count as f64 / of.max(1) as f64;
-        let missed = self.longest_gap_ms.map_or(0, |most| most / ROUND.as_millis() as u64) as usize;
+        let missed = self
+            .longest_gap_ms
+            .map_or(0, |most| most / ROUND.as_millis() as u64) as usize;
         let expected = outcome.expected.saturating_sub(missed);
         part(outcome.maps, expected) >= self.maps
             && part(outcome.honest, expected.max(outcome.maps)) >= self.honest
             && outcome.rss_mb <= self.rss_mb
-            && self.longest_gap_ms.is_none_or(|most| outcome.longest_gap_ms <= most)
-            && self.is_replaced.is_none_or(|is_replaced| outcome.is_replaced == is_replaced)
+            && self
+                .longest_gap_ms
+                .is_none_or(|most| outcome.longest_gap_ms <= most)
+            && self
+                .is_replaced
+                .is_none_or(|is_replaced| outcome.is_replaced == is_replaced)
             && outcome.believed_lies == 0
             && outcome.ended.is_empty()
     }
@@ -124,20 +135,36 @@ impl Bar {
 
 impl fmt::Display for Bar {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:.0} %, {:.0} %, {} MB", 100.0 * self.maps, 100.0 * self.honest, self.rss_mb)?;
-        self.longest_gap_ms.map_or(Ok(()), |most| write!(f, ", {most} ms"))
+        write!(
+            f,
+            "{:.0} %, {:.0} %, {} MB",
+            100.0 * self.maps,
+            100.0 * self.honest,
+            self.rss_mb
+        )?;
+        self.longest_gap_ms
+            .map_or(Ok(()), |most| write!(f, ", {most} ms"))
     }
 }
 
 impl fmt::Display for Outcome {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { maps, expected, honest, rss_mb, longest_gap_ms, .. } = self;
+        let Self {
+            maps,
+            expected,
+            honest,
+            rss_mb,
+            longest_gap_ms,
+            ..
+        } = self;
         write!(
             f,
             "{maps} of {expected} maps, {honest} with all honest reports, {rss_mb} MB, longest gap {longest_gap_ms} ms"
         )?;
         write!(f, ", {} deeds", self.deeds)?;
-        self.fault.iter().try_for_each(|fault| write!(f, ", attack ended: {fault}"))?;
+        self.fault
+            .iter()
+            .try_for_each(|fault| write!(f, ", attack ended: {fault}"))?;
         if self.believed_lies > 0 {
             write!(f, ", {} lies believed", self.believed_lies)?;
         }
@@ -153,7 +180,11 @@ impl fmt::Display for Outcome {
 
 /// All outcomes, for people.
 pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
-    let width = lines.iter().map(|(row, ..)| row.attack.chars().count()).max().unwrap_or_default();
+    let width = lines
+        .iter()
+        .map(|(row, ..)| row.attack.chars().count())
+        .max()
+        .unwrap_or_default();
     let mut text = format!(
         "{:width$}  {:16}  {:7}  {:22}  {:>11}  {:>6}  {:>6}  {:>6}  {:>5}  {:27}  verdict\n",
         "attack", "means", "at", "did", "maps", "honest", "RSS MB", "gap ms", "lies", "bar"
@@ -162,16 +193,21 @@ pub(crate) fn table(lines: &[(&Row, Victim, Outcome)]) -> String {
         let maps = format!("{}/{}", outcome.maps, outcome.expected);
         let lies = outcome.believed_lies;
         let verdict = match (row.took_place(outcome), row.bar.is_met(outcome)) {
-            (false, _) => outcome
-                .fault
-                .as_ref()
-                .map_or_else(|| "NOT ATTACKED: too few deeds".to_owned(), |fault| format!("FAILED: {fault}")),
+            (false, _) => outcome.fault.as_ref().map_or_else(
+                || "NOT ATTACKED: too few deeds".to_owned(),
+                |fault| format!("FAILED: {fault}"),
+            ),
             (true, true) => "held".to_owned(),
             (true, false) if outcome.ended.is_empty() => "BROKEN".to_owned(),
             (true, false) => format!("BROKEN, ended: {}", outcome.ended.join(", ")),
         };
-        let (attack, means, honest, rss) = (row.attack, row.means.name(), outcome.honest, outcome.rss_mb);
-        let (gap, did, at) = (outcome.longest_gap_ms, format!("{} {}", outcome.deeds, row.deeds.1), victim.name());
+        let (attack, means, honest, rss) =
+            (row.attack, row.means.name(), outcome.honest, outcome.rss_mb);
+        let (gap, did, at) = (
+            outcome.longest_gap_ms,
+            format!("{} {}", outcome.deeds, row.deeds.1),
+            victim.name(),
+        );
         let _ = writeln!(
             text,
             "{attack:width$}  {means:16}  {at:7}  {did:22}  {maps:>11}  {honest:>6}  {rss:>6}  {gap:>6}  {lies:>5}  {:27}  {verdict}",

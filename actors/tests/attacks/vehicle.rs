@@ -33,7 +33,10 @@ pub(crate) const ROWS: &[Row] = &[
         on_brokers: false,
         deeds: (100, "messages"),
         // They may move the lead, and cost nobody a map.
-        bar: Bar { is_replaced: None, ..UNHARMED },
+        bar: Bar {
+            is_replaced: None,
+            ..UNHARMED
+        },
         quick: false,
         run: |target| Box::pin(no_login(target, &[LEADER])),
     },
@@ -135,7 +138,11 @@ fn report() -> Vec<u8> {
 async fn flood(target: Target, readers: usize) -> anyhow::Result<()> {
     let reading = [subscribe("#"), report()];
     let connection = |index| {
-        let opening = if index < readers { &reading[0][..] } else { &[] };
+        let opening = if index < readers {
+            &reading[0][..]
+        } else {
+            &[]
+        };
         send_for_ever(&target, (&target.vehicle, VEHICLE), opening, &reading[1])
     };
     join_all((0..CONNECTIONS).map(connection)).await;
@@ -169,12 +176,14 @@ async fn repeated_subscriptions(target: Target) -> anyhow::Result<()> {
     let mut stream = log_in(&target, &target.vehicle, VEHICLE).await?;
     for observer in 0..64 {
         let topic = format!("ecod/v1/{CELL}/nodes/{VEHICLE}--{observer}");
-        stream.write_all(&packet(0x31, &[&text(&topic), &vec![b'x'; 16 * 1024]])).await?;
+        stream
+            .write_all(&packet(0x31, &[&text(&topic), &vec![b'x'; 16 * 1024]]))
+            .await?;
     }
     let filter = [&text("ecod/v1/+/nodes/#")[..], &[0]].concat();
     // As many as the broker takes, and more than that.
-    let packets =
-        [(64 * 1024 - 2) / filter.len(), 10_000].map(|filters| packet(0x82, &[&[0, 1], &filter.repeat(filters)]));
+    let packets = [(64 * 1024 - 2) / filter.len(), 10_000]
+        .map(|filters| packet(0x82, &[&[0, 1], &filter.repeat(filters)]));
     let (packets, target) = (&packets, &target);
     let ask = |number: usize| async move {
         let packet = &packets[number % 2];
@@ -201,15 +210,29 @@ async fn abandoned_sessions(target: Target) -> anyhow::Result<()> {
             }
         }
     };
-    tokio::join!(flood(Target { deeds: Arc::default(), ..target.clone() }, 0), leave).0
+    tokio::join!(
+        flood(
+            Target {
+                deeds: Arc::default(),
+                ..target.clone()
+            },
+            0
+        ),
+        leave
+    )
+    .0
 }
 
 async fn leave_session(target: &Target, tls: &Arc<ClientConfig>) -> anyhow::Result<()> {
     let mut stream = secure(target, tls).await?;
     let id = format!("{VEHICLE}-{}", uuid::Uuid::now_v7().simple());
     // Not a clean session.
-    stream.write_all(&packet(0x10, &[b"\0\x04MQTT\x04\x00\0\0", &text(&id)])).await?;
-    stream.write_all(&packet(0x82, &[&[0, 1], &text("#"), &[1]])).await?;
+    stream
+        .write_all(&packet(0x10, &[b"\0\x04MQTT\x04\x00\0\0", &text(&id)]))
+        .await?;
+    stream
+        .write_all(&packet(0x82, &[&[0, 1], &text("#"), &[1]]))
+        .await?;
     sleep(Duration::from_millis(50)).await;
     Ok(stream.shutdown().await?)
 }
@@ -237,8 +260,17 @@ async fn claims(target: Target) -> anyhow::Result<()> {
             }
         }
         if let Ok(mut stream) = log_in(&target, &target.vehicle, VEHICLE).await {
-            for topic in ["detections/v01", "nodes/v01", "global_detections", "reputations", "ledger/v01"] {
-                stream.write_all(&publish(&format!("ecod/v1/{CELL}/{topic}"), b"{}")).await.ok();
+            for topic in [
+                "detections/v01",
+                "nodes/v01",
+                "global_detections",
+                "reputations",
+                "ledger/v01",
+            ] {
+                stream
+                    .write_all(&publish(&format!("ecod/v1/{CELL}/{topic}"), b"{}"))
+                    .await
+                    .ok();
             }
         }
         sleep(Duration::from_millis(50)).await;
@@ -266,13 +298,18 @@ async fn websockets(target: Target) -> anyhow::Result<()> {
 
 async fn log_in_by_websocket(target: &Target) -> anyhow::Result<TlsStream<TcpStream>> {
     let mut request = "wss://broker.ecod.internal/".into_client_request()?;
-    request.headers_mut().insert("sec-websocket-protocol", "mqtt".parse()?);
+    request
+        .headers_mut()
+        .insert("sec-websocket-protocol", "mqtt".parse()?);
     let (mut socket, _) = client_async(request, secure(target, &target.vehicle).await?).await?;
     let id = format!("{VEHICLE}-{}", uuid::Uuid::now_v7().simple());
     let login = packet(0x10, &[b"\0\x04MQTT\x04\x02\0\0", &text(&id)]);
     socket.send(Message::binary(login)).await?;
     let answer = socket.next().await.context("no answer to the login")??;
-    anyhow::ensure!(answer.into_data()[..] == [0x20, 2, 0, 0], "the login was refused");
+    anyhow::ensure!(
+        answer.into_data()[..] == [0x20, 2, 0, 0],
+        "the login was refused"
+    );
     Ok(socket.into_inner())
 }
 
@@ -284,8 +321,19 @@ async fn no_login(target: Target, at: &'static [&'static str]) -> anyhow::Result
             let insider = Insider::join(&target, (name, Role::Cav), Some(credentials)).await?;
             let no_login = at.iter().copied().map(NodeName::from_static).collect();
             let followed = Epoch::new(1, NodeName::from_static(LEADER));
-            insider.repeat(1, Some(followed), Body::Status { over: None, no_login }).await
+            insider
+                .repeat(
+                    1,
+                    Some(followed),
+                    Body::Status {
+                        over: None,
+                        no_login,
+                    },
+                )
+                .await
         }
     };
-    try_join_all(VEHICLES.into_iter().zip(&target.vehicles).map(say)).await.map(drop)
+    try_join_all(VEHICLES.into_iter().zip(&target.vehicles).map(say))
+        .await
+        .map(drop)
 }

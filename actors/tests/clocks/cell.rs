@@ -67,12 +67,20 @@ impl Cell {
         let directory = tempfile::tempdir().unwrap();
         let frames = directory.path().join("frames");
         std::fs::create_dir(&frames).unwrap();
-        std::fs::write(frames.join("0.ppm"), [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat()).unwrap();
-        let car =
-            r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]"#;
+        std::fs::write(
+            frames.join("0.ppm"),
+            [b"P6 640 480 255\n".as_slice(), &[128; 640 * 480 * 3]].concat(),
+        )
+        .unwrap();
+        let car = r#"[{"label":"car","confidence":0.9,"bounding_box":{"x_min":300,"y_min":200,"x_max":340,"y_max":240}}]"#;
         std::fs::write(directory.path().join("detections.jsonl"), car).unwrap();
-        let brokers = ["edge", "euclid", "gauss"].map(|name| (name, free_tcp())).into();
-        let gossip = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let brokers = ["edge", "euclid", "gauss"]
+            .map(|name| (name, free_tcp()))
+            .into();
+        let gossip = UdpSocket::bind("127.0.0.1:0")
+            .unwrap()
+            .local_addr()
+            .unwrap();
         Self {
             directory,
             gossip,
@@ -102,29 +110,58 @@ impl Cell {
         let page = free_tcp();
         let config = self.config(name, page) + &self.certificates(name);
         std::fs::write(self.path(&format!("{name}.toml")), config).unwrap();
-        let log = File::options().create(true).append(true).open(self.path(&format!("{name}.log"))).unwrap();
+        let log = File::options()
+            .create(true)
+            .append(true)
+            .open(self.path(&format!("{name}.log")))
+            .unwrap();
         let mut command = Command::new(program());
-        command.arg("--config").arg(self.path(&format!("{name}.toml")));
-        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
+        command
+            .arg("--config")
+            .arg(self.path(&format!("{name}.toml")));
+        command
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(log);
         if clock != Fake::Off {
             self.set_file(name, clock);
             command
                 .env("LD_PRELOAD", libfaketime())
-                .env("FAKETIME_TIMESTAMP_FILE", self.path(&format!("{name}.faketime")))
+                .env(
+                    "FAKETIME_TIMESTAMP_FILE",
+                    self.path(&format!("{name}.faketime")),
+                )
                 .env("FAKETIME_NO_CACHE", "1")
                 .env("FAKETIME_DONT_FAKE_MONOTONIC", "1")
                 .env("NO_FAKE_STAT", "1");
         }
-        self.nodes.insert(name.to_owned(), Running { child: command.spawn().unwrap(), page });
+        self.nodes.insert(
+            name.to_owned(),
+            Running {
+                child: command.spawn().unwrap(),
+                page,
+            },
+        );
     }
 
     fn certificates(&mut self, name: &str) -> String {
-        let Some(authority) = &mut self.authority else { return String::new() };
+        let Some(authority) = &mut self.authority else {
+            return String::new();
+        };
         let node = NodeName::new(name).unwrap();
-        let role = if name == "edge" { Role::Edge } else { Role::Auto };
-        authority.issue(&node, role, Duration::from_secs(3600), true_time()).unwrap();
+        let role = if name == "edge" {
+            Role::Edge
+        } else {
+            Role::Auto
+        };
+        authority
+            .issue(&node, role, Duration::from_secs(3600), true_time())
+            .unwrap();
         let (certificate, key) = authority.files_of(&node);
-        format!("[tls]\nca = {:?}\ncertificate = {certificate:?}\nkey = {key:?}\n", authority.ca())
+        format!(
+            "[tls]\nca = {:?}\ncertificate = {certificate:?}\nkey = {key:?}\n",
+            authority.ca()
+        )
     }
 
     fn config(&self, name: &str, page: SocketAddr) -> String {
@@ -134,7 +171,11 @@ impl Cell {
             "noether" => "cav",
             _ => "auto",
         };
-        let bind = if name == "gauss" { self.gossip.to_string() } else { "127.0.0.1:0".into() };
+        let bind = if name == "gauss" {
+            self.gossip.to_string()
+        } else {
+            "127.0.0.1:0".into()
+        };
         let mut config = format!(
             "name = \"{name}\"\nrole = \"{role}\"\ncell = \"clocks\"\nmap_log = \"{directory}/{name}.maps\"\n\
              landmarks = [{{ id = \"spot\", x_m = 6.6, y_m = 0.0 }}]\n\
@@ -158,21 +199,31 @@ impl Cell {
     /// Starts the client without a node.
     pub(crate) fn feed(&mut self, clock: Fake) {
         let offset = Arc::new(AtomicI64::new(clock.seconds()));
-        let feeder = Feeder::start(self.brokers.values().copied().collect(), Arc::clone(&offset));
+        let feeder = Feeder::start(
+            self.brokers.values().copied().collect(),
+            Arc::clone(&offset),
+        );
         self.feeder = Some((feeder, offset));
     }
 
     /// Lets a clock step.
     pub(crate) fn set(&mut self, name: &str, clock: Fake) {
         if name == "feeder" {
-            self.feeder.as_ref().unwrap().1.store(clock.seconds(), Ordering::Relaxed);
+            self.feeder
+                .as_ref()
+                .unwrap()
+                .1
+                .store(clock.seconds(), Ordering::Relaxed);
         } else {
             self.set_file(name, clock);
         }
     }
 
     fn set_file(&self, name: &str, clock: Fake) {
-        let (file, new) = (self.path(&format!("{name}.faketime")), self.path(&format!("{name}.faketime.new")));
+        let (file, new) = (
+            self.path(&format!("{name}.faketime")),
+            self.path(&format!("{name}.faketime.new")),
+        );
         std::fs::write(&new, format!("{:+}\n", clock.seconds())).unwrap();
         std::fs::rename(new, file).unwrap();
     }
@@ -192,7 +243,10 @@ impl Cell {
     pub(crate) fn until(&mut self, what: &str, holds: impl Fn(&Record) -> bool) {
         let deadline = Instant::now() + PATIENCE;
         while !holds(self.record()) {
-            assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
+            assert!(
+                Instant::now() <= deadline,
+                "not within {PATIENCE:?}: {what}"
+            );
             self.look();
         }
     }
@@ -213,10 +267,17 @@ impl Cell {
     pub(crate) fn until_unready(&mut self, name: &str, reason: &str) {
         let deadline = Instant::now() + PATIENCE;
         while readiness(self.nodes[name].page).1.find(reason).is_none() {
-            assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {reason}, but {}", self.readiness(name));
+            assert!(
+                Instant::now() <= deadline,
+                "not within {PATIENCE:?}: {reason}, but {}",
+                self.readiness(name)
+            );
             self.look();
         }
-        assert!(!readiness(self.nodes[name].page).0, "{name} is ready and says {reason}");
+        assert!(
+            !readiness(self.nodes[name].page).0,
+            "{name} is ready and says {reason}"
+        );
     }
 
     /// A node's readiness in its own words; nothing while there is no page.
@@ -232,7 +293,11 @@ impl Cell {
             if let Some((at, _)) = self.claims[name].iter().find(ready) {
                 return *at;
             }
-            assert!(Instant::now() <= deadline, "{name} not ready within {PATIENCE:?}: {}", self.readiness(name));
+            assert!(
+                Instant::now() <= deadline,
+                "{name} not ready within {PATIENCE:?}: {}",
+                self.readiness(name)
+            );
             self.look();
         }
     }
@@ -246,10 +311,23 @@ impl Cell {
     ) -> Duration {
         let useful = self.record.times(since, is_useful);
         let (mut longest, mut idle_since) = (Duration::ZERO, None);
-        for (at, is_ready) in self.claims.get(name).into_iter().flatten().filter(|(at, _)| *at >= since) {
-            let last_useful = useful[..useful.partition_point(|time| time <= at)].last().copied();
-            idle_since = is_ready.then(|| idle_since.unwrap_or(*at).max(last_useful.unwrap_or_default()));
-            longest = longest.max(idle_since.map_or(Duration::ZERO, |idle_since| at.since(idle_since)));
+        for (at, is_ready) in self
+            .claims
+            .get(name)
+            .into_iter()
+            .flatten()
+            .filter(|(at, _)| *at >= since)
+        {
+            let last_useful = useful[..useful.partition_point(|time| time <= at)]
+                .last()
+                .copied();
+            idle_since = is_ready.then(|| {
+                idle_since
+                    .unwrap_or(*at)
+                    .max(last_useful.unwrap_or_default())
+            });
+            longest =
+                longest.max(idle_since.map_or(Duration::ZERO, |idle_since| at.since(idle_since)));
         }
         longest
     }
@@ -257,11 +335,25 @@ impl Cell {
 
 /// Readiness of a node and its reason; nothing while there is no page.
 fn readiness(page: SocketAddr) -> (bool, String) {
-    let Ok(mut stream) = TcpStream::connect(page) else { return (false, String::new()) };
-    write!(stream, "GET /readyz HTTP/1.1\r\nHost: {page}\r\nConnection: close\r\n\r\n").unwrap();
+    let Ok(mut stream) = TcpStream::connect(page) else {
+        return (false, String::new());
+    };
+    write!(
+        stream,
+        "GET /readyz HTTP/1.1\r\nHost: {page}\r\nConnection: close\r\n\r\n"
+    )
+    .unwrap();
     let mut answer = String::new();
     stream.read_to_string(&mut answer).unwrap();
-    (answer.starts_with("HTTP/1.1 200"), answer.split("\r\n\r\n").nth(1).unwrap_or_default().trim().to_owned())
+    (
+        answer.starts_with("HTTP/1.1 200"),
+        answer
+            .split("\r\n\r\n")
+            .nth(1)
+            .unwrap_or_default()
+            .trim()
+            .to_owned(),
+    )
 }
 
 impl Drop for Cell {
@@ -288,17 +380,27 @@ pub(crate) fn true_time() -> Timestamp {
 
 /// The program under test; `CLOCKS_PROGRAM` names another one to compare with.
 fn program() -> PathBuf {
-    std::env::var_os("CLOCKS_PROGRAM").map_or_else(|| env!("CARGO_BIN_EXE_ecod-node").into(), PathBuf::from)
+    std::env::var_os("CLOCKS_PROGRAM")
+        .map_or_else(|| env!("CARGO_BIN_EXE_ecod-node").into(), PathBuf::from)
 }
 
 /// The library that fakes wall clocks; Debian's package `libfaketime`, which `make setup` of the tests installs.
 fn libfaketime() -> PathBuf {
     let machine = std::env::consts::ARCH;
-    let file = PathBuf::from(format!("/usr/lib/{machine}-linux-gnu/faketime/libfaketimeMT.so.1"));
-    assert!(Path::is_file(&file), "{} is missing: apt install libfaketime", file.display());
+    let file = PathBuf::from(format!(
+        "/usr/lib/{machine}-linux-gnu/faketime/libfaketimeMT.so.1"
+    ));
+    assert!(
+        Path::is_file(&file),
+        "{} is missing: apt install libfaketime",
+        file.display()
+    );
     file
 }
 
 fn free_tcp() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+    TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
 }

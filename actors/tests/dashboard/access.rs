@@ -12,24 +12,53 @@ async fn without_the_token_nothing_but_health_is_told() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.token = Some(Secret::new("correct-horse-battery"));
     let (node, page) = start(config).await;
-    let api = ["/api/picture", "/api/events", "/api/history", "/api/frame?at=1", "/api/camera", "/api/floor_plan"];
-    for path in api.into_iter().chain(["/", "/main.js", "/metrics", "/nowhere"]) {
+    let api = [
+        "/api/picture",
+        "/api/events",
+        "/api/history",
+        "/api/frame?at=1",
+        "/api/camera",
+        "/api/floor_plan",
+    ];
+    for path in api
+        .into_iter()
+        .chain(["/", "/main.js", "/metrics", "/nowhere"])
+    {
         assert_eq!(get(page, path).await.status, 401, "{path}");
     }
-    let points = request(page, "POST", "/api/camera/mount", &[("Host", "localhost")], "{}").await;
+    let points = request(
+        page,
+        "POST",
+        "/api/camera/mount",
+        &[("Host", "localhost")],
+        "{}",
+    )
+    .await;
     assert_eq!(points.status, 401);
     assert_eq!(node.counters().events(Event::BrowserRefused), 11);
     assert_eq!(get(page, "/healthz").await.status, 200);
 
     let host = ("Host", "localhost");
     let bearer = ("Authorization", "Bearer correct-horse-battery");
-    assert_eq!(get_with(page, "/metrics", &[host, bearer]).await.status, 200);
+    assert_eq!(
+        get_with(page, "/metrics", &[host, bearer]).await.status,
+        200
+    );
     let signed_in = get(page, "/?token=correct-horse-battery").await;
-    assert_eq!((signed_in.status, signed_in.header("location")), (303, Some("/")));
+    assert_eq!(
+        (signed_in.status, signed_in.header("location")),
+        (303, Some("/"))
+    );
     let cookie = signed_in.header("set-cookie").unwrap();
-    assert!(cookie.contains("HttpOnly") && cookie.contains("SameSite=Lax"), "{cookie}");
+    assert!(
+        cookie.contains("HttpOnly") && cookie.contains("SameSite=Lax"),
+        "{cookie}"
+    );
     let cookie = ("Cookie", cookie.split(';').next().unwrap());
-    assert_eq!(get_with(page, "/api/picture", &[host, cookie]).await.status, 200);
+    assert_eq!(
+        get_with(page, "/api/picture", &[host, cookie]).await.status,
+        200
+    );
     assert_eq!(get(page, "/?token=wrong-horse-battery").await.status, 401);
     node.stop().await;
 }
@@ -37,13 +66,24 @@ async fn without_the_token_nothing_but_health_is_told() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_page_of_elsewhere_cannot_look_through_a_browser_here() {
     let (node, page) = start(config("euclid", Role::Auto, 1)).await;
-    assert_eq!(get_with(page, "/api/picture", &[("Host", "rebound.example:8080")]).await.status, 421);
+    assert_eq!(
+        get_with(page, "/api/picture", &[("Host", "rebound.example:8080")])
+            .await
+            .status,
+        421
+    );
     assert_eq!(node.counters().events(Event::BrowserRefused), 1);
     let answer = get(page, "/").await;
     assert_eq!(answer.status, 200);
     let policy = answer.header("content-security-policy").unwrap();
-    assert!(policy.starts_with("default-src 'none'") && !policy.contains("unsafe"), "{policy}");
-    assert_eq!(answer.header("cross-origin-resource-policy"), Some("same-origin"));
+    assert!(
+        policy.starts_with("default-src 'none'") && !policy.contains("unsafe"),
+        "{policy}"
+    );
+    assert_eq!(
+        answer.header("cross-origin-resource-policy"),
+        Some("same-origin")
+    );
     assert!(answer.header("access-control-allow-origin").is_none());
     assert_eq!(get(page, "/../Cargo.toml").await.status, 404);
     node.stop().await;

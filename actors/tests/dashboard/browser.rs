@@ -19,14 +19,18 @@ const SHOWN: &str = "document.querySelectorAll('#map .place.full').length >= 6 \
     && document.querySelectorAll('#reputations tr').length >= 4";
 
 /// The node is ready, whether or not vehicles report, and report where they should.
-const IS_READY: &str = "/^(Live|No reports|[0-9]+ trouble)/.test(document.querySelector('#state-text')?.textContent)";
+const IS_READY: &str =
+    "/^(Live|No reports|[0-9]+ trouble)/.test(document.querySelector('#state-text')?.textContent)";
 
 /// The map of a cell of processes fills, a vehicle takes over when the edge's process is killed, and the page says so,
 /// also to those who do not see it. Leaves pictures of the page in `target/dashboard`.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "needs Chromium: make test-dashboard"]
 async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
-    let pictures = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap().join("dashboard");
+    let pictures = Path::new(env!("CARGO_TARGET_TMPDIR"))
+        .parent()
+        .unwrap()
+        .join("dashboard");
     std::fs::create_dir_all(&pictures).unwrap();
     let directory = tempfile::tempdir().unwrap();
     let places: [Place; 3] = free_places();
@@ -41,16 +45,26 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     let opened = Instant::now();
     browser.open(&format!("http://{}/", at_euclid.page)).await;
     browser.until(IS_READY).await;
-    println!("page live {:?} after it was asked for, WebDriver included", opened.elapsed());
-    browser.until("document.querySelector('#leader').textContent === 'edge'").await;
+    println!(
+        "page live {:?} after it was asked for, WebDriver included",
+        opened.elapsed()
+    );
+    browser
+        .until("document.querySelector('#leader').textContent === 'edge'")
+        .await;
     browser.until(SHOWN).await;
     let first = "performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd";
     for (name, place) in [("edge", at_edge), ("gauss", at_gauss)] {
-        let link =
-            format!("document.querySelector('#nodes a[href=\"http://{}/\"]')?.textContent === '{name}'", place.page);
+        let link = format!(
+            "document.querySelector('#nodes a[href=\"http://{}/\"]')?.textContent === '{name}'",
+            place.page
+        );
         browser.until(&link).await;
     }
-    println!("page loaded in {} ms by the browser's own clock", browser.evaluate(first).await);
+    println!(
+        "page loaded in {} ms by the browser's own clock",
+        browser.evaluate(first).await
+    );
     tokio::time::sleep(Duration::from_secs(6)).await;
     for (name, width, height, scheme) in [
         ("light", 1440, 900, "light"),
@@ -59,22 +73,41 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
         ("tablet", 900, 1100, "dark"),
     ] {
         browser.look(width, height, scheme).await;
-        browser.screenshot(&pictures.join(format!("{name}.png"))).await;
+        browser
+            .screenshot(&pictures.join(format!("{name}.png")))
+            .await;
         let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(browser.evaluate(wider).await, false, "{name}: the page scrolls sideways");
+        assert_eq!(
+            browser.evaluate(wider).await,
+            false,
+            "{name}: the page scrolls sideways"
+        );
         let cut_off = "[...document.querySelectorAll('.scroll')].filter((it) => it.scrollWidth > it.clientWidth + 1)\
                        .map((it) => it.getAttribute('aria-labelledby')).join()";
         if width >= 1440 {
-            assert_eq!(browser.evaluate(cut_off).await, "", "{name}: tables that go on at the right");
+            assert_eq!(
+                browser.evaluate(cut_off).await,
+                "",
+                "{name}: tables that go on at the right"
+            );
         }
     }
     browser.look(1440, 900, "light").await;
 
     edge.0.kill().unwrap();
     let killed = Instant::now();
-    browser.until("!['edge', 'nobody', '–'].includes(document.querySelector('#leader').textContent)").await;
-    println!("another leader on the page {:?} after the edge was killed", killed.elapsed());
-    browser.until("/leads now, in place of edge/.test(document.querySelector('#announcer').textContent)").await;
+    browser
+        .until("!['edge', 'nobody', '–'].includes(document.querySelector('#leader').textContent)")
+        .await;
+    println!(
+        "another leader on the page {:?} after the edge was killed",
+        killed.elapsed()
+    );
+    browser
+        .until(
+            "/leads now, in place of edge/.test(document.querySelector('#announcer').textContent)",
+        )
+        .await;
     browser
         .until("[...document.querySelectorAll('#reigns tr')].some((row) => row.textContent.startsWith('edge'))")
         .await;
@@ -87,15 +120,28 @@ async fn a_browser_sees_the_map_fill_and_the_next_leader_take_over() {
     assert_eq!(browser.complaints().await, Vec::<String>::new());
 
     drop(vehicles);
-    browser.until("document.querySelector('#latency').textContent === '–'").await;
+    browser
+        .until("document.querySelector('#latency').textContent === '–'")
+        .await;
     drop(_euclid);
-    browser.until("document.querySelector('#state').classList.contains('stale')").await;
+    browser
+        .until("document.querySelector('#state').classList.contains('stale')")
+        .await;
     browser.until("!document.querySelector('#notice').hidden && document.body.classList.contains('stale-data')").await;
-    let age = browser.evaluate("document.querySelector('#state-age[aria-hidden=true]').textContent").await;
+    let age = browser
+        .evaluate("document.querySelector('#state-age[aria-hidden=true]').textContent")
+        .await;
     assert!(age.as_str().unwrap().ends_with(" s old"), "{age}");
-    let said = browser.evaluate("document.querySelector('#state-text').textContent").await;
-    assert_eq!(said, "Connection lost", "and nothing that changes every second");
-    let chart = browser.evaluate("Number(getComputedStyle(document.querySelector('#latency-chart')).opacity)").await;
+    let said = browser
+        .evaluate("document.querySelector('#state-text').textContent")
+        .await;
+    assert_eq!(
+        said, "Connection lost",
+        "and nothing that changes every second"
+    );
+    let chart = browser
+        .evaluate("Number(getComputedStyle(document.querySelector('#latency-chart')).opacity)")
+        .await;
     assert!(chart.as_f64().unwrap() < 1.0, "{chart}");
     browser.screenshot(&pictures.join("stale.png")).await;
     let _euclid = start("euclid", Role::Auto, at_euclid, &places, directory.path());
@@ -113,15 +159,21 @@ async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {
     let mut guarded = config("euclid", Role::Auto, 1);
     guarded.dashboard.token = Some(Secret::new("correct-horse-battery"));
     let (node, page) = cell::start(guarded).await;
-    let link = format!("data:text/html,<a href='http://{page}/?token=correct-horse-battery'>the lot</a>");
+    let link =
+        format!("data:text/html,<a href='http://{page}/?token=correct-horse-battery'>the lot</a>");
     browser.open(&link).await;
-    browser.evaluate("document.querySelector('a').click()").await;
+    browser
+        .evaluate("document.querySelector('a').click()")
+        .await;
     browser.until(IS_READY).await;
     assert_eq!(browser.evaluate("location.search").await, "");
     node.stop().await;
 
     let mut crowded = config("gauss", Role::Auto, 1);
-    (crowded.dashboard.max_connections, crowded.dashboard.max_rate_hz) = (16, 1.0);
+    (
+        crowded.dashboard.max_connections,
+        crowded.dashboard.max_rate_hz,
+    ) = (16, 1.0);
     let (node, page) = cell::start(crowded).await;
     let mut others = Vec::new();
     for _ in 0..8 {
@@ -130,12 +182,20 @@ async fn a_link_of_elsewhere_signs_in_and_a_page_too_many_follows_slowly() {
     }
     browser.open(&format!("http://{page}/")).await;
     browser.until(IS_READY).await;
-    let is_told = "/no room for another live page/.test(document.querySelector('#notice').textContent)";
+    let is_told =
+        "/no room for another live page/.test(document.querySelector('#notice').textContent)";
     browser.until(is_told).await;
     tokio::time::sleep(Duration::from_secs(5)).await;
-    assert_eq!(browser.evaluate(&format!("{IS_READY} && {is_told}")).await, true);
+    assert_eq!(
+        browser.evaluate(&format!("{IS_READY} && {is_told}")).await,
+        true
+    );
     drop(others);
-    browser.until(&format!("{IS_READY} && document.querySelector('#notice').hidden")).await;
+    browser
+        .until(&format!(
+            "{IS_READY} && document.querySelector('#notice').hidden"
+        ))
+        .await;
     browser.quit().await;
     node.stop().await;
 }
@@ -166,9 +226,19 @@ async fn an_older_browser_shows_the_map_and_a_page_that_cannot_be_drawn_says_so(
         .await;
     browser.until(&format!("{is_said} && !{is_live}")).await;
     tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(browser.evaluate(&format!("{is_said} && !{is_live}")).await, true, "and goes on to");
-    browser.evaluate("document.querySelector('#gone').id = 'places'").await;
-    browser.until(&format!("{is_live} && document.querySelector('#notice').hidden")).await;
+    assert_eq!(
+        browser.evaluate(&format!("{is_said} && !{is_live}")).await,
+        true,
+        "and goes on to"
+    );
+    browser
+        .evaluate("document.querySelector('#gone').id = 'places'")
+        .await;
+    browser
+        .until(&format!(
+            "{is_live} && document.querySelector('#notice').hidden"
+        ))
+        .await;
     browser.quit().await;
     node.stop().await;
 }
@@ -184,12 +254,21 @@ async fn every_table_that_goes_on_shows_it_by_a_shadow() {
     let browser = Browser::start().await;
     browser.look(390, 844, "light").await;
     browser.open(&format!("http://{page}/")).await;
-    browser.until("document.querySelectorAll('#verdicts tr').length >= 24").await;
+    browser
+        .until("document.querySelectorAll('#verdicts tr').length >= 24")
+        .await;
     let cut_off = "document.querySelector('#verdicts').closest('.scroll').scrollHeight > 400";
-    assert_eq!(browser.evaluate(cut_off).await, true, "the table is too short for this test");
-    let rows_of_troubles =
-        "[...document.querySelectorAll('#troubles-card thead')].map((it) => getComputedStyle(it).display).join()";
-    assert_eq!(browser.evaluate(rows_of_troubles).await, "none", "troubles are read without scrolling sideways");
+    assert_eq!(
+        browser.evaluate(cut_off).await,
+        true,
+        "the table is too short for this test"
+    );
+    let rows_of_troubles = "[...document.querySelectorAll('#troubles-card thead')].map((it) => getComputedStyle(it).display).join()";
+    assert_eq!(
+        browser.evaluate(rows_of_troubles).await,
+        "none",
+        "troubles are read without scrolling sideways"
+    );
     browser.evaluate(OVERFILL).await;
     let places = browser.evaluate(PLACES).await;
     let places: Vec<[f64; 4]> = serde_json::from_value(places).unwrap();
@@ -203,8 +282,12 @@ async fn every_table_that_goes_on_shows_it_by_a_shadow() {
         let pixel = |x: f64, y: f64| picture.at_2d::<Vec3b>(y as i32, x as i32).unwrap()[1];
         let of = |[left, top, right, bottom]: &[f64; 4]| {
             let steps = || (40..60).map(|step| f64::from(step) / 100.0);
-            let below = steps().map(|share| pixel(left + share * (right - left), bottom - 2.0)).max();
-            let beside = steps().map(|share| pixel(right - 2.0, top + share * (bottom - top))).max();
+            let below = steps()
+                .map(|share| pixel(left + share * (right - left), bottom - 2.0))
+                .max();
+            let beside = steps()
+                .map(|share| pixel(right - 2.0, top + share * (bottom - top)))
+                .max();
             [below.unwrap(), beside.unwrap()]
         };
         places.iter().map(of).collect::<Vec<_>>()
@@ -217,10 +300,20 @@ async fn every_table_that_goes_on_shows_it_by_a_shadow() {
     let ends = lightest("end.png").await;
     let shaded = "[...document.querySelectorAll('.scroll th:first-child')].filter((it) => it.checkVisibility()) \
         .every((it) => getComputedStyle(it).boxShadow !== 'none')";
-    assert_eq!(browser.evaluate(shaded).await, true, "rows above are hinted at below the heading");
+    assert_eq!(
+        browser.evaluate(shaded).await,
+        true,
+        "rows above are hinted at below the heading"
+    );
     for (table, (goes_on, ends)) in goes_on.iter().zip(&ends).enumerate() {
-        for (side, (goes_on, ends)) in ["below", "at the right"].into_iter().zip(goes_on.iter().zip(ends)) {
-            assert!(goes_on + 15 < *ends, "table {table} {side}: {goes_on} where it goes on, {ends} where it ends");
+        for (side, (goes_on, ends)) in ["below", "at the right"]
+            .into_iter()
+            .zip(goes_on.iter().zip(ends))
+        {
+            assert!(
+                goes_on + 15 < *ends,
+                "table {table} {side}: {goes_on} where it goes on, {ends} where it ends"
+            );
         }
     }
     browser.quit().await;
@@ -257,27 +350,60 @@ async fn a_wrong_position_is_got_over() {
         return Math.max(...xs) - Math.min(...xs); })(document.querySelectorAll('#map .place'))";
     browser.until(&format!("{width} > 300")).await;
     stray.stand(FAR_M).await;
-    let is_pointed_to = "/^stray, 9.* km$/.test(document.querySelector('#map text.cue')?.textContent)";
+    let is_pointed_to =
+        "/^stray, 9.* km$/.test(document.querySelector('#map text.cue')?.textContent)";
     browser.until(is_pointed_to).await;
-    assert_eq!(browser.evaluate(&format!("{width} > 300")).await, true, "a vehicle that sees nothing rules nothing");
+    assert_eq!(
+        browser.evaluate(&format!("{width} > 300")).await,
+        true,
+        "a vehicle that sees nothing rules nothing"
+    );
     stray.report(FAR_M, 1.0).await;
     tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(browser.evaluate(&format!("{width} > 300 && {is_pointed_to}")).await, true, "nor one that sees the lot");
-    browser.evaluate("document.querySelector('#map-outside').click()").await;
-    browser.until(&format!("{width} < 1 && document.querySelector('#map-outside').hidden")).await;
-    browser.evaluate("document.querySelector('#fit').click()").await;
-    browser.until(&format!("{width} > 300 && !document.querySelector('#map-outside').hidden")).await;
+    assert_eq!(
+        browser
+            .evaluate(&format!("{width} > 300 && {is_pointed_to}"))
+            .await,
+        true,
+        "nor one that sees the lot"
+    );
+    browser
+        .evaluate("document.querySelector('#map-outside').click()")
+        .await;
+    browser
+        .until(&format!(
+            "{width} < 1 && document.querySelector('#map-outside').hidden"
+        ))
+        .await;
+    browser
+        .evaluate("document.querySelector('#fit').click()")
+        .await;
+    browser
+        .until(&format!(
+            "{width} > 300 && !document.querySelector('#map-outside').hidden"
+        ))
+        .await;
 
     stray.report(1.0, FAR_M).await;
     browser
         .until("document.querySelectorAll('#map .body').length === 1 && document.querySelector('#map-outside').hidden")
         .await;
-    browser.evaluate("document.querySelector('#zoom-in').click()").await;
-    browser.until("document.querySelector('#map').classList.contains('zoomed')").await;
+    browser
+        .evaluate("document.querySelector('#zoom-in').click()")
+        .await;
+    browser
+        .until("document.querySelector('#map').classList.contains('zoomed')")
+        .await;
     let zoomed = browser.evaluate(width).await.as_f64().unwrap();
     stray.report(FAR_M, 1.0).await;
-    browser.until("!document.querySelector('#map-outside').hidden").await;
-    assert_eq!(browser.evaluate(width).await.as_f64().unwrap(), zoomed, "it stands where it was put");
+    browser
+        .until("!document.querySelector('#map-outside').hidden")
+        .await;
+    assert_eq!(
+        browser.evaluate(width).await.as_f64().unwrap(),
+        zoomed,
+        "it stands where it was put"
+    );
     browser.quit().await;
     node.stop().await;
 }
@@ -286,7 +412,9 @@ async fn a_wrong_position_is_got_over() {
 async fn finger(browser: &Browser) {
     browser.look(390, 844, "light").await;
     let middle = async || {
-        browser.evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })").await;
+        browser
+            .evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })")
+            .await;
         let middle = "(({ x, y, width, height }) => [x + width / 2, y + height / 2])\
             (document.querySelector('#map').getBoundingClientRect())";
         let middle = browser.evaluate(middle).await;
@@ -300,13 +428,21 @@ async fn finger(browser: &Browser) {
     browser.until(&format!("window.scrollY > {scrolled}")).await;
     assert!((browser.evaluate(place).await.as_f64().unwrap() - whole).abs() < 5.0);
 
-    browser.evaluate("document.querySelector('#zoom-in').click()").await;
-    browser.until("document.querySelector('#map').classList.contains('zoomed')").await;
+    browser
+        .evaluate("document.querySelector('#zoom-in').click()")
+        .await;
+    browser
+        .until("document.querySelector('#map').classList.contains('zoomed')")
+        .await;
     let zoomed = browser.evaluate(place).await.as_f64().unwrap();
     browser.swipe(middle().await, [0.0, 60.0]).await;
     browser.until(&format!("{place} - {zoomed} > 40")).await;
-    browser.evaluate("document.querySelector('#fit').click()").await;
-    browser.until(&format!("Math.abs({place} - {whole}) < 20")).await;
+    browser
+        .evaluate("document.querySelector('#fit').click()")
+        .await;
+    browser
+        .until(&format!("Math.abs({place} - {whole}) < 20"))
+        .await;
     browser.look(1440, 900, "light").await;
 }
 
@@ -314,24 +450,39 @@ async fn finger(browser: &Browser) {
 /// name.
 async fn keyboard_and_table(browser: &Browser) {
     let place = "Number(document.querySelector('#map .place').getAttribute('x'))";
-    browser.evaluate("document.querySelector('#map').focus()").await;
+    browser
+        .evaluate("document.querySelector('#map').focus()")
+        .await;
     let before = browser.evaluate(place).await.as_f64().unwrap();
     browser.press("ArrowRight").await;
-    browser.until(&format!("Math.abs({place} - {before}) > 30")).await;
+    browser
+        .until(&format!("Math.abs({place} - {before}) > 30"))
+        .await;
     browser.press("0").await;
-    browser.until(&format!("Math.abs({place} - {before}) < 20")).await;
-    browser.evaluate("document.querySelector('#as-table').click()").await;
+    browser
+        .until(&format!("Math.abs({place} - {before}) < 20"))
+        .await;
+    browser
+        .evaluate("document.querySelector('#as-table').click()")
+        .await;
     browser
         .until("document.querySelectorAll('#places tr').length >= 12 && document.querySelector('#map-frame').hidden")
         .await;
-    browser.evaluate("document.querySelector('#as-table').click()").await;
+    browser
+        .evaluate("document.querySelector('#as-table').click()")
+        .await;
     let nameless = "[...document.querySelectorAll('button, svg, [role], section')].filter((e) => !e.closest('[hidden]') \
         && !(e.textContent.trim() || e.getAttribute('aria-label') || e.getAttribute('aria-labelledby')) \
         && !e.getAttribute('aria-hidden')).map((e) => e.outerHTML.slice(0, 80))";
     let nameless = browser.evaluate(nameless).await;
     // The state before the first picture and a notice while all is well say nothing.
     assert_eq!(
-        nameless.as_array().unwrap().iter().filter(|e| !e.to_string().contains("role=\\\"alert")).count(),
+        nameless
+            .as_array()
+            .unwrap()
+            .iter()
+            .filter(|e| !e.to_string().contains("role=\\\"alert"))
+            .count(),
         0,
         "{nameless}"
     );

@@ -19,15 +19,26 @@ use crate::webdriver::Browser;
 
 /// A vehicle before which a person and a cat stand, and a dragon, which has no size.
 pub(crate) fn seeing(directory: &Path) -> NodeConfig {
-    let seen = [("person", [0.3, 0.3, 0.4, 0.6]), ("cat", [0.6, 0.55, 0.7, 0.62]), ("dragon", [0.7, 0.1, 0.8, 0.2])];
+    let seen = [
+        ("person", [0.3, 0.3, 0.4, 0.6]),
+        ("cat", [0.6, 0.55, 0.7, 0.62]),
+        ("dragon", [0.7, 0.1, 0.8, 0.2]),
+    ];
     let camera = camera(&directory.join("front"), "astronaut", &seen);
-    NodeConfig { camera: Some(camera), ..config("euclid", Role::Auto, 0) }
+    NodeConfig {
+        camera: Some(camera),
+        ..config("euclid", Role::Auto, 0)
+    }
 }
 
 /// The same with a camera to the rear, before which a dog stands.
 pub(crate) fn seeing_both_ways(directory: &Path) -> NodeConfig {
     let mut both = seeing(directory);
-    let mut rear = camera(&directory.join("rear"), "chelsea", &[("dog", [0.45, 0.5, 0.55, 0.7])]);
+    let mut rear = camera(
+        &directory.join("rear"),
+        "chelsea",
+        &[("dog", [0.45, 0.5, 0.55, 0.7])],
+    );
     (rear.name, rear.mount.forward_m, rear.mount.pan_deg) = (Some("rear".into()), -2.0, 180.0);
     both.cameras = vec![rear];
     both
@@ -37,7 +48,10 @@ pub(crate) fn seeing_both_ways(directory: &Path) -> NodeConfig {
 fn camera(directory: &Path, photograph: &str, seen: &[(&str, [f64; 4])]) -> CameraConfig {
     let (frames, detections) = (directory.join("frames"), directory.join("detections.jsonl"));
     std::fs::create_dir_all(&frames).unwrap();
-    let photograph = format!("{}/tests/data/photos/{photograph}.jpg", env!("CARGO_MANIFEST_DIR"));
+    let photograph = format!(
+        "{}/tests/data/photos/{photograph}.jpg",
+        env!("CARGO_MANIFEST_DIR")
+    );
     let photograph = image_codec::read(photograph.as_ref()).unwrap();
     let (width, height) = (photograph.cols(), photograph.rows());
     for frame in 0..2 {
@@ -45,7 +59,10 @@ fn camera(directory: &Path, photograph: &str, seen: &[(&str, [f64; 4])]) -> Came
         std::fs::write(frames.join(format!("{frame}.jpg")), jpeg).unwrap();
     }
     let seen = seen.iter().map(|(label, [left, top, right, bottom])| {
-        let (x, y) = (|share: f64| share * f64::from(width), |share: f64| share * f64::from(height));
+        let (x, y) = (
+            |share: f64| share * f64::from(width),
+            |share: f64| share * f64::from(height),
+        );
         serde_json::json!({ "label": label, "confidence": 0.87, "bounding_box":
             { "x_min": x(*left), "y_min": y(*top), "x_max": x(*right), "y_max": y(*bottom) } })
     });
@@ -66,7 +83,9 @@ async fn shown_after(node: &NodeHandle, time: Duration) -> u64 {
 async fn sees_objects(page: SocketAddr) {
     until("objects are on the map", || async {
         let picture = get(page, "/api/picture").await.json();
-        picture["map"]["message"]["objects"].as_array().is_some_and(|objects| objects.len() >= 2)
+        picture["map"]["message"]["objects"]
+            .as_array()
+            .is_some_and(|objects| objects.len() >= 2)
     })
     .await;
 }
@@ -80,23 +99,43 @@ async fn pictures_are_made_while_somebody_looks_and_five_a_second_at_most() {
 
     let mut pictures = Events::open_at(page, "/api/camera").await;
     let picture = pictures.next().await;
-    let jpeg = BASE64_STANDARD.decode(picture["jpeg"].as_str().unwrap()).unwrap();
+    let jpeg = BASE64_STANDARD
+        .decode(picture["jpeg"].as_str().unwrap())
+        .unwrap();
     let image = image_codec::decode(&jpeg).unwrap();
     assert!(image.cols() > 0 && image.cols() <= 640);
     let boxes = picture["boxes"].as_array().unwrap();
-    assert_eq!(boxes.iter().map(|seen| &seen["label"]).collect::<Vec<_>>(), ["person", "cat", "dragon"]);
+    assert_eq!(
+        boxes.iter().map(|seen| &seen["label"]).collect::<Vec<_>>(),
+        ["person", "cat", "dragon"]
+    );
     for (seen, places) in boxes.iter().zip([true, true, false]) {
         assert_eq!(seen["object"]["x_m"].is_f64(), places, "{seen}");
     }
-    for (edge, wanted) in boxes[0]["edges"].as_array().unwrap().iter().zip([0.3, 0.3, 0.4, 0.6]) {
-        assert!((edge.as_f64().unwrap() - wanted).abs() < 1e-6, "{}", boxes[0]);
+    for (edge, wanted) in boxes[0]["edges"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .zip([0.3, 0.3, 0.4, 0.6])
+    {
+        assert!(
+            (edge.as_f64().unwrap() - wanted).abs() < 1e-6,
+            "{}",
+            boxes[0]
+        );
     }
     let begun = Instant::now();
     let shown = shown_after(&node, Duration::from_secs(2)).await as f64;
-    assert!(shown >= 1.0 && shown <= 5.0 * begun.elapsed().as_secs_f64() + 1.0, "{shown}");
+    assert!(
+        shown >= 1.0 && shown <= 5.0 * begun.elapsed().as_secs_f64() + 1.0,
+        "{shown}"
+    );
 
     drop(pictures);
-    until("no more are made", || async { shown_after(&node, Duration::from_millis(600)).await == 0 }).await;
+    until("no more are made", || async {
+        shown_after(&node, Duration::from_millis(600)).await == 0
+    })
+    .await;
     node.stop().await;
 }
 
@@ -109,7 +148,10 @@ async fn a_camera_that_is_not_to_be_shown_is_not() {
     sees_objects(page).await;
     assert_eq!(get(page, "/api/camera").await.status, 404);
     assert_eq!(crate::mount::ask(page, "", &[]).await.status, 404);
-    assert_eq!(get(page, "/api/picture").await.json()["node"]["camera"], false);
+    assert_eq!(
+        get(page, "/api/picture").await.json()["node"]["camera"],
+        false
+    );
     assert_eq!(node.counters().events(Event::FrameShown), 0);
     node.stop().await;
 }
@@ -125,44 +167,82 @@ async fn a_box_and_its_object_light_up_together() {
     let browser = Browser::start().await;
     browser.look(1440, 900, "light").await;
     browser.open(&format!("http://{page}/")).await;
-    browser.until("document.querySelectorAll('#camera-boxes button').length === 3").await;
+    browser
+        .until("document.querySelectorAll('#camera-boxes button').length === 3")
+        .await;
     browser
         .until("document.querySelector('#camera').getContext('2d').getImageData(200, 200, 1, 1).data[3] === 255")
         .await;
-    browser.until("document.querySelectorAll('#map .ellipse').length >= 2").await;
+    browser
+        .until("document.querySelectorAll('#map .ellipse').length >= 2")
+        .await;
     let words = "[...document.querySelectorAll('#camera-boxes button')].map((box) => box.textContent).join()";
-    assert_eq!(browser.evaluate(words).await, "person 87 %,cat 87 %,dragon 87 %");
-    assert_eq!(browser.evaluate("document.querySelector('#camera-name').hidden").await, true, "there is one camera");
-    let lit_labels =
-        "[...document.querySelectorAll('#map g.lit')].map((it) => it.getAttribute('aria-label').split(',')[0]).join()";
-    let lit_boxes = "[...document.querySelectorAll('#camera-boxes .lit')].map((it) => it.textContent).join()";
+    assert_eq!(
+        browser.evaluate(words).await,
+        "person 87 %,cat 87 %,dragon 87 %"
+    );
+    assert_eq!(
+        browser
+            .evaluate("document.querySelector('#camera-name').hidden")
+            .await,
+        true,
+        "there is one camera"
+    );
+    let lit_labels = "[...document.querySelectorAll('#map g.lit')].map((it) => it.getAttribute('aria-label').split(',')[0]).join()";
+    let lit_boxes =
+        "[...document.querySelectorAll('#camera-boxes .lit')].map((it) => it.textContent).join()";
 
     browser.point_at("#camera-boxes button:nth-child(2)").await;
-    browser.until(&format!("{lit_labels} === 'cat' && {lit_boxes} === 'cat 87 %'")).await;
-    for (name, width, scheme) in
-        [("camera-light", 1440, "light"), ("camera-dark", 1440, "dark"), ("camera-phone", 390, "light")]
-    {
+    browser
+        .until(&format!(
+            "{lit_labels} === 'cat' && {lit_boxes} === 'cat 87 %'"
+        ))
+        .await;
+    for (name, width, scheme) in [
+        ("camera-light", 1440, "light"),
+        ("camera-dark", 1440, "dark"),
+        ("camera-phone", 390, "light"),
+    ] {
         browser.look(width, 900, scheme).await;
-        browser.evaluate("document.querySelector('#camera-card').scrollIntoView({ block: 'center' })").await;
+        browser
+            .evaluate("document.querySelector('#camera-card').scrollIntoView({ block: 'center' })")
+            .await;
         // The mouse may leave a box as the layout changes, and take the light away.
         let focus = "((box) => (box.blur(), box.focus()))(document.querySelector('#camera-boxes button:nth-child(2)'))";
-        browser.until(&format!("({focus}, {lit_boxes} === 'cat 87 %')")).await;
+        browser
+            .until(&format!("({focus}, {lit_boxes} === 'cat 87 %')"))
+            .await;
         tokio::time::sleep(Duration::from_secs(1)).await;
         browser.screenshot(&shots.join(format!("{name}.png"))).await;
         let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(browser.evaluate(wider).await, false, "{name}: the page scrolls sideways");
+        assert_eq!(
+            browser.evaluate(wider).await,
+            false,
+            "{name}: the page scrolls sideways"
+        );
     }
     browser.look(1440, 900, "light").await;
-    browser.evaluate("(document.activeElement.blur(), window.scrollTo(0, 0))").await;
+    browser
+        .evaluate("(document.activeElement.blur(), window.scrollTo(0, 0))")
+        .await;
     browser.point_at("#camera-title").await;
     browser.until(&format!("{lit_boxes} === ''")).await;
-    browser.evaluate("document.querySelector('#map g[aria-label^=person] .ellipse').id = 'person'").await;
+    browser
+        .evaluate("document.querySelector('#map g[aria-label^=person] .ellipse').id = 'person'")
+        .await;
     browser.point_at("#person").await;
-    browser.until(&format!("{lit_labels} === 'person' && {lit_boxes} === 'person 87 %'")).await;
+    browser
+        .until(&format!(
+            "{lit_labels} === 'person' && {lit_boxes} === 'person 87 %'"
+        ))
+        .await;
     assert_eq!(browser.complaints().await, Vec::<String>::new());
 
     browser.quit().await;
-    until("no more are made", || async { shown_after(&node, Duration::from_millis(600)).await == 0 }).await;
+    until("no more are made", || async {
+        shown_after(&node, Duration::from_millis(600)).await == 0
+    })
+    .await;
     node.stop().await;
 }
 
@@ -171,22 +251,36 @@ async fn a_box_and_its_object_light_up_together() {
 async fn the_pictures_of_each_camera_are_had_by_its_name() {
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(seeing_both_ways(directory.path())).await;
-    assert_eq!(get(page, "/api/picture").await.json()["node"]["cameras"], serde_json::json!([null, "rear"]));
-    for (path, expected) in
-        [("/api/camera", ["person", "cat", "dragon"].as_slice()), ("/api/camera?name=rear", &["dog"])]
-    {
+    assert_eq!(
+        get(page, "/api/picture").await.json()["node"]["cameras"],
+        serde_json::json!([null, "rear"])
+    );
+    for (path, expected) in [
+        ("/api/camera", ["person", "cat", "dragon"].as_slice()),
+        ("/api/camera?name=rear", &["dog"]),
+    ] {
         let picture = Events::open_at(page, path).await.next().await;
         let boxes = picture["boxes"].as_array().unwrap();
-        assert_eq!(boxes.iter().map(|seen| &seen["label"]).collect::<Vec<_>>(), expected, "{path}");
+        assert_eq!(
+            boxes.iter().map(|seen| &seen["label"]).collect::<Vec<_>>(),
+            expected,
+            "{path}"
+        );
         assert!(boxes[0]["object"]["x_m"].is_f64(), "{path}");
     }
     let refused = get(page, "/api/camera?name=left").await;
-    assert_eq!((refused.status, &*refused.body), (404, "no camera \"left\": there are rear\n"));
+    assert_eq!(
+        (refused.status, &*refused.body),
+        (404, "no camera \"left\": there are rear\n")
+    );
 
     let _looks = Events::open_at(page, "/api/camera?name=rear").await;
     let begun = Instant::now();
     let shown = shown_after(&node, Duration::from_secs(2)).await as f64;
-    assert!(shown >= 1.0 && shown <= 5.0 * begun.elapsed().as_secs_f64() + 2.0, "{shown}, of one camera alone");
+    assert!(
+        shown >= 1.0 && shown <= 5.0 * begun.elapsed().as_secs_f64() + 2.0,
+        "{shown}, of one camera alone"
+    );
     node.stop().await;
 }
 
@@ -202,8 +296,11 @@ async fn each_of_several_cameras_can_be_looked_at() {
     browser.look(1440, 900, "light").await;
     browser.open(&format!("http://{page}/")).await;
     let words = "[...document.querySelectorAll('#camera-boxes button')].map((box) => box.textContent).join()";
-    browser.until(&format!("{words} === 'person 87 %,cat 87 %,dragon 87 %'")).await;
-    let names = "[...document.querySelector('#camera-name').options].map((option) => option.text).join()";
+    browser
+        .until(&format!("{words} === 'person 87 %,cat 87 %,dragon 87 %'"))
+        .await;
+    let names =
+        "[...document.querySelector('#camera-name').options].map((option) => option.text).join()";
     assert_eq!(browser.evaluate(names).await, "euclid,rear");
     let choose = |index: usize| {
         format!(
@@ -211,40 +308,71 @@ async fn each_of_several_cameras_can_be_looked_at() {
              (document.querySelector('#camera-name'))"
         )
     };
-    let rows = |count: usize| format!("document.querySelectorAll('#mount-rows tr').length === {count}");
-    browser.evaluate("document.querySelector('#mount').click()").await;
+    let rows =
+        |count: usize| format!("document.querySelectorAll('#mount-rows tr').length === {count}");
+    browser
+        .evaluate("document.querySelector('#mount').click()")
+        .await;
     browser.click_within("#camera", [0.5, 0.9]).await;
     browser.until(&rows(1)).await;
 
     browser.evaluate(&choose(1)).await;
-    browser.until(&format!("{words} === 'dog 87 %' && {}", rows(0))).await;
-    browser.evaluate("document.querySelector('#mount').click()").await;
-    browser.until("document.querySelectorAll('#map g[aria-label^=dog]').length === 1").await;
+    browser
+        .until(&format!("{words} === 'dog 87 %' && {}", rows(0)))
+        .await;
+    browser
+        .evaluate("document.querySelector('#mount').click()")
+        .await;
+    browser
+        .until("document.querySelectorAll('#map g[aria-label^=dog]').length === 1")
+        .await;
     browser.point_at("#camera-boxes button").await;
-    let lit =
-        "[...document.querySelectorAll('#map g.lit')].map((it) => it.getAttribute('aria-label').split(',')[0]).join()";
-    browser.until(&format!("{lit} === 'dog' && document.querySelectorAll('#camera-boxes .lit').length === 1")).await;
+    let lit = "[...document.querySelectorAll('#map g.lit')].map((it) => it.getAttribute('aria-label').split(',')[0]).join()";
+    browser
+        .until(&format!(
+            "{lit} === 'dog' && document.querySelectorAll('#camera-boxes .lit').length === 1"
+        ))
+        .await;
     for (name, width) in [("cameras", 1440), ("cameras-phone", 390)] {
         browser.look(width, 900, "light").await;
-        browser.evaluate("document.querySelector('#camera-card').scrollIntoView({ block: 'center' })").await;
+        browser
+            .evaluate("document.querySelector('#camera-card').scrollIntoView({ block: 'center' })")
+            .await;
         tokio::time::sleep(Duration::from_secs(1)).await;
         browser.screenshot(&shots.join(format!("{name}.png"))).await;
         let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(browser.evaluate(wider).await, false, "{name}: the page scrolls sideways");
+        assert_eq!(
+            browser.evaluate(wider).await,
+            false,
+            "{name}: the page scrolls sideways"
+        );
     }
     browser.look(1440, 900, "light").await;
-    browser.evaluate("document.querySelector('#camera-card').scrollIntoView({ block: 'center' })").await;
+    browser
+        .evaluate("document.querySelector('#camera-card').scrollIntoView({ block: 'center' })")
+        .await;
     browser.evaluate(&choose(0)).await;
-    browser.until(&format!("{words} === 'person 87 %,cat 87 %,dragon 87 %' && {}", rows(1))).await;
+    browser
+        .until(&format!(
+            "{words} === 'person 87 %,cat 87 %,dragon 87 %' && {}",
+            rows(1)
+        ))
+        .await;
     assert_eq!(browser.complaints().await, Vec::<String>::new());
     browser.quit().await;
-    until("no more are made", || async { shown_after(&node, Duration::from_millis(600)).await == 0 }).await;
+    until("no more are made", || async {
+        shown_after(&node, Duration::from_millis(600)).await == 0
+    })
+    .await;
     node.stop().await;
 }
 
 /// Directory of the pictures that tests of the page leave.
 pub(crate) fn shots() -> PathBuf {
-    let shots = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap().join("dashboard");
+    let shots = Path::new(env!("CARGO_TARGET_TMPDIR"))
+        .parent()
+        .unwrap()
+        .join("dashboard");
     std::fs::create_dir_all(&shots).unwrap();
     shots
 }

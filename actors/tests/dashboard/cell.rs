@@ -46,7 +46,10 @@ pub(crate) fn config(name: &str, role: Role, landmarks: usize) -> NodeConfig {
 
 /// Two rows of parking spots, three metres apart.
 fn place(index: usize) -> (f64, f64) {
-    ((index / 2) as f64 * 3.0, if index.is_multiple_of(2) { 4.0 } else { -4.0 })
+    (
+        (index / 2) as f64 * 3.0,
+        if index.is_multiple_of(2) { 4.0 } else { -4.0 },
+    )
 }
 
 /// Starts a node in this process and waits for its page.
@@ -54,7 +57,10 @@ pub(crate) async fn start(config: NodeConfig) -> (NodeHandle, SocketAddr) {
     config.validate().unwrap();
     let node = node::start(config).await.unwrap();
     let mut address = node.dashboard_address();
-    let address = tokio::time::timeout(PATIENCE, address.wait_for(Option::is_some)).await.expect("no page").unwrap();
+    let address = tokio::time::timeout(PATIENCE, address.wait_for(Option::is_some))
+        .await
+        .expect("no page")
+        .unwrap();
     (node, address.unwrap())
 }
 
@@ -109,12 +115,17 @@ impl Stray {
                 }
             }
         });
-        Self { client, seq: 0, _task: tasks }
+        Self {
+            client,
+            seq: 0,
+            _task: tasks,
+        }
     }
 
     /// Reports from a place in the east that something stands at another.
     pub(crate) async fn report(&mut self, at_m: f64, seen_at_m: f64) {
-        self.send(at_m, vec![PerceivedObject::new("car", 0.8, seen_at_m, 0.0)]).await;
+        self.send(at_m, vec![PerceivedObject::new("car", 0.8, seen_at_m, 0.0)])
+            .await;
     }
 
     /// Reports from a place in the east that there is nothing.
@@ -131,12 +142,24 @@ impl Stray {
             ..ObjectReport::new(node, self.seq, clock::now())
         };
         let payload = encode(&report, Encoding::Json);
-        self.client.publish("ecod/v1/lot/vote_detections/stray", QoS::AtLeastOnce, false, payload).await.unwrap();
+        self.client
+            .publish(
+                "ecod/v1/lot/vote_detections/stray",
+                QoS::AtLeastOnce,
+                false,
+                payload,
+            )
+            .await
+            .unwrap();
     }
 }
 
 async fn report_to(broker: SocketAddr, vehicle: usize, landmarks: usize) {
-    let options = MqttOptions::new(format!("vehicle-{vehicle}"), broker.ip().to_string(), broker.port());
+    let options = MqttOptions::new(
+        format!("vehicle-{vehicle}"),
+        broker.ip().to_string(),
+        broker.port(),
+    );
     let (client, mut events) = AsyncClient::new(options, 16);
     let mut ticks = tokio::time::interval(Duration::from_millis(100));
     let mut seq = 0;
@@ -166,7 +189,11 @@ fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, Object
     let length = (landmarks / 2) as f64 * 3.0;
     let way_m = 3.0 * (second * 0.15 + vehicle as f64).sin();
     let from_west = vehicle.is_multiple_of(2);
-    let (x_m, y_m) = if from_west { (way_m - 3.0, -0.9) } else { (length - way_m, 0.9) };
+    let (x_m, y_m) = if from_west {
+        (way_m - 3.0, -0.9)
+    } else {
+        (length - way_m, 0.9)
+    };
     let heading_rad = if from_west { 0.1 } else { PI + 0.1 };
     let pose = WirePose::new(x_m, y_m, heading_rad);
     let in_view = |x: f64, y: f64| {
@@ -184,20 +211,36 @@ fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, Object
             y + 0.1 * (second * 1.3 + vehicle as f64).cos(),
         )
     };
-    let visible: Vec<usize> = (0..landmarks).filter(|index| in_view(place(*index).0, place(*index).1)).collect();
+    let visible: Vec<usize> = (0..landmarks)
+        .filter(|index| in_view(place(*index).0, place(*index).1))
+        .collect();
     let parked = visible.iter().filter(|index| *index % 5 != 2);
-    let mut objects: Vec<_> =
-        parked.map(|index| object("car", place(*index).0, place(*index).1, Some(*index))).collect();
-    let walker = (length / 2.0 + 5.0 * (second * 0.2).cos(), 1.6 * (second * 0.2).sin());
+    let mut objects: Vec<_> = parked
+        .map(|index| object("car", place(*index).0, place(*index).1, Some(*index)))
+        .collect();
+    let walker = (
+        length / 2.0 + 5.0 * (second * 0.2).cos(),
+        1.6 * (second * 0.2).sin(),
+    );
     if in_view(walker.0, walker.1) {
         objects.push(object("person", walker.0, walker.1, None));
     }
     let name = NAMES[vehicle % NAMES.len()];
-    let node = if vehicle < NAMES.len() { name.to_owned() } else { format!("{name}-{vehicle}") };
+    let node = if vehicle < NAMES.len() {
+        name.to_owned()
+    } else {
+        format!("{name}-{vehicle}")
+    };
     let node = NodeName::new(node).unwrap();
     let captured_at_us = clock::now();
-    let seen = visible.iter().map(|index| format!("slot-{index}").into()).collect();
-    let view = Some(FieldOfView { range_m: 16.0, angle_rad: 1.1 });
+    let seen = visible
+        .iter()
+        .map(|index| format!("slot-{index}").into())
+        .collect();
+    let view = Some(FieldOfView {
+        range_m: 16.0,
+        angle_rad: 1.1,
+    });
     let map = ObjectReport {
         pose: Some(pose),
         objects,
@@ -211,7 +254,19 @@ fn reports(vehicle: usize, seq: u64, landmarks: usize) -> [(&'static str, Object
         _ => "car",
     };
     let voted = visible.iter().filter(|index| **index < 6);
-    let votes = voted.map(|index| object(label(*index), place(*index).0, place(*index).1, Some(*index)));
-    let votes = ObjectReport { objects: votes.collect(), seen: None, view: None, ..map.clone() };
+    let votes = voted.map(|index| {
+        object(
+            label(*index),
+            place(*index).0,
+            place(*index).1,
+            Some(*index),
+        )
+    });
+    let votes = ObjectReport {
+        objects: votes.collect(),
+        seen: None,
+        view: None,
+        ..map.clone()
+    };
     [("detections", map), ("vote_detections", votes)]
 }

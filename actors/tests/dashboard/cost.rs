@@ -15,7 +15,10 @@ const SPAN: Duration = Duration::from_secs(10);
 async fn usage(page: SocketAddr) -> [f64; 2] {
     let metrics = get(page, "/metrics").await.body;
     ["process_resident_memory_bytes", "process_cpu_seconds_total"].map(|name| {
-        let line = metrics.lines().find(|line| line.starts_with(&format!("{name} "))).unwrap();
+        let line = metrics
+            .lines()
+            .find(|line| line.starts_with(&format!("{name} ")))
+            .unwrap();
         line.rsplit_once(' ').unwrap().1.parse().unwrap()
     })
 }
@@ -40,7 +43,11 @@ async fn what_a_node_costs_with_32_vehicles() {
     println!("first picture {:?} after it was asked for", first.elapsed());
     tokio::time::sleep(Duration::from_secs(3)).await;
     for looked_at in [false, true] {
-        let mut events = if looked_at { Some(Events::open(place.page).await) } else { None };
+        let mut events = if looked_at {
+            Some(Events::open(place.page).await)
+        } else {
+            None
+        };
         let [_, before] = usage(place.page).await;
         let begun = Instant::now();
         while begun.elapsed() < SPAN {
@@ -51,6 +58,9 @@ async fn what_a_node_costs_with_32_vehicles() {
         }
         let [bytes, after] = usage(place.page).await;
         let percent = 100.0 * (after - before) / begun.elapsed().as_secs_f64();
-        println!("32 vehicles, looked at: {looked_at}: {:.1} MB resident, {percent:.1} % of a core", bytes / 1e6);
+        println!(
+            "32 vehicles, looked at: {looked_at}: {:.1} MB resident, {percent:.1} % of a core",
+            bytes / 1e6
+        );
     }
 }

@@ -16,9 +16,15 @@ async fn a_page_of_the_nodes_host_shows_the_map_and_one_of_another_name_does_not
     let port = listener.local_addr().unwrap().port();
     tokio::spawn(async move {
         while let Ok((mut stream, _)) = listener.accept().await {
-            let head = format!("HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: {}\r\n", PAGE.len());
+            let head = format!(
+                "HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: {}\r\n",
+                PAGE.len()
+            );
             stream.read(&mut [0; 4096]).await.unwrap_or_default();
-            stream.write_all(format!("{head}Connection: close\r\n\r\n{PAGE}").as_bytes()).await.unwrap_or_default();
+            stream
+                .write_all(format!("{head}Connection: close\r\n\r\n{PAGE}").as_bytes())
+                .await
+                .unwrap_or_default();
         }
     });
     let config = config("euclid", Role::Auto, 12);
@@ -29,12 +35,22 @@ async fn a_page_of_the_nodes_host_shows_the_map_and_one_of_another_name_does_not
     let browser = Browser::start().await;
     browser.look(412, 800, "light").await;
     let query = format!("map.html?cell={cell}&port={}", door.port());
-    browser.open(&format!("http://127.0.0.1:{port}/{query}")).await;
-    browser.until("/^euclid, round/.test(document.querySelector('#state').textContent)").await;
-    browser.until("document.querySelectorAll('.place').length === 12").await;
+    browser
+        .open(&format!("http://127.0.0.1:{port}/{query}"))
+        .await;
+    browser
+        .until("/^euclid, round/.test(document.querySelector('#state').textContent)")
+        .await;
+    browser
+        .until("document.querySelectorAll('.place').length === 12")
+        .await;
     // Chromium takes every name below localhost for this machine; the door does not know it.
-    browser.open(&format!("http://elsewhere.localhost:{port}/{query}")).await;
-    browser.until("/^No connection/.test(document.querySelector('#state').textContent)").await;
+    browser
+        .open(&format!("http://elsewhere.localhost:{port}/{query}"))
+        .await;
+    browser
+        .until("/^No connection/.test(document.querySelector('#state').textContent)")
+        .await;
     browser.quit().await;
     node.stop().await;
 }

@@ -12,18 +12,43 @@ use crate::http::{get, try_request};
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_vehicle_is_ready_when_it_follows_a_leader_that_publishes() {
     let (cav, page) = start(config("euclid", Role::Cav, 2)).await;
-    assert_eq!((get(page, "/healthz").await.status, get(page, "/healthz").await.body.as_str()), (200, "ok\n"));
+    assert_eq!(
+        (
+            get(page, "/healthz").await.status,
+            get(page, "/healthz").await.body.as_str()
+        ),
+        (200, "ok\n")
+    );
     let alone = get(page, "/readyz").await;
-    assert_eq!((alone.status, alone.json()["reason"].as_str()), (503, Some("no leader known")));
+    assert_eq!(
+        (alone.status, alone.json()["reason"].as_str()),
+        (503, Some("no leader known"))
+    );
 
     let (edge, edge_page) = join(config("edge", Role::Edge, 2), &cav).await;
-    until("the edge is ready", || async { get(edge_page, "/readyz").await.json()["reason"] == "leading" }).await;
-    until("the vehicle is ready", || async { get(page, "/readyz").await.status == 200 }).await;
-    assert_eq!(get(page, "/readyz").await.json()["reason"], "following edge");
+    until("the edge is ready", || async {
+        get(edge_page, "/readyz").await.json()["reason"] == "leading"
+    })
+    .await;
+    until("the vehicle is ready", || async {
+        get(page, "/readyz").await.status == 200
+    })
+    .await;
+    assert_eq!(
+        get(page, "/readyz").await.json()["reason"],
+        "following edge"
+    );
 
     edge.stop().await;
-    until("the vehicle is not ready", || async { get(page, "/readyz").await.status == 503 }).await;
-    assert_eq!(get(page, "/healthz").await.status, 200, "it lives all the same");
+    until("the vehicle is not ready", || async {
+        get(page, "/readyz").await.status == 503
+    })
+    .await;
+    assert_eq!(
+        get(page, "/healthz").await.status,
+        200,
+        "it lives all the same"
+    );
     cav.stop().await;
 }
 
@@ -34,14 +59,26 @@ async fn a_busy_port_is_counted_and_taken_as_soon_as_it_is_free() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.listen = Some(address);
     let node = ecod_actors::node::start(config).await.unwrap();
-    until("it is counted", || async { node.counters().events(Event::DashboardNotBound) > 0 }).await;
-    until("the node leads all the same", || async { node.leadership().borrow().is_leading() }).await;
+    until("it is counted", || async {
+        node.counters().events(Event::DashboardNotBound) > 0
+    })
+    .await;
+    until("the node leads all the same", || async {
+        node.leadership().borrow().is_leading()
+    })
+    .await;
     assert_eq!(*node.dashboard_address().borrow(), None);
     drop(taken);
-    until("the page is served", || async { node.dashboard_address().borrow().is_some() }).await;
+    until("the page is served", || async {
+        node.dashboard_address().borrow().is_some()
+    })
+    .await;
     assert_eq!(get(address, "/healthz").await.status, 200);
     node.stop().await;
-    assert!(TcpListener::bind(address).is_ok(), "a stopped node leaves its port");
+    assert!(
+        TcpListener::bind(address).is_ok(),
+        "a stopped node leaves its port"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -55,9 +92,16 @@ async fn nodes_that_are_told_no_address_have_a_page_each_on_this_machine_only() 
     let (other, second) = start(unplaced("gauss")).await;
     assert!(first.ip().is_loopback() && second.ip().is_loopback());
     for (node, page) in [("euclid", first), ("gauss", second)] {
-        assert_eq!(get(page, "/api/picture").await.json()["node"]["name"], node, "{first} {second}");
+        assert_eq!(
+            get(page, "/api/picture").await.json()["node"]["name"],
+            node,
+            "{first} {second}"
+        );
     }
-    assert_ne!(second, DEFAULT_ADDRESS, "the first has it, or whoever had it before");
+    assert_ne!(
+        second, DEFAULT_ADDRESS,
+        "the first has it, or whoever had it before"
+    );
     assert_eq!(other.counters().events(Event::DashboardNotBound), 0);
     one.stop().await;
     other.stop().await;
@@ -68,7 +112,10 @@ async fn a_page_that_is_switched_off_is_not_there() {
     let mut config = config("euclid", Role::Auto, 1);
     config.dashboard.enabled = false;
     let node = ecod_actors::node::start(config).await.unwrap();
-    until("the node leads", || async { node.leadership().borrow().is_leading() }).await;
+    until("the node leads", || async {
+        node.leadership().borrow().is_leading()
+    })
+    .await;
     assert!(node.slots().dashboard.get().is_none());
     assert_eq!(*node.dashboard_address().borrow(), None);
     node.stop().await;

@@ -20,8 +20,15 @@ pub(crate) struct Answer {
 
 impl Answer {
     pub(crate) fn header(&self, name: &str) -> Option<&str> {
-        let named = |line: &&str| line.split_once(':').is_some_and(|(found, _)| found.eq_ignore_ascii_case(name));
-        self.headers.lines().find(named).and_then(|line| line.split_once(':')).map(|(_, value)| value.trim())
+        let named = |line: &&str| {
+            line.split_once(':')
+                .is_some_and(|(found, _)| found.eq_ignore_ascii_case(name))
+        };
+        self.headers
+            .lines()
+            .find(named)
+            .and_then(|line| line.split_once(':'))
+            .map(|(_, value)| value.trim())
     }
 
     pub(crate) fn json(&self) -> serde_json::Value {
@@ -58,10 +65,14 @@ pub(crate) async fn try_request(
     body: &str,
 ) -> io::Result<Answer> {
     let mut stream = BufReader::new(TcpStream::connect(address).await?);
-    let headers: String = headers.iter().map(|(name, value)| format!("{name}: {value}\r\n")).collect();
+    let headers: String = headers
+        .iter()
+        .map(|(name, value)| format!("{name}: {value}\r\n"))
+        .collect();
     let length = body.len();
-    let request =
-        format!("{method} {path} HTTP/1.1\r\n{headers}Content-Length: {length}\r\nConnection: close\r\n\r\n{body}");
+    let request = format!(
+        "{method} {path} HTTP/1.1\r\n{headers}Content-Length: {length}\r\nConnection: close\r\n\r\n{body}"
+    );
     stream.write_all(request.as_bytes()).await?;
     let mut head = String::new();
     while !head.ends_with("\r\n\r\n") {
@@ -69,9 +80,20 @@ pub(crate) async fn try_request(
             return Err(io::ErrorKind::UnexpectedEof.into());
         }
     }
-    let status = head.split(' ').nth(1).and_then(|status| status.parse().ok()).unwrap();
-    let mut answer = Answer { status, headers: head, body: String::new() };
-    if let Some(length) = answer.header("content-length").and_then(|length| length.parse().ok()) {
+    let status = head
+        .split(' ')
+        .nth(1)
+        .and_then(|status| status.parse().ok())
+        .unwrap();
+    let mut answer = Answer {
+        status,
+        headers: head,
+        body: String::new(),
+    };
+    if let Some(length) = answer
+        .header("content-length")
+        .and_then(|length| length.parse().ok())
+    {
         let mut bytes = vec![0; length];
         stream.read_exact(&mut bytes).await?;
         // A picture is no text, and no test reads it as such.
@@ -106,7 +128,10 @@ impl Events {
 
     pub(crate) async fn open_at(address: SocketAddr, path: &str) -> Self {
         let mut stream = TcpStream::connect(address).await.unwrap();
-        stream.write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes()).await.unwrap();
+        stream
+            .write_all(format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes())
+            .await
+            .unwrap();
         Self(BufReader::new(stream))
     }
 
@@ -114,7 +139,10 @@ impl Events {
     pub(crate) async fn next(&mut self) -> serde_json::Value {
         loop {
             let mut line = String::new();
-            let read = timeout(PATIENCE, self.0.read_line(&mut line)).await.expect("no picture").unwrap();
+            let read = timeout(PATIENCE, self.0.read_line(&mut line))
+                .await
+                .expect("no picture")
+                .unwrap();
             assert!(read > 0, "the stream ended");
             if let Some(data) = line.strip_prefix("data: ") {
                 return serde_json::from_str(data).unwrap();
@@ -123,7 +151,11 @@ impl Events {
     }
 
     /// Pictures until one is as wanted.
-    pub(crate) async fn until(&mut self, what: &str, holds: impl Fn(&serde_json::Value) -> bool) -> serde_json::Value {
+    pub(crate) async fn until(
+        &mut self,
+        what: &str,
+        holds: impl Fn(&serde_json::Value) -> bool,
+    ) -> serde_json::Value {
         let found = async {
             loop {
                 let picture = self.next().await;
@@ -132,6 +164,8 @@ impl Events {
                 }
             }
         };
-        timeout(PATIENCE, found).await.unwrap_or_else(|_| panic!("never seen: {what}"))
+        timeout(PATIENCE, found)
+            .await
+            .unwrap_or_else(|_| panic!("never seen: {what}"))
     }
 }

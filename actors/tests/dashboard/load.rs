@@ -40,14 +40,26 @@ const MOST: Duration = Duration::from_secs(2);
 async fn browsers_that_never_read_are_left_behind() {
     let (node, page) = start(config("edge", Role::Edge, 600)).await;
     let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 600);
-    until("the node is ready", || async { get(page, "/readyz").await.status == 200 }).await;
+    until("the node is ready", || async {
+        get(page, "/readyz").await.status == 200
+    })
+    .await;
     let mut deaf = Vec::new();
     for _ in 0..8 {
         let mut stream = TcpStream::connect(page).await.unwrap();
-        stream.write_all(b"GET /api/events HTTP/1.1\r\nHost: localhost\r\n\r\n").await.unwrap();
+        stream
+            .write_all(b"GET /api/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            .await
+            .unwrap();
         deaf.push(stream);
     }
-    let viewers = || async { get(page, "/metrics").await.body.lines().any(|line| line == "ecod_dashboard_viewers 8") };
+    let viewers = || async {
+        get(page, "/metrics")
+            .await
+            .body
+            .lines()
+            .any(|line| line == "ecod_dashboard_viewers 8")
+    };
     until("they are there", viewers).await;
     let (gap, ()) = longest_gap(&node, async {
         let mut reader = Events::open(page).await;
@@ -55,8 +67,13 @@ async fn browsers_that_never_read_are_left_behind() {
         while begun.elapsed() < Duration::from_secs(3) {
             reader.next().await;
         }
-        let alone =
-            || async { get(page, "/metrics").await.body.lines().any(|line| line == "ecod_dashboard_viewers 1") };
+        let alone = || async {
+            get(page, "/metrics")
+                .await
+                .body
+                .lines()
+                .any(|line| line == "ecod_dashboard_viewers 1")
+        };
         until("those that do not read are cut off", alone).await;
         reader.next().await;
     })
@@ -70,7 +87,10 @@ async fn browsers_that_never_read_are_left_behind() {
 async fn ten_thousand_messages_from_a_browser_are_slowed_down_and_counted() {
     let (node, page) = start(config("edge", Role::Edge, 20)).await;
     let _vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 20);
-    until("the node is ready", || async { get(page, "/readyz").await.status == 200 }).await;
+    until("the node is ready", || async {
+        get(page, "/readyz").await.status == 200
+    })
+    .await;
     let (gap, ()) = longest_gap(&node, async {
         let mut floods: JoinSet<()> = (0..4).map(|_| flood(page, 2500)).collect();
         while let Some(flooded) = floods.join_next().await {
@@ -81,8 +101,15 @@ async fn ten_thousand_messages_from_a_browser_are_slowed_down_and_counted() {
     println!("longest time between two maps beside 10,000 requests: {gap:?}");
     assert!(gap < MOST, "{gap:?}");
     assert!(node.counters().events(Event::BrowserThrottled) > 1000);
-    assert_eq!(get(page, "/healthz").await.status, 200, "health is told all the same");
-    until("pages are served again", || async { get(page, "/").await.status == 200 }).await;
+    assert_eq!(
+        get(page, "/healthz").await.status,
+        200,
+        "health is told all the same"
+    );
+    until("pages are served again", || async {
+        get(page, "/").await.status == 200
+    })
+    .await;
     node.stop().await;
 }
 
@@ -107,8 +134,14 @@ async fn a_flood_without_the_token_slows_down_nobody_who_has_it() {
             }
         });
     }
-    until("it is slowed down", || async { node.counters().events(Event::BrowserThrottled) > 100 }).await;
-    let known = [("Host", "localhost"), ("Authorization", "Bearer correct-horse-battery")];
+    until("it is slowed down", || async {
+        node.counters().events(Event::BrowserThrottled) > 100
+    })
+    .await;
+    let known = [
+        ("Host", "localhost"),
+        ("Authorization", "Bearer correct-horse-battery"),
+    ];
     for _ in 0..50 {
         assert_eq!(get_with(page, "/metrics", &known).await.status, 200);
     }
@@ -123,7 +156,10 @@ async fn connections_that_say_nothing_give_way_and_are_closed_soon() {
     for _ in 0..most + 10 {
         silent.push(TcpStream::connect(page).await.unwrap());
     }
-    until("some gave way", || async { node.counters().events(Event::BrowserRefused) >= 10 }).await;
+    until("some gave way", || async {
+        node.counters().events(Event::BrowserRefused) >= 10
+    })
+    .await;
     for path in ["/healthz", "/readyz", "/metrics", "/api/picture"] {
         assert!([200, 503].contains(&get(page, path).await.status), "{path}");
     }
@@ -131,7 +167,11 @@ async fn connections_that_say_nothing_give_way_and_are_closed_soon() {
     for mut stream in silent {
         assert_eq!(stream.read(&mut [0]).await.unwrap(), 0);
     }
-    assert!(begun.elapsed() < Duration::from_secs(20), "{:?}", begun.elapsed());
+    assert!(
+        begun.elapsed() < Duration::from_secs(20),
+        "{:?}",
+        begun.elapsed()
+    );
     node.stop().await;
 }
 
@@ -146,11 +186,18 @@ async fn as_many_pages_as_may_be_open_leave_room_for_machines() {
         live.push(Events::open(page).await);
         live.last_mut().unwrap().next().await;
         let mut stream = TcpStream::connect(page).await.unwrap();
-        stream.write_all(b"GET /api/history HTTP/1.1\r\nHost: localhost\r\n\r\n").await.unwrap();
+        stream
+            .write_all(b"GET /api/history HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            .await
+            .unwrap();
         assert!(stream.read(&mut [0; 64]).await.unwrap() > 0);
         kept.push(stream);
     }
-    assert_eq!(get(page, "/api/events").await.status, 503, "a page too many asks for pictures");
+    assert_eq!(
+        get(page, "/api/events").await.status,
+        503,
+        "a page too many asks for pictures"
+    );
     let refused = node.counters().events(Event::BrowserRefused);
     for path in ["/metrics", "/healthz", "/api/picture"] {
         assert_eq!(get(page, path).await.status, 200, "{path}");
@@ -160,7 +207,10 @@ async fn as_many_pages_as_may_be_open_leave_room_for_machines() {
     for _ in 0..20 {
         silent.push(TcpStream::connect(page).await.unwrap());
     }
-    until("some gave way", || async { node.counters().events(Event::BrowserRefused) >= refused + 16 }).await;
+    until("some gave way", || async {
+        node.counters().events(Event::BrowserRefused) >= refused + 16
+    })
+    .await;
     for events in &mut live {
         events.next().await;
     }

@@ -26,7 +26,10 @@ fn tracking(landmarks: usize) -> NodeConfig {
 fn object(label: &str, x_m: f64, y_m: f64, sigma_m: f64) -> PerceivedObject {
     let variance = sigma_m * sigma_m;
     let covariance_m2 = Some([variance, 0.0, variance]);
-    PerceivedObject { covariance_m2, ..PerceivedObject::new(label, 0.9, x_m, y_m) }
+    PerceivedObject {
+        covariance_m2,
+        ..PerceivedObject::new(label, 0.9, x_m, y_m)
+    }
 }
 
 /// A cup that two vehicles see, a dog that walks and only galileo sees, and a boat far away.
@@ -42,14 +45,26 @@ fn watch(broker: std::net::SocketAddr) -> JoinSet<()> {
                 let walked_m = 3.0 * (clock::now().micros() as f64 / 1e6 * 0.4).sin();
                 let mut objects = vec![object("cup", 1.0, 1.0, 0.1)];
                 if name == "galileo" {
-                    objects.extend([object("dog", 3.0 + walked_m, -1.0, 0.1), object("boat", 600.0, 200.0, 20.0)]);
+                    objects.extend([
+                        object("dog", 3.0 + walked_m, -1.0, 0.1),
+                        object("boat", 600.0, 200.0, 20.0),
+                    ]);
                 }
                 let pose = Some(WirePose::new(x_m, 0.0, 0.0));
                 let node = NodeName::from_static(name);
-                let report = ObjectReport { pose, objects, ..ObjectReport::new(node, seq, clock::now()) };
+                let report = ObjectReport {
+                    pose,
+                    objects,
+                    ..ObjectReport::new(node, seq, clock::now())
+                };
                 let topic = format!("ecod/v1/lot/detections/{name}");
                 // A broker that is not there gets nothing.
-                let _ = client.try_publish(topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json));
+                let _ = client.try_publish(
+                    topic,
+                    QoS::AtMostOnce,
+                    false,
+                    encode(&report, Encoding::Json),
+                );
             }
         });
     }
@@ -62,7 +77,10 @@ const WIDTH: &str = "(([...all]) => { const xs = all.map((place) => Number(place
 const DETAILS: &str = "(document.querySelector('#map-details').hidden ? '' : document.querySelector('#map-details').innerText.replaceAll('\\n', ' '))";
 
 fn shots() -> PathBuf {
-    let shots = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap().join("dashboard");
+    let shots = Path::new(env!("CARGO_TARGET_TMPDIR"))
+        .parent()
+        .unwrap()
+        .join("dashboard");
     std::fs::create_dir_all(&shots).unwrap();
     shots
 }
@@ -80,26 +98,44 @@ async fn a_far_object_is_pointed_to_and_things_tell_about_themselves() {
     browser.until(&all.join(" && ")).await;
 
     // The fit.
-    browser.until("/^boat, 6[0-9][0-9] m$/.test(document.querySelector('#map text.cue')?.textContent)").await;
+    browser
+        .until("/^boat, 6[0-9][0-9] m$/.test(document.querySelector('#map text.cue')?.textContent)")
+        .await;
     browser
         .until(&format!("{WIDTH} > 300 && document.querySelector('#map-outside').textContent.startsWith('1 outside')"))
         .await;
     let fill = "getComputedStyle(document.querySelector('#map g[aria-label^=boat] .ellipse')).fill";
-    assert_eq!(browser.evaluate(fill).await, "none", "an ellipse over the whole map does not cover it");
+    assert_eq!(
+        browser.evaluate(fill).await,
+        "none",
+        "an ellipse over the whole map does not cover it"
+    );
     browser.click("#map-outside").await;
-    browser.until(&format!("{WIDTH} < 30 && document.querySelector('#map-outside').hidden")).await;
-    browser.evaluate("document.querySelector('#fit').click()").await;
+    browser
+        .until(&format!(
+            "{WIDTH} < 30 && document.querySelector('#map-outside').hidden"
+        ))
+        .await;
+    browser
+        .evaluate("document.querySelector('#fit').click()")
+        .await;
     browser.until(&format!("{WIDTH} > 300")).await;
 
     // Details of what is pointed at.
-    browser.evaluate("document.querySelector('#map g[aria-label^=cup] .centre').id = 'cup'").await;
+    browser
+        .evaluate("document.querySelector('#map g[aria-label^=cup] .centre').id = 'cup'")
+        .await;
     browser.point_at("#cup").await;
-    browser.until(&format!("/^cup .*Seen by galileo, gauss /.test({DETAILS})")).await;
+    browser
+        .until(&format!("/^cup .*Seen by galileo, gauss /.test({DETAILS})"))
+        .await;
     browser.point_at("#map-title").await;
     browser.until(&format!("{DETAILS} === ''")).await;
 
     // By keys.
-    browser.evaluate("document.querySelector('#map').focus()").await;
+    browser
+        .evaluate("document.querySelector('#map').focus()")
+        .await;
     let at = "document.activeElement.getAttribute('aria-label')";
     for _ in 0..8 {
         browser.press("Tab").await;
@@ -107,7 +143,14 @@ async fn a_far_object_is_pointed_to_and_things_tell_about_themselves() {
             break;
         }
     }
-    assert!(browser.evaluate(at).await.as_str().unwrap().ends_with("seen only by galileo"));
+    assert!(
+        browser
+            .evaluate(at)
+            .await
+            .as_str()
+            .unwrap()
+            .ends_with("seen only by galileo")
+    );
     let fact = |what: &str| format!("/{what}/.test({DETAILS})");
     for what in [
         "^dog .*Seen only by galileo ",
@@ -119,35 +162,62 @@ async fn a_far_object_is_pointed_to_and_things_tell_about_themselves() {
     }
     browser.press("Enter").await;
     browser.evaluate("document.activeElement.blur()").await;
-    browser.until("document.querySelector('#map-details').classList.contains('kept')").await;
-    for (name, width, scheme) in [("map-light", 1280, "light"), ("map-dark", 1280, "dark"), ("map-phone", 390, "light")]
-    {
-        browser.look(width, if width < 600 { 844 } else { 800 }, scheme).await;
-        browser.evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })").await;
+    browser
+        .until("document.querySelector('#map-details').classList.contains('kept')")
+        .await;
+    for (name, width, scheme) in [
+        ("map-light", 1280, "light"),
+        ("map-dark", 1280, "dark"),
+        ("map-phone", 390, "light"),
+    ] {
+        browser
+            .look(width, if width < 600 { 844 } else { 800 }, scheme)
+            .await;
+        browser
+            .evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })")
+            .await;
         browser.until(&fact("^dog ")).await;
-        browser.screenshot(&shots().join(format!("{name}.png"))).await;
+        browser
+            .screenshot(&shots().join(format!("{name}.png")))
+            .await;
         let wider = "document.documentElement.scrollWidth > document.documentElement.clientWidth";
-        assert_eq!(browser.evaluate(wider).await, false, "{name}: the page scrolls sideways");
+        assert_eq!(
+            browser.evaluate(wider).await,
+            false,
+            "{name}: the page scrolls sideways"
+        );
     }
     browser.look(1280, 800, "light").await;
-    browser.evaluate("document.querySelector('#map').focus()").await;
+    browser
+        .evaluate("document.querySelector('#map').focus()")
+        .await;
     browser.press("Escape").await;
     browser.until(&format!("{DETAILS} === ''")).await;
-    browser.evaluate("document.querySelector('#map g[aria-label^=gauss] .body').id = 'gauss'").await;
+    browser
+        .evaluate("document.querySelector('#map g[aria-label^=gauss] .body').id = 'gauss'")
+        .await;
     browser.click("#gauss").await;
     browser.point_at("#map-title").await;
-    browser.until(&fact("^gauss .*Last report now .*Sees 1 object Position 6.00 m east")).await;
+    browser
+        .until(&fact(
+            "^gauss .*Last report now .*Sees 1 object Position 6.00 m east",
+        ))
+        .await;
     browser.click("#details-close").await;
     browser.until(&format!("{DETAILS} === ''")).await;
 
     // Trails: of the dog, and not of the cup.
     let pieces = "document.querySelectorAll('#map .trail').length";
-    browser.until(&format!("{pieces} >= 3 && {pieces} <= 4")).await;
+    browser
+        .until(&format!("{pieces} >= 3 && {pieces} <= 4"))
+        .await;
     let earlier = "(({ min }) => (document.querySelector('#timeline-cursor').value = min, \
         document.querySelector('#timeline-cursor').dispatchEvent(new Event('input'))))(document.querySelector('#timeline-cursor'))";
     browser.evaluate(earlier).await;
     browser.until(&format!("{pieces} === 0")).await;
-    browser.evaluate("document.querySelector('#timeline-live').click()").await;
+    browser
+        .evaluate("document.querySelector('#timeline-live').click()")
+        .await;
     browser.until(&format!("{pieces} >= 3")).await;
     assert_eq!(browser.complaints().await, Vec::<String>::new());
     browser.quit().await;
@@ -162,23 +232,44 @@ async fn terms_are_explained() {
     let browser = Browser::start().await;
     browser.look(390, 844, "light").await;
     browser.open(&format!("http://{page}/")).await;
-    browser.until("document.querySelector('#leader').textContent === 'euclid'").await;
+    browser
+        .until("document.querySelector('#leader').textContent === 'euclid'")
+        .await;
     let terms = "[...document.querySelectorAll('[data-term]')]";
-    let told = format!("{terms}.map((it) => document.getElementById(it.getAttribute('aria-describedby')).textContent)");
+    let told = format!(
+        "{terms}.map((it) => document.getElementById(it.getAttribute('aria-describedby')).textContent)"
+    );
     let told: Vec<String> = serde_json::from_value(browser.evaluate(&told).await).unwrap();
     assert!(told.len() >= 13, "{told:?}");
     for sentences in &told {
-        let longest = sentences.split(". ").map(|sentence| sentence.split_whitespace().count()).max().unwrap();
+        let longest = sentences
+            .split(". ")
+            .map(|sentence| sentence.split_whitespace().count())
+            .max()
+            .unwrap();
         assert!((5..=25).contains(&longest), "{sentences}");
     }
-    let tip = "(document.querySelector('#tip').hidden ? '' : document.querySelector('#tip').textContent)";
+    let tip =
+        "(document.querySelector('#tip').hidden ? '' : document.querySelector('#tip').textContent)";
     for (index, words) in told.iter().enumerate() {
-        if browser.evaluate(&format!("{terms}[{index}].checkVisibility()")).await == false {
+        if browser
+            .evaluate(&format!("{terms}[{index}].checkVisibility()"))
+            .await
+            == false
+        {
             continue;
         }
-        browser.evaluate(&format!("{terms}[{index}].scrollIntoView({{ block: 'center' }})")).await;
+        browser
+            .evaluate(&format!(
+                "{terms}[{index}].scrollIntoView({{ block: 'center' }})"
+            ))
+            .await;
         tokio::time::sleep(Duration::from_millis(50)).await;
-        browser.evaluate(&format!("{terms}[{index}].focus({{ preventScroll: true }})")).await;
+        browser
+            .evaluate(&format!(
+                "{terms}[{index}].focus({{ preventScroll: true }})"
+            ))
+            .await;
         assert_eq!(browser.evaluate(tip).await, words.as_str());
         let is_inside = "(({ left, top, right, bottom }) => left >= 0 && top >= 0 && right <= innerWidth && bottom <= innerHeight)\
             (document.querySelector('#tip').getBoundingClientRect())";
@@ -186,12 +277,17 @@ async fn terms_are_explained() {
         browser.press("Escape").await;
         assert_eq!(browser.evaluate(tip).await, "");
     }
-    browser.evaluate("(document.activeElement.blur(), scrollTo(0, 0))").await;
+    browser
+        .evaluate("(document.activeElement.blur(), scrollTo(0, 0))")
+        .await;
     // The page hides it while it scrolls, as it may still do.
     until("the term is explained", || async {
         browser.point_at("#cell").await;
         browser.point_at("[data-term=latency]").await;
-        browser.evaluate(&format!("{tip}.startsWith('Time from the oldest picture')")).await == true
+        browser
+            .evaluate(&format!("{tip}.startsWith('Time from the oldest picture')"))
+            .await
+            == true
     })
     .await;
     browser.screenshot(&shots().join("term.png")).await;
@@ -209,15 +305,23 @@ fn with_plan(directory: &Path) -> NodeConfig {
     use opencv::imgproc;
     let mut plan = Mat::new_rows_cols_with_default(400, 800, CV_8UC3, Scalar::all(250.0)).unwrap();
     let ink = Scalar::new(80.0, 60.0, 40.0, 0.0);
-    for [left, top, right, bottom] in [[4, 4, 796, 396], [170, 60, 560, 140], [170, 260, 560, 340]] {
+    for [left, top, right, bottom] in [[4, 4, 796, 396], [170, 60, 560, 140], [170, 260, 560, 340]]
+    {
         let (from, to) = (Point::new(left, top), Point::new(right, bottom));
         let area = opencv::core::Rect::from_points(from, to);
         imgproc::rectangle(&mut plan, area, ink, 4, imgproc::LINE_8, 0).unwrap();
     }
     let image = directory.join("plan.jpg");
-    std::fs::write(&image, ecod_actors::camera::image_codec::encode_jpeg(&plan, 95).unwrap()).unwrap();
+    std::fs::write(
+        &image,
+        ecod_actors::camera::image_codec::encode_jpeg(&plan, 95).unwrap(),
+    )
+    .unwrap();
     let point = |pixel, position_m| FloorPlanPoint { pixel, position_m };
-    let points = [point([200.0, 120.0], [0.0, 4.0]), point([500.0, 280.0], [15.0, -4.0])];
+    let points = [
+        point([200.0, 120.0], [0.0, 4.0]),
+        point([500.0, 280.0], [15.0, -4.0]),
+    ];
     let mut config = tracking(12);
     config.dashboard.floor_plan = Some(FloorPlanConfig { image, points });
     config
@@ -230,14 +334,23 @@ async fn a_floor_plan_lies_under_the_map_where_it_belongs() {
     let directory = tempfile::tempdir().unwrap();
     let (node, page) = start(with_plan(directory.path())).await;
     let answer = get(page, "/api/floor_plan").await;
-    assert_eq!((answer.status, answer.header("content-type")), (200, Some("image/png")));
+    assert_eq!(
+        (answer.status, answer.header("content-type")),
+        (200, Some("image/png"))
+    );
     let _vehicles = watch(node.broker_address().unwrap());
     let browser = Browser::start().await;
     browser.look(1280, 800, "light").await;
     browser.open(&format!("http://{page}/")).await;
-    browser.until("document.querySelectorAll('#map .place').length === 12").await;
-    browser.until("document.querySelector('#map image')?.getAttribute('width') === '800'").await;
-    browser.until("document.querySelector('#map g[aria-label^=dog]') !== null").await;
+    browser
+        .until("document.querySelectorAll('#map .place').length === 12")
+        .await;
+    browser
+        .until("document.querySelector('#map image')?.getAttribute('width') === '800'")
+        .await;
+    browser
+        .until("document.querySelector('#map g[aria-label^=dog]') !== null")
+        .await;
     // Slots 0 and 11 at their pixels of the plan.
     for (index, column, row) in [(0, 200, 120), (11, 500, 280)] {
         let apart = format!(
@@ -245,19 +358,38 @@ async fn a_floor_plan_lies_under_the_map_where_it_belongs() {
              (new DOMPoint({column}, {row}).matrixTransform(document.querySelector('#map image').transform.baseVal[0].matrix), \
              document.querySelectorAll('#map .place')[{index}])"
         );
-        assert!(browser.evaluate(&apart).await.as_f64().unwrap() < 0.5, "{index}");
+        assert!(
+            browser.evaluate(&apart).await.as_f64().unwrap() < 0.5,
+            "{index}"
+        );
     }
-    let shown =
-        browser.evaluate("(({ width }) => width)(document.querySelector('#map image').getBoundingClientRect())").await;
-    let panel = browser.evaluate("document.querySelector('#map').getBoundingClientRect().width").await;
+    let shown = browser
+        .evaluate(
+            "(({ width }) => width)(document.querySelector('#map image').getBoundingClientRect())",
+        )
+        .await;
+    let panel = browser
+        .evaluate("document.querySelector('#map').getBoundingClientRect().width")
+        .await;
     let share = shown.as_f64().unwrap() / panel.as_f64().unwrap();
-    assert!(share > 0.8 && share <= 1.0, "the plan fills {share} of the panel");
-    for (name, width, scheme) in
-        [("plan-light", 1280, "light"), ("plan-dark", 1280, "dark"), ("plan-phone", 390, "light")]
-    {
-        browser.look(width, if width < 600 { 844 } else { 800 }, scheme).await;
-        browser.evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })").await;
-        browser.screenshot(&shots().join(format!("{name}.png"))).await;
+    assert!(
+        share > 0.8 && share <= 1.0,
+        "the plan fills {share} of the panel"
+    );
+    for (name, width, scheme) in [
+        ("plan-light", 1280, "light"),
+        ("plan-dark", 1280, "dark"),
+        ("plan-phone", 390, "light"),
+    ] {
+        browser
+            .look(width, if width < 600 { 844 } else { 800 }, scheme)
+            .await;
+        browser
+            .evaluate("document.querySelector('#map-frame').scrollIntoView({ block: 'center' })")
+            .await;
+        browser
+            .screenshot(&shots().join(format!("{name}.png")))
+            .await;
     }
     assert_eq!(browser.complaints().await, Vec::<String>::new());
     browser.quit().await;
@@ -270,9 +402,22 @@ async fn a_floor_plan_that_is_no_image_ends_the_start() {
     let directory = tempfile::tempdir().unwrap();
     let image = directory.path().join("plan.png");
     std::fs::write(&image, "no image").unwrap();
-    let point = |metres: f64| FloorPlanPoint { pixel: [metres; 2], position_m: [metres; 2] };
+    let point = |metres: f64| FloorPlanPoint {
+        pixel: [metres; 2],
+        position_m: [metres; 2],
+    };
     let mut config = config("euclid", Role::Auto, 1);
-    config.dashboard.floor_plan = Some(FloorPlanConfig { image, points: [point(0.0), point(1.0)] });
-    let error = node::start(config).await.err().expect("it started").to_string();
-    assert!(error.contains("dashboard.floor_plan.image") && error.contains("a PNG, JPEG or WebP file"), "{error}");
+    config.dashboard.floor_plan = Some(FloorPlanConfig {
+        image,
+        points: [point(0.0), point(1.0)],
+    });
+    let error = node::start(config)
+        .await
+        .err()
+        .expect("it started")
+        .to_string();
+    assert!(
+        error.contains("dashboard.floor_plan.image") && error.contains("a PNG, JPEG or WebP file"),
+        "{error}"
+    );
 }

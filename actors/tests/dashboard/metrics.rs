@@ -13,7 +13,10 @@ use crate::http::get;
 /// Samples by name and labels; every line is checked.
 async fn scrape(page: SocketAddr) -> BTreeMap<String, f64> {
     let answer = get(page, "/metrics").await;
-    assert_eq!(answer.header("content-type"), Some("application/openmetrics-text; version=1.0.0; charset=utf-8"));
+    assert_eq!(
+        answer.header("content-type"),
+        Some("application/openmetrics-text; version=1.0.0; charset=utf-8")
+    );
     assert_eq!(answer.body.matches("# EOF").count(), 1);
     assert!(answer.body.ends_with("# EOF\n"));
     let mut types = BTreeMap::new();
@@ -32,7 +35,12 @@ async fn scrape(page: SocketAddr) -> BTreeMap<String, f64> {
                     .into_iter()
                     .any(|end| of(end).is_some_and(|kind| *kind == "histogram"));
             assert!(known, "{line}");
-            assert!(samples.insert(series.to_owned(), value.parse().unwrap()).is_none(), "{series} comes twice");
+            assert!(
+                samples
+                    .insert(series.to_owned(), value.parse().unwrap())
+                    .is_none(),
+                "{series} comes twice"
+            );
         }
     }
     samples
@@ -42,7 +50,10 @@ async fn scrape(page: SocketAddr) -> BTreeMap<String, f64> {
 async fn metrics_say_what_the_node_does() {
     let (node, page) = start(config("edge", Role::Edge, 6)).await;
     let before = scrape(page).await;
-    assert_eq!(before[r#"ecod_payloads_rejected_total{reason="malformed"}"#], 0.0, "there before it matters");
+    assert_eq!(
+        before[r#"ecod_payloads_rejected_total{reason="malformed"}"#], 0.0,
+        "there before it matters"
+    );
     let vehicles = Vehicles::start(&[node.broker_address().unwrap()], 4, 6);
     until("reports and reputations come", || async {
         let samples = scrape(page).await;
@@ -60,11 +71,14 @@ async fn metrics_say_what_the_node_does() {
     assert!(samples[r#"ecod_rounds_accepted_total{kind="map"}"#] > 5.0);
     assert!(samples["process_resident_memory_bytes"] > 1e6);
     assert!(samples["process_cpu_seconds_total"] > 0.0);
-    for file in
-        [include_str!("../../../packaging/prometheus/alerts.yml"), include_str!("../../../packaging/grafana/ecod.json")]
-    {
+    for file in [
+        include_str!("../../../packaging/prometheus/alerts.yml"),
+        include_str!("../../../packaging/grafana/ecod.json"),
+    ] {
         for name in names(file) {
-            let known = samples.keys().any(|series| series.split('{').next() == Some(name));
+            let known = samples
+                .keys()
+                .any(|series| series.split('{').next() == Some(name));
             assert!(known, "{name} is asked for and does not exist");
         }
     }
@@ -78,20 +92,37 @@ fn the_dashboard_of_grafana_shows_one_cell_at_a_time() {
     let text = include_str!("../../../packaging/grafana/ecod.json");
     let dashboard: Value = serde_json::from_str(text).unwrap();
     let variables = dashboard["templating"]["list"].as_array().unwrap();
-    let variable = |name: &str| variables.iter().find(|variable| variable["name"] == name).unwrap();
+    let variable = |name: &str| {
+        variables
+            .iter()
+            .find(|variable| variable["name"] == name)
+            .unwrap()
+    };
     assert_eq!(
         (&variable("cell")["multi"], &variable("cell")["includeAll"]),
         (&Value::from(false), &Value::from(false))
     );
-    assert!(variable("instance")["query"]["query"].as_str().unwrap().contains(r#"cell="$cell""#));
-    let targets = dashboard["panels"].as_array().unwrap().iter().flat_map(|panel| panel["targets"].as_array().unwrap());
-    let asked =
-        targets.chain(dashboard["annotations"]["list"].as_array().unwrap()).map(|it| it["expr"].as_str().unwrap());
+    assert!(
+        variable("instance")["query"]["query"]
+            .as_str()
+            .unwrap()
+            .contains(r#"cell="$cell""#)
+    );
+    let targets = dashboard["panels"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .flat_map(|panel| panel["targets"].as_array().unwrap());
+    let asked = targets
+        .chain(dashboard["annotations"]["list"].as_array().unwrap())
+        .map(|it| it["expr"].as_str().unwrap());
     let asked: Vec<_> = asked.collect();
     assert!(asked.len() > 20, "{asked:?}");
     for expression in asked {
-        let (series, chosen) =
-            (expression.matches('{').count(), expression.matches(r#"instance=~"$instance""#).count());
+        let (series, chosen) = (
+            expression.matches('{').count(),
+            expression.matches(r#"instance=~"$instance""#).count(),
+        );
         assert!(series > 0 && series == chosen, "{expression}");
     }
 }
@@ -121,18 +152,35 @@ fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
         Event::FrameDetected,
         Event::FrameShown,
     ];
-    let left_out: BTreeSet<_> =
-        Event::ALL.iter().filter(|event| !USUAL.contains(event)).map(|event| event.as_str()).collect();
+    let left_out: BTreeSet<_> = Event::ALL
+        .iter()
+        .filter(|event| !USUAL.contains(event))
+        .map(|event| event.as_str())
+        .collect();
     let page = include_str!("../../src/observe/dashboard/page/tables.js");
-    let drops = page.split_once("const DROPS = {").and_then(|(_, rest)| rest.split_once("};")).unwrap().0;
-    let shown =
-        drops.split('"').step_by(2).filter_map(|between| between.trim_matches([',', ' ', '\n']).strip_suffix(':'));
+    let drops = page
+        .split_once("const DROPS = {")
+        .and_then(|(_, rest)| rest.split_once("};"))
+        .unwrap()
+        .0;
+    let shown = drops
+        .split('"')
+        .step_by(2)
+        .filter_map(|between| between.trim_matches([',', ' ', '\n']).strip_suffix(':'));
     assert_eq!(shown.collect::<BTreeSet<_>>(), left_out);
-    let dashboard: Value = serde_json::from_str(include_str!("../../../packaging/grafana/ecod.json")).unwrap();
+    let dashboard: Value =
+        serde_json::from_str(include_str!("../../../packaging/grafana/ecod.json")).unwrap();
     let panels = dashboard["panels"].as_array().unwrap();
-    let panel = panels.iter().find(|panel| panel["title"] == "Left out or failed").unwrap();
+    let panel = panels
+        .iter()
+        .find(|panel| panel["title"] == "Left out or failed")
+        .unwrap();
     let asked = panel["targets"][0]["expr"].as_str().unwrap();
-    let asked = asked.split_once(r#"event=~""#).and_then(|(_, rest)| rest.split_once('"')).unwrap().0;
+    let asked = asked
+        .split_once(r#"event=~""#)
+        .and_then(|(_, rest)| rest.split_once('"'))
+        .unwrap()
+        .0;
     assert_eq!(asked.split('|').collect::<BTreeSet<_>>(), left_out);
 }
 
@@ -140,16 +188,27 @@ fn every_count_of_something_left_out_is_on_the_page_and_in_grafana() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn two_that_scrape_at_once_get_the_same() {
     let (node, page) = start(config("edge", Role::Edge, 6)).await;
-    until("the node is ready", || async { get(page, "/readyz").await.status == 200 }).await;
+    until("the node is ready", || async {
+        get(page, "/readyz").await.status == 200
+    })
+    .await;
     // The age of a round and the processor time change from one reading to the next.
-    until("the same twice", || async { get(page, "/metrics").await.body == get(page, "/metrics").await.body }).await;
+    until("the same twice", || async {
+        get(page, "/metrics").await.body == get(page, "/metrics").await.body
+    })
+    .await;
     let first = get(page, "/metrics").await.body;
-    until("something new", || async { get(page, "/metrics").await.body != first }).await;
+    until("something new", || async {
+        get(page, "/metrics").await.body != first
+    })
+    .await;
     node.stop().await;
 }
 
 /// The metrics that a file asks for.
 fn names(file: &str) -> Vec<&str> {
     let words = file.split(|c: char| !c.is_ascii_alphanumeric() && c != '_');
-    words.filter(|word| word.starts_with("ecod_") || word.starts_with("process_")).collect()
+    words
+        .filter(|word| word.starts_with("ecod_") || word.starts_with("process_"))
+        .collect()
 }

@@ -40,7 +40,13 @@ pub(crate) fn free_places<const N: usize>() -> [Place; N] {
 }
 
 /// Starts a node that finds the others at their places.
-pub(crate) fn start(name: &str, role: Role, place: Place, all: &[Place], directory: &Path) -> Process {
+pub(crate) fn start(
+    name: &str,
+    role: Role,
+    place: Place,
+    all: &[Place],
+    directory: &Path,
+) -> Process {
     let mut config = config(name, role, 12);
     config.listen = Some(place.broker);
     config.dashboard.listen = Some(place.page);
@@ -51,6 +57,11 @@ pub(crate) fn start(name: &str, role: Role, place: Place, all: &[Place], directo
     std::fs::write(&file, toml::to_string(&config).unwrap()).unwrap();
     let log = File::create(directory.join(format!("{name}.log"))).unwrap();
     let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-    command.arg("--config").arg(&file).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
+    command
+        .arg("--config")
+        .arg(&file)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(log);
     Process(command.spawn().unwrap())
 }

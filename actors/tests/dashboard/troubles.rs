@@ -24,7 +24,11 @@ use crate::cell::{config, join, start, until};
 use crate::http::get;
 
 /// A client that sends one report after the other, made by its number; ends when dropped. Its id is that of a node's run.
-fn send(broker: SocketAddr, node: &'static str, report: impl Fn(u64) -> String + Send + 'static) -> JoinSet<()> {
+fn send(
+    broker: SocketAddr,
+    node: &'static str,
+    report: impl Fn(u64) -> String + Send + 'static,
+) -> JoinSet<()> {
     let id = format!("{node}-{}", Uuid::from_u128(7).simple());
     let options = MqttOptions::new(id, broker.ip().to_string(), broker.port());
     let (client, mut events) = AsyncClient::new(options, 16);
@@ -33,7 +37,9 @@ fn send(broker: SocketAddr, node: &'static str, report: impl Fn(u64) -> String +
     tasks.spawn(async move {
         let topic = format!("ecod/v1/lot/detections/{node}");
         for seq in 1.. {
-            let sent = client.publish(&topic, QoS::AtMostOnce, false, report(seq)).await;
+            let sent = client
+                .publish(&topic, QoS::AtMostOnce, false, report(seq))
+                .await;
             sent.expect("the broker is there");
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
@@ -44,7 +50,9 @@ fn send(broker: SocketAddr, node: &'static str, report: impl Fn(u64) -> String +
 fn report(node: &str, seq: u64, ahead_s: u64, x_m: &str) -> String {
     let captured = (clock::now() + Duration::from_secs(ahead_s)).micros();
     let object = format!(r#"{{"label":"car","confidence":0.9,"x_m":{x_m},"y_m":0}}"#);
-    format!(r#"{{"schema":1,"node":"{node}","seq":{seq},"captured_at_us":{captured},"objects":[{object}]}}"#)
+    format!(
+        r#"{{"schema":1,"node":"{node}","seq":{seq},"captured_at_us":{captured},"objects":[{object}]}}"#
+    )
 }
 
 /// Troubles on the page of a node: subject, kind and cause, each with who tells it.
@@ -52,12 +60,16 @@ async fn told(page: SocketAddr) -> Vec<[String; 4]> {
     let picture = get(page, "/api/picture").await.json();
     let text = |value: &serde_json::Value| value.as_str().unwrap_or_default().to_owned();
     let all = picture["troubles"].as_array().unwrap().iter();
-    all.map(|trouble| ["told_by", "about", "kind", "cause"].map(|key| text(&trouble[key]))).collect()
+    all.map(|trouble| ["told_by", "about", "kind", "cause"].map(|key| text(&trouble[key])))
+        .collect()
 }
 
 async fn until_told(page: SocketAddr, expected: [&str; 3], cause: &str) {
     until(&format!("{expected:?} {cause}"), || async {
-        told(page).await.iter().any(|[by, about, kind, said]| [by, about, kind] == expected && said.contains(cause))
+        told(page)
+            .await
+            .iter()
+            .any(|[by, about, kind, said]| [by, about, kind] == expected && said.contains(cause))
     })
     .await;
 }
@@ -72,13 +84,29 @@ async fn what_the_leader_sees_is_on_every_page() {
     let watson = send(broker, "watson", |seq| report("watson", seq, 0, "NaN"));
     let late = send(broker, "late", |seq| report("late", seq, 5, "1"));
     for page in [edge_page, page] {
-        until_told(page, ["edge", "watson", "malformed"], "report rejected: objects[0].x_m: is NaN").await;
-        until_told(page, ["edge", "late", "clock_off"], "its clock is 5.0 s ahead").await;
+        until_told(
+            page,
+            ["edge", "watson", "malformed"],
+            "report rejected: objects[0].x_m: is NaN",
+        )
+        .await;
+        until_told(
+            page,
+            ["edge", "late", "clock_off"],
+            "its clock is 5.0 s ahead",
+        )
+        .await;
     }
     let metrics = get(edge_page, "/metrics").await.body;
-    assert!(metrics.contains("ecod_troubles{trouble=\"malformed\",of=\"other\"} 1"), "{metrics}");
+    assert!(
+        metrics.contains("ecod_troubles{trouble=\"malformed\",of=\"other\"} 1"),
+        "{metrics}"
+    );
     drop((watson, late));
-    until("both are forgotten", || async { told(edge_page).await.is_empty() && told(page).await.is_empty() }).await;
+    until("both are forgotten", || async {
+        told(edge_page).await.is_empty() && told(page).await.is_empty()
+    })
+    .await;
     stop([cav, edge]).await;
 }
 
@@ -87,15 +115,34 @@ async fn what_the_leader_sees_is_on_every_page() {
 async fn a_vehicle_is_told_that_its_reports_are_refused() {
     let (edge, _) = start(config("edge", Role::Edge, 2)).await;
     let (cav, page) = join(config("euclid", Role::Cav, 2), &edge).await;
-    until("it follows", || async { get(page, "/readyz").await.status == 200 }).await;
-    let broken = send(edge.broker_address().unwrap(), "euclid", |seq| report("euclid", seq, 0, "1e99"));
-    until_told(page, ["euclid", "", "reports_refused"], "edge says of this node: report rejected: objects[0].x_m")
-        .await;
+    until("it follows", || async {
+        get(page, "/readyz").await.status == 200
+    })
+    .await;
+    let broken = send(edge.broker_address().unwrap(), "euclid", |seq| {
+        report("euclid", seq, 0, "1e99")
+    });
+    until_told(
+        page,
+        ["euclid", "", "reports_refused"],
+        "edge says of this node: report rejected: objects[0].x_m",
+    )
+    .await;
     let ready = get(page, "/readyz").await;
     assert_eq!(ready.status, 503);
-    assert!(ready.json()["reason"].as_str().unwrap().starts_with("edge says of this node"), "{}", ready.body);
+    assert!(
+        ready.json()["reason"]
+            .as_str()
+            .unwrap()
+            .starts_with("edge says of this node"),
+        "{}",
+        ready.body
+    );
     drop(broken);
-    until("it is ready again", || async { get(page, "/readyz").await.status == 200 }).await;
+    until("it is ready again", || async {
+        get(page, "/readyz").await.status == 200
+    })
+    .await;
     stop([cav, edge]).await;
 }
 
@@ -109,19 +156,37 @@ async fn who_is_alone_says_why() {
     // The edge hears the greetings of a seed; it does not greet itself.
     until("the edge names the other cell", || async {
         let troubles = edge.troubles();
-        troubles.iter().any(|(_, trouble)| trouble.cause == "heard cell lott from 127.0.0.1, this is lot")
+        troubles
+            .iter()
+            .any(|(_, trouble)| trouble.cause == "heard cell lott from 127.0.0.1, this is lot")
     })
     .await;
     let mut unresolved = config("gauss", Role::Cav, 1);
     unresolved.membership.seeds = vec!["no-such-host.invalid:17884".into()];
     let (other, other_page) = start(unresolved).await;
-    until_told(other_page, ["gauss", "no-such-host.invalid:17884", "unresolved"], "cannot be resolved").await;
-    let reason = get(other_page, "/readyz").await.json()["reason"].as_str().unwrap().to_owned();
-    assert!(reason.starts_with("no leader known: cannot be resolved"), "{reason}");
+    until_told(
+        other_page,
+        ["gauss", "no-such-host.invalid:17884", "unresolved"],
+        "cannot be resolved",
+    )
+    .await;
+    let reason = get(other_page, "/readyz").await.json()["reason"]
+        .as_str()
+        .unwrap()
+        .to_owned();
+    assert!(
+        reason.starts_with("no leader known: cannot be resolved"),
+        "{reason}"
+    );
     let mut without_broker = config("hertz", Role::Cav, 1);
     without_broker.mqtt.broker = Some("no-such-host.invalid:1883".parse().unwrap());
     let (last, last_page) = start(without_broker).await;
-    until_told(last_page, ["hertz", "no-such-host.invalid:1883", "broker_unreachable"], "broker not reached").await;
+    until_told(
+        last_page,
+        ["hertz", "no-such-host.invalid:1883", "broker_unreachable"],
+        "broker not reached",
+    )
+    .await;
     assert_eq!(get(page, "/readyz").await.status, 503);
     stop([last, other, cav, edge]).await;
 }
@@ -135,8 +200,18 @@ async fn reports_that_are_not_taken_are_named_with_their_sender() {
     let (edge, page) = start(voting).await;
     let broker = edge.broker_address().unwrap();
     let watson = send(broker, "watson", |seq| report("watson", seq, 0, "1"));
-    until_told(page, ["edge", "watson", "not_fused"], "for an algorithm that the cell does not run").await;
-    until_told(page, ["edge", "watson", "overload"], "sends more than is taken").await;
+    until_told(
+        page,
+        ["edge", "watson", "not_fused"],
+        "for an algorithm that the cell does not run",
+    )
+    .await;
+    until_told(
+        page,
+        ["edge", "watson", "overload"],
+        "sends more than is taken",
+    )
+    .await;
     drop(watson);
     edge.stop().await;
 }
@@ -159,23 +234,41 @@ async fn a_broker_that_refuses_is_named_with_its_answer() {
         }
     });
     let (node, page) = start(refused).await;
-    until_told(page, ["euclid", &address, "broker_refuses"], "broker refuses this node").await;
+    until_told(
+        page,
+        ["euclid", &address, "broker_refuses"],
+        "broker refuses this node",
+    )
+    .await;
     node.stop().await;
 }
 
 /// A vehicle that is shown gray frames of this size, and detects in each what is recorded; `more` are further keys of its camera.
 #[cfg(feature = "camera")]
-fn watching(name: &str, directory: &Path, [width, height]: [usize; 2], detections: &str, more: &str) -> NodeConfig {
+fn watching(
+    name: &str,
+    directory: &Path,
+    [width, height]: [usize; 2],
+    detections: &str,
+    more: &str,
+) -> NodeConfig {
     let (frames, recorded) = (directory.join("frames"), directory.join("detections.jsonl"));
     std::fs::create_dir_all(&frames).unwrap();
-    let gray = [format!("P6 {width} {height} 255\n").as_bytes(), &vec![128; width * height * 3]].concat();
+    let gray = [
+        format!("P6 {width} {height} 255\n").as_bytes(),
+        &vec![128; width * height * 3],
+    ]
+    .concat();
     std::fs::write(frames.join("0.ppm"), gray).unwrap();
     std::fs::write(&recorded, detections).unwrap();
     let camera = format!(
         "source = {{ kind = \"images\", path = {frames:?}, looping = true }}\n{more}\n\
          detector = {{ kind = \"recorded\", path = {recorded:?}, looping = true }}"
     );
-    NodeConfig { camera: Some(toml::from_str(&camera).unwrap()), ..config(name, Role::Cav, 1) }
+    NodeConfig {
+        camera: Some(toml::from_str(&camera).unwrap()),
+        ..config(name, Role::Cav, 1)
+    }
 }
 
 /// A camera that is not there, one whose pose nobody sends, and one that sees what has no size.
@@ -193,7 +286,11 @@ async fn what_a_camera_lacks_is_named() {
     until_told(page, ["gauss", "", "no_pose"], "no pose is known").await;
     let mut gone = with_camera("hertz");
     let path = directory.path().join("none");
-    gone.camera.as_mut().unwrap().source = SourceConfig::Images { path, fps: 10.0, looping: true };
+    gone.camera.as_mut().unwrap().source = SourceConfig::Images {
+        path,
+        fps: 10.0,
+        looping: true,
+    };
     let (blind, page) = start(gone).await;
     until_told(page, ["hertz", "", "camera"], "the camera gives no frames").await;
     stop([blind, lost, seeing]).await;
@@ -205,9 +302,20 @@ async fn what_a_camera_lacks_is_named() {
 async fn a_camera_none_of_whose_detections_has_a_place_is_named_with_the_reason() {
     let directory = tempfile::tempdir().unwrap();
     let seen = r#"[{"label":"person","confidence":0.9,"bounding_box":{"x_min":0,"y_min":0,"x_max":64,"y_max":48}}]"#;
-    let near = watching("euclid", directory.path(), [64, 48], seen, "mount = { height_m = 1.5 }");
+    let near = watching(
+        "euclid",
+        directory.path(),
+        [64, 48],
+        seen,
+        "mount = { height_m = 1.5 }",
+    );
     let (node, page) = start(near).await;
-    until_told(page, ["euclid", "", "not_placed"], "the image's edge cuts the box").await;
+    until_told(
+        page,
+        ["euclid", "", "not_placed"],
+        "the image's edge cuts the box",
+    )
+    .await;
     node.stop().await;
 }
 
@@ -224,10 +332,24 @@ async fn a_camera_that_has_turned_is_named_with_its_angle() {
         let bounding_box = serde_json::json!({"x_min": x_px, "x_max": x_px + 20.0, "y_min": y_min, "y_max": y_max});
         serde_json::json!({"label": "person", "confidence": 0.9, "bounding_box": bounding_box})
     });
-    let (people, mount) =
-        (serde_json::Value::from_iter(people).to_string(), format!("mount = {{ height_m = {camera_m} }}"));
-    let (node, page) = start(watching("euclid", directory.path(), [640, 480], &people, &mount)).await;
-    until_told(page, ["euclid", "", "mount_mismatch"], "the camera looks 6° higher").await;
+    let (people, mount) = (
+        serde_json::Value::from_iter(people).to_string(),
+        format!("mount = {{ height_m = {camera_m} }}"),
+    );
+    let (node, page) = start(watching(
+        "euclid",
+        directory.path(),
+        [640, 480],
+        &people,
+        &mount,
+    ))
+    .await;
+    until_told(
+        page,
+        ["euclid", "", "mount_mismatch"],
+        "the camera looks 6° higher",
+    )
+    .await;
     node.stop().await;
 }
 
@@ -242,9 +364,15 @@ async fn an_observer_that_has_stopped_is_not_there() {
     let state = || async {
         let picture = get(page, "/api/picture").await.json();
         let nodes = picture["nodes"].as_array().unwrap().clone();
-        nodes.iter().find(|node| node["name"] == name.as_str()).map(|node| node["state"].as_str().map(str::to_owned))
+        nodes
+            .iter()
+            .find(|node| node["name"] == name.as_str())
+            .map(|node| node["state"].as_str().map(str::to_owned))
     };
-    until("it is there, with its status", || async { state().await.flatten().as_deref() == Some("following") }).await;
+    until("it is there, with its status", || async {
+        state().await.flatten().as_deref() == Some("following")
+    })
+    .await;
     observer.stop().await;
     until("it is gone", || async { state().await.is_none() }).await;
     edge.stop().await;

@@ -36,16 +36,29 @@ pub(crate) struct Cell {
 
 impl Cell {
     pub(crate) fn new() -> Self {
-        tracing_subscriber::fmt().with_env_filter(EnvFilter::from_default_env()).try_init().ok();
-        Self { nodes: BTreeMap::new(), directory: tempfile::tempdir().unwrap(), authority: None }
+        tracing_subscriber::fmt()
+            .with_env_filter(EnvFilter::from_default_env())
+            .try_init()
+            .ok();
+        Self {
+            nodes: BTreeMap::new(),
+            directory: tempfile::tempdir().unwrap(),
+            authority: None,
+        }
     }
 
     /// A cell whose nodes and programs have certificates.
     pub(crate) fn with_certificates() -> Self {
         let cell = Self::new();
-        let authority =
-            Authority::init(&cell.directory.path().join("pki"), &NodeName::from_static("lot"), clock::now());
-        Self { authority: Some(authority.unwrap()), ..cell }
+        let authority = Authority::init(
+            &cell.directory.path().join("pki"),
+            &NodeName::from_static("lot"),
+            clock::now(),
+        );
+        Self {
+            authority: Some(authority.unwrap()),
+            ..cell
+        }
     }
 
     /// An edge, two vehicles that may lead, and one that may not; all follow the edge, and gauss stands by.
@@ -59,7 +72,12 @@ impl Cell {
 
     pub(crate) async fn and_four(self, adjust: impl Fn(&mut NodeConfig)) -> Self {
         let mut cell = self;
-        let nodes = [("edge", Role::Edge), ("gauss", Role::Auto), ("noether", Role::Auto), ("euclid", Role::Cav)];
+        let nodes = [
+            ("edge", Role::Edge),
+            ("gauss", Role::Auto),
+            ("noether", Role::Auto),
+            ("euclid", Role::Cav),
+        ];
         for (name, role) in nodes {
             cell.start(name, role, |config| {
                 config.election.priority = if name == "gauss" { 200 } else { 100 };
@@ -74,41 +92,83 @@ impl Cell {
 
     /// Waits until every node takes maps of this node.
     pub(crate) async fn served_by(&self, name: &str) {
-        let all = |cell: &Self| cell.sources().iter().all(|source| source.as_deref() == Some(name));
+        let all = |cell: &Self| {
+            cell.sources()
+                .iter()
+                .all(|source| source.as_deref() == Some(name))
+        };
         self.until(&format!("{name} serves all"), all).await;
     }
 
     /// Waits until every node knows this node as the standby, and has a link to it.
     pub(crate) async fn stands_by(&self, name: &str) {
-        let standby = |node: &NodeHandle| node.leadership().borrow().standby.as_ref().map(ToString::to_string);
-        let all = |cell: &Self| cell.nodes.values().all(|(node, _)| standby(node).as_deref() == Some(name));
+        let standby = |node: &NodeHandle| {
+            node.leadership()
+                .borrow()
+                .standby
+                .as_ref()
+                .map(ToString::to_string)
+        };
+        let all = |cell: &Self| {
+            cell.nodes
+                .values()
+                .all(|(node, _)| standby(node).as_deref() == Some(name))
+        };
         self.until(&format!("{name} is the standby"), all).await;
         tokio::time::sleep(Duration::from_millis(300)).await;
     }
 
-    pub(crate) async fn start(&mut self, name: &str, role: Role, adjust: impl FnOnce(&mut NodeConfig)) {
+    pub(crate) async fn start(
+        &mut self,
+        name: &str,
+        role: Role,
+        adjust: impl FnOnce(&mut NodeConfig),
+    ) {
         let mut config = NodeConfig {
             name: Some(NodeName::new(name).unwrap()),
             cell: NodeName::from_static("lot"),
             role,
             listen: Some(loopback()),
             map_log: Some(self.map_log(name)),
-            landmarks: vec![LandmarkConfig::at("west", 0.0, 0.0), LandmarkConfig::at("east", 3.0, 0.0)],
+            landmarks: vec![
+                LandmarkConfig::at("west", 0.0, 0.0),
+                LandmarkConfig::at("east", 3.0, 0.0),
+            ],
             ..NodeConfig::default()
         };
         config.membership.bind = Some(loopback());
-        let seeds = self.nodes.values().filter_map(|(node, _)| node.gossip_address());
+        let seeds = self
+            .nodes
+            .values()
+            .filter_map(|(node, _)| node.gossip_address());
         config.membership.seeds = seeds.map(|address| address.to_string()).collect();
         config.membership.multicast.enabled = false;
         config.dashboard.enabled = false;
         if let Some(authority) = &mut self.authority {
-            let (node, year) = (NodeName::new(name).unwrap(), Duration::from_secs(365 * 86_400));
-            authority.issue(&node, Rights { priority: u8::MAX, ..Rights::from(role) }, year, clock::now()).unwrap();
+            let (node, year) = (
+                NodeName::new(name).unwrap(),
+                Duration::from_secs(365 * 86_400),
+            );
+            authority
+                .issue(
+                    &node,
+                    Rights {
+                        priority: u8::MAX,
+                        ..Rights::from(role)
+                    },
+                    year,
+                    clock::now(),
+                )
+                .unwrap();
             config.tls = Some(files(authority, &node));
         }
         adjust(&mut config);
         config.validate().unwrap();
-        let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
         let node = runtime.spawn(node::start(config)).await.unwrap().unwrap();
         self.nodes.insert(name.to_owned(), (node, runtime));
     }
@@ -119,9 +179,16 @@ impl Cell {
     }
 
     /// A program at one node's door, with the certificate of another.
-    pub(crate) async fn program_with(&self, id: &str, (door, owner): (&str, &str), filters: &[&str]) -> Program {
+    pub(crate) async fn program_with(
+        &self,
+        id: &str,
+        (door, owner): (&str, &str),
+        filters: &[&str],
+    ) -> Program {
         let door = self.door(door);
-        let Some(authority) = &self.authority else { return Program::connect(id, door, filters).await };
+        let Some(authority) = &self.authority else {
+            return Program::connect(id, door, filters).await;
+        };
         let owner = NodeName::new(owner).unwrap();
         let id = format!("{owner}--{id}-{}", Uuid::new_v4().simple());
         let credentials = Credentials::load(&files(authority, &owner), &owner).unwrap();
@@ -140,7 +207,10 @@ impl Cell {
         let text = std::fs::read_to_string(self.map_log(name)).unwrap_or_default();
         let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
         let map = |line| serde_json::from_str::<serde_json::Value>(line).unwrap()["map"].take();
-        whole.lines().map(|line| round_of(&serde_json::from_value(map(line)).unwrap())).collect()
+        whole
+            .lines()
+            .map(|line| round_of(&serde_json::from_value(map(line)).unwrap()))
+            .collect()
     }
 
     /// Waits until each program has its node's newest map: it has got exactly the maps that the node accepted, in order.
@@ -150,11 +220,23 @@ impl Cell {
         for (name, program) in programs {
             let accepted = self.accepted(name);
             let last = accepted.last().expect("the node accepts maps");
-            let got = || program.rounds().into_iter().map(|(round, _)| round).collect::<Vec<_>>();
-            self.until("the program has its node's newest map", |_| got().contains(last)).await;
+            let got = || {
+                program
+                    .rounds()
+                    .into_iter()
+                    .map(|(round, _)| round)
+                    .collect::<Vec<_>>()
+            };
+            self.until("the program has its node's newest map", |_| {
+                got().contains(last)
+            })
+            .await;
             let mut got = got();
             got.truncate(1 + got.iter().position(|round| round == last).unwrap());
-            let since = accepted.iter().position(|round| *round == got[0]).expect("the node accepted the first");
+            let since = accepted
+                .iter()
+                .position(|round| *round == got[0])
+                .expect("the node accepted the first");
             assert_eq!(got, accepted[since..], "{name}");
             leaders.push(got.into_iter().map(|(_, leader, _)| leader).collect());
         }
@@ -190,7 +272,10 @@ impl Cell {
     /// Whose map each node took last.
     pub(crate) fn sources(&self) -> Vec<Option<String>> {
         let source = |(node, _): &(NodeHandle, Runtime)| {
-            node.newest_map().borrow().as_ref().map(|received| received.map.aggregator.to_string())
+            node.newest_map()
+                .borrow()
+                .as_ref()
+                .map(|received| received.map.aggregator.to_string())
         };
         self.nodes.values().map(source).collect()
     }
@@ -198,20 +283,33 @@ impl Cell {
     pub(crate) async fn until(&self, what: &str, holds: impl Fn(&Self) -> bool) {
         let deadline = Instant::now() + PATIENCE;
         while !holds(self) {
-            assert!(Instant::now() < deadline, "never: {what}: {:?}", self.sources());
+            assert!(
+                Instant::now() < deadline,
+                "never: {what}: {:?}",
+                self.sources()
+            );
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     }
 
     /// Every round that a node accepts from now on, and when.
     pub(crate) fn watch(&self, name: &str) -> Arc<Mutex<Vec<(Round, Instant)>>> {
-        let (mut maps, seen) = (self.node(name).newest_map(), Arc::<Mutex<Vec<_>>>::default());
+        let (mut maps, seen) = (
+            self.node(name).newest_map(),
+            Arc::<Mutex<Vec<_>>>::default(),
+        );
         let rounds = Arc::clone(&seen);
         tokio::spawn(async move {
             while maps.changed().await.is_ok() {
                 let at = Instant::now();
-                let round = maps.borrow_and_update().as_ref().map(|received| round_of(&received.map));
-                rounds.lock().unwrap().extend(round.map(|round| (round, at)));
+                let round = maps
+                    .borrow_and_update()
+                    .as_ref()
+                    .map(|received| round_of(&received.map));
+                rounds
+                    .lock()
+                    .unwrap()
+                    .extend(round.map(|round| (round, at)));
             }
         });
         seen
@@ -220,7 +318,13 @@ impl Cell {
 
 fn files(authority: &Authority, node: &NodeName) -> TlsConfig {
     let (certificate, key) = authority.files_of(node);
-    TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(authority.revocation_list()), city: None }
+    TlsConfig {
+        ca: authority.ca(),
+        certificate,
+        key,
+        revocation_list: Some(authority.revocation_list()),
+        city: None,
+    }
 }
 
 fn loopback() -> SocketAddr {
@@ -253,29 +357,45 @@ pub(crate) struct Program {
 impl Program {
     /// Connects and subscribes; returns once the broker has answered.
     pub(crate) async fn connect(id: &str, door: SocketAddr, filters: &[&str]) -> Self {
-        Self::connect_with(MqttOptions::new(id, door.ip().to_string(), door.port()), filters).await
+        Self::connect_with(
+            MqttOptions::new(id, door.ip().to_string(), door.port()),
+            filters,
+        )
+        .await
     }
 
     async fn connect_with(mut options: MqttOptions, filters: &[&str]) -> Self {
         options.set_max_packet_size(Some(1 << 20));
         let (client, mut events) = AsyncClient::new(options, 64);
         for filter in filters {
-            client.subscribe(format!("ecod/v1/lot/{filter}"), QoS::AtLeastOnce).await.unwrap();
+            client
+                .subscribe(format!("ecod/v1/lot/{filter}"), QoS::AtLeastOnce)
+                .await
+                .unwrap();
         }
-        let (heard, answers) = (Arc::<Mutex<Vec<_>>>::default(), Arc::<Mutex<Vec<_>>>::default());
+        let (heard, answers) = (
+            Arc::<Mutex<Vec<_>>>::default(),
+            Arc::<Mutex<Vec<_>>>::default(),
+        );
         let (messages, acknowledgements) = (Arc::clone(&heard), Arc::clone(&answers));
         let (ready, mut is_ready) = tokio::sync::mpsc::unbounded_channel();
         let task = tokio::spawn(async move {
             loop {
                 match events.poll().await {
-                    Ok(Event::Incoming(Packet::Publish(publish))) => messages.lock().unwrap().push(Heard {
-                        topic: String::from_utf8(publish.topic.to_vec()).unwrap(),
-                        payload: publish.payload.to_vec(),
-                        at: Instant::now(),
-                    }),
-                    Ok(Event::Incoming(Packet::ConnAck(_) | Packet::SubAck(_))) => drop(ready.send(())),
+                    Ok(Event::Incoming(Packet::Publish(publish))) => {
+                        messages.lock().unwrap().push(Heard {
+                            topic: String::from_utf8(publish.topic.to_vec()).unwrap(),
+                            payload: publish.payload.to_vec(),
+                            at: Instant::now(),
+                        })
+                    }
+                    Ok(Event::Incoming(Packet::ConnAck(_) | Packet::SubAck(_))) => {
+                        drop(ready.send(()))
+                    }
                     Ok(Event::Incoming(Packet::PubAck(answer))) => {
-                        let text = answer.properties.and_then(|properties| properties.reason_string);
+                        let text = answer
+                            .properties
+                            .and_then(|properties| properties.reason_string);
                         acknowledgements
                             .lock()
                             .unwrap()
@@ -287,9 +407,16 @@ impl Program {
             }
         });
         for _ in 0..=filters.len() {
-            tokio::time::timeout(PATIENCE, is_ready.recv()).await.expect("the door answers");
+            tokio::time::timeout(PATIENCE, is_ready.recv())
+                .await
+                .expect("the door answers");
         }
-        Self { client, heard, answers, task }
+        Self {
+            client,
+            heard,
+            answers,
+            task,
+        }
     }
 
     pub(crate) fn heard(&self) -> Vec<Heard> {
@@ -297,28 +424,50 @@ impl Program {
     }
 
     pub(crate) fn heard_on(&self, topic: &str) -> Vec<Heard> {
-        self.heard().into_iter().filter(|heard| heard.topic == format!("ecod/v1/lot/{topic}")).collect()
+        self.heard()
+            .into_iter()
+            .filter(|heard| heard.topic == format!("ecod/v1/lot/{topic}"))
+            .collect()
     }
 
     /// The maps so far, and when they came.
     pub(crate) fn rounds(&self) -> Vec<(Round, Instant)> {
         let maps = self.heard_on("global_detections").into_iter();
-        maps.map(|heard| (round_of(&decode(&heard.payload, &Default::default()).unwrap()), heard.at)).collect()
+        maps.map(|heard| {
+            (
+                round_of(&decode(&heard.payload, &Default::default()).unwrap()),
+                heard.at,
+            )
+        })
+        .collect()
     }
 
     pub(crate) async fn publish(&self, topic: &str, payload: Vec<u8>, qos: QoS) {
-        self.client.publish(format!("ecod/v1/lot/{topic}"), qos, false, payload).await.unwrap();
+        self.client
+            .publish(format!("ecod/v1/lot/{topic}"), qos, false, payload)
+            .await
+            .unwrap();
     }
 
     /// Reports a car at a place.
     pub(crate) async fn report(&self, topic: &str, name: &str, seq: u64, x_m: f64) {
-        self.send(topic, name, seq, PerceivedObject::new("car", 0.9, x_m, 0.0)).await;
+        self.send(topic, name, seq, PerceivedObject::new("car", 0.9, x_m, 0.0))
+            .await;
     }
 
     /// Votes for a car at a known location.
     pub(crate) async fn vote(&self, name: &str, seq: u64, landmark: &str) {
         let car = PerceivedObject::new("car", 0.9, 0.0, 0.0);
-        self.send("vote_detections", name, seq, PerceivedObject { landmark: Some(landmark.into()), ..car }).await;
+        self.send(
+            "vote_detections",
+            name,
+            seq,
+            PerceivedObject {
+                landmark: Some(landmark.into()),
+                ..car
+            },
+        )
+        .await;
     }
 
     async fn send(&self, topic: &str, name: &str, seq: u64, object: PerceivedObject) {
@@ -326,7 +475,12 @@ impl Program {
             objects: vec![object],
             ..ObjectReport::new(NodeName::new(name).unwrap(), seq, clock::now())
         };
-        self.publish(&format!("{topic}/{name}"), encode(&report, Encoding::Json), QoS::AtMostOnce).await;
+        self.publish(
+            &format!("{topic}/{name}"),
+            encode(&report, Encoding::Json),
+            QoS::AtMostOnce,
+        )
+        .await;
     }
 
     /// Publishes with QoS 1; the reason and its text in the answer.
@@ -334,9 +488,22 @@ impl Program {
         self.ask_retained(topic, payload, false).await
     }
 
-    pub(crate) async fn ask_retained(&self, topic: &str, payload: Vec<u8>, retain: bool) -> (String, String) {
+    pub(crate) async fn ask_retained(
+        &self,
+        topic: &str,
+        payload: Vec<u8>,
+        retain: bool,
+    ) -> (String, String) {
         let before = self.answers.lock().unwrap().len();
-        self.client.publish(format!("ecod/v1/lot/{topic}"), QoS::AtLeastOnce, retain, payload).await.unwrap();
+        self.client
+            .publish(
+                format!("ecod/v1/lot/{topic}"),
+                QoS::AtLeastOnce,
+                retain,
+                payload,
+            )
+            .await
+            .unwrap();
         let deadline = Instant::now() + PATIENCE;
         loop {
             if let Some(answer) = self.answers.lock().unwrap().get(before) {

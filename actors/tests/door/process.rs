@@ -25,8 +25,16 @@ impl Node {
         fs::write(&file, text).unwrap();
         let log = File::create(directory.path().join("log")).unwrap();
         let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-        command.args(["--log-format", "text", "--stop-at-eof", "--config"]).arg(&file).stdin(Stdio::piped());
-        let process = command.env_remove("RUST_LOG").stdout(Stdio::null()).stderr(log).spawn().unwrap();
+        command
+            .args(["--log-format", "text", "--stop-at-eof", "--config"])
+            .arg(&file)
+            .stdin(Stdio::piped());
+        let process = command
+            .env_remove("RUST_LOG")
+            .stdout(Stdio::null())
+            .stderr(log)
+            .spawn()
+            .unwrap();
         Self { process, directory }
     }
 
@@ -39,11 +47,16 @@ impl Node {
         let started = Instant::now();
         loop {
             let log = self.log();
-            if let Some((address, _)) = log.split_once("broker serves address=").and_then(|(_, at)| at.split_once('\n'))
+            if let Some((address, _)) = log
+                .split_once("broker serves address=")
+                .and_then(|(_, at)| at.split_once('\n'))
             {
                 return address.parse().unwrap();
             }
-            assert!(started.elapsed() < PATIENCE, "the node does not listen:\n{log}");
+            assert!(
+                started.elapsed() < PATIENCE,
+                "the node does not listen:\n{log}"
+            );
             sleep(Duration::from_millis(20)).await;
         }
     }
@@ -51,7 +64,10 @@ impl Node {
     /// Resident memory: now (`VmRSS:`), or at most (`VmHWM:`).
     pub(crate) fn memory_kib(&self, key: &str) -> u64 {
         let status = fs::read_to_string(format!("/proc/{}/status", self.process.id())).unwrap();
-        let line = status.lines().find_map(|line| line.strip_prefix(key)).unwrap();
+        let line = status
+            .lines()
+            .find_map(|line| line.strip_prefix(key))
+            .unwrap();
         line.trim().trim_end_matches(" kB").parse().unwrap()
     }
 }

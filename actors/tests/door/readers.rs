@@ -24,7 +24,11 @@ async fn programs_that_never_read_cost_their_node_little_memory_and_others_no_ma
     let sender = Program::connect("sender", door, &[]).await;
     let mut readers = Vec::new();
     for index in 0..READERS {
-        let options = MqttOptions::new(format!("sleeper-{index}"), door.ip().to_string(), door.port());
+        let options = MqttOptions::new(
+            format!("sleeper-{index}"),
+            door.ip().to_string(),
+            door.port(),
+        );
         let (client, mut events) = AsyncClient::new(options, 4);
         client.subscribe("#", QoS::AtMostOnce).await.unwrap();
         // Login and subscription; then nobody polls.
@@ -36,7 +40,9 @@ async fn programs_that_never_read_cost_their_node_little_memory_and_others_no_ma
     let before = node.memory_kib("VmRSS:");
     let first = planner.rounds().len();
     for _ in 0..MEGABYTES * 10 {
-        sender.publish("pictures", vec![b'x'; 100_000], QoS::AtLeastOnce).await;
+        sender
+            .publish("pictures", vec![b'x'; 100_000], QoS::AtLeastOnce)
+            .await;
         sleep(Duration::from_millis(5)).await;
     }
     let sent = Instant::now();
@@ -46,10 +52,20 @@ async fn programs_that_never_read_cost_their_node_little_memory_and_others_no_ma
         assert!(sent.elapsed() < PATIENCE, "the maps go on:\n{}", node.log());
         sleep(Duration::from_millis(20)).await;
     }
-    let rounds: Vec<u64> = planner.rounds().into_iter().skip(first).map(|((.., round), _)| round).collect();
-    assert!(rounds.windows(2).all(|pair| pair[1] == pair[0] + 1), "each map: {rounds:?}");
+    let rounds: Vec<u64> = planner
+        .rounds()
+        .into_iter()
+        .skip(first)
+        .map(|((.., round), _)| round)
+        .collect();
+    assert!(
+        rounds.windows(2).all(|pair| pair[1] == pair[0] + 1),
+        "each map: {rounds:?}"
+    );
     let grown = node.memory_kib("VmHWM:").saturating_sub(before);
-    println!("{READERS} programs that never read, {MEGABYTES} MB for each: {grown} KiB more at most");
+    println!(
+        "{READERS} programs that never read, {MEGABYTES} MB for each: {grown} KiB more at most"
+    );
     assert!(grown < MAX_GROWN_KIB, "{grown} KiB");
     drop(readers);
 }

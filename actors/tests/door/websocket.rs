@@ -32,7 +32,11 @@ async fn open(door: SocketAddr, headers: &[(&'static str, &str)]) -> Result<Sock
             Ok(socket)
         }
         Err(Error::Http(answer)) => {
-            let text = answer.body().as_deref().map(String::from_utf8_lossy).unwrap_or_default();
+            let text = answer
+                .body()
+                .as_deref()
+                .map(String::from_utf8_lossy)
+                .unwrap_or_default();
             Err((answer.status().as_u16(), text.into_owned()))
         }
         Err(error) => panic!("{error}"),
@@ -42,12 +46,26 @@ async fn open(door: SocketAddr, headers: &[(&'static str, &str)]) -> Result<Sock
 /// A page of the node's own host.
 async fn page(door: SocketAddr) -> Socket {
     let origin = format!("http://{}:8000", door.ip());
-    open(door, &[("origin", &origin), ("sec-websocket-protocol", "mqttv3.1, mqtt")]).await.unwrap()
+    open(
+        door,
+        &[
+            ("origin", &origin),
+            ("sec-websocket-protocol", "mqttv3.1, mqtt"),
+        ],
+    )
+    .await
+    .unwrap()
 }
 
 /// A packet of MQTT 3.1.1 of less than 128 bytes.
 fn packet(kind: u8, head: &[u8], text: &str, rest: &[u8]) -> Vec<u8> {
-    let body = [head, &(text.len() as u16).to_be_bytes(), text.as_bytes(), rest].concat();
+    let body = [
+        head,
+        &(text.len() as u16).to_be_bytes(),
+        text.as_bytes(),
+        rest,
+    ]
+    .concat();
     [&[kind, u8::try_from(body.len()).unwrap()], &body[..]].concat()
 }
 
@@ -60,7 +78,14 @@ async fn hear(socket: &mut Socket, wanted: &[u8]) -> Vec<u8> {
     let mut heard = Vec::new();
     let hearing = async {
         while !heard.windows(wanted.len()).any(|part| part == wanted) {
-            heard.extend(socket.next().await.expect("still open").unwrap().into_data());
+            heard.extend(
+                socket
+                    .next()
+                    .await
+                    .expect("still open")
+                    .unwrap()
+                    .into_data(),
+            );
         }
     };
     timeout(PATIENCE, hearing).await.expect("not heard");
@@ -90,10 +115,19 @@ async fn a_page_takes_part_as_any_program() {
     let topic = "ecod/v1/lot/detections/edge--page";
     for seq in 1.. {
         let now = ecod_actors::platform::clock::now().micros().to_string();
-        let text = String::from_utf8_lossy(report).replace("NOW", &now).replace("\"seq\":1", &format!("\"seq\":{seq}"));
-        let body = [&(topic.len() as u16).to_be_bytes(), topic.as_bytes(), text.as_bytes()].concat();
+        let text = String::from_utf8_lossy(report)
+            .replace("NOW", &now)
+            .replace("\"seq\":1", &format!("\"seq\":{seq}"));
+        let body = [
+            &(topic.len() as u16).to_be_bytes(),
+            topic.as_bytes(),
+            text.as_bytes(),
+        ]
+        .concat();
         let length = [0x80 | (body.len() % 128) as u8, (body.len() / 128) as u8];
-        page.send(Message::binary([&[0x30], &length[..], &body].concat())).await.unwrap();
+        page.send(Message::binary([&[0x30], &length[..], &body].concat()))
+            .await
+            .unwrap();
         tokio::time::sleep(Duration::from_millis(50)).await;
         if is_at_east(cell.node("edge"), 3.1, "edge") {
             break;
@@ -102,10 +136,19 @@ async fn a_page_takes_part_as_any_program() {
     }
     hear(&mut page, br#""contributors":["edge"]"#).await;
     // The rights are the same, too.
-    page.send(Message::binary(packet(0x30, b"", "ecod/v1/lot/global_detections", b"{}"))).await.unwrap();
+    page.send(Message::binary(packet(
+        0x30,
+        b"",
+        "ecod/v1/lot/global_detections",
+        b"{}",
+    )))
+    .await
+    .unwrap();
     cell.until("the claim is counted", |cell| {
         let rejects = cell.node("edge").counters().rejects_by_source();
-        rejects.iter().any(|count| count.reason.as_str() == "not_permitted")
+        rejects
+            .iter()
+            .any(|count| count.reason.as_str() == "not_permitted")
     })
     .await;
     cell.stop().await;
@@ -115,12 +158,24 @@ async fn a_page_takes_part_as_any_program() {
 async fn a_page_of_another_site_is_refused_with_the_reason() {
     let (cell, door) = edge().await;
     for origin in ["https://evil.example", "null"] {
-        let (status, text) = open(door, &[("origin", origin), ("sec-websocket-protocol", "mqtt")]).await.err().unwrap();
-        assert!(status == 403 && text.contains(origin) && text.contains("this node's host"), "{status} {text}");
+        let (status, text) = open(
+            door,
+            &[("origin", origin), ("sec-websocket-protocol", "mqtt")],
+        )
+        .await
+        .err()
+        .unwrap();
+        assert!(
+            status == 403 && text.contains(origin) && text.contains("this node's host"),
+            "{status} {text}"
+        );
     }
     let (status, text) = open(door, &[]).await.err().unwrap();
     assert!(status == 400 && text.contains("`mqtt`"), "{status} {text}");
-    cell.until("all are counted", |cell| cell.node("edge").counters().events(Event::ClientUntrusted) == 3).await;
+    cell.until("all are counted", |cell| {
+        cell.node("edge").counters().events(Event::ClientUntrusted) == 3
+    })
+    .await;
     cell.stop().await;
 }
 
@@ -128,16 +183,31 @@ async fn a_page_of_another_site_is_refused_with_the_reason() {
 async fn a_browser_at_a_door_is_told_that_no_page_is_there() {
     let (cell, door) = edge().await;
     let mut browser = TcpStream::connect(door).await.unwrap();
-    browser.write_all(b"GET / HTTP/1.1\r\nHost: localhost:1883\r\nConnection: keep-alive\r\n\r\n").await.unwrap();
+    browser
+        .write_all(b"GET / HTTP/1.1\r\nHost: localhost:1883\r\nConnection: keep-alive\r\n\r\n")
+        .await
+        .unwrap();
     let mut answer = String::new();
-    timeout(Duration::from_secs(3), browser.read_to_string(&mut answer)).await.expect("answered").unwrap();
+    timeout(Duration::from_secs(3), browser.read_to_string(&mut answer))
+        .await
+        .expect("answered")
+        .unwrap();
     let (head, text) = answer.split_once("\r\n\r\n").unwrap();
-    assert!(head.starts_with("HTTP/1.1 426 ") && head.ends_with(&format!("Content-Length: {}", text.len())), "{head}");
-    assert!(text.contains("MQTT") && text.contains("http://127.0.0.1:8080/"), "{text}");
+    assert!(
+        head.starts_with("HTTP/1.1 426 ")
+            && head.ends_with(&format!("Content-Length: {}", text.len())),
+        "{head}"
+    );
+    assert!(
+        text.contains("MQTT") && text.contains("http://127.0.0.1:8080/"),
+        "{text}"
+    );
     let mut endless = TcpStream::connect(door).await.unwrap();
     endless.write_all(b"GET /").await.unwrap();
     let sending = async { while endless.write_all(&[b'x'; 1024]).await.is_ok() {} };
-    timeout(Duration::from_secs(3), sending).await.expect("a request without end is cut off");
+    timeout(Duration::from_secs(3), sending)
+        .await
+        .expect("a request without end is cut off");
     cell.stop().await;
 }
 

@@ -35,8 +35,15 @@ struct Running {
 impl Default for Cell {
     fn default() -> Self {
         // With RUST_LOG=info a failing test tells what the nodes did.
-        tracing_subscriber::fmt().with_env_filter(EnvFilter::from_default_env()).try_init().ok();
-        Self { directory: tempfile::tempdir().unwrap(), seed: free_address(), nodes: BTreeMap::new() }
+        tracing_subscriber::fmt()
+            .with_env_filter(EnvFilter::from_default_env())
+            .try_init()
+            .ok();
+        Self {
+            directory: tempfile::tempdir().unwrap(),
+            seed: free_address(),
+            nodes: BTreeMap::new(),
+        }
     }
 }
 
@@ -47,13 +54,29 @@ impl Cell {
     }
 
     /// The same with an adjusted configuration.
-    pub(crate) async fn start_with(&mut self, name: &str, role: Role, adjust: impl FnOnce(&mut NodeConfig)) {
+    pub(crate) async fn start_with(
+        &mut self,
+        name: &str,
+        role: Role,
+        adjust: impl FnOnce(&mut NodeConfig),
+    ) {
         let is_seed = self.nodes.is_empty();
-        let mut config = config(name, role, is_seed.then_some(self.seed), self.seed, self.directory.path());
+        let mut config = config(
+            name,
+            role,
+            is_seed.then_some(self.seed),
+            self.seed,
+            self.directory.path(),
+        );
         adjust(&mut config);
-        let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
         let node = runtime.spawn(node::start(config)).await.unwrap().unwrap();
-        self.nodes.insert(name.to_owned(), Running { node, runtime });
+        self.nodes
+            .insert(name.to_owned(), Running { node, runtime });
     }
 
     /// Ends all tasks of a node where they are; its sockets close.
@@ -91,7 +114,11 @@ impl Cell {
     /// Waits until every node follows this node, whatever maps it gets.
     pub(crate) async fn led_by(&self, leader: &str) {
         self.until(&format!("all follow {leader}"), |cell| {
-            let follows = |name: &String| cell.leadership(name).leader().is_some_and(|name| name.as_str() == leader);
+            let follows = |name: &String| {
+                cell.leadership(name)
+                    .leader()
+                    .is_some_and(|name| name.as_str() == leader)
+            };
             cell.names().iter().all(follows).then_some(())
         })
         .await;
@@ -100,7 +127,11 @@ impl Cell {
     /// Waits until every node takes maps of this node and follows it.
     pub(crate) async fn served_by(&self, leader: &str) {
         self.until(&format!("{leader} serves all"), |cell| {
-            (cell.sources().iter().all(|source| source.as_deref() == Some(leader))).then_some(())
+            (cell
+                .sources()
+                .iter()
+                .all(|source| source.as_deref() == Some(leader)))
+            .then_some(())
         })
         .await;
     }
@@ -110,7 +141,8 @@ impl Cell {
         self.until(&format!("another than {old} serves all"), |cell| {
             let sources = cell.sources();
             let first = sources.first()?.clone()?;
-            (first != old && sources.iter().all(|source| *source == Some(first.clone()))).then_some(first)
+            (first != old && sources.iter().all(|source| *source == Some(first.clone())))
+                .then_some(first)
         })
         .await
     }
@@ -119,9 +151,14 @@ impl Cell {
     pub(crate) async fn standby_is_named(&self) -> String {
         let standby = self
             .until("all agree on the standby", |cell| {
-                let mut named = cell.nodes.values().map(|running| running.node.leadership().borrow().standby.clone());
+                let mut named = cell
+                    .nodes
+                    .values()
+                    .map(|running| running.node.leadership().borrow().standby.clone());
                 let first = named.next()??;
-                named.all(|name| name.as_ref() == Some(&first)).then(|| first.to_string())
+                named
+                    .all(|name| name.as_ref() == Some(&first))
+                    .then(|| first.to_string())
             })
             .await;
         tokio::time::sleep(Duration::from_millis(300)).await;
@@ -132,7 +169,14 @@ impl Cell {
     fn sources(&self) -> Vec<Option<String>> {
         let source = |running: &Running| {
             let leader = running.node.leadership().borrow().leader()?.clone();
-            let source = running.node.newest_map().borrow().as_ref()?.map.aggregator.clone();
+            let source = running
+                .node
+                .newest_map()
+                .borrow()
+                .as_ref()?
+                .map
+                .aggregator
+                .clone();
             (leader == source).then(|| source.to_string())
         };
         self.nodes.values().map(source).collect()
@@ -144,8 +188,15 @@ impl Cell {
             if let Some(found) = holds(self) {
                 return found;
             }
-            let leaderships: Vec<_> = self.names().iter().map(|name| (name.clone(), self.leadership(name))).collect();
-            assert!(tokio::time::Instant::now() < deadline, "not within {PATIENCE:?}: {what}: {leaderships:?}");
+            let leaderships: Vec<_> = self
+                .names()
+                .iter()
+                .map(|name| (name.clone(), self.leadership(name)))
+                .collect();
+            assert!(
+                tokio::time::Instant::now() < deadline,
+                "not within {PATIENCE:?}: {what}: {leaderships:?}"
+            );
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
@@ -187,5 +238,8 @@ pub(crate) fn config(
 
 /// An address at which nobody gossips now.
 pub(crate) fn free_address() -> SocketAddr {
-    UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+    UdpSocket::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
 }

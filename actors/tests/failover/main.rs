@@ -23,7 +23,12 @@ use path::Path;
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn maps_go_on_without_the_edge_and_with_it_again() {
     let mut cell = Cell::default();
-    for (name, role) in [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Auto), ("noether", Role::Auto)] {
+    for (name, role) in [
+        ("edge", Role::Edge),
+        ("euclid", Role::Auto),
+        ("gauss", Role::Auto),
+        ("noether", Role::Auto),
+    ] {
         cell.start(name, role).await;
     }
     cell.served_by("edge").await;
@@ -34,7 +39,10 @@ async fn maps_go_on_without_the_edge_and_with_it_again() {
     for name in ["euclid", "gauss", "noether"] {
         let record = cell.record(name);
         record.never_goes_back();
-        eprintln!("{name}: longest gap when the edge was killed {:?}", record.longest_gap());
+        eprintln!(
+            "{name}: longest gap when the edge was killed {:?}",
+            record.longest_gap()
+        );
         assert!(record.longest_gap() < Duration::from_secs(5));
     }
 
@@ -65,7 +73,10 @@ async fn a_cell_outlives_its_leader_and_standby() {
     for name in cell.names() {
         let record = cell.record(&name);
         record.never_goes_back();
-        eprintln!("{name}: longest gap when leader and standby were killed {:?}", record.longest_gap());
+        eprintln!(
+            "{name}: longest gap when leader and standby were killed {:?}",
+            record.longest_gap()
+        );
     }
     cell.stop().await;
 }
@@ -96,8 +107,10 @@ async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
     cell.served_by("euclid").await;
     cell.standby_is_named().await;
     let slots = cell.node("euclid").slots().clone();
-    let kills: [(&str, &dyn Fn()); 2] =
-        [("broker", &|| slots.broker.get().unwrap().kill()), ("fuser", &|| slots.fuser.get().unwrap().kill())];
+    let kills: [(&str, &dyn Fn()); 2] = [
+        ("broker", &|| slots.broker.get().unwrap().kill()),
+        ("fuser", &|| slots.fuser.get().unwrap().kill()),
+    ];
     for (part, kill) in kills {
         kill();
         eprintln!("killed the leader's {part}");
@@ -115,7 +128,9 @@ async fn a_leader_without_a_part_gives_up_the_lead_and_gets_it_back() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
-    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let address = broker
+        .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+        .unwrap();
     let (first, second) = (Path::to(address).await, Path::to(address).await);
     let mut cell = Cell::default();
     for (name, path) in [("euclid", &first), ("gauss", &second)] {
@@ -131,13 +146,20 @@ async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
     first.block(true);
     let blocked = Instant::now();
     cell.led_by("gauss").await;
-    eprintln!("the other led {:?} after the leader's broker fell silent", blocked.elapsed());
+    eprintln!(
+        "the other led {:?} after the leader's broker fell silent",
+        blocked.elapsed()
+    );
 
     second.block(true);
     let epoch = cell.leadership("gauss").epoch;
     for _ in 0..30 {
         tokio::time::sleep(Duration::from_millis(100)).await;
-        assert_eq!(cell.leadership("gauss").position, Position::Leading, "there is nobody to make way for");
+        assert_eq!(
+            cell.leadership("gauss").position,
+            Position::Leading,
+            "there is nobody to make way for"
+        );
         assert_eq!(cell.leadership("gauss").epoch, epoch);
     }
     first.block(false);
@@ -151,7 +173,11 @@ async fn a_leader_with_a_silent_broker_makes_way_if_there_is_a_better_one() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_cav_follows_the_election_and_takes_no_part_in_leading() {
     let mut cell = Cell::default();
-    for (name, role) in [("euclid", Role::Auto), ("gauss", Role::Cav), ("noether", Role::Auto)] {
+    for (name, role) in [
+        ("euclid", Role::Auto),
+        ("gauss", Role::Cav),
+        ("noether", Role::Auto),
+    ] {
         cell.start(name, role).await;
     }
     cell.served_by("euclid").await;

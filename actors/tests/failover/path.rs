@@ -24,13 +24,20 @@ impl Path {
         let blocked = Arc::clone(&is_blocked);
         let task = tokio::spawn(async move {
             while let Ok((near, _)) = listener.accept().await {
-                let Ok(far) = TcpStream::connect(broker).await else { continue };
-                let ((near_in, near_out), (far_in, far_out)) = (near.into_split(), far.into_split());
+                let Ok(far) = TcpStream::connect(broker).await else {
+                    continue;
+                };
+                let ((near_in, near_out), (far_in, far_out)) =
+                    (near.into_split(), far.into_split());
                 tokio::spawn(pass(near_in, far_out, blocked.subscribe()));
                 tokio::spawn(pass(far_in, near_out, blocked.subscribe()));
             }
         });
-        Self { address, is_blocked, task }
+        Self {
+            address,
+            is_blocked,
+            task,
+        }
     }
 
     pub(crate) fn block(&self, is_blocked: bool) {
@@ -44,10 +51,15 @@ impl Drop for Path {
     }
 }
 
-async fn pass(mut from: OwnedReadHalf, mut to: OwnedWriteHalf, mut is_blocked: watch::Receiver<bool>) {
+async fn pass(
+    mut from: OwnedReadHalf,
+    mut to: OwnedWriteHalf,
+    mut is_blocked: watch::Receiver<bool>,
+) {
     let mut buffer = vec![0; 64 * 1024];
     while let Ok(read @ 1..) = from.read(&mut buffer).await {
-        if is_blocked.wait_for(|is_blocked| !is_blocked).await.is_err() || to.write_all(&buffer[..read]).await.is_err()
+        if is_blocked.wait_for(|is_blocked| !is_blocked).await.is_err()
+            || to.write_all(&buffer[..read]).await.is_err()
         {
             return;
         }

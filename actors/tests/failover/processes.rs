@@ -40,8 +40,18 @@ impl Drop for Logs<'_> {
 }
 
 fn start(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Process {
-    let log = File::options().create(true).append(true).open(directory.join(format!("{name}.log"))).unwrap();
-    Process(command(name, role, seed, directory).stdout(Stdio::null()).stderr(log).spawn().unwrap())
+    let log = File::options()
+        .create(true)
+        .append(true)
+        .open(directory.join(format!("{name}.log")))
+        .unwrap();
+    Process(
+        command(name, role, seed, directory)
+            .stdout(Stdio::null())
+            .stderr(log)
+            .spawn()
+            .unwrap(),
+    )
 }
 
 /// The program as a node of this name, whose files are in the directory.
@@ -58,8 +68,13 @@ fn command(name: &str, role: Role, seed: SocketAddr, directory: &Path) -> Comman
 
 /// A node's certificates, if the cell has a CA in its directory.
 fn certificates(name: &str, role: Role, directory: &Path) -> Option<TlsConfig> {
-    let (mut authority, node) = (Authority::open(&directory.join(CA)).ok()?, NodeName::new(name).unwrap());
-    authority.issue(&node, role, Duration::from_secs(3600), clock::now()).unwrap();
+    let (mut authority, node) = (
+        Authority::open(&directory.join(CA)).ok()?,
+        NodeName::new(name).unwrap(),
+    );
+    authority
+        .issue(&node, role, Duration::from_secs(3600), clock::now())
+        .unwrap();
     let (certificate, key) = authority.files_of(&node);
     Some(TlsConfig {
         ca: authority.ca(),
@@ -84,7 +99,12 @@ fn vehicles_go_on_when_the_process_of_the_edge_is_killed() {
 #[test]
 fn vehicles_with_certificates_go_on_when_the_process_of_the_edge_is_killed() {
     let directory = tempfile::tempdir().unwrap();
-    Authority::init(&directory.path().join(CA), &NodeName::from_static("cell"), clock::now()).unwrap();
+    Authority::init(
+        &directory.path().join(CA),
+        &NodeName::from_static("cell"),
+        clock::now(),
+    )
+    .unwrap();
     edge_is_killed(&directory);
 }
 
@@ -99,7 +119,10 @@ fn a_second_process_of_a_name_ends_and_the_leader_stays() {
     let until = |what: &str, holds: &dyn Fn() -> bool| {
         let deadline = Instant::now() + PATIENCE;
         while !holds() {
-            assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
+            assert!(
+                Instant::now() <= deadline,
+                "not within {PATIENCE:?}: {what}"
+            );
             std::thread::sleep(Duration::from_millis(20));
         }
     };
@@ -115,10 +138,15 @@ fn a_second_process_of_a_name_ends_and_the_leader_stays() {
         let ended = second.output().unwrap();
         let said = String::from_utf8_lossy(&ended.stderr);
         assert_eq!(ended.status.code(), Some(4), "{said}");
-        let reason = "another running node of the cell cell is called euclid: give one of them another name";
+        let reason =
+            "another running node of the cell cell is called euclid: give one of them another name";
         assert!(said.contains(reason), "{said}");
         // By itself it may lead itself, until it has heard long enough that its name is taken.
-        assert_ne!(Record::read(&elsewhere.path().join("euclid.maps")).source(), Some("edge"), "it took part");
+        assert_ne!(
+            Record::read(&elsewhere.path().join("euclid.maps")).source(),
+            Some("edge"),
+            "it took part"
+        );
     }
     let seen = record().last_round();
     until("maps go on", &|| record().last_round() > seen + 5);
@@ -127,7 +155,11 @@ fn a_second_process_of_a_name_ends_and_the_leader_stays() {
     let epochs = record.epochs_from(before, "edge");
     assert_eq!(epochs.len(), 1, "{epochs:?}");
     eprintln!("longest gap beside a namesake {:?}", record.longest_gap());
-    assert!(record.longest_gap() < Duration::from_secs(1), "{:?}", record.longest_gap());
+    assert!(
+        record.longest_gap() < Duration::from_secs(1),
+        "{:?}",
+        record.longest_gap()
+    );
 }
 
 fn edge_is_killed(directory: &TempDir) {
@@ -138,28 +170,40 @@ fn edge_is_killed(directory: &TempDir) {
     let until = |what: &str, holds: &dyn Fn(&Record) -> bool| {
         let deadline = Instant::now() + PATIENCE;
         while !vehicles.iter().all(|name| holds(&record(name))) {
-            assert!(Instant::now() <= deadline, "not within {PATIENCE:?}: {what}");
+            assert!(
+                Instant::now() <= deadline,
+                "not within {PATIENCE:?}: {what}"
+            );
             std::thread::sleep(Duration::from_millis(20));
         }
     };
 
     let edge = start("edge", Role::Edge, seed, directory.path());
     let _vehicles = vehicles.map(|name| start(name, Role::Auto, seed, directory.path()));
-    until("the edge serves all", &|record| !record.is_empty() && record.source() == Some("edge"));
+    until("the edge serves all", &|record| {
+        !record.is_empty() && record.source() == Some("edge")
+    });
     // Time to be told who stands by, and to connect to it.
     std::thread::sleep(Duration::from_secs(2));
     drop(edge);
-    until("a vehicle serves all", &|record| record.source() != Some("edge"));
+    until("a vehicle serves all", &|record| {
+        record.source() != Some("edge")
+    });
     for name in vehicles {
         let record = record(name);
         record.never_goes_back();
-        eprintln!("{name}: longest gap when the process was killed {:?}", record.longest_gap());
+        eprintln!(
+            "{name}: longest gap when the process was killed {:?}",
+            record.longest_gap()
+        );
         assert!(record.longest_gap() < Duration::from_secs(5));
     }
 
     let before = record("gauss").last_round();
     let _edge = start("edge", Role::Edge, seed, directory.path());
-    until("the edge leads again", &|record| record.source() == Some("edge"));
+    until("the edge leads again", &|record| {
+        record.source() == Some("edge")
+    });
     std::thread::sleep(Duration::from_millis(500));
     for name in vehicles {
         record(name).never_goes_back();

@@ -16,7 +16,10 @@ impl Record {
     pub(crate) fn read(path: &Path) -> Self {
         let text = std::fs::read_to_string(path).unwrap_or_default();
         // The last line of a killed process may be cut short.
-        let maps = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        let maps = text
+            .lines()
+            .filter_map(|line| serde_json::from_str(line).ok())
+            .collect();
         Self { maps }
     }
 
@@ -26,7 +29,9 @@ impl Record {
 
     /// Whose map was taken last.
     pub(crate) fn source(&self) -> Option<&str> {
-        self.maps.last().map(|received| received.map.aggregator.as_str())
+        self.maps
+            .last()
+            .map(|received| received.map.aggregator.as_str())
     }
 
     pub(crate) fn last_round(&self) -> u64 {
@@ -35,9 +40,13 @@ impl Record {
 
     /// Epochs of the maps from the round on, which is of the leader at that time.
     pub(crate) fn epochs_from(&self, round: u64, leader: &str) -> BTreeSet<Epoch> {
-        let is_earlier = |taken: &&ReceivedMap| taken.map.aggregator.as_str() != leader || taken.map.round < round;
+        let is_earlier = |taken: &&ReceivedMap| {
+            taken.map.aggregator.as_str() != leader || taken.map.round < round
+        };
         let taken = self.maps.iter().skip_while(is_earlier);
-        taken.map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone())).collect()
+        taken
+            .map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone()))
+            .collect()
     }
 
     pub(crate) fn longest_gap(&self) -> Duration {
@@ -49,10 +58,18 @@ impl Record {
     #[track_caller]
     pub(crate) fn never_goes_back(&self) {
         let place = |received: &ReceivedMap| {
-            (Epoch::new(received.map.epoch, received.map.aggregator.clone()), received.map.round)
+            (
+                Epoch::new(received.map.epoch, received.map.aggregator.clone()),
+                received.map.round,
+            )
         };
         for pair in self.maps.windows(2) {
-            assert!(place(&pair[1]) > place(&pair[0]), "{:?} after {:?}", place(&pair[1]), place(&pair[0]));
+            assert!(
+                place(&pair[1]) > place(&pair[0]),
+                "{:?} after {:?}",
+                place(&pair[1]),
+                place(&pair[0])
+            );
         }
     }
 
@@ -70,7 +87,12 @@ impl Record {
         assert!(rounds.len() > 5, "only {rounds:?}");
         for pair in rounds.windows(2) {
             let (next, may_repeat) = (pair[0].0 + 1, pair[1].1 != pair[0].1 && pair[1].1 != owner);
-            assert!(pair[1].0 == next || may_repeat && pair[1].0 < next, "{:?} after {:?}", pair[1], pair[0]);
+            assert!(
+                pair[1].0 == next || may_repeat && pair[1].0 < next,
+                "{:?} after {:?}",
+                pair[1],
+                pair[0]
+            );
         }
         assert_eq!(self.source(), Some(owner));
     }

@@ -17,18 +17,47 @@ async fn a_busy_port_is_an_answer_and_the_actor_goes_on() {
     let (actor, handle) = Actor::spawn(None, Broker, broker).await.unwrap();
     let taken = TcpListener::bind(own).unwrap();
     let busy = taken.local_addr().unwrap();
-    let refused = call!(actor, |reply| BrokerMessage::Start { address: busy, reply }).unwrap();
-    assert!(matches!(&refused, Err(BrokerError::Bind { address, .. }) if *address == busy), "{refused:?}");
-    assert_eq!(call!(actor, |reply| BrokerMessage::Health { reply }).unwrap(), BrokerHealth::Stopped);
+    let refused = call!(actor, |reply| BrokerMessage::Start {
+        address: busy,
+        reply
+    })
+    .unwrap();
+    assert!(
+        matches!(&refused, Err(BrokerError::Bind { address, .. }) if *address == busy),
+        "{refused:?}"
+    );
+    assert_eq!(
+        call!(actor, |reply| BrokerMessage::Health { reply }).unwrap(),
+        BrokerHealth::Stopped
+    );
 
-    let bound = call!(actor, |reply| BrokerMessage::Start { address: own, reply }).unwrap().unwrap();
-    assert_eq!(call!(actor, |reply| BrokerMessage::Health { reply }).unwrap(), BrokerHealth::Serving(bound));
+    let bound = call!(actor, |reply| BrokerMessage::Start {
+        address: own,
+        reply
+    })
+    .unwrap()
+    .unwrap();
+    assert_eq!(
+        call!(actor, |reply| BrokerMessage::Health { reply }).unwrap(),
+        BrokerHealth::Serving(bound)
+    );
     call!(actor, |reply| BrokerMessage::Stop { reply }).unwrap();
     // A program that another test begins holds copies of all sockets for a moment.
-    until("the broker to be gone", || TcpStream::connect(bound).is_err()).await;
+    until("the broker to be gone", || {
+        TcpStream::connect(bound).is_err()
+    })
+    .await;
 
-    let bound = call!(actor, |reply| BrokerMessage::Start { address: bound, reply }).unwrap().unwrap();
+    let bound = call!(actor, |reply| BrokerMessage::Start {
+        address: bound,
+        reply
+    })
+    .unwrap()
+    .unwrap();
     actor.kill();
     handle.await.unwrap();
-    until("a killed actor's broker to be gone", || TcpStream::connect(bound).is_err()).await;
+    until("a killed actor's broker to be gone", || {
+        TcpStream::connect(bound).is_err()
+    })
+    .await;
 }

@@ -7,7 +7,9 @@ use std::time::Duration;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, ReportKind, Role};
+use ecod::wire::{
+    GlobalMap, NodeState, NodeStatus, ObjectReport, PerceivedObject, ReportKind, Role,
+};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::telemetry::counters::Counters;
@@ -21,7 +23,8 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use uuid::Uuid;
 
-pub(crate) const LOOPBACK: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
+pub(crate) const LOOPBACK: SocketAddr =
+    SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 const PATIENCE: Duration = Duration::from_secs(20);
 
 pub(crate) fn embedded() -> (EmbeddedBroker, BrokerAddress) {
@@ -49,9 +52,16 @@ pub(crate) struct Node {
 
 impl Node {
     /// A node whose links are up.
-    pub(crate) async fn join(node: &str, role: SubscriptionRole, mqtt: MqttConfig, brokers: &[&BrokerAddress]) -> Self {
+    pub(crate) async fn join(
+        node: &str,
+        role: SubscriptionRole,
+        mqtt: MqttConfig,
+        brokers: &[&BrokerAddress],
+    ) -> Self {
         let mut node = Self::start(node, role, mqtt).await;
-        node.send(GatewayMessage::SetBrokers { addresses: brokers.iter().copied().cloned().collect() });
+        node.send(GatewayMessage::SetBrokers {
+            addresses: brokers.iter().copied().cloned().collect(),
+        });
         for _ in brokers {
             node.link(LinkState::Up).await;
         }
@@ -61,7 +71,10 @@ impl Node {
     pub(crate) async fn start(node: &str, role: SubscriptionRole, mqtt: MqttConfig) -> Self {
         let (sender, deliveries) = mpsc::unbounded_channel();
         let counters = Arc::new(Counters::default());
-        let status = NodeStatus { epoch: 1, ..NodeStatus::starting(name(node), Uuid::new_v4(), Role::Auto, "0.1.0") };
+        let status = NodeStatus {
+            epoch: 1,
+            ..NodeStatus::starting(name(node), Uuid::new_v4(), Role::Auto, "0.1.0")
+        };
         let arguments = GatewayArguments {
             cell: name("test"),
             role,
@@ -75,7 +88,14 @@ impl Node {
             looks_on: false,
         };
         let (gateway, handle) = Actor::spawn(None, Gateway, arguments).await.unwrap();
-        Self { name: name(node), gateway, counters, status, deliveries, handle }
+        Self {
+            name: name(node),
+            gateway,
+            counters,
+            status,
+            deliveries,
+            handle,
+        }
     }
 
     pub(crate) fn send(&self, message: GatewayMessage) {
@@ -84,7 +104,10 @@ impl Node {
 
     pub(crate) fn report(&self, seq: u64) {
         let report = Arc::new(report(self.name.as_str(), seq));
-        self.send(GatewayMessage::PublishReport { kind: ReportKind::Detections, report });
+        self.send(GatewayMessage::PublishReport {
+            kind: ReportKind::Detections,
+            report,
+        });
     }
 
     /// The next message for which `pick` has an answer; others are passed over.
@@ -97,7 +120,9 @@ impl Node {
                 }
             }
         };
-        tokio::time::timeout(PATIENCE, found).await.expect("the message arrives")
+        tokio::time::timeout(PATIENCE, found)
+            .await
+            .expect("the message arrives")
     }
 
     pub(crate) async fn next_report(&mut self) -> (NodeName, u64) {
@@ -151,7 +176,9 @@ pub(crate) async fn until(what: &str, reached: impl Fn() -> bool) {
             tokio::time::sleep(Duration::from_millis(2)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, reached).await.unwrap_or_else(|_| panic!("never reached: {what}"));
+    tokio::time::timeout(PATIENCE, reached)
+        .await
+        .unwrap_or_else(|_| panic!("never reached: {what}"));
 }
 
 /// A client that knows nothing of ECOD.
@@ -162,17 +189,29 @@ pub(crate) struct Stranger {
 
 impl Stranger {
     pub(crate) async fn connect(broker: &BrokerAddress) -> Self {
-        let mut options = MqttOptions::new(Uuid::new_v4().to_string(), broker.host(), broker.port());
+        let mut options =
+            MqttOptions::new(Uuid::new_v4().to_string(), broker.host(), broker.port());
         options.set_max_packet_size(usize::MAX, usize::MAX);
         let (client, mut events) = AsyncClient::new(options, 16);
-        let first = tokio::time::timeout(PATIENCE, events.poll()).await.unwrap().unwrap();
+        let first = tokio::time::timeout(PATIENCE, events.poll())
+            .await
+            .unwrap()
+            .unwrap();
         assert!(matches!(first, Event::Incoming(Packet::ConnAck(_))));
         Self { client, events }
     }
 
     /// Publishes with QoS 1 and waits until the broker has taken it; false when the broker hangs up instead.
-    pub(crate) async fn publish(&mut self, topic: &str, retain: bool, payload: impl Into<Vec<u8>>) -> bool {
-        self.client.publish(topic, QoS::AtLeastOnce, retain, payload).await.unwrap();
+    pub(crate) async fn publish(
+        &mut self,
+        topic: &str,
+        retain: bool,
+        payload: impl Into<Vec<u8>>,
+    ) -> bool {
+        self.client
+            .publish(topic, QoS::AtLeastOnce, retain, payload)
+            .await
+            .unwrap();
         let taken = async {
             loop {
                 match self.events.poll().await {
@@ -194,5 +233,9 @@ pub(crate) fn report(node: &str, seq: u64) -> ObjectReport {
 }
 
 pub(crate) fn map(aggregator: &str, round: u64) -> Arc<GlobalMap> {
-    Arc::new(GlobalMap::new(&Epoch::new(1, name(aggregator)), round, Timestamp(1_732_154_400_200_000)))
+    Arc::new(GlobalMap::new(
+        &Epoch::new(1, name(aggregator)),
+        round,
+        Timestamp(1_732_154_400_200_000),
+    ))
 }

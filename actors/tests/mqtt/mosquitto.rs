@@ -34,24 +34,39 @@ impl Mosquitto {
         Self::configured(|directory| {
             let file = directory.join("permissions");
             std::fs::write(&file, format!("user {user}\n{permissions}\n")).unwrap();
-            format!("{}acl_file {}\n", passwords(directory, user, password), file.display())
+            format!(
+                "{}acl_file {}\n",
+                passwords(directory, user, password),
+                file.display()
+            )
         })
     }
 
     /// With further settings, whose files may be in the directory.
     pub(crate) fn configured(settings: impl Fn(&Path) -> String) -> Self {
-        assert!(Path::new(PROGRAM).exists(), "{PROGRAM} is missing: install Debian's package mosquitto");
+        assert!(
+            Path::new(PROGRAM).exists(),
+            "{PROGRAM} is missing: install Debian's package mosquitto"
+        );
         let directory = tempfile::tempdir().unwrap();
         let settings = settings(directory.path());
         // Another process may take the port between its choice and mosquitto's start.
         for _ in 0..5 {
-            let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+            let port = std::net::TcpListener::bind("127.0.0.1:0")
+                .unwrap()
+                .local_addr()
+                .unwrap()
+                .port();
             let user = "user root\nset_tcp_nodelay true\n";
             let text = format!("listener {port} 127.0.0.1\n{user}{settings}");
             std::fs::write(directory.path().join("mosquitto.conf"), text).unwrap();
             let mut child = spawn(directory.path());
             if serves(&mut child, port) {
-                return Self { child, directory, port };
+                return Self {
+                    child,
+                    directory,
+                    port,
+                };
             }
         }
         panic!("mosquitto did not start on any of five free ports");
@@ -76,12 +91,20 @@ impl Mosquitto {
     }
 
     fn signal(&self, signal: Signal) {
-        kill(Pid::from_raw(i32::try_from(self.child.id()).unwrap()), signal).unwrap();
+        kill(
+            Pid::from_raw(i32::try_from(self.child.id()).unwrap()),
+            signal,
+        )
+        .unwrap();
     }
 
     pub(crate) fn revive(&mut self) {
         self.child = spawn(self.directory.path());
-        assert!(serves(&mut self.child, self.port), "mosquitto starts again on port {}", self.port);
+        assert!(
+            serves(&mut self.child, self.port),
+            "mosquitto starts again on port {}",
+            self.port
+        );
     }
 }
 
@@ -95,8 +118,17 @@ impl Drop for Mosquitto {
 
 fn passwords(directory: &Path, user: &str, password: &str) -> String {
     let file = directory.join("passwords");
-    let made = Command::new("mosquitto_passwd").arg("-b").arg("-c").arg(&file).args([user, password]).status();
-    assert!(made.is_ok_and(|status| status.success()), "mosquitto_passwd makes {}", file.display());
+    let made = Command::new("mosquitto_passwd")
+        .arg("-b")
+        .arg("-c")
+        .arg(&file)
+        .args([user, password])
+        .status();
+    assert!(
+        made.is_ok_and(|status| status.success()),
+        "mosquitto_passwd makes {}",
+        file.display()
+    );
     format!("allow_anonymous false\npassword_file {}\n", file.display())
 }
 

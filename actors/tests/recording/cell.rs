@@ -13,7 +13,9 @@ use ecod::wire::{ObjectReport, PerceivedObject, ReportKind, Role, WirePose};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::node::{self, NodeHandle};
-use ecod_actors::observe::recorder::{LogEvent, LogIdentity, LogMessage, LogReader, RecordConfig, SchemaName, files};
+use ecod_actors::observe::recorder::{
+    LogEvent, LogIdentity, LogMessage, LogReader, RecordConfig, SchemaName, files,
+};
 use ecod_actors::platform::clock;
 use tempfile::TempDir;
 use tokio::runtime::{Builder, Runtime};
@@ -27,7 +29,10 @@ pub(crate) fn name(text: &str) -> NodeName {
 
 /// An address at which nobody gossips now.
 pub(crate) fn free_address() -> SocketAddr {
-    UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+    UdpSocket::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap()
 }
 
 /// A node that records below `directory`: loopback only, found by a seed.
@@ -43,8 +48,14 @@ pub(crate) fn config(
         role,
         listen: Some(SocketAddr::from(([127, 0, 0, 1], 0))),
         state_dir: Some(directory.into()),
-        landmarks: vec![LandmarkConfig::at("slot-0", 2.0, 1.0), LandmarkConfig::at("slot-1", 4.0, 1.0)],
-        record: Some(RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory.join(node)) }),
+        landmarks: vec![
+            LandmarkConfig::at("slot-0", 2.0, 1.0),
+            LandmarkConfig::at("slot-1", 4.0, 1.0),
+        ],
+        record: Some(RecordConfig {
+            min_free_mb: 0,
+            ..RecordConfig::new(directory.join(node))
+        }),
         ..NodeConfig::default()
     };
     config.membership.bind = Some(bind.unwrap_or(SocketAddr::from(([127, 0, 0, 1], 0))));
@@ -69,8 +80,16 @@ pub(crate) struct Cell {
 impl Default for Cell {
     fn default() -> Self {
         // With RUST_LOG=info a failing test tells what the nodes did.
-        tracing_subscriber::fmt().with_env_filter(EnvFilter::from_default_env()).try_init().ok();
-        Self { directory: tempfile::tempdir().unwrap(), seed: free_address(), nodes: BTreeMap::new(), seq: 0 }
+        tracing_subscriber::fmt()
+            .with_env_filter(EnvFilter::from_default_env())
+            .try_init()
+            .ok();
+        Self {
+            directory: tempfile::tempdir().unwrap(),
+            seed: free_address(),
+            nodes: BTreeMap::new(),
+            seq: 0,
+        }
     }
 }
 
@@ -80,7 +99,13 @@ impl Cell {
     }
 
     pub(crate) fn config(&self, node: &str, role: Role) -> NodeConfig {
-        config(node, role, self.nodes.is_empty().then_some(self.seed), self.seed, self.directory.path())
+        config(
+            node,
+            role,
+            self.nodes.is_empty().then_some(self.seed),
+            self.seed,
+            self.directory.path(),
+        )
     }
 
     /// Starts a node on a runtime of its own; the first is the seed of the others.
@@ -91,7 +116,11 @@ impl Cell {
     /// The same with another configuration.
     pub(crate) async fn start_with(&mut self, config: NodeConfig) {
         let node = config.name.as_ref().unwrap().to_string();
-        let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
         let handle = runtime.spawn(node::start(config)).await.unwrap().unwrap();
         self.nodes.insert(node, (handle, runtime));
     }
@@ -99,7 +128,14 @@ impl Cell {
     /// Ends all tasks of a node where they are.
     pub(crate) fn kill(&mut self, node: &str) {
         let (handle, runtime) = self.nodes.remove(node).unwrap();
-        self.seed = self.nodes.values().next().unwrap().0.gossip_address().unwrap();
+        self.seed = self
+            .nodes
+            .values()
+            .next()
+            .unwrap()
+            .0
+            .gossip_address()
+            .unwrap();
         runtime.shutdown_background();
         drop(handle);
     }
@@ -122,11 +158,18 @@ impl Cell {
         let end = tokio::time::Instant::now() + time;
         while tokio::time::Instant::now() < end {
             self.seq += 1;
-            for (number, (node, (handle, _))) in self.nodes.iter().enumerate().filter(|(_, (node, _))| *node != "edge")
+            for (number, (node, (handle, _))) in self
+                .nodes
+                .iter()
+                .enumerate()
+                .filter(|(_, (node, _))| *node != "edge")
             {
                 let report = Arc::new(report(node, self.seq, number));
                 for kind in [ReportKind::Detections, ReportKind::VoteDetections] {
-                    let message = GatewayMessage::PublishReport { kind, report: Arc::clone(&report) };
+                    let message = GatewayMessage::PublishReport {
+                        kind,
+                        report: Arc::clone(&report),
+                    };
                     handle.slots().gateway.send(message);
                 }
             }
@@ -137,7 +180,10 @@ impl Cell {
     /// Waits until every node takes maps of this node and follows it.
     pub(crate) async fn served_by(&self, leader: &str) {
         self.until(&format!("{leader} serves all"), |cell| {
-            cell.sources().iter().all(|source| source.as_deref() == Some(leader)).then_some(())
+            cell.sources()
+                .iter()
+                .all(|source| source.as_deref() == Some(leader))
+                .then_some(())
         })
         .await;
     }
@@ -147,7 +193,8 @@ impl Cell {
         self.until(&format!("another than {old} serves all"), |cell| {
             let sources = cell.sources();
             let first = sources.first()?.clone()?;
-            (first != old && sources.iter().all(|source| *source == Some(first.clone()))).then_some(first)
+            (first != old && sources.iter().all(|source| *source == Some(first.clone())))
+                .then_some(first)
         })
         .await
     }
@@ -161,13 +208,20 @@ impl Cell {
         self.nodes.values().map(source).collect()
     }
 
-    pub(crate) async fn until<T>(&self, what: &str, mut holds: impl FnMut(&Self) -> Option<T>) -> T {
+    pub(crate) async fn until<T>(
+        &self,
+        what: &str,
+        mut holds: impl FnMut(&Self) -> Option<T>,
+    ) -> T {
         let deadline = tokio::time::Instant::now() + PATIENCE;
         loop {
             if let Some(found) = holds(self) {
                 return found;
             }
-            assert!(tokio::time::Instant::now() < deadline, "not within {PATIENCE:?}: {what}");
+            assert!(
+                tokio::time::Instant::now() < deadline,
+                "not within {PATIENCE:?}: {what}"
+            );
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
@@ -201,7 +255,11 @@ pub(crate) struct Log {
 
 impl Log {
     pub(crate) fn read(directory: &Path) -> Self {
-        let mut log = Self { identity: None, messages: Vec::new(), problems: Vec::new() };
+        let mut log = Self {
+            identity: None,
+            messages: Vec::new(),
+            problems: Vec::new(),
+        };
         for file in files(directory).unwrap() {
             for event in LogReader::open(&file).unwrap() {
                 match event {
@@ -215,12 +273,21 @@ impl Log {
     }
 
     pub(crate) fn count(&self, schema: SchemaName) -> usize {
-        self.messages.iter().filter(|message| message.schema == schema).count()
+        self.messages
+            .iter()
+            .filter(|message| message.schema == schema)
+            .count()
     }
 
     /// The maps and verdicts.
     pub(crate) fn fused(&self) -> Vec<FusedLine> {
-        let fused = |message: &&LogMessage| matches!(message.schema, SchemaName::GlobalMap | SchemaName::Verdicts);
-        self.messages.iter().filter(fused).map(|message| serde_json::from_slice(&message.json).unwrap()).collect()
+        let fused = |message: &&LogMessage| {
+            matches!(message.schema, SchemaName::GlobalMap | SchemaName::Verdicts)
+        };
+        self.messages
+            .iter()
+            .filter(fused)
+            .map(|message| serde_json::from_slice(&message.json).unwrap())
+            .collect()
     }
 }

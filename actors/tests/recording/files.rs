@@ -18,7 +18,10 @@ fn log(version: u64) -> Vec<u8> {
 /// The same with other metadata.
 fn log_with(changes: &[(&str, &str)]) -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
-    let mut writer: Writer<_> = WriteOptions::new().compression(None).create(&mut bytes).unwrap();
+    let mut writer: Writer<_> = WriteOptions::new()
+        .compression(None)
+        .create(&mut bytes)
+        .unwrap();
     let fusion = serde_json::to_string(&ReplayConfig::default().fusion).unwrap();
     let metadata = [
         ("log", "1".into()),
@@ -30,13 +33,27 @@ fn log_with(changes: &[(&str, &str)]) -> Vec<u8> {
         ("landmarks", "[]".into()),
     ];
     let mut metadata: BTreeMap<_, _> = metadata.map(|(key, value)| (key.to_owned(), value)).into();
-    metadata.extend(changes.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())));
-    writer.write_metadata(&Metadata { name: "ecod.log".into(), metadata }).unwrap();
+    metadata.extend(
+        changes
+            .iter()
+            .map(|(key, value)| ((*key).to_owned(), (*value).to_owned())),
+    );
+    writer
+        .write_metadata(&Metadata {
+            name: "ecod.log".into(),
+            metadata,
+        })
+        .unwrap();
     let mut channel = |schema: &str, topic: &str| {
         let schema = writer.add_schema(schema, "jsonschema", b"{}").unwrap();
-        writer.add_channel(schema, topic, "json", &BTreeMap::new()).unwrap()
+        writer
+            .add_channel(schema, topic, "json", &BTreeMap::new())
+            .unwrap()
     };
-    let (reports, tea) = (channel("ecod.ObjectReport", "detections/a"), channel("ecod.Tea", "tea"));
+    let (reports, tea) = (
+        channel("ecod.ObjectReport", "detections/a"),
+        channel("ecod.Tea", "tea"),
+    );
     for (second, channel_id) in [(1, reports), (2, tea), (3, reports)] {
         let micros: u64 = 1_732_154_400_000_000 + second * 1_000_000;
         let report = format!(
@@ -44,8 +61,15 @@ fn log_with(changes: &[(&str, &str)]) -> Vec<u8> {
             "objects":[{{"label":"car","confidence":0.9,"x_m":1.0,"y_m":2.0,"landmark":"slot-0"}}]}}"#
         );
         let time = micros * 1000;
-        let header = MessageHeader { channel_id, sequence: second as u32, log_time: time, publish_time: time };
-        writer.write_to_known_channel(&header, report.as_bytes()).unwrap();
+        let header = MessageHeader {
+            channel_id,
+            sequence: second as u32,
+            log_time: time,
+            publish_time: time,
+        };
+        writer
+            .write_to_known_channel(&header, report.as_bytes())
+            .unwrap();
         writer.flush().unwrap();
     }
     writer.finish().unwrap();
@@ -68,7 +92,11 @@ fn replay(inputs: &[&Path]) -> (i32, usize, String) {
     }
     let run = command.output().unwrap();
     let lines = run.stdout.iter().filter(|byte| **byte == b'\n').count();
-    (run.status.code().unwrap(), lines, String::from_utf8(run.stderr).unwrap())
+    (
+        run.status.code().unwrap(),
+        lines,
+        String::from_utf8(run.stderr).unwrap(),
+    )
 }
 
 #[test]
@@ -76,23 +104,45 @@ fn what_can_be_read_of_a_log_is_used_and_the_rest_is_named() {
     let folder = TempDir::new().unwrap();
     let whole = log(1);
     let (code, lines, said) = replay(&[&file(&folder, "whole.mcap", &whole)]);
-    assert!(code == 0 && lines > 10 && said.contains("2 lines, 2 used"), "{code} {lines} {said}");
-    assert!(said.contains("1 messages of \"ecod.Tea\" are not known"), "{said}");
+    assert!(
+        code == 0 && lines > 10 && said.contains("2 lines, 2 used"),
+        "{code} {lines} {said}"
+    );
+    assert!(
+        said.contains("1 messages of \"ecod.Tea\" are not known"),
+        "{said}"
+    );
 
-    let second = whole.windows(8).rposition(|bytes| bytes == b"captured").unwrap();
+    let second = whole
+        .windows(8)
+        .rposition(|bytes| bytes == b"captured")
+        .unwrap();
     let (code, lines, said) = replay(&[&file(&folder, "cut.mcap", &whole[..second])]);
-    assert!(code == 0 && lines > 0 && said.contains("cut.mcap was not finished"), "{code} {lines} {said}");
+    assert!(
+        code == 0 && lines > 0 && said.contains("cut.mcap was not finished"),
+        "{code} {lines} {said}"
+    );
     assert!(said.contains("1 lines, 1 used"), "{said}");
 
     let mut damaged = whole.clone();
     damaged[second..second + 20].fill(0xff);
     let (code, _, said) = replay(&[&file(&folder, "damaged.mcap", &damaged)]);
-    assert!(code == 0 && said.contains("damaged.mcap is damaged"), "{said}");
+    assert!(
+        code == 0 && said.contains("damaged.mcap is damaged"),
+        "{said}"
+    );
 
     for length in 0..whole.len() {
-        let reader =
-            ecod_actors::observe::recorder::LogReader::open(&file(&folder, "any.mcap", &whole[..length])).unwrap();
-        assert!(reader.take(1000).count() < 1000, "cut at {length}, reading ends");
+        let reader = ecod_actors::observe::recorder::LogReader::open(&file(
+            &folder,
+            "any.mcap",
+            &whole[..length],
+        ))
+        .unwrap();
+        assert!(
+            reader.take(1000).count() < 1000,
+            "cut at {length}, reading ends"
+        );
     }
 }
 
@@ -103,22 +153,45 @@ fn a_log_whose_configuration_cannot_be_read_is_replayed_only_under_one_that_is_g
     let unknown = r#"{"later_key": 1}"#;
     let config = file(&folder, "cell.toml", b"cell = \"cell\"\n");
     for (name, bytes, why) in [
-        ("newer.mcap", log(7), "newer.mcap has version 7 of the log, this program knows 1"),
-        ("unknown.mcap", log_with(&[("fusion", unknown)]), "metadata `fusion` of the log cannot be used"),
+        (
+            "newer.mcap",
+            log(7),
+            "newer.mcap has version 7 of the log, this program knows 1",
+        ),
+        (
+            "unknown.mcap",
+            log_with(&[("fusion", unknown)]),
+            "metadata `fusion` of the log cannot be used",
+        ),
     ] {
         let log = file(&folder, name, &bytes);
         let output = file(&folder, "rounds.jsonl", b"of an earlier replay");
         let run = |more: &[&Path]| {
             let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-            command.arg("replay").arg("--input").arg(&log).arg("--output").arg(&output).args(more);
+            command
+                .arg("replay")
+                .arg("--input")
+                .arg(&log)
+                .arg("--output")
+                .arg(&output)
+                .args(more);
             let run = command.output().unwrap();
-            (run.status.code().unwrap(), String::from_utf8(run.stderr).unwrap())
+            (
+                run.status.code().unwrap(),
+                String::from_utf8(run.stderr).unwrap(),
+            )
         };
         let (code, said) = run(&[]);
-        assert!(code == 2 && said.contains(why) && said.contains("--config"), "{code} {said}");
+        assert!(
+            code == 2 && said.contains(why) && said.contains("--config"),
+            "{code} {said}"
+        );
         assert_eq!(std::fs::read(&output).unwrap(), b"of an earlier replay");
         let (code, said) = run(&[Path::new("--config"), &config]);
-        assert!(code == 0 && said.contains(why) && said.contains("2 lines, 2 used"), "{code} {said}");
+        assert!(
+            code == 0 && said.contains(why) && said.contains("2 lines, 2 used"),
+            "{code} {said}"
+        );
     }
 }
 
@@ -133,21 +206,51 @@ fn of_several_nodes_logs_in_one_directory_one_is_chosen() {
     let ecod = |command: &str, input: &str, output: &str, more: &[&str]| {
         let output = file(&folder, output, b"of before");
         let mut run = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-        run.arg(command).args(input.split_whitespace()).arg(logs.path()).arg("--output").arg(&output).args(more);
+        run.arg(command)
+            .args(input.split_whitespace())
+            .arg(logs.path())
+            .arg("--output")
+            .arg(&output)
+            .args(more);
         let run = run.output().unwrap();
         let said = String::from_utf8(run.stderr).unwrap();
-        (run.status.code().unwrap(), said, std::fs::read_to_string(&output).unwrap())
+        (
+            run.status.code().unwrap(),
+            said,
+            std::fs::read_to_string(&output).unwrap(),
+        )
     };
-    for (command, input, output) in [("replay", "--input", "rounds.jsonl"), ("report", "", "report.html")] {
+    for (command, input, output) in [
+        ("replay", "--input", "rounds.jsonl"),
+        ("report", "", "report.html"),
+    ] {
         let (code, said, written) = ecod(command, input, output, &[]);
-        assert!(code == 2 && said.contains("several nodes, edge, gauss: choose one by --node"), "{code} {said}");
+        assert!(
+            code == 2 && said.contains("several nodes, edge, gauss: choose one by --node"),
+            "{code} {said}"
+        );
         assert_eq!(written, "of before");
         let (code, said, _) = ecod(command, input, output, &["--node", "euclid"]);
-        assert!(code == 2 && said.contains("no log of euclid here, but of edge, gauss"), "{code} {said}");
+        assert!(
+            code == 2 && said.contains("no log of euclid here, but of edge, gauss"),
+            "{code} {said}"
+        );
         // The two logs hold the same dates.
-        let lenient: &[&str] = if command == "replay" { &["--max-rejected", "100"] } else { &[] };
-        let (code, said, written) = ecod(command, input, output, &[&["--node", "gauss"], lenient].concat());
-        assert!(code == 0 && !said.contains("edge") && written.contains("gauss"), "{code} {said}");
+        let lenient: &[&str] = if command == "replay" {
+            &["--max-rejected", "100"]
+        } else {
+            &[]
+        };
+        let (code, said, written) = ecod(
+            command,
+            input,
+            output,
+            &[&["--node", "gauss"], lenient].concat(),
+        );
+        assert!(
+            code == 0 && !said.contains("edge") && written.contains("gauss"),
+            "{code} {said}"
+        );
         assert!(command == "report" || said.contains("4 lines"), "{said}");
     }
 }
@@ -157,26 +260,42 @@ fn another_version_or_configuration_further_on_is_told_of_and_used_from_there() 
     let folder = TempDir::new().unwrap();
     let one = file(&folder, "one.mcap", &log(1));
     let run = uuid::Uuid::from_u128(1).to_string();
-    let moved = [("run", &*run), ("version", "0.0.1"), ("landmarks", r#"[{"id":"slot-0","x_m":1.5,"y_m":2.0}]"#)];
+    let moved = [
+        ("run", &*run),
+        ("version", "0.0.1"),
+        ("landmarks", r#"[{"id":"slot-0","x_m":1.5,"y_m":2.0}]"#),
+    ];
     let other = file(&folder, "other.mcap", &log_with(&moved));
     let ((_, alone, _), (_, other_alone, _)) = (replay(&[&one]), replay(&[&other]));
     let (code, lines, said) = replay(&[&one, &other]);
     assert_eq!((code, lines), (0, alone + other_alone), "{said}");
     assert_eq!(said.matches("2 lines, 2 used").count(), 2, "{said}");
-    for part in ["other.mcap was written by version 0.0.1", "other.mcap is of a run under another configuration"] {
+    for part in [
+        "other.mcap was written by version 0.0.1",
+        "other.mcap is of a run under another configuration",
+    ] {
         assert_eq!(said.matches(part).count(), 1, "{said}");
     }
     let same = file(&folder, "same.mcap", &log_with(&[("run", &run)]));
     let (_, _, said) = replay(&[&one, &same]);
-    assert!(said.contains("4 lines") && !said.contains("another configuration"), "{said}");
+    assert!(
+        said.contains("4 lines") && !said.contains("another configuration"),
+        "{said}"
+    );
 }
 
 #[test]
 fn what_is_no_log_is_refused_by_name() {
     let folder = TempDir::new().unwrap();
-    let (one, lines) = (file(&folder, "one.mcap", &log(1)), file(&folder, "lines.jsonl", b"{}\n"));
+    let (one, lines) = (
+        file(&folder, "one.mcap", &log(1)),
+        file(&folder, "lines.jsonl", b"{}\n"),
+    );
     let (code, _, said) = replay(&[&one, &lines]);
-    assert!(code == 2 && said.contains("lines.jsonl is not a log"), "{said}");
+    assert!(
+        code == 2 && said.contains("lines.jsonl is not a log"),
+        "{said}"
+    );
     let (code, _, said) = replay(&[Path::new("/no/such.mcap")]);
     assert!(code == 2 && said.contains("/no/such.mcap"), "{said}");
     let empty = TempDir::new().unwrap();
@@ -187,16 +306,34 @@ fn what_is_no_log_is_refused_by_name() {
 #[test]
 fn a_report_is_one_page_with_everything_in_it() {
     let folder = TempDir::new().unwrap();
-    let (log, page) = (file(&folder, "log.mcap", &log(1)), folder.path().join("report.html"));
+    let (log, page) = (
+        file(&folder, "log.mcap", &log(1)),
+        folder.path().join("report.html"),
+    );
     let report = |log: &Path| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-        command.arg("report").arg(log).arg("-o").arg(&page).output().unwrap()
+        command
+            .arg("report")
+            .arg(log)
+            .arg("-o")
+            .arg(&page)
+            .output()
+            .unwrap()
     };
     let run = report(&log);
-    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+    assert!(
+        run.status.success(),
+        "{}",
+        String::from_utf8_lossy(&run.stderr)
+    );
     let html = std::fs::read_to_string(&page).unwrap();
     assert!(html.contains("Log of gauss") && html.contains("prefers-color-scheme: dark"));
-    assert!(["<script", "src=", "href=", "url("].iter().all(|part| !html.contains(part)), "self-contained");
+    assert!(
+        ["<script", "src=", "href=", "url("]
+            .iter()
+            .all(|part| !html.contains(part)),
+        "self-contained"
+    );
     assert!(String::from_utf8_lossy(&run.stderr).contains("ecod.Tea"));
     let run = report(&file(&folder, "not.mcap", b"{}"));
     assert_eq!(run.status.code(), Some(2));
@@ -213,16 +350,38 @@ fn the_doctor_says_what_is_broken_by_its_exit_code_and_as_json() {
     };
     let doctor = |config: &Path, json: bool| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_ecod-node"));
-        command.arg("doctor").arg("--config").arg(config).args(json.then_some("--json")).output().unwrap()
+        command
+            .arg("doctor")
+            .arg("--config")
+            .arg(config)
+            .args(json.then_some("--json"))
+            .output()
+            .unwrap()
     };
     let sound = doctor(&config("sound.toml", ""), false);
     let text = String::from_utf8_lossy(&sound.stdout).into_owned();
-    assert!(sound.status.success() && text.contains("ok    broker port"), "{text}");
-    let broken = doctor(&config("broken.toml", "state_dir = \"/proc/no/such\""), true);
+    assert!(
+        sound.status.success() && text.contains("ok    broker port"),
+        "{text}"
+    );
+    let broken = doctor(
+        &config("broken.toml", "state_dir = \"/proc/no/such\""),
+        true,
+    );
     assert_eq!(broken.status.code(), Some(1));
     let findings: serde_json::Value = serde_json::from_slice(&broken.stdout).unwrap();
-    let state = findings.as_array().unwrap().iter().find(|finding| finding["check"] == "state directory").unwrap();
+    let state = findings
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|finding| finding["check"] == "state directory")
+        .unwrap();
     assert_eq!(state["verdict"], "broken");
     assert!(state["fix"].as_str().unwrap().contains("state_dir"));
-    assert_eq!(doctor(&config("typo.toml", "stat_dir = \"x\""), false).status.code(), Some(2));
+    assert_eq!(
+        doctor(&config("typo.toml", "stat_dir = \"x\""), false)
+            .status
+            .code(),
+        Some(2)
+    );
 }

@@ -23,30 +23,53 @@ use cell::{Cell, Log, name};
 /// The lines that a replay of a node's log writes, and what it says.
 fn replay(log: &std::path::Path) -> (Vec<FusedLine>, String) {
     let arguments = ["replay", "--input", log.to_str().unwrap(), "--output", "-"];
-    let run = Command::new(env!("CARGO_BIN_EXE_ecod-node")).args(arguments).output().unwrap();
+    let run = Command::new(env!("CARGO_BIN_EXE_ecod-node"))
+        .args(arguments)
+        .output()
+        .unwrap();
     let said = String::from_utf8(run.stderr).unwrap();
     assert!(run.status.success(), "{said}");
-    let lines = run.stdout.split(|byte| *byte == b'\n').filter(|line| !line.is_empty());
-    (lines.map(|line| serde_json::from_slice(line).unwrap()).collect(), said)
+    let lines = run
+        .stdout
+        .split(|byte| *byte == b'\n')
+        .filter(|line| !line.is_empty());
+    (
+        lines
+            .map(|line| serde_json::from_slice(line).unwrap())
+            .collect(),
+        said,
+    )
 }
 
 /// Whose line it is, of which term and round, and whether it is a map.
 fn key(line: &FusedLine) -> (String, u64, u64, bool) {
     match line {
         FusedLine::Map(map) => (map.aggregator.to_string(), map.epoch, map.round, true),
-        FusedLine::Verdicts(verdicts) => (verdicts.aggregator.to_string(), verdicts.epoch, verdicts.round, false),
+        FusedLine::Verdicts(verdicts) => (
+            verdicts.aggregator.to_string(),
+            verdicts.epoch,
+            verdicts.round,
+            false,
+        ),
     }
 }
 
 fn by_key(lines: &[FusedLine]) -> BTreeMap<(String, u64, u64, bool), String> {
-    lines.iter().map(|line| (key(line), serde_json::to_string(line).unwrap())).collect()
+    lines
+        .iter()
+        .map(|line| (key(line), serde_json::to_string(line).unwrap()))
+        .collect()
 }
 
 /// Every map and verdict of every leader comes out of its log again, to the last bit, across a failover and back.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_every_leader_made_is_made_again_from_its_log() {
     let mut cell = Cell::default();
-    for (node, role) in [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Auto)] {
+    for (node, role) in [
+        ("edge", Role::Edge),
+        ("euclid", Role::Auto),
+        ("gauss", Role::Auto),
+    ] {
         cell.start(node, role).await;
     }
     cell.served_by("edge").await;
@@ -63,7 +86,11 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
     for node in ["edge", "euclid", "gauss"] {
         let dir = directory.path().join(node);
         let recorded = Log::read(&dir);
-        let own: Vec<_> = recorded.fused().into_iter().filter(|line| key(line).0 == node).collect();
+        let own: Vec<_> = recorded
+            .fused()
+            .into_iter()
+            .filter(|line| key(line).0 == node)
+            .collect();
         let (again, said) = replay(&dir);
         let (own, again) = (by_key(&own), by_key(&again));
         for (key, line) in &own {
@@ -71,16 +98,29 @@ async fn what_every_leader_made_is_made_again_from_its_log() {
         }
         // A killed node has made rounds that it had no time to write down, and the other way round.
         let more = again.keys().filter(|key| !own.contains_key(*key)).count();
-        assert!(more <= 20, "{node}: {more} rounds of {} were not recorded", again.len());
-        assert!(!said.contains("missing") && !said.contains("middle"), "{said}");
+        assert!(
+            more <= 20,
+            "{node}: {more} rounds of {} were not recorded",
+            again.len()
+        );
+        assert!(
+            !said.contains("missing") && !said.contains("middle"),
+            "{said}"
+        );
         // A node that leads only while the others stop has no reports to fuse.
         if node == "edge" || node == substitute {
-            assert!(own.values().any(|line| line.contains("\"euclid\"")), "{node} fused reports");
+            assert!(
+                own.values().any(|line| line.contains("\"euclid\"")),
+                "{node} fused reports"
+            );
         }
         leaders.extend((!own.is_empty()).then_some(node));
         eprintln!("{node}: {} recorded, {} made again", own.len(), again.len());
     }
-    assert!(leaders.contains(&"edge") && leaders.contains(&&*substitute), "{leaders:?}");
+    assert!(
+        leaders.contains(&"edge") && leaders.contains(&&*substitute),
+        "{leaders:?}"
+    );
 }
 
 /// An edit between two runs of a node holds for the second alone, also when both are made again.
@@ -93,7 +133,9 @@ async fn every_run_is_made_again_under_its_own_configuration() {
     cell.drive(Duration::from_secs(1)).await;
     cell.kill("edge");
     let mut config = cell.config("edge", Role::Edge);
-    config.landmarks.push(LandmarkConfig::at("slot-2", 6.0, 1.0));
+    config
+        .landmarks
+        .push(LandmarkConfig::at("slot-2", 6.0, 1.0));
     cell.start_with(config).await;
     cell.served_by("edge").await;
     cell.drive(Duration::from_secs(2)).await;
@@ -107,8 +149,15 @@ async fn every_run_is_made_again_under_its_own_configuration() {
         assert_eq!(again.get(key), Some(line), "{key:?}\n{said}");
     }
     let of_second_run = own.values().filter(|line| line.contains("slot-2")).count();
-    assert!(of_second_run > 5 && of_second_run < own.len(), "{of_second_run} of {}", own.len());
-    assert!(!said.contains("missing") && !said.contains("middle"), "{said}");
+    assert!(
+        of_second_run > 5 && of_second_run < own.len(),
+        "{of_second_run} of {}",
+        own.len()
+    );
+    assert!(
+        !said.contains("missing") && !said.contains("middle"),
+        "{said}"
+    );
 }
 
 /// An observer's log has what all of the cell said, and the reports in it can be fused, also those of several runs.
@@ -121,14 +170,34 @@ async fn an_observer_records_what_all_say() {
     let dir = cell.directory().join("observer");
     let seed = cell.node("edge").gossip_address().unwrap().to_string();
     let config = cell.directory().join("edge.toml");
-    std::fs::write(&config, toml::to_string(&cell.config("edge", Role::Edge)).unwrap()).unwrap();
-    let arguments = ["record", "--config", config.to_str().unwrap(), "--dir", dir.to_str().unwrap(), "--seed", &seed];
+    std::fs::write(
+        &config,
+        toml::to_string(&cell.config("edge", Role::Edge)).unwrap(),
+    )
+    .unwrap();
+    let arguments = [
+        "record",
+        "--config",
+        config.to_str().unwrap(),
+        "--dir",
+        dir.to_str().unwrap(),
+        "--seed",
+        &seed,
+    ];
     for time in [Duration::from_secs(4), Duration::from_secs(2)] {
-        let observer = Command::new(env!("CARGO_BIN_EXE_ecod-node")).args(arguments).spawn().unwrap();
+        let observer = Command::new(env!("CARGO_BIN_EXE_ecod-node"))
+            .args(arguments)
+            .spawn()
+            .unwrap();
         let name = format!("recorder-{}", observer.id());
         let mut observer = disk::Process(observer);
         cell.until("the observer takes part", |cell| {
-            cell.node("edge").members().borrow().iter().any(|member| member.name.as_str() == name).then_some(())
+            cell.node("edge")
+                .members()
+                .borrow()
+                .iter()
+                .any(|member| member.name.as_str() == name)
+                .then_some(())
         })
         .await;
         cell.drive(time).await;
@@ -159,15 +228,32 @@ async fn an_observer_records_what_all_say() {
         FusedLine::Verdicts(verdicts) => verdicts.verdicts[0].label.clone(),
     };
     assert!(
-        lines.len() > 20 && lines.iter().filter(|line| labels(line).as_deref() == Some("car")).count() > 20,
+        lines.len() > 20
+            && lines
+                .iter()
+                .filter(|line| labels(line).as_deref() == Some("car"))
+                .count()
+                > 20,
         "{said}"
     );
     assert!(lines.iter().all(|line| key(line).0 == "recorder"));
     let identity = log.identity.unwrap();
-    assert_eq!((identity.cell, identity.node), (name("cell"), name("recorder")));
+    assert_eq!(
+        (identity.cell, identity.node),
+        (name("cell"), name("recorder"))
+    );
     let files = files(&dir).unwrap();
-    let is_named = |file: &std::path::PathBuf| file.file_name().unwrap().to_str().unwrap().starts_with("recorder-2");
-    assert!(files.len() == 2 && files.iter().all(is_named), "a limit holds for all runs: {files:?}");
+    let is_named = |file: &std::path::PathBuf| {
+        file.file_name()
+            .unwrap()
+            .to_str()
+            .unwrap()
+            .starts_with("recorder-2")
+    };
+    assert!(
+        files.len() == 2 && files.iter().all(is_named),
+        "a limit holds for all runs: {files:?}"
+    );
     let (alone, _) = replay(&files[0]);
     assert!(alone.len() < lines.len(), "the second run is replayed too");
 }

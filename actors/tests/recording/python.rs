@@ -27,10 +27,23 @@ except Exception:
 /// The maps that Python finds in a log.
 fn maps_by(python: &str, dir: &Path, state: &str) -> usize {
     let read = |log: &std::path::PathBuf| {
-        let run = Command::new(python).args(["-c", SCRIPT]).arg(log).arg(state).output().unwrap();
-        assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stderr));
+        let run = Command::new(python)
+            .args(["-c", SCRIPT])
+            .arg(log)
+            .arg(state)
+            .output()
+            .unwrap();
+        assert!(
+            run.status.success(),
+            "{}",
+            String::from_utf8_lossy(&run.stderr)
+        );
         let is_map = |line: &&str| line.starts_with("ecod.GlobalMap ");
-        String::from_utf8(run.stdout).unwrap().lines().filter(is_map).count()
+        String::from_utf8(run.stdout)
+            .unwrap()
+            .lines()
+            .filter(is_map)
+            .count()
     };
     files(dir).unwrap().iter().map(read).sum()
 }
@@ -39,22 +52,35 @@ fn maps_by(python: &str, dir: &Path, state: &str) -> usize {
 #[ignore = "needs the Python package mcap, which `make recording-check` installs"]
 fn the_python_reader_reads_a_finished_log_and_one_of_a_killed_process() {
     let python = std::env::var("MCAP_PYTHON").unwrap_or("python3".into());
-    let has_reader =
-        Command::new(&python).args(["-c", "import mcap"]).output().is_ok_and(|output| output.status.success());
-    assert!(has_reader, "{python} has no package mcap: run `make recording-check`");
+    let has_reader = Command::new(&python)
+        .args(["-c", "import mcap"])
+        .output()
+        .is_ok_and(|output| output.status.success());
+    assert!(
+        has_reader,
+        "{python} has no package mcap: run `make recording-check`"
+    );
     for state in ["finished", "killed"] {
         let directory = tempfile::tempdir().unwrap();
         let dir = directory.path().join("edge");
         let mut process = edge(directory.path(), "");
-        wait_until("maps are on the disk", directory.path(), || maps(&dir) >= 20);
+        wait_until("maps are on the disk", directory.path(), || {
+            maps(&dir) >= 20
+        });
         if state == "finished" {
             process.terminate();
         } else {
             process.0.kill().unwrap();
             process.0.wait().unwrap();
         }
-        let (theirs, ours) = (maps_by(&python, &dir, state), Log::read(&dir).count(SchemaName::GlobalMap));
+        let (theirs, ours) = (
+            maps_by(&python, &dir, state),
+            Log::read(&dir).count(SchemaName::GlobalMap),
+        );
         // Of a chunk that is cut short, this project's own reader takes what is whole.
-        assert!(theirs >= 20 && theirs <= ours && (state == "killed" || theirs == ours), "{state}: {theirs} of {ours}");
+        assert!(
+            theirs >= 20 && theirs <= ours && (state == "killed" || theirs == ours),
+            "{state}: {theirs} of {ours}"
+        );
     }
 }

@@ -23,14 +23,18 @@ use crate::fixture::{Cell, DAY, GONE_WITHIN, SOON, node};
 fn stolen(cell: &mut Cell) -> (EmbeddedBroker, BrokerAddress) {
     let files = cell.pki.issue("stolen", Role::Auto, DAY);
     let guard = AccessPolicy {
-        credentials: Some(Arc::new(Credentials::load(&files, &node("stolen")).unwrap())),
+        credentials: Some(Arc::new(
+            Credentials::load(&files, &node("stolen")).unwrap(),
+        )),
         topics: Topics::new(&node("lot")),
         limits: Default::default(),
         elected: Arc::new(|_| true),
         counters: Arc::default(),
     };
     let mut broker = EmbeddedBroker::protected(BrokerConfig::default(), guard);
-    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let address = broker
+        .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+        .unwrap();
     (broker, address.into())
 }
 
@@ -40,7 +44,12 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
     let (_broker, stolen) = stolen(&mut cell);
     let honest = BrokerAddress::from(cell.address);
     let tls = Some(cell.pki.issue("gauss", Role::Cav, DAY));
-    let config = NodeConfig { name: Some(node("gauss")), cell: node("lot"), tls, ..NodeConfig::default() };
+    let config = NodeConfig {
+        name: Some(node("gauss")),
+        cell: node("lot"),
+        tls,
+        ..NodeConfig::default()
+    };
     let (sender, mut links) = mpsc::unbounded_channel();
     let counters = Arc::<Counters>::default();
     let arguments = GatewayArguments {
@@ -60,14 +69,23 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
         looks_on: false,
     };
     let (gateway, _) = Actor::spawn(None, Gateway, arguments).await.unwrap();
-    gateway.cast(GatewayMessage::SetBrokers { addresses: vec![honest.clone(), stolen.clone()] }).unwrap();
+    gateway
+        .cast(GatewayMessage::SetBrokers {
+            addresses: vec![honest.clone(), stolen.clone()],
+        })
+        .unwrap();
     for _ in 0..2 {
         let (_, state) = timeout(SOON, links.recv()).await.unwrap().unwrap();
         assert_eq!(state, LinkState::Up);
     }
 
-    cell.pki.authority.revoke(&node("stolen"), ecod_actors::platform::clock::now()).unwrap();
-    let lost = timeout(GONE_WITHIN, links.recv()).await.expect("still connected");
+    cell.pki
+        .authority
+        .revoke(&node("stolen"), ecod_actors::platform::clock::now())
+        .unwrap();
+    let lost = timeout(GONE_WITHIN, links.recv())
+        .await
+        .expect("still connected");
     assert_eq!(lost, Some((stolen.clone(), LinkState::Down)));
     let refused = async {
         while counters.events(Event::ConnectFailed) < 2 {
@@ -75,8 +93,17 @@ async fn a_vehicle_leaves_a_broker_that_is_revoked_and_stays_with_the_others() {
         }
     };
     timeout(SOON, refused).await.unwrap();
-    assert_eq!((counters.events(Event::Connected), counters.events(Event::Disconnected)), (2, 1));
+    assert_eq!(
+        (
+            counters.events(Event::Connected),
+            counters.events(Event::Disconnected)
+        ),
+        (2, 1)
+    );
     let links = ractor::call_t!(gateway, |reply| GatewayMessage::Links { reply }, 5000).unwrap();
-    assert_eq!((links[&honest], links[&stolen]), (LinkState::Up, LinkState::Down));
+    assert_eq!(
+        (links[&honest], links[&stolen]),
+        (LinkState::Up, LinkState::Down)
+    );
     gateway.stop(None);
 }

@@ -25,16 +25,23 @@ async fn without_a_certificate_nobody_gets_in() {
     let mut plain = TcpStream::connect(cell.address).await.unwrap();
     plain.write_all(&LOGIN_PACKET).await.unwrap();
     let mut answer = Vec::new();
-    timeout(SOON, plain.read_to_end(&mut answer)).await.expect("left waiting").ok();
+    timeout(SOON, plain.read_to_end(&mut answer))
+        .await
+        .expect("left waiting")
+        .ok();
     assert_ne!(answer.first(), Some(&0x20), "no CONNACK");
 
-    let anonymous = external_broker(("mqtt.ca", &cell.pki.authority.ca()), None).unwrap().client();
+    let anonymous = external_broker(("mqtt.ca", &cell.pki.authority.ca()), None)
+        .unwrap()
+        .client();
     let stream = TcpStream::connect(cell.address).await.unwrap();
     let name = ServerName::try_from(BROKER_NAME).unwrap();
     // With TLS 1.3 the client learns of the refusal from what it reads first.
     if let Ok(mut stream) = TlsConnector::from(anonymous).connect(name, stream).await {
         stream.write_all(&LOGIN_PACKET).await.ok();
-        let read = timeout(SOON, stream.read(&mut [0; 16])).await.expect("left waiting");
+        let read = timeout(SOON, stream.read(&mut [0; 16]))
+            .await
+            .expect("left waiting");
         assert!(!matches!(read, Ok(1..)), "{read:?}");
     }
     cell.counted(Event::ClientUntrusted, 2).await;
@@ -45,7 +52,9 @@ async fn without_a_certificate_nobody_gets_in() {
 async fn a_certificate_of_another_cell_is_worth_nothing() {
     let mut cell = Cell::start().await;
     let theirs = Pki::new().issue_elsewhere("euclid", &cell);
-    let refused = Client::new(cell.address, "euclid", &client_config("euclid", &theirs.0)).log_in().await;
+    let refused = Client::new(cell.address, "euclid", &client_config("euclid", &theirs.0))
+        .log_in()
+        .await;
     assert!(refused.is_err(), "{refused:?}");
     cell.counted(Event::ClientUntrusted, 1).await;
     cell.honest_traffic_goes_on().await;
@@ -55,26 +64,55 @@ async fn a_certificate_of_another_cell_is_worth_nothing() {
 async fn a_vehicle_of_the_city_gets_in_and_nobody_of_its_other_cells_does_with_whatever_chain() {
     let mut cell = Cell::start_in(Pki::in_city(), |_| ()).await;
     let city = cell.pki.city.as_mut().unwrap();
-    city.issue(&node("gauss"), Role::Cav, DAY, clock::now()).unwrap();
-    let mut other = city.init_cell(&cell.pki.directory.path().join("other"), &node("other"), clock::now()).unwrap();
-    other.issue(&node("zeno"), Role::Edge, DAY, clock::now()).unwrap();
+    city.issue(&node("gauss"), Role::Cav, DAY, clock::now())
+        .unwrap();
+    let mut other = city
+        .init_cell(
+            &cell.pki.directory.path().join("other"),
+            &node("other"),
+            clock::now(),
+        )
+        .unwrap();
+    other
+        .issue(&node("zeno"), Role::Edge, DAY, clock::now())
+        .unwrap();
 
     let gauss = cell.pki.files(cell.pki.city.as_ref().unwrap(), "gauss");
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &gauss));
     gauss.log_in().await.unwrap();
 
     let zeno = cell.pki.files(&other, "zeno");
-    let chain = [&zeno.certificate, &other.ca(), &cell.pki.city.as_ref().unwrap().ca()];
-    let chain: String = chain.iter().map(|path| fs::read_to_string(path).unwrap()).collect();
+    let chain = [
+        &zeno.certificate,
+        &other.ca(),
+        &cell.pki.city.as_ref().unwrap().ca(),
+    ];
+    let chain: String = chain
+        .iter()
+        .map(|path| fs::read_to_string(path).unwrap())
+        .collect();
     let certificate = cell.pki.directory.path().join("chain.pem");
     fs::write(&certificate, chain).unwrap();
-    let zeno = client_config("zeno", &TlsConfig { certificate, ..zeno });
+    let zeno = client_config(
+        "zeno",
+        &TlsConfig {
+            certificate,
+            ..zeno
+        },
+    );
     let refused = Client::new(cell.address, "zeno", &zeno).log_in().await;
     assert!(refused.is_err());
     cell.counted(Event::ClientUntrusted, 1).await;
 
-    cell.pki.city.as_mut().unwrap().revoke(&node("gauss"), clock::now()).unwrap();
-    timeout(GONE_WITHIN, gauss.drive()).await.expect("still connected");
+    cell.pki
+        .city
+        .as_mut()
+        .unwrap()
+        .revoke(&node("gauss"), clock::now())
+        .unwrap();
+    timeout(GONE_WITHIN, gauss.drive())
+        .await
+        .expect("still connected");
     cell.honest_traffic_goes_on().await;
 }
 
@@ -82,7 +120,14 @@ impl Pki {
     /// A certificate of this CA for somebody who trusts the cell's.
     fn issue_elsewhere(mut self, name: &str, cell: &Cell) -> (TlsConfig, Self) {
         let files = self.issue(name, Role::Edge, DAY);
-        (TlsConfig { ca: cell.pki.authority.ca(), revocation_list: None, ..files }, self)
+        (
+            TlsConfig {
+                ca: cell.pki.authority.ca(),
+                revocation_list: None,
+                ..files
+            },
+            self,
+        )
     }
 }
 
@@ -91,8 +136,15 @@ async fn an_expired_certificate_is_refused() {
     let mut cell = Cell::start().await;
     let expired = cell.pki.issue("gauss", Role::Auto, Duration::ZERO);
     tokio::time::sleep(Duration::from_millis(1100)).await;
-    let refused = Client::new(cell.address, "gauss", &client_config("gauss", &expired)).log_in().await;
-    assert!(refused.as_ref().is_err_and(|error| error.to_lowercase().contains("expired")), "{refused:?}");
+    let refused = Client::new(cell.address, "gauss", &client_config("gauss", &expired))
+        .log_in()
+        .await;
+    assert!(
+        refused
+            .as_ref()
+            .is_err_and(|error| error.to_lowercase().contains("expired")),
+        "{refused:?}"
+    );
     cell.counted(Event::ClientUntrusted, 1).await;
     cell.honest_traffic_goes_on().await;
 }
@@ -105,8 +157,14 @@ async fn who_is_connected_when_its_certificate_expires_is_cut_off_within_half_a_
     let issued = Instant::now();
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &brief));
     gauss.log_in().await.unwrap();
-    timeout(VALID + Duration::from_secs(32), gauss.drive()).await.expect("still connected");
-    assert!(issued.elapsed() > VALID, "it was valid: {:?}", issued.elapsed());
+    timeout(VALID + Duration::from_secs(32), gauss.drive())
+        .await
+        .expect("still connected");
+    assert!(
+        issued.elapsed() > VALID,
+        "it was valid: {:?}",
+        issued.elapsed()
+    );
     cell.counted(Event::ClientExpelled, 1).await;
     cell.honest_traffic_goes_on().await;
 }
@@ -118,22 +176,43 @@ async fn who_is_revoked_is_cut_off_and_stays_out_and_the_broker_runs_on() {
     let tls = client_config("gauss", &files);
     let mut gauss = Client::new(cell.address, "gauss", &tls);
     gauss.log_in().await.unwrap();
-    cell.pki.authority.revoke(&crate::fixture::node("gauss"), ecod_actors::platform::clock::now()).unwrap();
-    timeout(GONE_WITHIN, gauss.drive()).await.expect("still connected");
+    cell.pki
+        .authority
+        .revoke(
+            &crate::fixture::node("gauss"),
+            ecod_actors::platform::clock::now(),
+        )
+        .unwrap();
+    timeout(GONE_WITHIN, gauss.drive())
+        .await
+        .expect("still connected");
     cell.counted(Event::ClientExpelled, 1).await;
     let refused = Client::new(cell.address, "gauss", &tls).log_in().await;
-    assert!(refused.as_ref().is_err_and(|error| error.to_lowercase().contains("revoked")), "{refused:?}");
+    assert!(
+        refused
+            .as_ref()
+            .is_err_and(|error| error.to_lowercase().contains("revoked")),
+        "{refused:?}"
+    );
     cell.honest_traffic_goes_on().await;
     let renewed = cell.pki.issue("gauss", Role::Auto, DAY);
-    Client::new(cell.address, "gauss", &client_config("gauss", &renewed)).log_in().await.unwrap();
+    Client::new(cell.address, "gauss", &client_config("gauss", &renewed))
+        .log_in()
+        .await
+        .unwrap();
 }
 
 /// A vehicle that never leads cannot pose as a broker: its own kind does not trust it.
 #[tokio::test]
 async fn a_client_trusts_no_broker_with_the_certificate_of_a_mere_vehicle() {
     let mut cell = Cell::start().await;
-    let (cav, gauss) = (cell.pki.issue("euclid", Role::Cav, DAY), cell.pki.issue("gauss", Role::Auto, DAY));
-    let posing = ecod_actors::transport::pki::Credentials::load(&cav, &crate::fixture::node("euclid")).unwrap();
+    let (cav, gauss) = (
+        cell.pki.issue("euclid", Role::Cav, DAY),
+        cell.pki.issue("gauss", Role::Auto, DAY),
+    );
+    let posing =
+        ecod_actors::transport::pki::Credentials::load(&cav, &crate::fixture::node("euclid"))
+            .unwrap();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let server = tokio_rustls::TlsAcceptor::from(Arc::clone(&posing.current().server));
@@ -141,8 +220,13 @@ async fn a_client_trusts_no_broker_with_the_certificate_of_a_mere_vehicle() {
         let (stream, _) = listener.accept().await.unwrap();
         server.accept(stream).await.map(drop)
     });
-    let refused = Client::new(address, "gauss", &client_config("gauss", &gauss)).log_in().await;
+    let refused = Client::new(address, "gauss", &client_config("gauss", &gauss))
+        .log_in()
+        .await;
     assert!(refused.is_err() && serving.await.unwrap().is_err());
-    Client::new(cell.address, "gauss", &client_config("gauss", &gauss)).log_in().await.unwrap();
+    Client::new(cell.address, "gauss", &client_config("gauss", &gauss))
+        .log_in()
+        .await
+        .unwrap();
     cell.honest_traffic_goes_on().await;
 }

@@ -13,15 +13,25 @@ async fn nobody_speaks_on_the_topics_of_another() {
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
     gauss.log_in().await.unwrap();
-    let others = ["detections/euclid", "vote_detections/euclid", "nodes/edge", "ledger/edge"];
+    let others = [
+        "detections/euclid",
+        "vote_detections/euclid",
+        "nodes/edge",
+        "ledger/edge",
+    ];
     // The last three are for the elected alone, which the broker's node knows from authenticated datagrams.
     let elected = ["global_detections", "global_verdicts", "reputations"];
     for (denied, topic) in (1..).zip(others.into_iter().chain(elected)) {
-        gauss.publish_and_wait(&format!("ecod/v1/lot/{topic}"), false).await.unwrap();
+        gauss
+            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), false)
+            .await
+            .unwrap();
         assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
     }
     let counts = cell.counters.rejects_by_source();
-    let by_gauss = counts.iter().find(|count| count.source == "gauss" && count.reason.as_str() == "not_permitted");
+    let by_gauss = counts
+        .iter()
+        .find(|count| count.source == "gauss" && count.reason.as_str() == "not_permitted");
     assert_eq!(by_gauss.map(|count| count.times), Some(7));
     // The edge sees the next report, and none of the above.
     cell.honest_traffic_goes_on().await;
@@ -34,8 +44,15 @@ async fn one_certificate_is_one_vehicle() {
     let mut gauss = Client::new(cell.address, "gauss--2", &client_config("gauss", &files));
     gauss.log_in().await.unwrap();
     // Its parts may report, and count as the vehicle; they have no evidence, nor are others' parts its own.
-    for (denied, topic) in (1..).zip(["detections/gauss-2", "vote_detections/euclid--2", "ledger/gauss--2"]) {
-        gauss.publish_and_wait(&format!("ecod/v1/lot/{topic}"), false).await.unwrap();
+    for (denied, topic) in (1..).zip([
+        "detections/gauss-2",
+        "vote_detections/euclid--2",
+        "ledger/gauss--2",
+    ]) {
+        gauss
+            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), false)
+            .await
+            .unwrap();
         assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
     }
     cell.honest_traffic_goes_on().await;
@@ -48,7 +65,10 @@ async fn a_vehicle_that_never_leads_shares_no_evidence_and_describes_no_cell() {
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
     gauss.log_in().await.unwrap();
     for (denied, topic) in (1..).zip(["ledger/gauss", "cell"]) {
-        gauss.publish_and_wait(&format!("ecod/v1/lot/{topic}"), false).await.unwrap();
+        gauss
+            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), false)
+            .await
+            .unwrap();
         assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
     }
     cell.honest_traffic_goes_on().await;
@@ -60,15 +80,29 @@ async fn a_report_is_not_kept_for_latecomers() {
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
     gauss.log_in().await.unwrap();
-    for (denied, topic) in (1..).zip(["detections/gauss", "vote_detections/gauss", "ledger/gauss"]) {
-        gauss.publish_and_wait(&format!("ecod/v1/lot/{topic}"), true).await.unwrap();
+    for (denied, topic) in (1..).zip(["detections/gauss", "vote_detections/gauss", "ledger/gauss"])
+    {
+        gauss
+            .publish_and_wait(&format!("ecod/v1/lot/{topic}"), true)
+            .await
+            .unwrap();
         assert_eq!(cell.counters.events(Event::ClientDenied), denied, "{topic}");
     }
-    let will = LastWill::new("ecod/v1/lot/detections/gauss", "stale", QoS::AtLeastOnce, true);
+    let will = LastWill::new(
+        "ecod/v1/lot/detections/gauss",
+        "stale",
+        QoS::AtLeastOnce,
+        true,
+    );
     let id = format!("gauss-{}", Uuid::now_v7().simple());
-    let refused = Client::with_id(cell.address, &id, &client_config("gauss", &files), |options| {
-        options.set_last_will(will);
-    });
+    let refused = Client::with_id(
+        cell.address,
+        &id,
+        &client_config("gauss", &files),
+        |options| {
+            options.set_last_will(will);
+        },
+    );
     assert!({ refused }.log_in().await.is_err());
     cell.honest_traffic_goes_on().await;
 }
@@ -79,17 +113,32 @@ async fn nobody_logs_in_as_another_or_leaves_its_last_will() {
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     let tls = client_config("gauss", &files);
     let run = Uuid::now_v7().simple();
-    let posing = Client::with_id(cell.address, &format!("euclid-{run}"), &tls, |_| ()).log_in().await;
-    assert!(posing.is_err(), "a login under the name of another would end the other's");
-    let drawn = Client::with_id(cell.address, &run.to_string(), &tls, |_| ()).log_in().await;
+    let posing = Client::with_id(cell.address, &format!("euclid-{run}"), &tls, |_| ())
+        .log_in()
+        .await;
+    assert!(
+        posing.is_err(),
+        "a login under the name of another would end the other's"
+    );
+    let drawn = Client::with_id(cell.address, &run.to_string(), &tls, |_| ())
+        .log_in()
+        .await;
     assert!(drawn.is_err(), "it may be what the broker drew for another");
-    let will = LastWill::new("ecod/v1/lot/nodes/euclid", "offline", QoS::AtLeastOnce, true);
+    let will = LastWill::new(
+        "ecod/v1/lot/nodes/euclid",
+        "offline",
+        QoS::AtLeastOnce,
+        true,
+    );
     let leaving = Client::with_id(cell.address, &format!("gauss-{run}"), &tls, |options| {
         options.set_last_will(will);
     });
     let refused = { leaving }.log_in().await;
     assert!(refused.is_err(), "{refused:?}");
     cell.counted(Event::ClientDenied, 3).await;
-    Client::with_id(cell.address, "", &tls, |_| ()).log_in().await.unwrap();
+    Client::with_id(cell.address, "", &tls, |_| ())
+        .log_in()
+        .await
+        .unwrap();
     cell.honest_traffic_goes_on().await;
 }

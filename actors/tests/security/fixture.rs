@@ -53,20 +53,39 @@ impl Pki {
     pub(crate) fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
         let authority = Authority::init(directory.path(), &node("lot"), clock::now()).unwrap();
-        Self { directory, authority, city: None }
+        Self {
+            directory,
+            authority,
+            city: None,
+        }
     }
 
     /// The same below a city.
     pub(crate) fn in_city() -> Self {
         let directory = tempfile::tempdir().unwrap();
-        let mut city = Authority::init_city(&directory.path().join("city"), &node("town"), clock::now()).unwrap();
-        let authority = city.init_cell(&directory.path().join("lot"), &node("lot"), clock::now()).unwrap();
-        Self { directory, authority, city: Some(city) }
+        let mut city =
+            Authority::init_city(&directory.path().join("city"), &node("town"), clock::now())
+                .unwrap();
+        let authority = city
+            .init_cell(&directory.path().join("lot"), &node("lot"), clock::now())
+            .unwrap();
+        Self {
+            directory,
+            authority,
+            city: Some(city),
+        }
     }
 
     /// The files of a new certificate.
-    pub(crate) fn issue(&mut self, name: &str, rights: impl Into<Rights>, valid: Duration) -> TlsConfig {
-        self.authority.issue(&node(name), rights, valid, clock::now()).unwrap();
+    pub(crate) fn issue(
+        &mut self,
+        name: &str,
+        rights: impl Into<Rights>,
+        valid: Duration,
+    ) -> TlsConfig {
+        self.authority
+            .issue(&node(name), rights, valid, clock::now())
+            .unwrap();
         self.files(&self.authority, name)
     }
 
@@ -75,14 +94,28 @@ impl Pki {
         let (certificate, key) = issuer.files_of(&node(name));
         let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
         let city = self.city.as_ref();
-        let city = city.map(|city| CityTlsConfig { ca: city.ca(), revocation_list: Some(city.revocation_list()) });
-        TlsConfig { ca, certificate, key, revocation_list: Some(list), city }
+        let city = city.map(|city| CityTlsConfig {
+            ca: city.ca(),
+            revocation_list: Some(city.revocation_list()),
+        });
+        TlsConfig {
+            ca,
+            certificate,
+            key,
+            revocation_list: Some(list),
+            city,
+        }
     }
 }
 
 /// The client's side of certificates.
 pub(crate) fn client_config(name: &str, files: &TlsConfig) -> Arc<ClientConfig> {
-    Arc::clone(&Credentials::load(files, &node(name)).unwrap().current().client)
+    Arc::clone(
+        &Credentials::load(files, &node(name))
+            .unwrap()
+            .current()
+            .client,
+    )
 }
 
 /// Another host than the honest ones, as far as a broker can see.
@@ -104,7 +137,10 @@ pub(crate) async fn secure(cell: &mut Cell) -> TlsStream<TcpStream> {
     let name = ServerName::try_from(BROKER_NAME).unwrap();
     // The time to log in runs from here.
     let connector = TlsConnector::from(client_config("gauss", &files));
-    connector.connect(name, knock(cell.address).await).await.unwrap()
+    connector
+        .connect(name, knock(cell.address).await)
+        .await
+        .unwrap()
 }
 
 /// An edge's broker, which `edge` is elected to use, and two honest clients.
@@ -136,7 +172,10 @@ impl Cell {
         let guard = AccessPolicy {
             credentials: Some(Arc::new(Credentials::load(&edge, &node("edge")).unwrap())),
             topics: Topics::new(&node("lot")),
-            limits: Limits { payload_bytes: MAX_REPORT, ..Limits::default() },
+            limits: Limits {
+                payload_bytes: MAX_REPORT,
+                ..Limits::default()
+            },
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::clone(&counters),
         };
@@ -148,20 +187,31 @@ impl Cell {
         };
         adjust(&mut config);
         let mut broker = EmbeddedBroker::protected(config, guard);
-        let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+        let address = broker
+            .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+            .unwrap();
         let mut edge = Client::new(address, "edge", &client_config("edge", &edge));
         edge.log_in().await.unwrap();
         edge.subscribe("ecod/v1/lot/#").await;
         let mut euclid = Client::new(address, "euclid", &client_config("euclid", &euclid));
         euclid.log_in().await.unwrap();
-        Self { pki, address, counters, edge, euclid, sent: 0, _broker: broker }
+        Self {
+            pki,
+            address,
+            counters,
+            edge,
+            euclid,
+            sent: 0,
+            _broker: broker,
+        }
     }
 
     /// Asserts that a report of the vehicle reaches the edge, and nothing else does.
     pub(crate) async fn honest_traffic_goes_on(&mut self) {
         self.sent += 1;
         let report = format!("report {}", self.sent);
-        self.euclid.publish("ecod/v1/lot/detections/euclid", report.as_bytes());
+        self.euclid
+            .publish("ecod/v1/lot/detections/euclid", report.as_bytes());
         let flush = self.euclid.drive();
         tokio::pin!(flush);
         let received = async {
@@ -170,14 +220,21 @@ impl Cell {
                 received = timeout(SOON, self.edge.message()) => received.expect("nothing came").unwrap(),
             }
         };
-        assert_eq!(received.await, ("ecod/v1/lot/detections/euclid".to_owned(), report));
+        assert_eq!(
+            received.await,
+            ("ecod/v1/lot/detections/euclid".to_owned(), report)
+        );
     }
 
     /// Waits until something was counted.
     pub(crate) async fn counted(&self, event: Event, at_least: u64) {
         let until = Instant::now() + SOON;
         while self.counters.events(event) < at_least {
-            assert!(Instant::now() < until, "{event:?}: {} of {at_least}", self.counters.events(event));
+            assert!(
+                Instant::now() < until,
+                "{event:?}: {} of {at_least}",
+                self.counters.events(event)
+            );
             sleep(Duration::from_millis(10)).await;
         }
     }
@@ -191,7 +248,12 @@ pub(crate) struct Client {
 
 impl Client {
     pub(crate) fn new(address: SocketAddr, name: &str, tls: &Arc<ClientConfig>) -> Self {
-        Self::with_id(address, &format!("{name}-{}", Uuid::now_v7().simple()), tls, |_| ())
+        Self::with_id(
+            address,
+            &format!("{name}-{}", Uuid::now_v7().simple()),
+            tls,
+            |_| (),
+        )
     }
 
     pub(crate) fn with_id(
@@ -201,7 +263,9 @@ impl Client {
         adjust: impl FnOnce(&mut MqttOptions),
     ) -> Self {
         let mut options = MqttOptions::new(client_id, address.ip().to_string(), address.port());
-        options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(Arc::clone(tls))));
+        options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(
+            Arc::clone(tls),
+        )));
         options.set_max_packet_size(4 * MAX_PACKET, 4 * MAX_PACKET);
         adjust(&mut options);
         let (client, events) = AsyncClient::new(options, 64);
@@ -210,21 +274,32 @@ impl Client {
 
     /// Connects, or says why not.
     pub(crate) async fn log_in(&mut self) -> Result<(), String> {
-        let polled = timeout(SOON, self.events.poll()).await.map_err(|_| "no answer".to_owned())?;
+        let polled = timeout(SOON, self.events.poll())
+            .await
+            .map_err(|_| "no answer".to_owned())?;
         polled.map(drop).map_err(|error| error.to_string())
     }
 
     pub(crate) async fn subscribe(&mut self, filter: &str) {
         self.client.try_subscribe(filter, QoS::AtMostOnce).unwrap();
-        while !matches!(self.events.poll().await.unwrap(), rumqttc::Event::Incoming(Packet::SubAck(_))) {}
+        while !matches!(
+            self.events.poll().await.unwrap(),
+            rumqttc::Event::Incoming(Packet::SubAck(_))
+        ) {}
     }
 
     pub(crate) fn publish(&self, topic: &str, payload: &[u8]) {
-        self.client.try_publish(topic, QoS::AtMostOnce, false, payload).unwrap();
+        self.client
+            .try_publish(topic, QoS::AtMostOnce, false, payload)
+            .unwrap();
     }
 
     /// Publishes and waits until the broker has dealt with it, permitted or not.
-    pub(crate) async fn publish_and_wait(&mut self, topic: &str, retain: bool) -> Result<(), String> {
+    pub(crate) async fn publish_and_wait(
+        &mut self,
+        topic: &str,
+        retain: bool,
+    ) -> Result<(), String> {
         self.publish_all_and_wait(topic, retain, b"forged").await
     }
 
@@ -235,7 +310,9 @@ impl Client {
         retain: bool,
         payload: &[u8],
     ) -> Result<(), String> {
-        self.client.try_publish(topic, QoS::AtLeastOnce, retain, payload).unwrap();
+        self.client
+            .try_publish(topic, QoS::AtLeastOnce, retain, payload)
+            .unwrap();
         let acknowledged = async {
             loop {
                 match self.events.poll().await {
@@ -261,7 +338,10 @@ impl Client {
         loop {
             match self.events.poll().await {
                 Ok(rumqttc::Event::Incoming(Packet::Publish(publish))) => {
-                    return Ok((publish.topic, String::from_utf8_lossy(&publish.payload).into_owned()));
+                    return Ok((
+                        publish.topic,
+                        String::from_utf8_lossy(&publish.payload).into_owned(),
+                    ));
                 }
                 Ok(_) => {}
                 Err(error) => return Err(error.to_string()),

@@ -15,7 +15,8 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::time::timeout;
 
 use crate::fixture::{
-    Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config, knock, knock_from, node, secure,
+    Cell, Client, DAY, MAX_EACH, MAX_PACKET, MAX_REPORT, SOON, client_config, knock, knock_from,
+    node, secure,
 };
 
 /// Waits until the other side has closed, whatever came before.
@@ -33,7 +34,10 @@ async fn who_knocks_too_often_is_not_heard_and_others_are() {
     }
     cell.counted(Event::ClientThrottled, 100).await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
-    Client::new(cell.address, "gauss", &client_config("gauss", &files)).log_in().await.unwrap();
+    Client::new(cell.address, "gauss", &client_config("gauss", &files))
+        .log_in()
+        .await
+        .unwrap();
     cell.honest_traffic_goes_on().await;
 }
 
@@ -61,7 +65,10 @@ async fn a_node_comes_back_while_its_own_address_floods() {
     cell.counted(Event::ClientThrottled, 60).await;
     let files = cell.pki.issue("gauss", Role::Auto, DAY);
     for _ in 0..5 {
-        Client::new(cell.address, "gauss", &client_config("gauss", &files)).log_in().await.expect("kept out");
+        Client::new(cell.address, "gauss", &client_config("gauss", &files))
+            .log_in()
+            .await
+            .expect("kept out");
         cell.honest_traffic_goes_on().await;
     }
     assert!(!flood.is_finished());
@@ -103,7 +110,11 @@ async fn what_is_no_mqtt_ends_its_own_connection_only() {
         // A login of an unknown protocol; two logins; a login and noise.
         vec![0x10, 12, 0, 4, b'M', b'Q', b'X', b'X', 9, 2, 0, 60, 0, 0],
         [login, login].concat(),
-        login.into_iter().chain((0..200).map(|_| rng.random())).chain([0x30, 0xff, 0xff, 0xff, 0xff, 0xff]).collect(),
+        login
+            .into_iter()
+            .chain((0..200).map(|_| rng.random()))
+            .chain([0x30, 0xff, 0xff, 0xff, 0xff, 0xff])
+            .collect(),
     ];
     for opening in openings {
         let mut stream = secure(&mut cell).await;
@@ -123,7 +134,8 @@ async fn who_only_looks_whether_a_broker_is_there_is_not_counted_as_kept_out() {
         closed(&mut stream).await;
     }
     cell.honest_traffic_goes_on().await;
-    let counted = [Event::ClientUntrusted, Event::ClientMalformed].map(|event| cell.counters.events(event));
+    let counted =
+        [Event::ClientUntrusted, Event::ClientMalformed].map(|event| cell.counters.events(event));
     assert_eq!(counted, [0, 0]);
 }
 
@@ -145,7 +157,10 @@ async fn a_report_as_large_as_a_map_is_refused() {
     let mut gauss = Client::new(cell.address, "gauss", &client_config("gauss", &files));
     gauss.log_in().await.unwrap();
     let large = vec![b'x'; 2 * MAX_REPORT];
-    gauss.publish_all_and_wait("ecod/v1/lot/detections/gauss", false, &large).await.unwrap();
+    gauss
+        .publish_all_and_wait("ecod/v1/lot/detections/gauss", false, &large)
+        .await
+        .unwrap();
     assert_eq!(cell.counters.events(Event::ClientDenied), 1);
     cell.honest_traffic_goes_on().await;
 }
@@ -161,22 +176,37 @@ async fn one_certificate_does_not_take_the_places_of_others() {
         client.log_in().await.unwrap();
         held.push(client);
     }
-    assert!(Client::new(cell.address, "gauss", &tls).log_in().await.is_err());
+    assert!(
+        Client::new(cell.address, "gauss", &tls)
+            .log_in()
+            .await
+            .is_err()
+    );
     cell.counted(Event::ClientsFull, 1).await;
     cell.honest_traffic_goes_on().await;
     held.pop();
     let returned = async {
-        while Client::new(cell.address, "gauss", &tls).log_in().await.is_err() {
+        while Client::new(cell.address, "gauss", &tls)
+            .log_in()
+            .await
+            .is_err()
+        {
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
     };
-    timeout(SOON, returned).await.expect("who leaves makes room");
+    timeout(SOON, returned)
+        .await
+        .expect("who leaves makes room");
 }
 
 /// The broker of a node that nobody configured: for this machine only, without certificates.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn limits_hold_on_loopback_as_they_come() {
-    let mut config = NodeConfig { name: Some(node("edge")), role: Role::Edge, ..NodeConfig::default() };
+    let mut config = NodeConfig {
+        name: Some(node("edge")),
+        role: Role::Edge,
+        ..NodeConfig::default()
+    };
     config.listen = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
     config.membership.bind = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
     config.membership.multicast.enabled = false;
@@ -191,7 +221,10 @@ async fn limits_hold_on_loopback_as_they_come() {
     let mut options = rumqttc::MqttOptions::new("anyone", "127.0.0.1", address.port());
     options.set_keep_alive(Duration::from_secs(5));
     let (_client, mut events) = rumqttc::AsyncClient::new(options, 8);
-    timeout(SOON, events.poll()).await.expect("kept out").unwrap();
+    timeout(SOON, events.poll())
+        .await
+        .expect("kept out")
+        .unwrap();
     closed(&mut dribbling).await;
     for stream in &mut silent {
         closed(stream).await;
@@ -220,9 +253,14 @@ async fn limits_hold_without_certificates_too() {
         elected: Arc::new(|_| true),
         counters: Arc::clone(&counters),
     };
-    let config = BrokerConfig { handshake_timeout_ms: 300, ..BrokerConfig::default() };
+    let config = BrokerConfig {
+        handshake_timeout_ms: 300,
+        ..BrokerConfig::default()
+    };
     let mut broker = EmbeddedBroker::protected(config, guard);
-    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let address = broker
+        .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+        .unwrap();
     let mut silent = knock(address).await;
     closed(&mut silent).await;
     // Counted a moment after the connection is closed.

@@ -10,7 +10,9 @@ use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;
 use ecod_actors::platform::clock;
 use ecod_actors::platform::secret::Secret;
-use ecod_actors::transport::gossip::{FrameCounters, FrameEvent, MembershipConfig, MembershipEvent};
+use ecod_actors::transport::gossip::{
+    FrameCounters, FrameEvent, MembershipConfig, MembershipEvent,
+};
 use ractor::{Actor, ActorRef, call_t};
 use tokio::net::UdpSocket;
 use tokio::sync::watch;
@@ -34,7 +36,10 @@ async fn start(name: &str, seed: Option<SocketAddr>) -> Node {
         ..MembershipConfig::default()
     };
     config.multicast.enabled = false;
-    let (payloads, counters) = (Arc::<Mutex<Vec<Bytes>>>::default(), Arc::<FrameCounters>::default());
+    let (payloads, counters) = (
+        Arc::<Mutex<Vec<Bytes>>>::default(),
+        Arc::<FrameCounters>::default(),
+    );
     let (sink, (sender, members)) = (Arc::clone(&payloads), watch::channel(Vec::new()));
     let arguments = MembershipArguments {
         name: node(name),
@@ -54,7 +59,13 @@ async fn start(name: &str, seed: Option<SocketAddr>) -> Node {
     };
     let (actor, _) = Actor::spawn(None, Membership, arguments).await.unwrap();
     let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000).unwrap();
-    Node { actor, address, payloads, counters, members }
+    Node {
+        actor,
+        address,
+        payloads,
+        counters,
+        members,
+    }
 }
 
 async fn until(what: &str, mut holds: impl FnMut() -> bool) {
@@ -95,18 +106,39 @@ async fn a_repeated_frame_is_taken_once_and_counted() {
     let edge = start("edge", None).await;
     let repeating = tokio::spawn(repeat(edge.address, relay));
     let euclid = start("euclid", Some(between)).await;
-    until("they meet", || !edge.members.borrow().is_empty() && !euclid.members.borrow().is_empty()).await;
+    until("they meet", || {
+        !edge.members.borrow().is_empty() && !euclid.members.borrow().is_empty()
+    })
+    .await;
     for n in 0..20u8 {
         let payload = Bytes::copy_from_slice(&[n]);
-        euclid.actor.cast(MembershipMessage::Send { to: node("edge"), payload }).unwrap();
+        euclid
+            .actor
+            .cast(MembershipMessage::Send {
+                to: node("edge"),
+                payload,
+            })
+            .unwrap();
         sleep(Duration::from_millis(5)).await;
     }
     until("all arrive", || edge.payloads.lock().unwrap().len() >= 20).await;
-    until("repetitions are counted", || edge.counters.get(FrameEvent::Replayed) >= 20).await;
+    until("repetitions are counted", || {
+        edge.counters.get(FrameEvent::Replayed) >= 20
+    })
+    .await;
     sleep(Duration::from_millis(200)).await;
-    let taken = edge.payloads.lock().unwrap().iter().map(|payload| payload[0]).collect::<Vec<_>>();
+    let taken = edge
+        .payloads
+        .lock()
+        .unwrap()
+        .iter()
+        .map(|payload| payload[0])
+        .collect::<Vec<_>>();
     assert_eq!(taken, (0..20).collect::<Vec<_>>(), "each once, in order");
-    assert!(!edge.members.borrow().is_empty(), "the two still know each other");
+    assert!(
+        !edge.members.borrow().is_empty(),
+        "the two still know each other"
+    );
     repeating.abort();
     euclid.actor.stop(None);
     edge.actor.stop(None);

@@ -5,7 +5,9 @@ use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant};
 
 use ecod::wire::{Role, Topics};
-use ecod_actors::transport::broker::{AccessPolicy, BrokerConfig, BrokerHealth, EmbeddedBroker, MqttBroker};
+use ecod_actors::transport::broker::{
+    AccessPolicy, BrokerConfig, BrokerHealth, EmbeddedBroker, MqttBroker,
+};
 use ecod_actors::transport::pki::Credentials;
 use tokio::time::{sleep, timeout};
 
@@ -26,7 +28,9 @@ async fn a_broker_that_hangs_is_found_dead_and_not_waited_for() {
         counters: Arc::default(),
     };
     let mut broker = EmbeddedBroker::protected(BrokerConfig::default(), guard);
-    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let address = broker
+        .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+        .unwrap();
     let mut edge = Client::new(address, "edge", &client_config("edge", &files));
     edge.log_in().await.unwrap();
     for _ in 0..10 {
@@ -43,7 +47,11 @@ async fn a_broker_that_hangs_is_found_dead_and_not_waited_for() {
     timeout(SOON, found).await.expect("still taken for well");
     let begun = Instant::now();
     broker.stop();
-    assert!(begun.elapsed() < SOON / 2, "waited {:?} for a broker that hangs", begun.elapsed());
+    assert!(
+        begun.elapsed() < SOON / 2,
+        "waited {:?} for a broker that hangs",
+        begun.elapsed()
+    );
     driving.abort();
     drop(release);
 }

@@ -9,7 +9,9 @@ use ecod_actors::actors::membership::{Membership, MembershipArguments};
 use ecod_actors::messages::membership::MembershipMessage;
 use ecod_actors::platform::clock;
 use ecod_actors::platform::secret::Secret;
-use ecod_actors::transport::gossip::{FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent};
+use ecod_actors::transport::gossip::{
+    FrameCounters, FrameEvent, Member, MembershipConfig, MembershipEvent,
+};
 use ecod_actors::transport::pki::{Credentials, TlsConfig};
 use ractor::{Actor, ActorRef, call_t};
 use tokio::sync::watch;
@@ -38,7 +40,10 @@ impl Node {
             ..MembershipConfig::default()
         };
         config.multicast.enabled = false;
-        let (events, counters) = (Arc::<Mutex<Vec<_>>>::default(), Arc::<FrameCounters>::default());
+        let (events, counters) = (
+            Arc::<Mutex<Vec<_>>>::default(),
+            Arc::<FrameCounters>::default(),
+        );
         let (sink, (sender, members)) = (Arc::clone(&events), watch::channel(Vec::new()));
         let arguments = MembershipArguments {
             name: node(name),
@@ -46,7 +51,8 @@ impl Node {
             run: clock::now().micros(),
             role: Role::Edge,
             broker: None,
-            credentials: files.map(|files| Arc::new(Credentials::load(files, &node(name)).unwrap())),
+            credentials: files
+                .map(|files| Arc::new(Credentials::load(files, &node(name)).unwrap())),
             config,
             events: Arc::new(move |event| sink.lock().unwrap().push(event)),
             members: sender,
@@ -54,11 +60,21 @@ impl Node {
         };
         let (actor, _) = Actor::spawn(None, Membership, arguments).await.unwrap();
         let address = call_t!(actor, |reply| MembershipMessage::Address { reply }, 5000).unwrap();
-        Self { actor, address, events, counters, members }
+        Self {
+            actor,
+            address,
+            events,
+            counters,
+            members,
+        }
     }
 
     fn sees(&self) -> Vec<(String, Role)> {
-        self.members.borrow().iter().map(|member| (member.name.to_string(), member.role)).collect()
+        self.members
+            .borrow()
+            .iter()
+            .map(|member| (member.name.to_string(), member.role))
+            .collect()
     }
 }
 
@@ -74,20 +90,37 @@ async fn until(what: &str, mut holds: impl FnMut() -> bool) {
 #[tokio::test]
 async fn nodes_meet_by_their_certificates_and_whoever_has_the_key_alone_meets_nobody() {
     let mut pki = Pki::new();
-    let [edge, euclid] = [pki.issue("edge", Role::Edge, DAY), pki.issue("euclid", Role::Auto, DAY)];
+    let [edge, euclid] = [
+        pki.issue("edge", Role::Edge, DAY),
+        pki.issue("euclid", Role::Auto, DAY),
+    ];
     let edge = Node::start("edge", Some(&edge), None).await;
     let bare = Node::start("gauss", None, Some(edge.address)).await;
     let mut elsewhere = Pki::new();
-    let strange = TlsConfig { ca: pki.authority.ca(), ..elsewhere.issue("zeno", Role::Edge, DAY) };
-    let strange = TlsConfig { revocation_list: None, ..strange };
+    let strange = TlsConfig {
+        ca: pki.authority.ca(),
+        ..elsewhere.issue("zeno", Role::Edge, DAY)
+    };
+    let strange = TlsConfig {
+        revocation_list: None,
+        ..strange
+    };
     let strange = Node::start("zeno", Some(&strange), Some(edge.address)).await;
     let euclid = Node::start("euclid", Some(&euclid), Some(edge.address)).await;
-    until("they meet", || edge.sees().len() == 1 && euclid.sees().len() == 1).await;
-    until("the others are counted", || {
-        edge.counters.get(FrameEvent::Uncertified) > 1 && edge.counters.get(FrameEvent::Untrusted) > 1
+    until("they meet", || {
+        edge.sees().len() == 1 && euclid.sees().len() == 1
     })
     .await;
-    assert_eq!(edge.sees(), [("euclid".to_owned(), Role::Auto)], "as its certificate says");
+    until("the others are counted", || {
+        edge.counters.get(FrameEvent::Uncertified) > 1
+            && edge.counters.get(FrameEvent::Untrusted) > 1
+    })
+    .await;
+    assert_eq!(
+        edge.sees(),
+        [("euclid".to_owned(), Role::Auto)],
+        "as its certificate says"
+    );
     assert_eq!(euclid.sees(), [("edge".to_owned(), Role::Edge)]);
     assert!(bare.sees().is_empty() && strange.sees().is_empty());
     for node in [edge, bare, strange, euclid] {
@@ -98,14 +131,28 @@ async fn nodes_meet_by_their_certificates_and_whoever_has_the_key_alone_meets_no
 #[tokio::test]
 async fn a_revoked_node_is_down_soon_after_the_list_is_written() {
     let mut pki = Pki::new();
-    let [edge, euclid] = [pki.issue("edge", Role::Edge, DAY), pki.issue("euclid", Role::Auto, DAY)];
+    let [edge, euclid] = [
+        pki.issue("edge", Role::Edge, DAY),
+        pki.issue("euclid", Role::Auto, DAY),
+    ];
     let edge = Node::start("edge", Some(&edge), None).await;
     let euclid = Node::start("euclid", Some(&euclid), Some(edge.address)).await;
-    until("they meet", || edge.sees().len() == 1 && euclid.sees().len() == 1).await;
+    until("they meet", || {
+        edge.sees().len() == 1 && euclid.sees().len() == 1
+    })
+    .await;
     pki.authority.revoke(&node("euclid"), clock::now()).unwrap();
     let written = Instant::now();
-    let is_down = |event: &MembershipEvent| *event == MembershipEvent::Down { name: node("euclid") };
-    until("it is down", || edge.events.lock().unwrap().iter().any(is_down)).await;
+    let is_down = |event: &MembershipEvent| {
+        *event
+            == MembershipEvent::Down {
+                name: node("euclid"),
+            }
+    };
+    until("it is down", || {
+        edge.events.lock().unwrap().iter().any(is_down)
+    })
+    .await;
     println!("down {:?} after the list was written", written.elapsed());
     assert!(written.elapsed() < GONE_WITHIN, "{:?}", written.elapsed());
     assert_eq!(edge.counters.get(FrameEvent::Expelled), 1);

@@ -16,8 +16,14 @@ use crate::nodes::{aggregator, start, start_cell, start_with, until};
 /// An edge whose broker has room for its own node only.
 async fn full_edge(pki: &mut Pki) -> NodeHandle {
     let tls = pki.issue("edge", Role::Edge, DAY);
-    let edge = start_with("edge", Role::Edge, tls, None, |config| config.broker.max_clients = 1).await;
-    until("edge leads alone", || aggregator(&edge).as_deref() == Some("edge")).await;
+    let edge = start_with("edge", Role::Edge, tls, None, |config| {
+        config.broker.max_clients = 1
+    })
+    .await;
+    until("edge leads alone", || {
+        aggregator(&edge).as_deref() == Some("edge")
+    })
+    .await;
     edge
 }
 
@@ -35,8 +41,16 @@ async fn followers_of_a_leader_that_lets_nobody_in_go_on_to_the_next() {
     let term = euclid.leadership().borrow().term;
     // Longer than an edge is on trial before it is handed the lead.
     sleep(Duration::from_secs(7)).await;
-    assert!(nodes.into_iter().all(follows_euclid), "{:?}", nodes.map(aggregator));
-    assert_eq!(euclid.leadership().borrow().term, term, "the lead moved again");
+    assert!(
+        nodes.into_iter().all(follows_euclid),
+        "{:?}",
+        nodes.map(aggregator)
+    );
+    assert_eq!(
+        euclid.leadership().borrow().term,
+        term,
+        "the lead moved again"
+    );
     for node in [gauss, euclid, edge] {
         node.stop().await;
     }
@@ -64,20 +78,32 @@ impl Write for Log {
 
 /// Sessions of the membership go on by the former certificate. New connections meet the other one.
 #[tokio::test]
-async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_and_go_on_to_the_next() {
+async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_and_go_on_to_the_next()
+ {
     let (mut pki, mut elsewhere) = (Pki::new(), Pki::new());
-    let files = [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Cav)]
-        .map(|(node, role)| pki.issue(node, role, DAY));
+    let files = [
+        ("edge", Role::Edge),
+        ("euclid", Role::Auto),
+        ("gauss", Role::Cav),
+    ]
+    .map(|(node, role)| pki.issue(node, role, DAY));
     let foreign = elsewhere.issue("edge", Role::Edge, DAY);
     let tls = client_config("gauss", &files[2]);
     // The edge alone trusts the other CA.
-    let own = TlsConfig { ca: files[0].ca.with_file_name("both.pem"), revocation_list: None, ..files[0].clone() };
+    let own = TlsConfig {
+        ca: files[0].ca.with_file_name("both.pem"),
+        revocation_list: None,
+        ..files[0].clone()
+    };
     let both = [&files[0].ca, &foreign.ca].map(|ca| fs::read_to_string(ca).unwrap());
     fs::write(&own.ca, both.concat()).unwrap();
     let [_, euclid, gauss] = files;
     let [edge, euclid, gauss] = start_cell([own.clone(), euclid, gauss]).await;
     let broker = edge.broker_address().unwrap();
-    for (from, to) in [(&foreign.certificate, &own.certificate), (&foreign.key, &own.key)] {
+    for (from, to) in [
+        (&foreign.certificate, &own.certificate),
+        (&foreign.key, &own.key),
+    ] {
         fs::copy(from, to).unwrap();
     }
     let refused = Instant::now() + SOON;
@@ -86,14 +112,23 @@ async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_an
     }
     let log = Log::default();
     let writer = log.clone();
-    let lines = tracing_subscriber::fmt().with_ansi(false).with_writer(move || writer.clone()).finish();
+    let lines = tracing_subscriber::fmt()
+        .with_ansi(false)
+        .with_writer(move || writer.clone())
+        .finish();
     let _logging = tracing::subscriber::set_default(lines);
     for node in [&euclid, &gauss] {
         node.slots().gateway.get().unwrap().kill();
     }
     let follows_euclid = |node: &NodeHandle| aggregator(node).as_deref() == Some("euclid");
-    until("euclid leads all", || [&edge, &euclid, &gauss].into_iter().all(follows_euclid)).await;
-    assert!(log.has("there is no login at its broker") && log.has(r#"about="edge""#), "no warning");
+    until("euclid leads all", || {
+        [&edge, &euclid, &gauss].into_iter().all(follows_euclid)
+    })
+    .await;
+    assert!(
+        log.has("there is no login at its broker") && log.has(r#"about="edge""#),
+        "no warning"
+    );
     for node in [gauss, euclid, edge] {
         node.stop().await;
     }
@@ -103,15 +138,31 @@ async fn followers_that_refuse_the_certificate_of_their_leaders_broker_say_so_an
 #[tokio::test]
 async fn an_edge_that_returns_with_another_cas_certificate_costs_a_healthy_cell_nothing() {
     let (mut pki, mut elsewhere) = (Pki::new(), Pki::new());
-    let files = [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Cav)]
-        .map(|(node, role)| pki.issue(node, role, DAY));
+    let files = [
+        ("edge", Role::Edge),
+        ("euclid", Role::Auto),
+        ("gauss", Role::Cav),
+    ]
+    .map(|(node, role)| pki.issue(node, role, DAY));
     let [edge, euclid, gauss] = start_cell(files).await;
     edge.stop().await;
-    until("euclid leads", || aggregator(&gauss).as_deref() == Some("euclid")).await;
+    until("euclid leads", || {
+        aggregator(&gauss).as_deref() == Some("euclid")
+    })
+    .await;
     let term = euclid.leadership().borrow().term;
-    let foreign = TlsConfig { ca: pki.authority.ca(), ..elsewhere.issue("edge", Role::Edge, DAY) };
+    let foreign = TlsConfig {
+        ca: pki.authority.ca(),
+        ..elsewhere.issue("edge", Role::Edge, DAY)
+    };
     let edge = start("edge", Role::Edge, foreign, euclid.gossip_address()).await;
-    let round = || gauss.newest_map().borrow().as_ref().map_or(0, |newest| newest.map.round);
+    let round = || {
+        gauss
+            .newest_map()
+            .borrow()
+            .as_ref()
+            .map_or(0, |newest| newest.map.round)
+    };
     // Longer than an edge is on trial before it is handed the lead.
     let (first, began) = (round(), Instant::now());
     sleep(Duration::from_secs(8)).await;
@@ -119,7 +170,10 @@ async fn an_edge_that_returns_with_another_cas_certificate_costs_a_healthy_cell_
     let expected = began.elapsed().as_millis() as u64 / 100;
     assert_eq!(aggregator(&gauss).as_deref(), Some("euclid"));
     assert_eq!(euclid.leadership().borrow().term, term, "the lead moved");
-    assert!(rounds * 20 >= expected * 19, "{rounds} of {expected} rounds");
+    assert!(
+        rounds * 20 >= expected * 19,
+        "{rounds} of {expected} rounds"
+    );
     assert!(edge.members().borrow().is_empty(), "admitted");
     for node in [gauss, euclid, edge] {
         node.stop().await;
@@ -134,6 +188,9 @@ async fn a_leader_that_lets_nobody_in_says_so_where_nobody_else_can_lead() {
     let gauss = start("gauss", Role::Cav, gauss, edge.gossip_address()).await;
     until("edge knows it", || edge.leadership().borrow().is_deserted).await;
     gauss.stop().await;
-    until("nobody is left to complain", || !edge.leadership().borrow().is_deserted).await;
+    until("nobody is left to complain", || {
+        !edge.leadership().borrow().is_deserted
+    })
+    .await;
     edge.stop().await;
 }

@@ -13,7 +13,12 @@ use tokio::time::{Instant, sleep};
 use crate::fixture::{SOON, node as name};
 
 /// Starts a node that greets another one.
-pub(crate) async fn start(node: &str, role: Role, tls: TlsConfig, seed: Option<SocketAddr>) -> NodeHandle {
+pub(crate) async fn start(
+    node: &str,
+    role: Role,
+    tls: TlsConfig,
+    seed: Option<SocketAddr>,
+) -> NodeHandle {
     start_with(node, role, tls, seed, |_| ()).await
 }
 
@@ -48,7 +53,10 @@ pub(crate) async fn start_cell([edge, euclid, gauss]: [TlsConfig; 3]) -> [NodeHa
     let gauss = start("gauss", Role::Cav, gauss, euclid.gossip_address()).await;
     until("edge leads all, with a standby", || {
         let stands_by = euclid.leadership().borrow().position == Position::StandingBy;
-        stands_by && [&euclid, &gauss].iter().all(|node| aggregator(node).as_deref() == Some("edge"))
+        stands_by
+            && [&euclid, &gauss]
+                .iter()
+                .all(|node| aggregator(node).as_deref() == Some("edge"))
     })
     .await;
     [edge, euclid, gauss]
@@ -56,7 +64,10 @@ pub(crate) async fn start_cell([edge, euclid, gauss]: [TlsConfig; 3]) -> [NodeHa
 
 /// Leader of the newest map of a node.
 pub(crate) fn aggregator(node: &NodeHandle) -> Option<String> {
-    node.newest_map().borrow().as_ref().map(|newest| newest.map.aggregator.to_string())
+    node.newest_map()
+        .borrow()
+        .as_ref()
+        .map(|newest| newest.map.aggregator.to_string())
 }
 
 /// Waits for something; the time that it took.

@@ -26,18 +26,36 @@ async fn log_in(cell: &mut Cell, name: &str, role: Role, flags: u8) -> TlsStream
     log_in_as(cell, name, &files, &id, flags).await
 }
 
-async fn log_in_as(cell: &Cell, name: &str, files: &TlsConfig, id: &str, flags: u8) -> TlsStream<TcpStream> {
+async fn log_in_as(
+    cell: &Cell,
+    name: &str,
+    files: &TlsConfig,
+    id: &str,
+    flags: u8,
+) -> TlsStream<TcpStream> {
     let server = ServerName::try_from(BROKER_NAME).unwrap();
     let connector = TlsConnector::from(client_config(name, files));
-    let mut stream = connector.connect(server, knock(cell.address).await).await.unwrap();
+    let mut stream = connector
+        .connect(server, knock(cell.address).await)
+        .await
+        .unwrap();
     greet(&mut stream, id, flags).await;
     stream
 }
 
 async fn greet(stream: &mut (impl AsyncRead + AsyncWrite + Unpin), id: &str, flags: u8) {
-    stream.write_all(&packet(0x10, &[b"\0\x04MQTT\x04", &[flags, 0, 0], &text(id)])).await.unwrap();
+    stream
+        .write_all(&packet(
+            0x10,
+            &[b"\0\x04MQTT\x04", &[flags, 0, 0], &text(id)],
+        ))
+        .await
+        .unwrap();
     let mut answer = [0; 4];
-    timeout(SOON, stream.read_exact(&mut answer)).await.expect("no answer").unwrap();
+    timeout(SOON, stream.read_exact(&mut answer))
+        .await
+        .expect("no answer")
+        .unwrap();
     assert_eq!(answer, [0x20, 2, 0, 0]);
 }
 
@@ -46,21 +64,40 @@ const CLEAN: u8 = 0x02;
 /// The fixture's own subscriber of everything, which reads only while it is asked to.
 const IDLE: &str = "edge";
 
-async fn subscribe(stream: &mut (impl AsyncRead + AsyncWrite + Unpin), filter: &str, qos: u8) -> u8 {
-    stream.write_all(&packet(0x82, &[&[0, 1], &text(filter), &[qos]])).await.unwrap();
+async fn subscribe(
+    stream: &mut (impl AsyncRead + AsyncWrite + Unpin),
+    filter: &str,
+    qos: u8,
+) -> u8 {
+    stream
+        .write_all(&packet(0x82, &[&[0, 1], &text(filter), &[qos]]))
+        .await
+        .unwrap();
     let mut answer = [0; 5];
-    timeout(SOON, stream.read_exact(&mut answer)).await.expect("no answer").unwrap();
+    timeout(SOON, stream.read_exact(&mut answer))
+        .await
+        .expect("no answer")
+        .unwrap();
     assert_eq!(answer[0], 0x90);
     answer[4]
 }
 
 fn report(node: &str, bytes: usize) -> Vec<u8> {
-    packet(0x30, &[&text(&format!("ecod/v1/lot/detections/{node}")), &vec![b'x'; bytes]])
+    packet(
+        0x30,
+        &[
+            &text(&format!("ecod/v1/lot/detections/{node}")),
+            &vec![b'x'; bytes],
+        ],
+    )
 }
 
 fn shed(counters: &Counters, reason: ShedReason, source: &str) -> u64 {
     let shed = counters.all_shed();
-    shed.iter().filter(|shed| shed.reason == reason && shed.source == source).map(|shed| shed.times).sum()
+    shed.iter()
+        .filter(|shed| shed.reason == reason && shed.source == source)
+        .map(|shed| shed.times)
+        .sum()
 }
 
 /// Reads packets until so many PUBLISHes have come; the result is their bytes.
@@ -94,7 +131,10 @@ impl Honest {
     async fn start(cell: &mut Cell) -> Self {
         let vehicle = log_in(cell, "v01", Role::Cav, CLEAN).await;
         let mut leader = log_in(cell, "v02", Role::Auto, CLEAN).await;
-        assert_eq!(subscribe(&mut leader, "ecod/v1/lot/detections/v01", 0).await, 0);
+        assert_eq!(
+            subscribe(&mut leader, "ecod/v1/lot/detections/v01", 0).await,
+            0
+        );
         Self { vehicle, leader }
     }
 
@@ -102,7 +142,9 @@ impl Honest {
     async fn report(&mut self) -> Duration {
         let begun = Instant::now();
         self.vehicle.write_all(&report("v01", 2000)).await.unwrap();
-        timeout(SOON, read_messages(&mut self.leader, 1)).await.expect("nothing came");
+        timeout(SOON, read_messages(&mut self.leader, 1))
+            .await
+            .expect("nothing came");
         begun.elapsed()
     }
 }
@@ -131,7 +173,10 @@ async fn readers_that_do_not_read_lose_their_own_messages_only() {
         assert!(took < Duration::from_secs(2), "a report took {took:?}");
         sleep(Duration::from_millis(20)).await;
     }
-    assert!(!flood.is_finished(), "the flood comes from another, who only waits");
+    assert!(
+        !flood.is_finished(),
+        "the flood comes from another, who only waits"
+    );
     flood.abort();
     assert_eq!(shed(&cell.counters, ShedReason::ReaderSlow, "v02"), 0);
 }
@@ -146,7 +191,9 @@ async fn one_certificate_sends_no_more_than_its_share_and_others_do_not_wait() {
     let watcher = tokio::spawn(async move {
         let (started, mut bytes) = (Instant::now(), 0);
         while started.elapsed() < TIME {
-            bytes += timeout(SOON, read_messages(&mut watcher, 1)).await.expect("the flood ended");
+            bytes += timeout(SOON, read_messages(&mut watcher, 1))
+                .await
+                .expect("the flood ended");
         }
         bytes
     });
@@ -166,7 +213,10 @@ async fn one_certificate_sends_no_more_than_its_share_and_others_do_not_wait() {
     let mib = watcher.await.unwrap() >> 20;
     // 4 MiB a second after a burst of 16 MiB.
     assert!((10..=44).contains(&mib), "{mib} MiB in {TIME:?}");
-    assert!(slowest < Duration::from_secs(2), "a report took {slowest:?}");
+    assert!(
+        slowest < Duration::from_secs(2),
+        "a report took {slowest:?}"
+    );
 }
 
 #[tokio::test]
@@ -174,11 +224,17 @@ async fn subscriptions_of_all_clients_of_one_certificate_count_together() {
     let mut cell = Cell::start().await;
     let mut first = log_in(&mut cell, "gauss", Role::Cav, CLEAN).await;
     for n in 0..200 {
-        assert_eq!(subscribe(&mut first, &format!("ecod/v1/lot/nodes/{n}"), 0).await, 0);
+        assert_eq!(
+            subscribe(&mut first, &format!("ecod/v1/lot/nodes/{n}"), 0).await,
+            0
+        );
     }
     let mut second = log_in(&mut cell, "gauss", Role::Cav, CLEAN).await;
     for n in 0..56 {
-        assert_eq!(subscribe(&mut second, &format!("ecod/v1/lot/nodes/{n}"), 0).await, 0);
+        assert_eq!(
+            subscribe(&mut second, &format!("ecod/v1/lot/nodes/{n}"), 0).await,
+            0
+        );
     }
     assert_eq!(subscribe(&mut second, "one/more", 0).await, 0x80);
     drop(first);
@@ -201,7 +257,11 @@ async fn nothing_is_kept_for_who_is_absent_or_does_not_acknowledge() {
     for _ in 0..2 {
         // Not a clean session.
         let mut gauss = log_in_as(&cell, "gauss", &files, id, 0).await;
-        assert_eq!(subscribe(&mut gauss, "ecod/v1/lot/detections/v01", 1).await, 0, "another quality than asked for");
+        assert_eq!(
+            subscribe(&mut gauss, "ecod/v1/lot/detections/v01", 1).await,
+            0,
+            "another quality than asked for"
+        );
         gauss.shutdown().await.unwrap();
         drop(gauss);
         for _ in 0..10 {
@@ -218,8 +278,10 @@ async fn nothing_is_kept_for_who_is_absent_or_does_not_acknowledge() {
 async fn two_hundred_vehicles_lose_nothing() {
     const VEHICLES: usize = 200;
     const REPORTS: usize = 20;
-    let mut cell =
-        Cell::start_with(|config| (config.connect_burst, config.handshake_timeout_ms) = (1000, 10_000)).await;
+    let mut cell = Cell::start_with(|config| {
+        (config.connect_burst, config.handshake_timeout_ms) = (1000, 10_000)
+    })
+    .await;
     let mut reader = log_in(&mut cell, "gauss", Role::Auto, CLEAN).await;
     subscribe(&mut reader, "ecod/v1/lot/detections/+", 0).await;
     let reader = tokio::spawn(async move { read_messages(&mut reader, VEHICLES * REPORTS).await });
@@ -237,10 +299,18 @@ async fn two_hundred_vehicles_lose_nothing() {
         });
     }
     let vehicles = vehicles.join_all().await;
-    let bytes = timeout(SOON, reader).await.expect("reports are missing").unwrap();
+    let bytes = timeout(SOON, reader)
+        .await
+        .expect("reports are missing")
+        .unwrap();
     assert!(bytes > VEHICLES * REPORTS * 2000);
     assert_eq!(cell.counters.events(Event::ClientStalled), 0);
-    let shed: Vec<_> = cell.counters.all_shed().into_iter().filter(|shed| shed.source != IDLE).collect();
+    let shed: Vec<_> = cell
+        .counters
+        .all_shed()
+        .into_iter()
+        .filter(|shed| shed.source != IDLE)
+        .collect();
     assert_eq!(shed, []);
     drop(vehicles);
 }
@@ -252,7 +322,11 @@ async fn large_maps_reach_all_readers() {
     const MAPS: usize = 20;
     let adjust = |config: &mut BrokerConfig| {
         config.max_packet_bytes = None;
-        (config.connect_burst, config.handshake_timeout_ms, config.max_clients_each) = (1000, 10_000, 64);
+        (
+            config.connect_burst,
+            config.handshake_timeout_ms,
+            config.max_clients_each,
+        ) = (1000, 10_000, 64);
     };
     let mut cell = Cell::start_with(adjust).await;
     let mut readers = JoinSet::new();
@@ -262,13 +336,18 @@ async fn large_maps_reach_all_readers() {
         readers.spawn(async move { read_messages(&mut reader, MAPS).await });
     }
     let mut leader = log_in(&mut cell, "edge", Role::Edge, CLEAN).await;
-    let map = packet(0x30, &[&text("ecod/v1/lot/global_detections"), &vec![b'x'; 100_000]]);
+    let map = packet(
+        0x30,
+        &[&text("ecod/v1/lot/global_detections"), &vec![b'x'; 100_000]],
+    );
     let mut ticks = interval(Duration::from_millis(100));
     for _ in 0..MAPS {
         ticks.tick().await;
         leader.write_all(&map).await.unwrap();
     }
-    let received = timeout(SOON, readers.join_all()).await.expect("maps are missing");
+    let received = timeout(SOON, readers.join_all())
+        .await
+        .expect("maps are missing");
     assert!(received.iter().all(|bytes| *bytes > MAPS * 100_000));
     assert_eq!(cell.counters.events(Event::ClientStalled), 0);
     assert_eq!(cell.counters.all_shed(), []);
@@ -286,7 +365,9 @@ async fn readers_without_certificates_that_do_not_read_lose_their_own_messages_o
         counters: Arc::clone(&counters),
     };
     let mut broker = EmbeddedBroker::protected(BrokerConfig::default(), policy);
-    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let address = broker
+        .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+        .unwrap();
     let connect = async |id: &str| {
         let mut stream = TcpStream::connect(address).await.unwrap();
         greet(&mut stream, id, CLEAN).await;
@@ -313,7 +394,9 @@ async fn readers_without_certificates_that_do_not_read_lose_their_own_messages_o
     while shed(&counters, ShedReason::ReaderSlow, "this machine") < 50 {
         assert!(Instant::now() < until, "{:?}", counters.all_shed());
         vehicle.write_all(&report("v01", 2000)).await.unwrap();
-        timeout(SOON, read_messages(&mut leader, 1)).await.expect("nothing came");
+        timeout(SOON, read_messages(&mut leader, 1))
+            .await
+            .expect("nothing came");
         sleep(Duration::from_millis(20)).await;
     }
     flood.abort();

@@ -11,7 +11,14 @@ pub(crate) fn inverted(sender: &str, epoch: u64, aggregator: &str) -> LedgerShar
     let name = |name: &str| NodeName::new(name).unwrap();
     let entry = |node: &str, correct, incorrect| {
         let (aggregator, node, label) = (name(aggregator), name(node), "cup".into());
-        LedgerEntry { epoch, aggregator, node, label, correct, incorrect }
+        LedgerEntry {
+            epoch,
+            aggregator,
+            node,
+            label,
+            correct,
+            incorrect,
+        }
     };
     LedgerShare {
         schema: SCHEMA_VERSION,

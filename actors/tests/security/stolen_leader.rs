@@ -16,9 +16,12 @@ const REPLACED_WITHIN: Duration = Duration::from_secs(1);
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_revoked_leader_is_replaced_as_soon_as_the_list_is_read_and_does_not_come_back() {
     let mut pki = Pki::new();
-    let [mut edge_files, euclid_files, gauss_files] =
-        [("edge", Role::Edge), ("euclid", Role::Auto), ("gauss", Role::Cav)]
-            .map(|(node, role)| pki.issue(node, role, DAY));
+    let [mut edge_files, euclid_files, gauss_files] = [
+        ("edge", Role::Edge),
+        ("euclid", Role::Auto),
+        ("gauss", Role::Cav),
+    ]
+    .map(|(node, role)| pki.issue(node, role, DAY));
     let own_list = tempfile::NamedTempFile::new().unwrap();
     std::fs::copy(pki.authority.revocation_list(), own_list.path()).unwrap();
     edge_files.revocation_list = Some(own_list.path().into());
@@ -28,21 +31,35 @@ async fn a_revoked_leader_is_replaced_as_soon_as_the_list_is_read_and_does_not_c
     pki.authority.revoke(&name("edge"), clock::now()).unwrap();
     let revoked = Instant::now();
     let read_in = until("the list is read", || {
-        let knows_edge = |node: &NodeHandle| node.members().borrow().iter().any(|member| member.name == name("edge"));
+        let knows_edge = |node: &NodeHandle| {
+            node.members()
+                .borrow()
+                .iter()
+                .any(|member| member.name == name("edge"))
+        };
         !knows_edge(&euclid) || !knows_edge(&gauss)
     })
     .await;
-    let replaced_in = until("maps of another leader", || aggregator(&gauss).as_deref() == Some("euclid")).await;
-    println!("the next leader's first map came {replaced_in:?} after the list was read, which took {read_in:?}");
-    assert!(read_in < GONE_WITHIN && replaced_in < REPLACED_WITHIN, "{read_in:?}, {replaced_in:?}");
+    let replaced_in = until("maps of another leader", || {
+        aggregator(&gauss).as_deref() == Some("euclid")
+    })
+    .await;
+    println!(
+        "the next leader's first map came {replaced_in:?} after the list was read, which took {read_in:?}"
+    );
+    assert!(
+        read_in < GONE_WITHIN && replaced_in < REPLACED_WITHIN,
+        "{read_in:?}, {replaced_in:?}"
+    );
     let reputations_of = |node: &NodeHandle| {
         let newest = node.newest_reputations().borrow().clone();
         newest.and_then(|newest| newest.message.aggregator.clone())
     };
     until("all is of another leader", || {
-        [&euclid, &gauss]
-            .into_iter()
-            .all(|node| aggregator(node).as_deref() == Some("euclid") && reputations_of(node) == Some(name("euclid")))
+        [&euclid, &gauss].into_iter().all(|node| {
+            aggregator(node).as_deref() == Some("euclid")
+                && reputations_of(node) == Some(name("euclid"))
+        })
     })
     .await;
     let gone_in = revoked.elapsed();
@@ -51,7 +68,11 @@ async fn a_revoked_leader_is_replaced_as_soon_as_the_list_is_read_and_does_not_c
     let end = Instant::now() + Duration::from_secs(3);
     while Instant::now() < end {
         for node in [&euclid, &gauss] {
-            assert_eq!(aggregator(node).as_deref(), Some("euclid"), "the revoked leader is heard again");
+            assert_eq!(
+                aggregator(node).as_deref(),
+                Some("euclid"),
+                "the revoked leader is heard again"
+            );
         }
         sleep(Duration::from_millis(5)).await;
     }

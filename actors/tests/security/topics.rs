@@ -22,19 +22,40 @@ fn login(will: Option<&str>) -> Vec<u8> {
     let will_payload = will.map(|_| text("gone")).unwrap_or_default();
     // Clean session; with a will, that is to be retained.
     let flags = if will.is_some() { 0x26 } else { 0x02 };
-    packet(0x10, &[b"\0\x04MQTT\x04", &[flags, 0, 60], &text(""), &will_topic, &will_payload])
+    packet(
+        0x10,
+        &[
+            b"\0\x04MQTT\x04",
+            &[flags, 0, 60],
+            &text(""),
+            &will_topic,
+            &will_payload,
+        ],
+    )
 }
 
 /// Sends a packet and asserts what is answered.
 async fn ask(stream: &mut (impl AsyncRead + AsyncWrite + Unpin), packet: &[u8], expected: &[u8]) {
     stream.write_all(packet).await.unwrap();
     let mut answer = vec![0; expected.len()];
-    timeout(SOON, stream.read_exact(&mut answer)).await.expect("no answer").expect("cut off");
+    timeout(SOON, stream.read_exact(&mut answer))
+        .await
+        .expect("no answer")
+        .expect("cut off");
     assert_eq!(answer, expected);
 }
 
-async fn subscribe(stream: &mut (impl AsyncRead + AsyncWrite + Unpin), filter: &str, expected: &[u8]) {
-    ask(stream, &packet(0x82, &[&[0, 1], &text(filter), &[0]]), expected).await;
+async fn subscribe(
+    stream: &mut (impl AsyncRead + AsyncWrite + Unpin),
+    filter: &str,
+    expected: &[u8],
+) {
+    ask(
+        stream,
+        &packet(0x82, &[&[0, 1], &text(filter), &[0]]),
+        expected,
+    )
+    .await;
 }
 
 fn too_deep(levels: usize) -> String {
@@ -48,8 +69,18 @@ async fn topics_and_filters_beyond_measure_are_refused() {
         let mut stream = secure(&mut cell).await;
         ask(&mut stream, &login(None), &CONNACK).await;
         subscribe(&mut stream, &topic, &SUBACK_FAILURE).await;
-        ask(&mut stream, &packet(0xa2, &[&[0, 2], &text(&topic)]), &UNSUBACK).await;
-        ask(&mut stream, &packet(0x32, &[&text(&topic), &[0, 3], b"payload"]), &PUBACK).await;
+        ask(
+            &mut stream,
+            &packet(0xa2, &[&[0, 2], &text(&topic)]),
+            &UNSUBACK,
+        )
+        .await;
+        ask(
+            &mut stream,
+            &packet(0x32, &[&text(&topic), &[0, 3], b"payload"]),
+            &PUBACK,
+        )
+        .await;
         cell.honest_traffic_goes_on().await;
     }
     for will in [too_deep(7_000), too_deep(40), "a".repeat(15_000)] {
@@ -66,7 +97,12 @@ async fn subscriptions_without_number_are_refused() {
     let mut stream = secure(&mut cell).await;
     ask(&mut stream, &login(None), &CONNACK).await;
     for n in 0..256 {
-        subscribe(&mut stream, &format!("ecod/v1/lot/nodes/{n}"), &[0x90, 3, 0, 1, 0]).await;
+        subscribe(
+            &mut stream,
+            &format!("ecod/v1/lot/nodes/{n}"),
+            &[0x90, 3, 0, 1, 0],
+        )
+        .await;
     }
     subscribe(&mut stream, "one/more", &SUBACK_FAILURE).await;
     cell.honest_traffic_goes_on().await;
@@ -79,8 +115,13 @@ async fn a_packet_of_too_many_filters_ends_its_connection() {
     ask(&mut stream, &login(None), &CONNACK).await;
     let filters = [&text("nodes/+")[..], &[0]].concat().repeat(7000);
     // The broker may cut it off before the last byte.
-    stream.write_all(&packet(0x82, &[&[0, 1], &filters])).await.ok();
-    let ended = timeout(SOON, stream.read(&mut [0])).await.expect("it is not cut off");
+    stream
+        .write_all(&packet(0x82, &[&[0, 1], &filters]))
+        .await
+        .ok();
+    let ended = timeout(SOON, stream.read(&mut [0]))
+        .await
+        .expect("it is not cut off");
     assert!(matches!(ended, Ok(0) | Err(_)), "{ended:?}");
     cell.counted(Event::ClientMalformed, 1).await;
     cell.honest_traffic_goes_on().await;
@@ -90,14 +131,21 @@ async fn a_packet_of_too_many_filters_ends_its_connection() {
 #[tokio::test]
 async fn a_broker_without_a_guard_survives_endless_topics() {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
-    let address = broker.start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).unwrap();
+    let address = broker
+        .start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+        .unwrap();
     let deep = too_deep(15_000);
     for will in [None, Some(deep.as_str())] {
         let mut stream = TcpStream::connect(address).await.unwrap();
         ask(&mut stream, &login(will), &CONNACK).await;
         subscribe(&mut stream, &deep, &SUBACK_FAILURE).await;
         // To be retained.
-        ask(&mut stream, &packet(0x33, &[&text(&deep), &[0, 3], b"payload"]), &PUBACK).await;
+        ask(
+            &mut stream,
+            &packet(0x33, &[&text(&deep), &[0, 3], b"payload"]),
+            &PUBACK,
+        )
+        .await;
     }
     let mut stream = TcpStream::connect(address).await.unwrap();
     ask(&mut stream, &login(None), &CONNACK).await;

@@ -18,12 +18,26 @@ use crate::fixture::{Cell, MAX_EACH, SOON, secure};
 /// A WebSocket with a certificate that asks to log in with this client id; gives the answer, nothing when it is cut off.
 async fn log_in(cell: &mut Cell, id: &str) -> (WebSocketStream<TlsStream<TcpStream>>, Vec<u8>) {
     let mut request = "wss://broker.ecod.internal/".into_client_request().unwrap();
-    request.headers_mut().insert("sec-websocket-protocol", "mqtt".parse().unwrap());
+    request
+        .headers_mut()
+        .insert("sec-websocket-protocol", "mqtt".parse().unwrap());
     let (mut socket, _) = client_async(request, secure(cell).await).await.unwrap();
-    let body = [&b"\0\x04MQTT\x04\x02\0\x3c\0"[..], &[id.len() as u8], id.as_bytes()].concat();
-    socket.send(Message::binary([&[0x10, body.len() as u8], &body[..]].concat())).await.unwrap();
+    let body = [
+        &b"\0\x04MQTT\x04\x02\0\x3c\0"[..],
+        &[id.len() as u8],
+        id.as_bytes(),
+    ]
+    .concat();
+    socket
+        .send(Message::binary(
+            [&[0x10, body.len() as u8], &body[..]].concat(),
+        ))
+        .await
+        .unwrap();
     let answer = timeout(SOON, socket.next()).await.expect("left waiting");
-    let answer = answer.and_then(Result::ok).map(|message| message.into_data().to_vec());
+    let answer = answer
+        .and_then(Result::ok)
+        .map(|message| message.into_data().to_vec());
     (socket, answer.unwrap_or_default())
 }
 
@@ -64,7 +78,11 @@ async fn frames_without_content_count_as_what_they_take() {
             while let Some(left) = END.checked_sub(started.elapsed())
                 && let Ok(Ok(())) = timeout(left, socket.get_mut().write_all(&frames)).await
             {
-                bytes += if started.elapsed() < BEGIN { 0 } else { frames.len() };
+                bytes += if started.elapsed() < BEGIN {
+                    0
+                } else {
+                    frames.len()
+                };
             }
             bytes
         });

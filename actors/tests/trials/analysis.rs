@@ -83,17 +83,32 @@ pub(crate) const QUIET: Duration = Duration::from_secs(1);
 
 /// Judges a trial by the logs of all its processes.
 pub(crate) fn judge(runs: &[NodeRun], phases: &[Phase]) -> Verdict {
-    let mut verdict = Verdict { stale_accepted: runs.iter().map(stale).sum(), ..Verdict::default() };
-    let mut known: BTreeSet<&Epoch> =
-        phases.first().map(|first| epochs(runs, Timestamp::default(), first.from)).unwrap_or_default();
+    let mut verdict = Verdict {
+        stale_accepted: runs.iter().map(stale).sum(),
+        ..Verdict::default()
+    };
+    let mut known: BTreeSet<&Epoch> = phases
+        .first()
+        .map(|first| epochs(runs, Timestamp::default(), first.from))
+        .unwrap_or_default();
     for phase in phases {
         for run in runs.iter().filter(|run| phase.measured.contains(&run.node)) {
             verdict.gap = verdict.gap.max(longest_wait(run, phase.from, phase.until));
             verdict.missed_rounds += missed(run, phase);
         }
-        verdict.unrecovered |= phase.components.iter().flatten().any(|node| !served(runs, node, phase.until));
-        verdict.double_leader |= phase.components.iter().any(|component| leaders(runs, component, phase.until) > 1);
-        let new: BTreeSet<&Epoch> = epochs(runs, phase.from, phase.until).difference(&known).copied().collect();
+        verdict.unrecovered |= phase
+            .components
+            .iter()
+            .flatten()
+            .any(|node| !served(runs, node, phase.until));
+        verdict.double_leader |= phase
+            .components
+            .iter()
+            .any(|component| leaders(runs, component, phase.until) > 1);
+        let new: BTreeSet<&Epoch> = epochs(runs, phase.from, phase.until)
+            .difference(&known)
+            .copied()
+            .collect();
         let beyond = new.len().saturating_sub(*phase.changes.end());
         let lacking = phase.changes.start().saturating_sub(new.len());
         verdict.false_failovers += (beyond + lacking) as u64;
@@ -121,38 +136,58 @@ pub(crate) fn stale(run: &NodeRun) -> u64 {
 }
 
 /// Pairs of maps taken one after the other, the second within the time.
-fn pairs(run: &NodeRun, from: Timestamp, until: Timestamp) -> impl Iterator<Item = (&Accepted, &Accepted)> {
+fn pairs(
+    run: &NodeRun,
+    from: Timestamp,
+    until: Timestamp,
+) -> impl Iterator<Item = (&Accepted, &Accepted)> {
     let within = move |map: &Accepted| from <= map.at && map.at <= until;
-    run.accepted.windows(2).map(|pair| (&pair[0], &pair[1])).filter(move |(_, second)| within(second))
+    run.accepted
+        .windows(2)
+        .map(|pair| (&pair[0], &pair[1]))
+        .filter(move |(_, second)| within(second))
 }
 
 /// The longest time between two maps that a process took, the second between these times.
 pub(crate) fn longest_wait(run: &NodeRun, from: Timestamp, until: Timestamp) -> Option<Duration> {
-    pairs(run, from, until).map(|(first, second)| second.at.since(first.at)).max()
+    pairs(run, from, until)
+        .map(|(first, second)| second.at.since(first.at))
+        .max()
 }
 
 fn missed(run: &NodeRun, phase: &Phase) -> u64 {
-    let between = |(first, second): (&Accepted, &Accepted)| match second.round.checked_sub(first.round) {
-        Some(step) if step > 0 => step - 1,
-        _ => u64::from(second.epoch != first.epoch),
-    };
+    let between =
+        |(first, second): (&Accepted, &Accepted)| match second.round.checked_sub(first.round) {
+            Some(step) if step > 0 => step - 1,
+            _ => u64::from(second.epoch != first.epoch),
+        };
     pairs(run, phase.from, phase.until).map(between).sum()
 }
 
 /// True if the node, or the program at its door, still took maps at this time.
 pub(crate) fn served(runs: &[NodeRun], node: &NodeName, until: Timestamp) -> bool {
-    let maps = runs.iter().filter(|run| run.node == *node).flat_map(|run| &run.accepted);
-    maps.into_iter().any(|map| map.at <= until && until.since(map.at) <= SERVED_WITHIN)
+    let maps = runs
+        .iter()
+        .filter(|run| run.node == *node)
+        .flat_map(|run| &run.accepted);
+    maps.into_iter()
+        .any(|map| map.at <= until && until.since(map.at) <= SERVED_WITHIN)
 }
 
 fn leaders(runs: &[NodeRun], component: &BTreeSet<NodeName>, until: Timestamp) -> usize {
-    let maps = runs.iter().filter(|run| component.contains(&run.node)).flat_map(|run| &run.accepted);
+    let maps = runs
+        .iter()
+        .filter(|run| component.contains(&run.node))
+        .flat_map(|run| &run.accepted);
     let quiet = maps.filter(|map| map.at <= until && until.since(map.at) <= QUIET);
     quiet.map(|map| &map.epoch).collect::<BTreeSet<_>>().len()
 }
 
 fn epochs(runs: &[NodeRun], from: Timestamp, until: Timestamp) -> BTreeSet<&Epoch> {
-    let maps = runs.iter().flat_map(|run| &run.accepted).filter(|map| from <= map.at && map.at <= until);
+    let maps = runs
+        .iter()
+        .flat_map(|run| &run.accepted)
+        .filter(|map| from <= map.at && map.at <= until);
     maps.map(|map| &map.epoch).collect()
 }
 
@@ -175,7 +210,12 @@ mod tests {
         let epoch = Epoch::new(term, name(leader));
         let map = |n| {
             let at = ms(at_ms + 100 * n);
-            Accepted { at, epoch: epoch.clone(), round: first_round + n, fused_at: at }
+            Accepted {
+                at,
+                epoch: epoch.clone(),
+                round: first_round + n,
+                fused_at: at,
+            }
         };
         (0..count).map(map).collect()
     }
@@ -185,11 +225,20 @@ mod tests {
     }
 
     fn run(node: &str, parts: &[Vec<Accepted>]) -> NodeRun {
-        NodeRun { node: name(node), accepted: parts.concat() }
+        NodeRun {
+            node: name(node),
+            accepted: parts.concat(),
+        }
     }
 
     fn phase(from: u64, until: u64, changes: RangeInclusive<usize>, nodes: &[&str]) -> Phase {
-        Phase { from: ms(from), until: ms(until), changes, components: vec![names(nodes)], measured: names(nodes) }
+        Phase {
+            from: ms(from),
+            until: ms(until),
+            changes,
+            components: vec![names(nodes)],
+            measured: names(nodes),
+        }
     }
 
     #[test]
@@ -198,7 +247,13 @@ mod tests {
         let a = run("a", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1050, 20)]);
         let b = run("b", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1060, 20)]);
         let verdict = judge(&[a, b], &[phase(910, 2950, 1..=1, &["a", "b"])]);
-        assert_eq!(verdict, Verdict { gap: Some(Duration::from_millis(160)), ..Verdict::default() });
+        assert_eq!(
+            verdict,
+            Verdict {
+                gap: Some(Duration::from_millis(160)),
+                ..Verdict::default()
+            }
+        );
     }
 
     #[test]
@@ -207,10 +262,16 @@ mod tests {
         let late = run("b", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 13, 1300, 18)]);
         let runs = [a, late];
         let verdict = judge(&runs, &[phase(910, 2950, 1..=1, &["a", "b"])]);
-        assert_eq!((verdict.gap, verdict.missed_rounds), (Some(Duration::from_millis(400)), 2));
+        assert_eq!(
+            (verdict.gap, verdict.missed_rounds),
+            (Some(Duration::from_millis(400)), 2)
+        );
         let mut only_a = phase(910, 2950, 1..=1, &["a", "b"]);
         only_a.measured = names(&["a"]);
-        assert_eq!(judge(&runs, &[only_a]).gap, Some(Duration::from_millis(150)));
+        assert_eq!(
+            judge(&runs, &[only_a]).gap,
+            Some(Duration::from_millis(150))
+        );
     }
 
     #[test]
@@ -219,16 +280,32 @@ mod tests {
         let verdict = judge(&[twice], &[phase(500, 2900, 1..=1, &["a"])]);
         assert_eq!((verdict.missed_rounds, verdict.stale_accepted), (1, 0));
         let seamless = run("a", &[maps("a", 2, 1, 0, 10), maps(EDGE, 3, 11, 1000, 20)]);
-        assert_eq!(judge(&[seamless], &[phase(500, 2900, 1..=1, &["a"])]).missed_rounds, 0);
+        assert_eq!(
+            judge(&[seamless], &[phase(500, 2900, 1..=1, &["a"])]).missed_rounds,
+            0
+        );
     }
 
     #[test]
     fn a_map_of_a_superseded_leader_is_stale_in_the_run_that_knew_better() {
-        let fooled = run("a", &[maps("a", 2, 11, 0, 10), maps(EDGE, 1, 30, 1000, 2), maps("a", 2, 21, 1200, 20)]);
-        assert_eq!(judge(&[fooled], &[phase(0, 3100, 0..=2, &["a"])]).stale_accepted, 2);
+        let fooled = run(
+            "a",
+            &[
+                maps("a", 2, 11, 0, 10),
+                maps(EDGE, 1, 30, 1000, 2),
+                maps("a", 2, 21, 1200, 20),
+            ],
+        );
+        assert_eq!(
+            judge(&[fooled], &[phase(0, 3100, 0..=2, &["a"])]).stale_accepted,
+            2
+        );
         let before = run("a", &[maps("a", 2, 11, 0, 10)]);
         let restarted = run("a", &[maps(EDGE, 1, 30, 1000, 2)]);
-        assert_eq!(judge(&[before, restarted], &[phase(0, 1100, 0..=2, &["a"])]).stale_accepted, 0);
+        assert_eq!(
+            judge(&[before, restarted], &[phase(0, 1100, 0..=2, &["a"])]).stale_accepted,
+            0
+        );
     }
 
     #[test]
@@ -236,7 +313,10 @@ mod tests {
         let a = run("a", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1050, 20)]);
         let lost = run("b", &[maps(EDGE, 1, 1, 0, 10)]);
         assert!(judge(&[a.clone(), lost], &[phase(910, 2950, 1..=1, &["a", "b"])]).unrecovered);
-        assert!(judge(&[a], &[phase(910, 2950, 1..=1, &["a", "b"])]).unrecovered, "no log at all");
+        assert!(
+            judge(&[a], &[phase(910, 2950, 1..=1, &["a", "b"])]).unrecovered,
+            "no log at all"
+        );
     }
 
     #[test]
@@ -253,13 +333,32 @@ mod tests {
 
     #[test]
     fn changes_that_no_fault_explains_and_changes_that_fail_to_come_are_counted() {
-        let a = run("a", &[maps(EDGE, 1, 1, 0, 10), maps("a", 2, 11, 1000, 10), maps("b", 3, 21, 2000, 10)]);
+        let a = run(
+            "a",
+            &[
+                maps(EDGE, 1, 1, 0, 10),
+                maps("a", 2, 11, 1000, 10),
+                maps("b", 3, 21, 2000, 10),
+            ],
+        );
         let runs = [a];
         let false_failovers = |phases: &[Phase]| judge(&runs, phases).false_failovers;
         assert_eq!(false_failovers(&[phase(500, 2900, 0..=0, &["a"])]), 2);
         assert_eq!(false_failovers(&[phase(500, 2900, 1..=1, &["a"])]), 1);
-        assert_eq!(false_failovers(&[phase(500, 1500, 1..=1, &["a"]), phase(1500, 2900, 1..=1, &["a"])]), 0);
-        assert_eq!(false_failovers(&[phase(500, 900, 1..=1, &["a"]), phase(900, 2900, 2..=2, &["a"])]), 1);
+        assert_eq!(
+            false_failovers(&[
+                phase(500, 1500, 1..=1, &["a"]),
+                phase(1500, 2900, 1..=1, &["a"])
+            ]),
+            0
+        );
+        assert_eq!(
+            false_failovers(&[
+                phase(500, 900, 1..=1, &["a"]),
+                phase(900, 2900, 2..=2, &["a"])
+            ]),
+            1
+        );
     }
 
     #[test]

@@ -110,7 +110,11 @@ impl Cell {
             lossy: false,
         };
         let mut ports = Ports::new();
-        let broker = if plan.external_broker { Some(cell.start_mosquitto(&mut ports)?) } else { None };
+        let broker = if plan.external_broker {
+            Some(cell.start_mosquitto(&mut ports)?)
+        } else {
+            None
+        };
         let frames = cell.directory.path().join("frames");
         fs::create_dir(&frames)?;
         fs::write(frames.join("0.ppm"), frame())?;
@@ -118,10 +122,22 @@ impl Cell {
         let all = (0..plan.nodes).map(|node| addresses(&mut ports, node, plan.bridged));
         let all = all.collect::<anyhow::Result<Vec<_>>>()?;
         for (index, address) in all.iter().enumerate() {
-            let name = if index == EDGE { "edge".to_owned() } else { format!("v{index:02}") };
+            let name = if index == EDGE {
+                "edge".to_owned()
+            } else {
+                format!("v{index:02}")
+            };
             let home = cell.directory.path().join(&name);
             fs::create_dir(&home)?;
-            let text = configuration(plan, index, &name, *address, &all, broker, cell.directory.path());
+            let text = configuration(
+                plan,
+                index,
+                &name,
+                *address,
+                &all,
+                broker,
+                cell.directory.path(),
+            );
             fs::write(home.join("node.toml"), text)?;
             cell.nodes.push(Node {
                 name: NodeName::new(name)?,
@@ -166,12 +182,20 @@ impl Cell {
     pub(crate) async fn open_doors(&mut self) -> anyhow::Result<()> {
         for node in self.nodes.iter_mut().filter(|node| node.process.is_some()) {
             let log = node.door_log();
-            node.door = Some(doors::open(node.address.broker, node.namespace.as_deref(), &log)?);
+            node.door = Some(doors::open(
+                node.address.broker,
+                node.namespace.as_deref(),
+                &log,
+            )?);
         }
         let started = Instant::now();
         for node in self.nodes.iter().filter(|node| node.door.is_some()) {
             while logs::at_door(&node.door_log())?.is_empty() {
-                ensure!(started.elapsed() < START_TIMEOUT, "the client beside {} gets no map", node.name);
+                ensure!(
+                    started.elapsed() < START_TIMEOUT,
+                    "the client beside {} gets no map",
+                    node.name
+                );
                 tokio::time::sleep(Duration::from_millis(50)).await;
             }
         }
@@ -181,32 +205,50 @@ impl Cell {
     /// Maps of the client at each door.
     pub(crate) fn doors(&self) -> anyhow::Result<Vec<NodeRun>> {
         let opened = self.nodes.iter().filter(|node| node.door.is_some());
-        opened.map(|node| Ok(NodeRun { node: node.name.clone(), accepted: logs::at_door(&node.door_log())? })).collect()
+        opened
+            .map(|node| {
+                Ok(NodeRun {
+                    node: node.name.clone(),
+                    accepted: logs::at_door(&node.door_log())?,
+                })
+            })
+            .collect()
     }
 
     /// The reason for which the cell is not well yet.
     fn disagreement(&mut self) -> anyhow::Result<Option<String>> {
         let mut leaders = BTreeSet::new();
         for node in &mut self.nodes {
-            let Some(process) = &mut node.process else { continue };
+            let Some(process) = &mut node.process else {
+                continue;
+            };
             if let Some(status) = process.ended()? {
                 bail!("{} ended with {status}: {}", node.name, node.last_words());
             }
             match logs::last_accepted(&node.map_log())? {
-                Some(map) if clock::now().since(map.at) < Duration::from_millis(400) => leaders.insert(map.epoch),
+                Some(map) if clock::now().since(map.at) < Duration::from_millis(400) => {
+                    leaders.insert(map.epoch)
+                }
                 _ => return Ok(Some(format!("{} gets no maps", node.name))),
             };
         }
         let edge = &self.nodes[EDGE];
         let wanted = edge.process.as_ref().map(|_| &edge.name);
         Ok(match leaders.first() {
-            Some(leader) if leaders.len() == 1 && wanted.is_none_or(|edge| *edge == leader.leader) => None,
+            Some(leader)
+                if leaders.len() == 1 && wanted.is_none_or(|edge| *edge == leader.leader) =>
+            {
+                None
+            }
             _ => Some(format!("leaders are {leaders:?}")),
         })
     }
 
     pub(crate) fn kill(&mut self, node: usize) -> anyhow::Result<()> {
-        let process = self.nodes[node].process.take().context("the process does not run")?;
+        let process = self.nodes[node]
+            .process
+            .take()
+            .context("the process does not run")?;
         process.kill()
     }
 
@@ -219,11 +261,18 @@ impl Cell {
         let node = &mut self.nodes[node];
         let process = node.process.as_ref().context("the process does not run")?;
         node.paused = paused;
-        if paused { process.pause() } else { process.resume() }
+        if paused {
+            process.pause()
+        } else {
+            process.resume()
+        }
     }
 
     pub(crate) fn kill_mosquitto(&mut self) -> anyhow::Result<()> {
-        self.mosquitto.take().context("there is no external broker")?.kill()
+        self.mosquitto
+            .take()
+            .context("there is no external broker")?
+            .kill()
     }
 
     /// Starts so many processes that do nothing but compute, or ends them.
@@ -231,7 +280,9 @@ impl Cell {
         self.busy.clear();
         let shell = Path::new("/bin/sh");
         for _ in 0..loops {
-            self.busy.push(Process::start(command(shell, None).args(["-c", "while :; do :; done"]))?);
+            self.busy.push(Process::start(
+                command(shell, None).args(["-c", "while :; do :; done"]),
+            )?);
         }
         Ok(())
     }
@@ -240,7 +291,11 @@ impl Cell {
     pub(crate) fn flood(&mut self, index: usize) -> anyhow::Result<()> {
         let other = if index == 1 { 2 } else { 1 };
         let [node, other] = [index, other].map(|index| &self.nodes[index]);
-        let process = node.process.as_ref().context("the process does not run")?.id();
+        let process = node
+            .process
+            .as_ref()
+            .context("the process does not run")?
+            .id();
         let flood = Flood::start(node.address.broker, &node.name, process, &other.name)?;
         self.flood = Some((index, clock::now(), flood));
         Ok(())
@@ -248,29 +303,49 @@ impl Cell {
 
     /// The node whose door is flooded.
     pub(crate) fn flooded(&self) -> Option<&NodeName> {
-        self.flood.as_ref().map(|(index, ..)| &self.nodes[*index].name)
+        self.flood
+            .as_ref()
+            .map(|(index, ..)| &self.nodes[*index].name)
     }
 
     /// Cost of the flood so far, if there is one.
     pub(crate) fn flood_cost(&self) -> anyhow::Result<Option<FloodCost>> {
-        let (Some((_, since, flood)), Some(flooded)) = (&self.flood, self.flooded()) else { return Ok(None) };
+        let (Some((_, since, flood)), Some(flooded)) = (&self.flood, self.flooded()) else {
+            return Ok(None);
+        };
         let (messages, grown_kib) = flood.cost()?;
-        let others = self.nodes.iter().skip(1).filter(|node| node.name != *flooded);
-        let unheard = others.map(|node| logs::without(&node.map_log(), flooded, *since)).sum::<anyhow::Result<_>>()?;
-        Ok(Some(FloodCost { messages, grown_kib, unheard }))
+        let others = self
+            .nodes
+            .iter()
+            .skip(1)
+            .filter(|node| node.name != *flooded);
+        let unheard = others
+            .map(|node| logs::without(&node.map_log(), flooded, *since))
+            .sum::<anyhow::Result<_>>()?;
+        Ok(Some(FloodCost {
+            messages,
+            grown_kib,
+            unheard,
+        }))
     }
 
     /// Cuts the network in two, the edge being on the larger side, or heals it.
     pub(crate) fn split(&mut self, split: bool) -> anyhow::Result<()> {
         let half = self.nodes.len() - self.nodes.len() / 2;
-        self.apart = if split { (half..self.nodes.len()).collect() } else { Vec::new() };
+        self.apart = if split {
+            (half..self.nodes.len()).collect()
+        } else {
+            Vec::new()
+        };
         self.bridged()?.split(&self.apart)
     }
 
     /// The leader's packets do not reach the last vehicle that may lead, or do again.
     pub(crate) fn cut_one_way(&mut self, cut: bool) -> anyhow::Result<()> {
         let nodes = self.nodes.len();
-        let last = (0..nodes).rfind(|index| !is_cav(nodes, *index)).context("the cell has no nodes")?;
+        let last = (0..nodes)
+            .rfind(|index| !is_cav(nodes, *index))
+            .context("the cell has no nodes")?;
         self.unreached = cut.then_some(last);
         self.bridged()?.cut_one_way(EDGE, last, cut)
     }
@@ -315,15 +390,29 @@ impl Cell {
             let node = &self.nodes[*index];
             node.process.is_some() && !node.paused && !self.lossy
         };
-        let reached = (0..self.nodes.len()).filter(|index| runs(index) && self.unreached != Some(*index));
-        let (apart, together): (Vec<_>, Vec<_>) = reached.partition(|index| self.apart.contains(index));
-        let names = |side: Vec<usize>| side.into_iter().map(|index| self.nodes[index].name.clone()).collect();
-        [together, apart].into_iter().filter(|side| !side.is_empty()).map(names).collect()
+        let reached =
+            (0..self.nodes.len()).filter(|index| runs(index) && self.unreached != Some(*index));
+        let (apart, together): (Vec<_>, Vec<_>) =
+            reached.partition(|index| self.apart.contains(index));
+        let names = |side: Vec<usize>| {
+            side.into_iter()
+                .map(|index| self.nodes[index].name.clone())
+                .collect()
+        };
+        [together, apart]
+            .into_iter()
+            .filter(|side| !side.is_empty())
+            .map(names)
+            .collect()
     }
 
     /// The vehicles that run; the edge serves them but is none.
     pub(crate) fn vehicles(&self) -> BTreeSet<NodeName> {
-        let vehicles = self.nodes.iter().skip(1).filter(|node| node.process.is_some());
+        let vehicles = self
+            .nodes
+            .iter()
+            .skip(1)
+            .filter(|node| node.process.is_some());
         vehicles.map(|node| node.name.clone()).collect()
     }
 
@@ -349,15 +438,26 @@ impl Cell {
 
     /// The running processes: node and run, and number.
     pub(crate) fn processes(&self) -> Vec<(String, u32)> {
-        let process = |node: &Node| Some((format!("{}, run {}", node.name, node.runs), node.process.as_ref()?.id()));
+        let process = |node: &Node| {
+            Some((
+                format!("{}, run {}", node.name, node.runs),
+                node.process.as_ref()?.id(),
+            ))
+        };
         self.nodes.iter().filter_map(process).collect()
     }
 
     /// Maps that every run of every process accepted.
     pub(crate) fn runs(&self) -> anyhow::Result<Vec<NodeRun>> {
-        let runs = self.nodes.iter().flat_map(|node| (1..=node.runs).map(move |run| (node, run)));
+        let runs = self
+            .nodes
+            .iter()
+            .flat_map(|node| (1..=node.runs).map(move |run| (node, run)));
         let read = |(node, run): (&Node, usize)| {
-            Ok(NodeRun { node: node.name.clone(), accepted: logs::accepted(&node.map_log_of(run))? })
+            Ok(NodeRun {
+                node: node.name.clone(),
+                accepted: logs::accepted(&node.map_log_of(run))?,
+            })
         };
         runs.map(read).collect()
     }
@@ -370,7 +470,9 @@ impl Cell {
 
     fn newest(&self) -> anyhow::Result<Option<Accepted>> {
         let running = self.nodes.iter().filter(|node| node.process.is_some());
-        let maps = running.map(|node| logs::last_accepted(&node.map_log())).collect::<anyhow::Result<Vec<_>>>()?;
+        let maps = running
+            .map(|node| logs::last_accepted(&node.map_log()))
+            .collect::<anyhow::Result<Vec<_>>>()?;
         Ok(maps.into_iter().flatten().max_by_key(|map| map.at))
     }
 
@@ -387,8 +489,13 @@ impl Cell {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, ports.free()?));
         let file = self.directory.path().join("mosquitto.conf");
         let listener = format!("listener {} {}", address.port(), address.ip());
-        fs::write(&file, format!("{listener}\nuser root\nset_tcp_nodelay true\nallow_anonymous true\n"))?;
-        self.mosquitto = Some(Process::start(command(Path::new(MOSQUITTO), None).arg("-c").arg(file))?);
+        fs::write(
+            &file,
+            format!("{listener}\nuser root\nset_tcp_nodelay true\nallow_anonymous true\n"),
+        )?;
+        self.mosquitto = Some(Process::start(
+            command(Path::new(MOSQUITTO), None).arg("-c").arg(file),
+        )?);
         Ok(address)
     }
 }
@@ -398,13 +505,17 @@ impl Node {
         self.runs += 1;
         let log = File::options().create(true).append(true).open(self.log())?;
         let mut command: Command = command(Path::new(PROGRAM), self.namespace.as_deref());
-        command.env_clear().envs(std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")));
+        command.env_clear().envs(
+            std::env::vars_os().filter(|(key, _)| !key.to_string_lossy().starts_with("ECOD_")),
+        );
         command
             .args(["--log-format", "text", "--config"])
             .arg(self.directory.join("node.toml"))
             .arg("--map-log")
             .arg(self.map_log());
-        self.process = Some(Process::start(command.stderr(log).current_dir(&self.directory))?);
+        self.process = Some(Process::start(
+            command.stderr(log).current_dir(&self.directory),
+        )?);
         Ok(())
     }
 

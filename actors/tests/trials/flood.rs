@@ -68,9 +68,19 @@ enum Misuse {
 
 impl Flood {
     /// Starts the programs at the door of a node with this process; some claim another's name.
-    pub(crate) fn start(door: SocketAddr, node: &NodeName, process: u32, other: &NodeName) -> anyhow::Result<Self> {
-        let (messages, resident_kib) = (Arc::<AtomicU64>::default(), memory_kib(process, "VmRSS:")?);
-        let runtime = Builder::new_multi_thread().worker_threads(1).enable_all().build().context("no thread")?;
+    pub(crate) fn start(
+        door: SocketAddr,
+        node: &NodeName,
+        process: u32,
+        other: &NodeName,
+    ) -> anyhow::Result<Self> {
+        let (messages, resident_kib) =
+            (Arc::<AtomicU64>::default(), memory_kib(process, "VmRSS:")?);
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .context("no thread")?;
         for index in 0..EACH {
             let part = NodeName::new(format!("{node}--flood{index}"))?;
             let misuses = [
@@ -91,7 +101,12 @@ impl Flood {
                 });
             }
         }
-        Ok(Self { runtime: Some(runtime), messages, process, resident_kib })
+        Ok(Self {
+            runtime: Some(runtime),
+            messages,
+            process,
+            resident_kib,
+        })
     }
 
     /// Messages so far, and by how much the node has grown at most.
@@ -104,7 +119,8 @@ impl Flood {
 fn memory_kib(process: u32, key: &str) -> anyhow::Result<u64> {
     let status = fs::read_to_string(format!("/proc/{process}/status"))?;
     let line = status.lines().find_map(|line| line.strip_prefix(key));
-    line.and_then(|rest| rest.split_whitespace().next()?.parse().ok()).with_context(|| format!("no {key}"))
+    line.and_then(|rest| rest.split_whitespace().next()?.parse().ok())
+        .with_context(|| format!("no {key}"))
 }
 
 impl Drop for Flood {
@@ -125,20 +141,38 @@ impl Misuse {
         let path = |name: &NodeName| topics.path(&ReportKind::Detections.topic(name.clone()));
         match self {
             Self::Reports(part) => {
-                let report =
-                    ObjectReport { seen: Some(Vec::new()), ..ObjectReport::new(part.clone(), 0, clock::now()) };
+                let report = ObjectReport {
+                    seen: Some(Vec::new()),
+                    ..ObjectReport::new(part.clone(), 0, clock::now())
+                };
                 let report = |seq| {
-                    let report = ObjectReport { seq, captured_at_us: clock::now(), ..report.clone() };
+                    let report = ObjectReport {
+                        seq,
+                        captured_at_us: clock::now(),
+                        ..report.clone()
+                    };
                     (path(part), encode(&report, Encoding::Json))
                 };
                 send(&client, &mut events, messages, report).await;
             }
             Self::Large(part) => {
-                send(&client, &mut events, messages, |_| (path(part), vec![b' '; LARGE_BYTES])).await;
+                send(&client, &mut events, messages, |_| {
+                    (path(part), vec![b' '; LARGE_BYTES])
+                })
+                .await;
             }
             Self::Foreign(other) => {
                 let map = format!("ecod/v1/{CELL}/global_detections");
-                let message = |seq| (if seq % 2 == 0 { path(other) } else { map.clone() }, b"{}".to_vec());
+                let message = |seq| {
+                    (
+                        if seq % 2 == 0 {
+                            path(other)
+                        } else {
+                            map.clone()
+                        },
+                        b"{}".to_vec(),
+                    )
+                };
                 send(&client, &mut events, messages, message).await;
             }
             Self::Connections => drop(events.poll().await),
@@ -165,7 +199,11 @@ async fn send(
     let publish = async {
         for seq in 0.. {
             let (topic, payload) = message(seq);
-            let qos = if seq % 2 == 0 { QoS::AtMostOnce } else { QoS::AtLeastOnce };
+            let qos = if seq % 2 == 0 {
+                QoS::AtMostOnce
+            } else {
+                QoS::AtLeastOnce
+            };
             if client.publish(topic, qos, false, payload).await.is_err() {
                 return;
             }

@@ -41,10 +41,20 @@ pub(crate) fn accepted(path: &Path) -> anyhow::Result<Vec<Accepted>> {
 
 /// Number of maps in a log, from a time on, to which a node contributes nothing.
 pub(crate) fn without(path: &Path, node: &NodeName, since: Timestamp) -> anyhow::Result<u64> {
-    let lacks = |map: &Map| map.landmarks.iter().all(|landmark| !landmark.contributors.contains(node));
+    let lacks = |map: &Map| {
+        map.landmarks
+            .iter()
+            .all(|landmark| !landmark.contributors.contains(node))
+    };
     let lines = whole_lines(path)?;
-    let lines = lines.lines().map(serde_json::from_str::<Line>).collect::<Result<Vec<_>, _>>()?;
-    Ok(lines.iter().filter(|line| line.received_at_us >= since && lacks(&line.map)).count() as u64)
+    let lines = lines
+        .lines()
+        .map(serde_json::from_str::<Line>)
+        .collect::<Result<Vec<_>, _>>()?;
+    Ok(lines
+        .iter()
+        .filter(|line| line.received_at_us >= since && lacks(&line.map))
+        .count() as u64)
 }
 
 /// All maps that a client at a node's door got.
@@ -56,8 +66,14 @@ pub(crate) fn at_door(path: &Path) -> anyhow::Result<Vec<Accepted>> {
     })
 }
 
-fn maps(path: &Path, parse: impl Fn(&str) -> anyhow::Result<Accepted>) -> anyhow::Result<Vec<Accepted>> {
-    whole_lines(path)?.lines().map(|line| parse(line).with_context(|| format!("map log {}", path.display()))).collect()
+fn maps(
+    path: &Path,
+    parse: impl Fn(&str) -> anyhow::Result<Accepted>,
+) -> anyhow::Result<Vec<Accepted>> {
+    whole_lines(path)?
+        .lines()
+        .map(|line| parse(line).with_context(|| format!("map log {}", path.display())))
+        .collect()
 }
 
 /// The text of a log without an unfinished last line.
@@ -72,8 +88,12 @@ fn whole_lines(path: &Path) -> anyhow::Result<String> {
 
 /// The last map of a log, if there is any yet.
 pub(crate) fn last_accepted(path: &Path) -> anyhow::Result<Option<Accepted>> {
-    let Some(tail) = tail(path)? else { return Ok(None) };
-    let Some((whole, _)) = tail.rsplit_once('\n') else { return Ok(None) };
+    let Some(tail) = tail(path)? else {
+        return Ok(None);
+    };
+    let Some((whole, _)) = tail.rsplit_once('\n') else {
+        return Ok(None);
+    };
     let line = whole.rsplit('\n').next().unwrap_or_default();
     // The tail may begin within the only line.
     Ok(parse(line).ok())
@@ -83,19 +103,35 @@ pub(crate) fn last_accepted(path: &Path) -> anyhow::Result<Option<Accepted>> {
 pub(crate) fn standby(log: &Path) -> anyhow::Result<Option<NodeName>> {
     let text = fs::read_to_string(log).with_context(|| format!("cannot read {}", log.display()))?;
     let last = text.lines().rfind(|line| line.contains("position=Leading"));
-    let name = last.and_then(|line| line.split("standby=").nth(1)).and_then(|rest| rest.split_whitespace().next());
+    let name = last
+        .and_then(|line| line.split("standby=").nth(1))
+        .and_then(|rest| rest.split_whitespace().next());
     Ok(name.and_then(|name| NodeName::new(name).ok()))
 }
 
 fn parse(line: &str) -> anyhow::Result<Accepted> {
-    let Line { received_at_us, map } = serde_json::from_str(line)?;
+    let Line {
+        received_at_us,
+        map,
+    } = serde_json::from_str(line)?;
     Ok(map.received(received_at_us))
 }
 
 impl Map {
     fn received(self, at: Timestamp) -> Accepted {
-        let Self { epoch, aggregator, round, fused_at_us: fused_at, .. } = self;
-        Accepted { at, epoch: Epoch::new(epoch, aggregator), round, fused_at }
+        let Self {
+            epoch,
+            aggregator,
+            round,
+            fused_at_us: fused_at,
+            ..
+        } = self;
+        Accepted {
+            at,
+            epoch: Epoch::new(epoch, aggregator),
+            round,
+            fused_at,
+        }
     }
 }
 
@@ -130,9 +166,16 @@ mod tests {
     #[test]
     fn a_line_cut_short_by_a_kill_is_left_out() {
         let line = LINE.replace('\n', "");
-        let log = file(&format!("{line}\n{}\n{}", line.replace("88", "89"), &line[..40]));
+        let log = file(&format!(
+            "{line}\n{}\n{}",
+            line.replace("88", "89"),
+            &line[..40]
+        ));
         let maps = accepted(log.path()).unwrap();
-        assert_eq!(maps.iter().map(|map| map.round).collect::<Vec<_>>(), [88, 89]);
+        assert_eq!(
+            maps.iter().map(|map| map.round).collect::<Vec<_>>(),
+            [88, 89]
+        );
         assert_eq!(maps[0].epoch.to_string(), "edge@3");
         assert_eq!(last_accepted(log.path()).unwrap().as_ref(), maps.last());
     }
@@ -140,7 +183,10 @@ mod tests {
     #[test]
     fn maps_without_a_node_count_from_a_time_on() {
         let (maps, euclid) = (LINE.replace('\n', ""), NodeName::from_static("euclid"));
-        let seen = maps.replace(r#""landmarks":[]"#, r#""landmarks":[{"contributors":["euclid"]}]"#);
+        let seen = maps.replace(
+            r#""landmarks":[]"#,
+            r#""landmarks":[{"contributors":["euclid"]}]"#,
+        );
         let log = file(&format!("{maps}\n{maps}\n{seen}\n"));
         let without = |since| without(log.path(), &euclid, Timestamp(since)).unwrap();
         assert_eq!((without(1500), without(1501)), (2, 0));
@@ -159,7 +205,10 @@ mod tests {
         let lines = "INFO leadership position=Leading epoch=edge@1\n\
                      INFO leadership position=Leading epoch=edge@1 standby=v01\n\
                      INFO leadership position=Following epoch=v01@2 standby=v02\n";
-        assert_eq!(standby(file(lines).path()).unwrap().unwrap().as_str(), "v01");
+        assert_eq!(
+            standby(file(lines).path()).unwrap().unwrap().as_str(),
+            "v01"
+        );
         assert_eq!(standby(file("").path()).unwrap(), None);
     }
 }

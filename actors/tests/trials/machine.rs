@@ -61,7 +61,10 @@ impl Machine {
     /// The findings in words.
     pub(crate) fn account(&self) -> String {
         let (withheld, delay) = (100.0 * self.most_withheld(), self.longest_delay);
-        format!("{withheld:.0} % of the processors' time withheld, a sleeper late by {} ms", delay.as_millis())
+        format!(
+            "{withheld:.0} % of the processors' time withheld, a sleeper late by {} ms",
+            delay.as_millis()
+        )
     }
 
     /// The largest part of the processors' time that was withheld over half a second, 0 to 1.
@@ -74,7 +77,12 @@ impl Machine {
             let span = until.saturating_duration_since(*from).max(WINDOW);
             Some(after.saturating_sub(*before).as_secs_f64() / span.as_secs_f64())
         };
-        self.readings.iter().enumerate().filter_map(part).fold(0.0, f64::max) / processors as f64
+        self.readings
+            .iter()
+            .enumerate()
+            .filter_map(part)
+            .fold(0.0, f64::max)
+            / processors as f64
     }
 }
 
@@ -98,20 +106,45 @@ mod tests {
 
     fn machine(readings: impl IntoIterator<Item = (u64, u64)>) -> Machine {
         let start = Instant::now();
-        let reading = |(at, withheld)| (start + Duration::from_millis(at), Duration::from_millis(withheld));
-        Machine { readings: readings.into_iter().map(reading).collect(), ..Machine::default() }
+        let reading = |(at, withheld)| {
+            (
+                start + Duration::from_millis(at),
+                Duration::from_millis(withheld),
+            )
+        };
+        Machine {
+            readings: readings.into_iter().map(reading).collect(),
+            ..Machine::default()
+        }
     }
 
     #[test]
     fn the_part_that_is_withheld_counts_by_half_seconds() {
         let all = std::thread::available_parallelism().unwrap().get() as u64;
         let part = |readings: &[(u64, u64)]| {
-            (100.0 * machine(readings.iter().map(|(at, withheld)| (*at, withheld * all))).most_withheld()).round()
+            (100.0
+                * machine(readings.iter().map(|(at, withheld)| (*at, withheld * all)))
+                    .most_withheld())
+            .round()
         };
         let now_and_then: Vec<_> = (0..100).map(|n| (50 * n, 1000 + 10 * (n / 2))).collect();
         assert_eq!(part(&now_and_then), 10.0);
-        assert_eq!(part(&[(0, 7), (50, 7), (100, 107), (150, 107), (500, 107), (1000, 110)]), 20.0);
-        assert_eq!(part(&[(0, 0), (50, 0), (2050, 400)]), 20.0, "the reader stood still as well");
+        assert_eq!(
+            part(&[
+                (0, 7),
+                (50, 7),
+                (100, 107),
+                (150, 107),
+                (500, 107),
+                (1000, 110)
+            ]),
+            20.0
+        );
+        assert_eq!(
+            part(&[(0, 0), (50, 0), (2050, 400)]),
+            20.0,
+            "the reader stood still as well"
+        );
         assert_eq!(part(&[(0, 0), (100, 50)]), 10.0);
         assert_eq!(part(&[]), 0.0);
     }

@@ -51,9 +51,15 @@ fn trials() {
 #[track_caller]
 fn end_with_the_harness(work: impl Future<Output = anyhow::Result<()>>) {
     // Processes end with the thread that started them: all are started by this one.
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
     let outcome = runtime.block_on(async {
-        let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        let (mut interrupt, mut terminate) = (
+            signal(SignalKind::interrupt())?,
+            signal(SignalKind::terminate())?,
+        );
         tokio::select! {
             outcome = work => outcome,
             _ = interrupt.recv() => bail!("interrupted"),
@@ -66,27 +72,39 @@ fn end_with_the_harness(work: impl Future<Output = anyhow::Result<()>>) {
 }
 
 async fn run_all() -> anyhow::Result<()> {
-    let trials: usize = std::env::var("TRIALS").ok().map_or(Ok(20), |text| text.parse()).context("TRIALS")?;
+    let trials: usize = std::env::var("TRIALS")
+        .ok()
+        .map_or(Ok(20), |text| text.parse())
+        .context("TRIALS")?;
     let (scenarios, sizes) = (filter("SCENARIOS"), filter("NODES"));
     let known = |name: &String| SCENARIOS.iter().any(|scenario| scenario.name == name);
     if let Some(unknown) = scenarios.iter().flatten().find(|name| !known(name)) {
         let names: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
         bail!("no scenario {unknown}; there are {}", names.join(", "));
     }
-    let chosen =
-        |list: &Option<Vec<String>>, item: &str| list.as_ref().is_none_or(|list| list.iter().any(|i| i == item));
+    let chosen = |list: &Option<Vec<String>>, item: &str| {
+        list.as_ref()
+            .is_none_or(|list| list.iter().any(|i| i == item))
+    };
     let mut outcomes = Vec::new();
-    for scenario in SCENARIOS.iter().filter(|scenario| chosen(&scenarios, scenario.name)) {
+    for scenario in SCENARIOS
+        .iter()
+        .filter(|scenario| chosen(&scenarios, scenario.name))
+    {
         if let Some(lack) = lacking(scenario.needs) {
             println!("{}: skipped, {lack}", scenario.name);
             continue;
         }
-        for nodes in NODES.into_iter().filter(|nodes| chosen(&sizes, &nodes.to_string())) {
+        for nodes in NODES
+            .into_iter()
+            .filter(|nodes| chosen(&sizes, &nodes.to_string()))
+        {
             if nodes < scenario.least_nodes {
                 continue;
             }
             let mut verdicts: Vec<Verdict> = Vec::new();
-            let void = |verdicts: &[Verdict]| verdicts.iter().filter(|verdict| verdict.is_void).count();
+            let void =
+                |verdicts: &[Verdict]| verdicts.iter().filter(|verdict| verdict.is_void).count();
             while verdicts.len() < trials + void(&verdicts).min(trials) {
                 let trial = verdicts.len() - void(&verdicts) + 1;
                 verdicts.push(run(scenario, nodes, trial, trials).await?);
@@ -97,41 +115,90 @@ async fn run_all() -> anyhow::Result<()> {
     }
     println!("\n{}", table(&outcomes));
     let misses: Vec<String> = outcomes.iter().flat_map(Outcome::misses).collect();
-    if misses.is_empty() { Ok(()) } else { bail!("bars missed: {}", misses.join("; ")) }
+    if misses.is_empty() {
+        Ok(())
+    } else {
+        bail!("bars missed: {}", misses.join("; "))
+    }
 }
 
 /// One trial, told in one line.
-async fn run(scenario: &Scenario, nodes: usize, trial: usize, trials: usize) -> anyhow::Result<Verdict> {
+async fn run(
+    scenario: &Scenario,
+    nodes: usize,
+    trial: usize,
+    trials: usize,
+) -> anyhow::Result<Verdict> {
     let plan = Plan {
         nodes,
         edge: scenario.edge,
-        external_broker: matches!(scenario.needs, Needs::Mosquitto | Needs::MosquittoAndFallback),
+        external_broker: matches!(
+            scenario.needs,
+            Needs::Mosquitto | Needs::MosquittoAndFallback
+        ),
         fallback: scenario.needs == Needs::MosquittoAndFallback,
         bridged: matches!(scenario.needs, Needs::Namespaces | Needs::PacketFilter),
         votes: false,
     };
     let mut cell = Cell::start(&plan)?;
     let outcome = perform(scenario, &mut cell).await;
-    let label = format!("{}, {nodes} nodes, trial {trial} of {trials}", scenario.name);
+    let label = format!(
+        "{}, {nodes} nodes, trial {trial} of {trials}",
+        scenario.name
+    );
     match outcome {
         Ok(verdict) => {
-            let gap = verdict.gap.map_or_else(|| "none".to_owned(), |gap| format!("{} ms", gap.as_millis()));
-            let misses = Outcome::new(scenario, nodes, &[Verdict { is_void: false, ..verdict.clone() }]).misses();
+            let gap = verdict.gap.map_or_else(
+                || "none".to_owned(),
+                |gap| format!("{} ms", gap.as_millis()),
+            );
+            let misses = Outcome::new(
+                scenario,
+                nodes,
+                &[Verdict {
+                    is_void: false,
+                    ..verdict.clone()
+                }],
+            )
+            .misses();
             // A trial that meets its bars in spite of it counts.
-            let verdict = Verdict { is_void: verdict.is_void && !misses.is_empty(), ..verdict };
-            let void = if verdict.is_void { ", void: the machine stood still" } else { "" };
-            let flood = verdict.flood.as_ref().map_or_else(String::new, |FloodCost { messages, grown_kib, .. }| {
-                format!(", {messages} messages of a flood, which the node met with {} MiB", grown_kib / 1024)
-            });
+            let verdict = Verdict {
+                is_void: verdict.is_void && !misses.is_empty(),
+                ..verdict
+            };
+            let void = if verdict.is_void {
+                ", void: the machine stood still"
+            } else {
+                ""
+            };
+            let flood = verdict.flood.as_ref().map_or_else(
+                String::new,
+                |FloodCost {
+                     messages,
+                     grown_kib,
+                     ..
+                 }| {
+                    format!(
+                        ", {messages} messages of a flood, which the node met with {} MiB",
+                        grown_kib / 1024
+                    )
+                },
+            );
             println!("{label}: gap {gap}{flood}{void}");
             if !misses.is_empty() {
                 let mut shown = verdict.clone();
                 shown.doors.delays.clear();
-                println!("    {}; {shown:?}, files in {}", misses.join("; "), cell.keep_files().display());
+                println!(
+                    "    {}; {shown:?}, files in {}",
+                    misses.join("; "),
+                    cell.keep_files().display()
+                );
             }
             Ok(verdict)
         }
-        Err(error) => Err(error).with_context(|| format!("{label}, files in {}", cell.keep_files().display())),
+        Err(error) => {
+            Err(error).with_context(|| format!("{label}, files in {}", cell.keep_files().display()))
+        }
     }
 }
 
@@ -141,7 +208,11 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
         cell.until_standby().await?;
     }
     cell.open_doors().await?;
-    let mut voters = if scenario.votes { Some(Voters::connect(cell.brokers()).await?) } else { None };
+    let mut voters = if scenario.votes {
+        Some(Voters::connect(cell.brokers()).await?)
+    } else {
+        None
+    };
     let before = match &mut voters {
         Some(voters) => Some(voters.vote().await?),
         None => None,
@@ -157,7 +228,9 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
     }
     let after = voters.as_ref().and_then(Voters::newest);
     let reputations_changed = match (before, after) {
-        (Some(before), Some(after)) => after.epoch <= before.epoch || after.reputations != before.reputations,
+        (Some(before), Some(after)) => {
+            after.epoch <= before.epoch || after.reputations != before.reputations
+        }
         (before, after) => before.is_some() || after.is_some(),
     };
     if machine.is_starved() {
@@ -167,7 +240,13 @@ async fn perform(scenario: &Scenario, cell: &mut Cell) -> anyhow::Result<Verdict
     // Doors first: a node has written what its door has sent.
     let (doors, runs) = (cell.doors()?, cell.runs()?);
     let doors = judge_doors(&runs, &doors, &phases, cell.flooded());
-    Ok(Verdict { reputations_changed, is_void: machine.is_starved(), doors, flood, ..judge(&runs, &phases) })
+    Ok(Verdict {
+        reputations_changed,
+        is_void: machine.is_starved(),
+        doors,
+        flood,
+        ..judge(&runs, &phases)
+    })
 }
 
 fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
@@ -178,7 +257,10 @@ fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
                 Who::Leader => cell.leader(),
                 Who::Standby => cell.standby(),
             };
-            let victims = victims.iter().map(find).collect::<anyhow::Result<Vec<_>>>()?;
+            let victims = victims
+                .iter()
+                .map(find)
+                .collect::<anyhow::Result<Vec<_>>>()?;
             victims.into_iter().try_for_each(|victim| cell.kill(victim))
         }
         Fault::RestartEdge => cell.restart(EDGE),
@@ -197,32 +279,44 @@ fn apply(fault: Fault, cell: &mut Cell) -> anyhow::Result<()> {
 }
 
 fn phase(step: &Step, from: ecod::model::time::Timestamp, cell: &Cell) -> Phase {
-    let mut measured = if step.measured { cell.vehicles() } else { Default::default() };
+    let mut measured = if step.measured {
+        cell.vehicles()
+    } else {
+        Default::default()
+    };
     if let Some(unreached) = cell.unreached() {
         measured.remove(unreached);
     }
     let changes = step.changes.0..=step.changes.1;
-    Phase { from, until: clock::now(), changes, components: cell.components(), measured }
+    Phase {
+        from,
+        until: clock::now(),
+        changes,
+        components: cell.components(),
+        measured,
+    }
 }
 
 /// Why a scenario cannot be run here, if it cannot.
 fn lacking(needs: Needs) -> Option<&'static str> {
-    let namespaces = || (!network::has_namespaces()).then_some("network namespaces cannot be made here");
+    let namespaces =
+        || (!network::has_namespaces()).then_some("network namespaces cannot be made here");
     match needs {
         Needs::Loopback => None,
         Needs::Mosquitto | Needs::MosquittoAndFallback => {
             (!cell::has_mosquitto()).then_some("mosquitto is not installed")
         }
         Needs::Namespaces => namespaces(),
-        Needs::PacketFilter => {
-            namespaces().or_else(|| (!network::has_packet_filter()).then_some("nftables is not installed"))
-        }
+        Needs::PacketFilter => namespaces()
+            .or_else(|| (!network::has_packet_filter()).then_some("nftables is not installed")),
     }
 }
 
 /// The parts of a list in the environment.
 fn filter(key: &str) -> Option<Vec<String>> {
-    let list = std::env::var(key).ok().filter(|list| !list.trim().is_empty())?;
+    let list = std::env::var(key)
+        .ok()
+        .filter(|list| !list.trim().is_empty())?;
     Some(list.split(',').map(|item| item.trim().to_owned()).collect())
 }
 
@@ -235,5 +329,7 @@ fn write(outcomes: &[Outcome]) -> anyhow::Result<()> {
 /// Where a file of results belongs.
 fn target_file(name: &str) -> PathBuf {
     let target = std::env::var_os("CARGO_TARGET_DIR").map(PathBuf::from);
-    target.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../target")).join(name)
+    target
+        .unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../target"))
+        .join(name)
 }

@@ -23,7 +23,8 @@ pub(crate) struct Bridged {
 /// True if namespaces can be made here.
 pub(crate) fn has_namespaces() -> bool {
     let probe = namespace(usize::MAX);
-    let made = ip(&["netns", "add", &probe]).and_then(|()| ip(&["link", "add", &bridge('p'), "type", "bridge"]));
+    let made = ip(&["netns", "add", &probe])
+        .and_then(|()| ip(&["link", "add", &bridge('p'), "type", "bridge"]));
     let _ = ip(&["link", "delete", &bridge('p')]);
     let _ = ip(&["netns", "delete", &probe]);
     made.is_ok()
@@ -31,7 +32,12 @@ pub(crate) fn has_namespaces() -> bool {
 
 /// True if packets can be dropped at random here.
 pub(crate) fn has_packet_filter() -> bool {
-    Command::new("nft").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
+    Command::new("nft")
+        .arg("--version")
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .status()
+        .is_ok_and(|s| s.success())
 }
 
 impl Bridged {
@@ -39,16 +45,40 @@ impl Bridged {
     pub(crate) fn new(nodes: usize) -> anyhow::Result<Self> {
         let network = Self { nodes };
         for side in ['a', 'b'] {
-            ip(&["link", "add", &bridge(side), "type", "bridge", "mcast_snooping", "0"])?;
+            ip(&[
+                "link",
+                "add",
+                &bridge(side),
+                "type",
+                "bridge",
+                "mcast_snooping",
+                "0",
+            ])?;
             ip(&["link", "set", &bridge(side), "up"])?;
         }
-        ip(&["address", "add", &format!("{HARNESS}/24"), "dev", &bridge('a')])?;
+        ip(&[
+            "address",
+            "add",
+            &format!("{HARNESS}/24"),
+            "dev",
+            &bridge('a'),
+        ])?;
         for node in 0..nodes {
             let (space, port) = (namespace(node), port(node));
             ip(&["netns", "add", &space])?;
-            ip(&["link", "add", &port, "type", "veth", "peer", "name", "eth0", "netns", &space])?;
+            ip(&[
+                "link", "add", &port, "type", "veth", "peer", "name", "eth0", "netns", &space,
+            ])?;
             ip(&["link", "set", &port, "master", &bridge('a'), "up"])?;
-            ip(&["-n", &space, "address", "add", &format!("{}/24", address(node)), "dev", "eth0"])?;
+            ip(&[
+                "-n",
+                &space,
+                "address",
+                "add",
+                &format!("{}/24", address(node)),
+                "dev",
+                "eth0",
+            ])?;
             ip(&["-n", &space, "link", "set", "lo", "up"])?;
             ip(&["-n", &space, "link", "set", "eth0", "up"])?;
             ip(&["-n", &space, "route", "add", "224.0.0.0/4", "dev", "eth0"])?;
@@ -82,7 +112,9 @@ impl Bridged {
             "delete table inet trials\n".to_owned()
         } else {
             let rule = format!("iifname \"eth0\" numgen random mod 100 < {percent} drop");
-            format!("table inet trials {{\nchain input {{\ntype filter hook input priority 0; {rule}; }}\n}}\n")
+            format!(
+                "table inet trials {{\nchain input {{\ntype filter hook input priority 0; {rule}; }}\n}}\n"
+            )
         };
         (0..self.nodes).try_for_each(|node| nft(&namespace(node), &rules))
     }
@@ -125,18 +157,29 @@ fn ip(arguments: &[&str]) -> anyhow::Result<()> {
 }
 
 fn nft(namespace: &str, rules: &str) -> anyhow::Result<()> {
-    run(Command::new("ip").args(["netns", "exec", namespace, "nft", "-f", "-"]), rules)
+    run(
+        Command::new("ip").args(["netns", "exec", namespace, "nft", "-f", "-"]),
+        rules,
+    )
 }
 
 fn run(command: &mut Command, input: &str) -> anyhow::Result<()> {
-    command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
-    let mut child = command.spawn().with_context(|| format!("cannot run {command:?}"))?;
+    command
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped());
+    let mut child = command
+        .spawn()
+        .with_context(|| format!("cannot run {command:?}"))?;
     if let Some(mut stdin) = child.stdin.take() {
         stdin.write_all(input.as_bytes())?;
     }
     let output = child.wait_with_output()?;
     if !output.status.success() {
-        bail!("{command:?}: {}", String::from_utf8_lossy(&output.stderr).trim());
+        bail!(
+            "{command:?}: {}",
+            String::from_utf8_lossy(&output.stderr).trim()
+        );
     }
     Ok(())
 }

@@ -17,12 +17,18 @@ impl Ports {
     /// Starts somewhere else in every process.
     pub(crate) fn new() -> Self {
         let span = u32::from(Self::LAST - Self::FIRST);
-        Self { next: Self::FIRST + (clock::now().micros() as u32 % span) as u16 }
+        Self {
+            next: Self::FIRST + (clock::now().micros() as u32 % span) as u16,
+        }
     }
 
     pub(crate) fn free(&mut self) -> anyhow::Result<u16> {
         for _ in Self::FIRST..Self::LAST {
-            self.next = if self.next >= Self::LAST { Self::FIRST } else { self.next + 1 };
+            self.next = if self.next >= Self::LAST {
+                Self::FIRST
+            } else {
+                self.next + 1
+            };
             let address = (Ipv4Addr::LOCALHOST, self.next);
             if TcpListener::bind(address).is_ok() && UdpSocket::bind(address).is_ok() {
                 return Ok(self.next);

@@ -25,14 +25,19 @@ pub(crate) fn command(program: &Path, namespace: Option<&str>) -> Command {
         None => Command::new("setpriv"),
     };
     command.args(["--pdeathsig", "KILL", "--"]).arg(program);
-    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    command
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null());
     command
 }
 
 impl Process {
     /// Starts the command. Must be called on the thread that lives as long as the harness: the process ends with it.
     pub(crate) fn start(command: &mut Command) -> anyhow::Result<Self> {
-        let child = command.spawn().with_context(|| format!("cannot start {:?}", command.get_program()))?;
+        let child = command
+            .spawn()
+            .with_context(|| format!("cannot start {:?}", command.get_program()))?;
         Ok(Self { child })
     }
 

@@ -141,13 +141,19 @@ pub(crate) const SCENARIOS: [Scenario; 13] = [
     Scenario {
         name: "edge_sigkill_door_flood",
         least_nodes: 3,
-        script: &[step(Fault::FloodStandby, 3, (0, 0)), measured(Fault::Kill(&[Who::Edge]), 3, (1, 1))],
+        script: &[
+            step(Fault::FloodStandby, 3, (0, 0)),
+            measured(Fault::Kill(&[Who::Edge]), 3, (1, 1)),
+        ],
         gap: GapBar::Killed,
         ..BASE
     },
     Scenario {
         name: "edge_sigstop_sigcont",
-        script: &[measured(Fault::PauseEdge, 3, (1, 1)), step(Fault::ResumeEdge, 9, (1, 2))],
+        script: &[
+            measured(Fault::PauseEdge, 3, (1, 1)),
+            step(Fault::ResumeEdge, 9, (1, 2)),
+        ],
         gap: GapBar::Silent,
         ..BASE
     },
@@ -168,7 +174,10 @@ pub(crate) const SCENARIOS: [Scenario; 13] = [
     },
     Scenario {
         name: "edge_restart",
-        script: &[step(Fault::Kill(&[Who::Edge]), 2, (1, 1)), measured(Fault::RestartEdge, 8, (1, 1))],
+        script: &[
+            step(Fault::Kill(&[Who::Edge]), 2, (1, 1)),
+            measured(Fault::RestartEdge, 8, (1, 1)),
+        ],
         seamless: true,
         ..BASE
     },
@@ -193,11 +202,18 @@ pub(crate) const SCENARIOS: [Scenario; 13] = [
         gap: GapBar::Killed,
         ..BASE
     },
-    Scenario { name: "six_busy_loops", script: &[measured(Fault::Busy(6), 10, (0, 0))], ..BASE },
+    Scenario {
+        name: "six_busy_loops",
+        script: &[measured(Fault::Busy(6), 10, (0, 0))],
+        ..BASE
+    },
     Scenario {
         name: "split_and_heal",
         needs: Needs::Namespaces,
-        script: &[measured(Fault::Split, 4, (1, 1)), step(Fault::Heal(Cure::Split), 10, (0, 2))],
+        script: &[
+            measured(Fault::Split, 4, (1, 1)),
+            step(Fault::Heal(Cure::Split), 10, (0, 2)),
+        ],
         gap: GapBar::Silent,
         ..BASE
     },
@@ -205,21 +221,35 @@ pub(crate) const SCENARIOS: [Scenario; 13] = [
         name: "one_way_loss",
         needs: Needs::Namespaces,
         least_nodes: 3,
-        script: &[measured(Fault::CutOneWay, 6, (0, 2)), step(Fault::Heal(Cure::OneWay), 10, (0, 2))],
+        script: &[
+            measured(Fault::CutOneWay, 6, (0, 2)),
+            step(Fault::Heal(Cure::OneWay), 10, (0, 2)),
+        ],
         ..BASE
     },
     Scenario {
         name: "loss_20_percent",
         needs: Needs::PacketFilter,
-        script: &[measured(Fault::Lose(20), 10, (0, 0)), step(Fault::Heal(Cure::Loss), 4, (0, 0))],
+        script: &[
+            measured(Fault::Lose(20), 10, (0, 0)),
+            step(Fault::Heal(Cure::Loss), 4, (0, 0)),
+        ],
         ..BASE
     },
 ];
 
 const fn step(fault: Fault, seconds: u64, changes: (usize, usize)) -> Step {
-    Step { fault, watch: Duration::from_secs(seconds), changes, measured: false }
+    Step {
+        fault,
+        watch: Duration::from_secs(seconds),
+        changes,
+        measured: false,
+    }
 }
 
 const fn measured(fault: Fault, seconds: u64, changes: (usize, usize)) -> Step {
-    Step { measured: true, ..step(fault, seconds, changes) }
+    Step {
+        measured: true,
+        ..step(fault, seconds, changes)
+    }
 }

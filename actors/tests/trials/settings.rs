@@ -16,13 +16,20 @@ pub(crate) struct Addresses {
 }
 
 /// Addresses of a node: free ports on loopback, or fixed ones in a namespace.
-pub(crate) fn addresses(ports: &mut Ports, node: usize, bridged: bool) -> anyhow::Result<Addresses> {
+pub(crate) fn addresses(
+    ports: &mut Ports,
+    node: usize,
+    bridged: bool,
+) -> anyhow::Result<Addresses> {
     let (ip, broker, gossip) = if bridged {
         (network::address(node), 1883, 17_884)
     } else {
         (Ipv4Addr::LOCALHOST, ports.free()?, ports.free()?)
     };
-    Ok(Addresses { broker: (ip, broker).into(), gossip: (ip, gossip).into() })
+    Ok(Addresses {
+        broker: (ip, broker).into(),
+        gossip: (ip, gossip).into(),
+    })
 }
 
 /// The cell's name.
@@ -57,8 +64,16 @@ pub(crate) fn configuration(
         _ if is_cav(plan.nodes, index) => "cav",
         _ => "auto",
     };
-    let seeds: Vec<_> = all.iter().take(3).map(|seed| format!("\"{}\"", seed.gossip)).collect();
-    let seeds = if plan.bridged { String::new() } else { seeds.join(", ") };
+    let seeds: Vec<_> = all
+        .iter()
+        .take(3)
+        .map(|seed| format!("\"{}\"", seed.gossip))
+        .collect();
+    let seeds = if plan.bridged {
+        String::new()
+    } else {
+        seeds.join(", ")
+    };
     let mut text = format!(
         "name = \"{name}\"\ncell = \"{CELL}\"\nrole = \"{role}\"\nlisten = \"{}\"\nstate_dir = \"state\"\n\n\
          [membership]\nkey = \"a key for trials\"\nbind = \"{}\"\nseeds = [{seeds}]\n\n\
@@ -67,7 +82,11 @@ pub(crate) fn configuration(
         own.broker, own.gossip, plan.bridged
     );
     if let Some(broker) = broker {
-        let _ = write!(text, "\n[mqtt]\nbroker = \"{broker}\"\nfallback_to_embedded = {}\n", plan.fallback);
+        let _ = write!(
+            text,
+            "\n[mqtt]\nbroker = \"{broker}\"\nfallback_to_embedded = {}\n",
+            plan.fallback
+        );
     }
     if index != EDGE {
         let (frames, detections) = (shared.join("frames"), shared.join("detections.jsonl"));

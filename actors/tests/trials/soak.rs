@@ -71,15 +71,29 @@ struct Minute {
 }
 
 async fn run() -> anyhow::Result<()> {
-    let (minutes, nodes, seed) = (setting("MINUTES", 30)?, setting("NODES", 32)? as usize, setting("SEED", 1)?);
+    let (minutes, nodes, seed) = (
+        setting("MINUTES", 30)?,
+        setting("NODES", 32)? as usize,
+        setting("SEED", 1)?,
+    );
     if nodes < disturbance::LEAST_NODES {
-        bail!("NODES={nodes}: a soak takes {} or more", disturbance::LEAST_NODES);
+        bail!(
+            "NODES={nodes}: a soak takes {} or more",
+            disturbance::LEAST_NODES
+        );
     }
     let bridged = network::has_namespaces() && network::has_packet_filter();
     if !bridged {
         println!("no splits and no losses: network namespaces or nftables are missing here");
     }
-    let plan = Plan { nodes, edge: true, external_broker: false, fallback: false, bridged, votes: true };
+    let plan = Plan {
+        nodes,
+        edge: true,
+        external_broker: false,
+        fallback: false,
+        bridged,
+        votes: true,
+    };
     let mut cell = Cell::start(&plan)?;
     let outcome = pass(&mut cell, minutes, seed, bridged).await;
     match outcome {
@@ -88,9 +102,15 @@ async fn run() -> anyhow::Result<()> {
             if failures.is_empty() {
                 return Ok(());
             }
-            bail!("{}; files in {}", failures.join("; "), cell.keep_files().display())
+            bail!(
+                "{}; files in {}",
+                failures.join("; "),
+                cell.keep_files().display()
+            )
         }
-        Err(error) => Err(error).with_context(|| format!("files in {}", cell.keep_files().display())),
+        Err(error) => {
+            Err(error).with_context(|| format!("files in {}", cell.keep_files().display()))
+        }
     }
 }
 
@@ -126,7 +146,10 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
             largest,
             span: (from, clock::now()),
         };
-        println!("minute {number} of {minutes}: {disturbance}; {}", tell(&minute));
+        println!(
+            "minute {number} of {minutes}: {disturbance}; {}",
+            tell(&minute)
+        );
         past.push(minute);
     }
     drop(intruder);
@@ -135,7 +158,9 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
     for minute in &mut past {
         minute.longest_gap_ms = longest_gap(&runs, minute.span).as_millis() as u64;
     }
-    let growing = series.iter().filter_map(|(process, series)| Some(format!("{process}: {}", series.growth()?)));
+    let growing = series
+        .iter()
+        .filter_map(|(process, series)| Some(format!("{process}: {}", series.growth()?)));
     let accepted = || runs.iter().flat_map(|run| &run.accepted);
     Ok(Summary {
         nodes: cell.nodes(),
@@ -144,11 +169,21 @@ async fn pass(cell: &mut Cell, minutes: u64, seed: u64, bridged: bool) -> anyhow
         stale_accepted: runs.iter().map(stale).sum(),
         forged_accepted,
         accepted_older_than_1_s: accepted().filter(|map| map.age() > MAX_AGE).count(),
-        oldest_accepted_ms: accepted().map(Accepted::age).max().unwrap_or_default().as_millis() as u64,
-        unrecovered_minutes: past.iter().filter(|minute| minute.recovered_after_ms.is_none()).count(),
+        oldest_accepted_ms: accepted()
+            .map(Accepted::age)
+            .max()
+            .unwrap_or_default()
+            .as_millis() as u64,
+        unrecovered_minutes: past
+            .iter()
+            .filter(|minute| minute.recovered_after_ms.is_none())
+            .count(),
         watched_for_growth: series.values().filter(|series| series.is_telling()).count(),
         growing: growing.collect(),
-        largest: past.iter().map(|minute| minute.largest).fold(Resources::default(), Resources::max),
+        largest: past
+            .iter()
+            .map(|minute| minute.largest)
+            .fold(Resources::default(), Resources::max),
         minutes: past,
     })
 }
@@ -158,7 +193,8 @@ fn take_out_forged(runs: &mut [NodeRun]) -> usize {
     let nodes: BTreeSet<_> = runs.iter().map(|run| run.node.clone()).collect();
     let all = |runs: &[NodeRun]| runs.iter().map(|run| run.accepted.len()).sum::<usize>();
     let before = all(runs);
-    runs.iter_mut().for_each(|run| run.accepted.retain(|map| nodes.contains(&map.epoch.leader)));
+    runs.iter_mut()
+        .for_each(|run| run.accepted.retain(|map| nodes.contains(&map.epoch.leader)));
     before - all(runs)
 }
 
@@ -166,9 +202,13 @@ fn take_out_forged(runs: &mut [NodeRun]) -> usize {
 fn longest_gap(runs: &[NodeRun], (from, until): (Timestamp, Timestamp)) -> Duration {
     let throughout = |run: &&NodeRun| {
         let first_and_last = run.accepted.first().zip(run.accepted.last());
-        first_and_last.is_some_and(|(first, last)| first.at <= from && until.since(last.at) < MINUTE / 60)
+        first_and_last
+            .is_some_and(|(first, last)| first.at <= from && until.since(last.at) < MINUTE / 60)
     };
-    let waits = runs.iter().filter(throughout).filter_map(|run| longest_wait(run, from, until));
+    let waits = runs
+        .iter()
+        .filter(throughout)
+        .filter_map(|run| longest_wait(run, from, until));
     waits.max().unwrap_or_default()
 }
 
@@ -177,16 +217,29 @@ fn tell(minute: &Minute) -> String {
         Some(ms) => format!("all well {:.1} s later", ms as f64 / 1000.0),
         None => "NOT RECOVERED".to_owned(),
     };
-    format!("{recovered}, {} leads; at most {}", minute.leader, minute.largest)
+    format!(
+        "{recovered}, {} leads; at most {}",
+        minute.leader, minute.largest
+    )
 }
 
 /// Prints and writes the summary; what went wrong, in words.
 fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
-    println!("\nminute  {:<44}{:>10}{:>12}  {:<8}largest", "disturbance", "gap ms", "well after", "leader");
+    println!(
+        "\nminute  {:<44}{:>10}{:>12}  {:<8}largest",
+        "disturbance", "gap ms", "well after", "leader"
+    );
     for (number, minute) in summary.minutes.iter().enumerate() {
-        let well = minute.recovered_after_ms.map_or_else(|| "never".to_owned(), |ms| format!("{ms} ms"));
+        let well = minute
+            .recovered_after_ms
+            .map_or_else(|| "never".to_owned(), |ms| format!("{ms} ms"));
         let (what, gap) = (&minute.disturbance, minute.longest_gap_ms);
-        println!("{:>6}  {what:<44}{gap:>10}{well:>12}  {:<8}{}", number + 1, minute.leader, minute.largest);
+        println!(
+            "{:>6}  {what:<44}{gap:>10}{well:>12}  {:<8}{}",
+            number + 1,
+            minute.leader,
+            minute.largest
+        );
     }
     println!(
         "\n{} nodes, {} minutes, seed {}: {} maps taken, {} of them superseded, {} forged, {} older than 1 s (the oldest {} ms); \
@@ -214,12 +267,18 @@ fn report(summary: &Summary) -> anyhow::Result<Vec<String>> {
         count("maps older than 1 s taken", summary.accepted_older_than_1_s),
         count("minutes unrecovered", summary.unrecovered_minutes),
     ];
-    Ok(counted.into_iter().flatten().chain(summary.growing.iter().cloned()).collect())
+    Ok(counted
+        .into_iter()
+        .flatten()
+        .chain(summary.growing.iter().cloned())
+        .collect())
 }
 
 fn setting(key: &str, default: u64) -> anyhow::Result<u64> {
     match std::env::var(key).ok().filter(|text| !text.is_empty()) {
-        Some(text) => text.parse().with_context(|| format!("{key}={text}: must be a whole number")),
+        Some(text) => text
+            .parse()
+            .with_context(|| format!("{key}={text}: must be a whole number")),
         None => Ok(default),
     }
 }

@@ -6,7 +6,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::ensure;
 use ecod::model::names::NodeName;
-use ecod::wire::{NodeStatus, ObjectReport, PerceivedObject, ReportKind, Reputations, Role, SCHEMA_VERSION};
+use ecod::wire::{
+    NodeStatus, ObjectReport, PerceivedObject, ReportKind, Reputations, Role, SCHEMA_VERSION,
+};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::messages::gateway::GatewayMessage;
 use ecod_actors::platform::clock;
@@ -39,8 +41,12 @@ impl Voters {
     pub(crate) async fn connect(brokers: Vec<SocketAddr>) -> anyhow::Result<Self> {
         let newest: Arc<Mutex<Option<Arc<Reputations>>>> = Arc::default();
         let kept = Arc::clone(&newest);
-        let status =
-            NodeStatus::starting(NodeName::from_static("voters"), Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
+        let status = NodeStatus::starting(
+            NodeName::from_static("voters"),
+            Uuid::now_v7(),
+            Role::Cav,
+            env!("CARGO_PKG_VERSION"),
+        );
         let arguments = GatewayArguments {
             cell: NodeName::from_static(CELL),
             role: SubscriptionRole::Follower,
@@ -58,8 +64,14 @@ impl Voters {
             looks_on: false,
         };
         let (gateway, _) = Actor::spawn(None, Gateway, arguments).await?;
-        gateway.cast(GatewayMessage::SetBrokers { addresses: brokers.into_iter().map(Into::into).collect() })?;
-        Ok(Self { gateway, newest, seq: 0 })
+        gateway.cast(GatewayMessage::SetBrokers {
+            addresses: brokers.into_iter().map(Into::into).collect(),
+        })?;
+        Ok(Self {
+            gateway,
+            newest,
+            seq: 0,
+        })
     }
 
     /// Votes for a while, lets the votes settle, and gives the reputations that came of them.
@@ -69,7 +81,10 @@ impl Voters {
             self.seq += 1;
             for (node, label) in VOTES {
                 let report = Arc::new(vote(NodeName::from_static(node), label, self.seq));
-                self.gateway.cast(GatewayMessage::PublishReport { kind: ReportKind::VoteDetections, report })?;
+                self.gateway.cast(GatewayMessage::PublishReport {
+                    kind: ReportKind::VoteDetections,
+                    report,
+                })?;
             }
             tokio::time::sleep(VOTE_PERIOD).await;
         }
@@ -78,11 +93,19 @@ impl Voters {
         loop {
             tokio::time::sleep(SETTLING).await;
             let after = self.newest();
-            let has_settled = before.zip(after.as_ref()).is_some_and(|(b, a)| b.reputations == a.reputations);
-            if let Some(reputations) = after.as_ref().filter(|after| has_settled && is_unmasked(after)) {
+            let has_settled = before
+                .zip(after.as_ref())
+                .is_some_and(|(b, a)| b.reputations == a.reputations);
+            if let Some(reputations) = after
+                .as_ref()
+                .filter(|after| has_settled && is_unmasked(after))
+            {
                 return Ok(reputations.clone());
             }
-            ensure!(ended.elapsed() < PATIENCE, "the votes did not become reputations: {after:?}");
+            ensure!(
+                ended.elapsed() < PATIENCE,
+                "the votes did not become reputations: {after:?}"
+            );
             before = after;
         }
     }
@@ -101,20 +124,30 @@ impl Drop for Voters {
 
 fn is_unmasked(reputations: &Reputations) -> bool {
     let told = |node| reputations.reputations.get(&NodeName::from_static(node));
-    told("liar").is_some_and(|liar| liar.incorrect > 0) && told("euclid").is_some_and(|euclid| euclid.correct > 0)
+    told("liar").is_some_and(|liar| liar.incorrect > 0)
+        && told("euclid").is_some_and(|euclid| euclid.correct > 0)
 }
 
 fn keep(newest: &mut Option<Arc<Reputations>>, reputations: Arc<Reputations>) {
     let order = |r: &Reputations| (r.epoch, r.round);
-    if newest.as_ref().is_none_or(|known| order(known) <= order(&reputations)) {
+    if newest
+        .as_ref()
+        .is_none_or(|known| order(known) <= order(&reputations))
+    {
         *newest = Some(reputations);
     }
 }
 
 fn vote(node: NodeName, label: &str, seq: u64) -> ObjectReport {
-    let object = PerceivedObject { landmark: Some(LANDMARK.into()), ..PerceivedObject::new(label, 0.9, 6.0, 0.0) };
+    let object = PerceivedObject {
+        landmark: Some(LANDMARK.into()),
+        ..PerceivedObject::new(label, 0.9, 6.0, 0.0)
+    };
     let (_schema, captured_at_us) = (SCHEMA_VERSION, clock::now());
-    ObjectReport { objects: vec![object], ..ObjectReport::new(node, seq, captured_at_us) }
+    ObjectReport {
+        objects: vec![object],
+        ..ObjectReport::new(node, seq, captured_at_us)
+    }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

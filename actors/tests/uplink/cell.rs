@@ -14,8 +14,12 @@ use ecod_actors::transport::mqtt::BrokerAddress;
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 /// The place of the first cell; others are some metres from it.
-pub(crate) const ORIGIN: GeographicOrigin =
-    GeographicOrigin { latitude_deg: 52.2, longitude_deg: 21.0, height_m: 100.0, rotation_deg: 0.0 };
+pub(crate) const ORIGIN: GeographicOrigin = GeographicOrigin {
+    latitude_deg: 52.2,
+    longitude_deg: 21.0,
+    height_m: 100.0,
+    rotation_deg: 0.0,
+};
 
 /// An edge on loopback alone that leads a cell without known locations.
 pub(crate) fn config(cell: &'static str, broker: BrokerAddress) -> NodeConfig {
@@ -42,12 +46,19 @@ pub(crate) async fn start(config: NodeConfig) -> NodeHandle {
 
 /// The round of the node's newest map.
 pub(crate) fn round(node: &NodeHandle) -> u64 {
-    node.newest_map().borrow().as_ref().map_or(0, |newest| newest.map.round)
+    node.newest_map()
+        .borrow()
+        .as_ref()
+        .map_or(0, |newest| newest.map.round)
 }
 
 /// The present trouble of a kind.
 pub(crate) fn trouble(node: &NodeHandle, kind: &str) -> Option<Trouble> {
-    node.counters().troubles().present().into_iter().find(|trouble| trouble.kind == kind)
+    node.counters()
+        .troubles()
+        .present()
+        .into_iter()
+        .find(|trouble| trouble.kind == kind)
 }
 
 /// Lets time pass until it holds.
@@ -57,5 +68,7 @@ pub(crate) async fn until(what: &str, holds: impl AsyncFn() -> bool) {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    tokio::time::timeout(PATIENCE, reached).await.unwrap_or_else(|_| panic!("not within {PATIENCE:?}: {what}"));
+    tokio::time::timeout(PATIENCE, reached)
+        .await
+        .unwrap_or_else(|_| panic!("not within {PATIENCE:?}: {what}"));
 }

@@ -43,9 +43,17 @@ async fn a_region_gets_maps_at_their_rate_and_keeps_status_and_description() {
         let mean = last.since(*first).as_secs_f64() / 10.0;
         eprintln!("{}: {:.3} s from map to map", broker.name(), mean);
         assert!((0.4..1.0).contains(&mean), "{mean}");
-        assert!(maps.iter().all(|(message, _)| message.origin == ORIGIN && message.map.aggregator.as_str() == "edge"));
+        assert!(
+            maps.iter().all(|(message, _)| message.origin == ORIGIN
+                && message.map.aggregator.as_str() == "edge")
+        );
         let tile = Quadkey::of_cell(&ORIGIN);
-        assert!(subscriber.heard().iter().all(|heard| heard.topic.tile == tile));
+        assert!(
+            subscriber
+                .heard()
+                .iter()
+                .all(|heard| heard.topic.tile == tile)
+        );
 
         let late = Subscriber::new(&broker.address());
         let has_both = || late.status("north").is_some() && late.description("north").is_some();
@@ -53,13 +61,22 @@ async fn a_region_gets_maps_at_their_rate_and_keeps_status_and_description() {
         let retained = late.heard().into_iter().filter(|heard| heard.is_retained);
         assert_eq!(retained.count(), 2, "maps are not kept");
         let status = late.status("north").unwrap();
-        assert_eq!((status.state, status.node.as_str()), (NodeState::Aggregating, "edge"));
+        assert_eq!(
+            (status.state, status.node.as_str()),
+            (NodeState::Aggregating, "edge")
+        );
         assert_eq!(late.description("north").unwrap().text, description);
 
         let counters = node.counters().clone();
-        assert!(counters.events(Event::RegionPublished) >= 11 && counters.events(Event::CellMapAccepted) == 0);
+        assert!(
+            counters.events(Event::RegionPublished) >= 11
+                && counters.events(Event::CellMapAccepted) == 0
+        );
         node.stop().await;
-        let offline = || late.status("north").is_some_and(|status| status.state == NodeState::Offline);
+        let offline = || {
+            late.status("north")
+                .is_some_and(|status| status.state == NodeState::Offline)
+        };
         until("the stopped node's last status", async || offline()).await;
         tokio::time::sleep(Duration::from_millis(50)).await;
     }

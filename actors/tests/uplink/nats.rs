@@ -23,11 +23,16 @@ impl Nats {
 
     /// Admits only this user.
     pub(crate) fn with_user(user: &str, password: &str) -> Self {
-        Self::configured(&format!("authorization {{ users = [ {{ user: {user}, password: \"{password}\" }} ] }}\n"))
+        Self::configured(&format!(
+            "authorization {{ users = [ {{ user: {user}, password: \"{password}\" }} ] }}\n"
+        ))
     }
 
     fn configured(settings: &str) -> Self {
-        assert!(Path::new(PROGRAM).exists(), "{PROGRAM} is missing: install Debian's package nats-server");
+        assert!(
+            Path::new(PROGRAM).exists(),
+            "{PROGRAM} is missing: install Debian's package nats-server"
+        );
         let directory = tempfile::tempdir().unwrap();
         // With MQTT it needs a name and JetStream. Port -1 is any free one.
         let text = format!(
@@ -36,7 +41,11 @@ impl Nats {
         );
         std::fs::write(directory.path().join("settings.conf"), text).unwrap();
         let (child, port) = spawn(directory.path(), None);
-        Self { child, directory, port }
+        Self {
+            child,
+            directory,
+            port,
+        }
     }
 
     pub(crate) fn address(&self) -> BrokerAddress {
@@ -68,20 +77,35 @@ fn spawn(directory: &Path, port: Option<u16>) -> (Child, u16) {
     let text = std::fs::read_to_string(&settings).unwrap();
     let port = port.map_or_else(|| "-1".to_owned(), |port| port.to_string());
     let file = directory.join("nats.conf");
-    std::fs::write(&file, format!("{text}mqtt {{ host: 127.0.0.1, port: {port} }}\n")).unwrap();
+    std::fs::write(
+        &file,
+        format!("{text}mqtt {{ host: 127.0.0.1, port: {port} }}\n"),
+    )
+    .unwrap();
     std::fs::remove_file(&log).ok();
     let mut command = Command::new(PROGRAM);
-    command.arg("-c").arg(&file).arg("-l").arg(&log).stdout(Stdio::null()).stderr(Stdio::null());
+    command
+        .arg("-c")
+        .arg(&file)
+        .arg("-l")
+        .arg(&log)
+        .stdout(Stdio::null())
+        .stderr(Stdio::null());
     let mut child = command.spawn().unwrap();
     let deadline = Instant::now() + Duration::from_secs(20);
     loop {
         let said = std::fs::read_to_string(&log).unwrap_or_default();
-        let listens = said.lines().find_map(|line| line.split_once("Listening for MQTT clients on mqtt://127.0.0.1:"));
+        let listens = said
+            .lines()
+            .find_map(|line| line.split_once("Listening for MQTT clients on mqtt://127.0.0.1:"));
         if let Some((_, port)) = listens.filter(|_| said.contains("Server is ready")) {
             return (child, port.trim().parse().unwrap());
         }
         let ended = child.try_wait().unwrap();
-        assert!(ended.is_none() && Instant::now() < deadline, "nats-server does not listen: {said}");
+        assert!(
+            ended.is_none() && Instant::now() < deadline,
+            "nats-server does not listen: {said}"
+        );
         std::thread::sleep(Duration::from_millis(10));
     }
 }

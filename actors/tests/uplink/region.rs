@@ -8,8 +8,8 @@ use bytes::Bytes;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, CellMap, CellReputation, Limits, NodeStatus, Payload, RegionTopic, RegionTopicKind,
-    ReputationTopic, decode,
+    CellDescription, CellMap, CellReputation, Limits, NodeStatus, Payload, RegionTopic,
+    RegionTopicKind, ReputationTopic, decode,
 };
 use ecod_actors::platform::clock;
 use ecod_actors::transport::mqtt::BrokerAddress;
@@ -28,11 +28,17 @@ pub(crate) enum Broker {
 
 impl Broker {
     pub(crate) fn both() -> [Self; 2] {
-        [Self::Mosquitto(Mosquitto::start()), Self::Nats(Nats::start())]
+        [
+            Self::Mosquitto(Mosquitto::start()),
+            Self::Nats(Nats::start()),
+        ]
     }
 
     pub(crate) fn both_with_user(user: &str, password: &str) -> [Self; 2] {
-        [Self::Mosquitto(Mosquitto::with_user(user, password)), Self::Nats(Nats::with_user(user, password))]
+        [
+            Self::Mosquitto(Mosquitto::with_user(user, password)),
+            Self::Nats(Nats::with_user(user, password)),
+        ]
     }
 
     pub(crate) fn name(&self) -> &'static str {
@@ -91,28 +97,46 @@ pub(crate) struct Subscriber {
 
 impl Subscriber {
     pub(crate) fn new(broker: &BrokerAddress) -> Self {
-        let mut options = MqttOptions::new(Uuid::new_v4().simple().to_string(), broker.host(), broker.port());
+        let mut options = MqttOptions::new(
+            Uuid::new_v4().simple().to_string(),
+            broker.host(),
+            broker.port(),
+        );
         options.set_keep_alive(Duration::from_secs(60));
         let (client, mut events) = AsyncClient::new(options, 64);
         let heard = Arc::<Mutex<Vec<Heard>>>::default();
         let reputations = Arc::<Mutex<BTreeMap<_, _>>>::default();
-        let (list, words, subscriber) = (Arc::clone(&heard), Arc::clone(&reputations), client.clone());
+        let (list, words, subscriber) =
+            (Arc::clone(&heard), Arc::clone(&reputations), client.clone());
         let task = tokio::spawn(async move {
             loop {
                 match events.poll().await {
                     Ok(Event::Incoming(Incoming::ConnAck(_))) => {
-                        subscriber.try_subscribe("ecod/v1/geo/#", QoS::AtMostOnce).unwrap();
-                        subscriber.try_subscribe("ecod/v1/rep/#", QoS::AtMostOnce).unwrap();
+                        subscriber
+                            .try_subscribe("ecod/v1/geo/#", QoS::AtMostOnce)
+                            .unwrap();
+                        subscriber
+                            .try_subscribe("ecod/v1/rep/#", QoS::AtMostOnce)
+                            .unwrap();
                     }
-                    Ok(Event::Incoming(Incoming::Publish(publish))) if !publish.payload.is_empty() => {
+                    Ok(Event::Incoming(Incoming::Publish(publish)))
+                        if !publish.payload.is_empty() =>
+                    {
                         if ReputationTopic::parse(&publish.topic).is_some() {
                             let word = decode(&publish.payload, &Limits::default()).unwrap();
                             words.lock().unwrap().insert(publish.topic.clone(), word);
                         }
                         // Junk of a test's own is none of a cell's.
-                        let Some(topic) = RegionTopic::parse(&publish.topic) else { continue };
+                        let Some(topic) = RegionTopic::parse(&publish.topic) else {
+                            continue;
+                        };
                         let at = clock::now();
-                        let heard = Heard { topic, payload: publish.payload, is_retained: publish.retain, at };
+                        let heard = Heard {
+                            topic,
+                            payload: publish.payload,
+                            is_retained: publish.retain,
+                            at,
+                        };
                         list.lock().unwrap().push(heard);
                     }
                     Ok(_) => {}
@@ -120,7 +144,12 @@ impl Subscriber {
                 }
             }
         });
-        Self { heard, reputations, client, task }
+        Self {
+            heard,
+            reputations,
+            client,
+            task,
+        }
     }
 
     pub(crate) async fn publish(&self, topic: &RegionTopic, payload: impl Into<Vec<u8>>) {
@@ -128,12 +157,19 @@ impl Subscriber {
     }
 
     pub(crate) async fn publish_at(&self, topic: &str, payload: impl Into<Vec<u8>>) {
-        self.client.publish(topic, QoS::AtMostOnce, false, payload.into()).await.unwrap();
+        self.client
+            .publish(topic, QoS::AtMostOnce, false, payload.into())
+            .await
+            .unwrap();
     }
 
     /// The last counts of a cell about a vehicle.
     pub(crate) fn reputation(&self, vehicle: &str, cell: &str) -> Option<CellReputation> {
-        self.reputations.lock().unwrap().get(&format!("ecod/v1/rep/{vehicle}/{cell}")).cloned()
+        self.reputations
+            .lock()
+            .unwrap()
+            .get(&format!("ecod/v1/rep/{vehicle}/{cell}"))
+            .cloned()
     }
 
     pub(crate) fn heard(&self) -> Vec<Heard> {
@@ -144,7 +180,8 @@ impl Subscriber {
     pub(crate) fn maps(&self, cell: &str) -> Vec<(CellMap, Timestamp)> {
         let of_cell = |heard: &Heard| heard.topic.cell.as_str() == cell;
         let maps = self.heard().into_iter().filter(of_cell);
-        maps.filter_map(|heard| Some((heard.read(RegionTopicKind::Map)?, heard.at))).collect()
+        maps.filter_map(|heard| Some((heard.read(RegionTopicKind::Map)?, heard.at)))
+            .collect()
     }
 
     /// The last status of a cell's leader.
@@ -159,7 +196,11 @@ impl Subscriber {
 
     fn last<T: Payload>(&self, cell: &str, kind: RegionTopicKind) -> Option<T> {
         let heard = self.heard();
-        heard.iter().rev().filter(|heard| heard.topic.cell.as_str() == cell).find_map(|heard| heard.read(kind))
+        heard
+            .iter()
+            .rev()
+            .filter(|heard| heard.topic.cell.as_str() == cell)
+            .find_map(|heard| heard.read(kind))
     }
 }
 
@@ -171,14 +212,20 @@ impl Drop for Subscriber {
 
 /// The longest time between two maps.
 pub(crate) fn longest_gap(maps: &[(CellMap, Timestamp)]) -> Duration {
-    maps.windows(2).map(|pair| pair[1].1.since(pair[0].1)).max().unwrap_or_default()
+    maps.windows(2)
+        .map(|pair| pair[1].1.since(pair[0].1))
+        .max()
+        .unwrap_or_default()
 }
 
 /// The maps that subscribers take: each later than all before. Where two lead for a moment, the later epoch's count.
 pub(crate) fn in_order(maps: Vec<(CellMap, Timestamp)>) -> Vec<(CellMap, Timestamp)> {
     let mut taken: Vec<(CellMap, Timestamp)> = Vec::new();
     for (message, at) in maps {
-        if taken.last().is_none_or(|(last, _)| order(last) < order(&message)) {
+        if taken
+            .last()
+            .is_none_or(|(last, _)| order(last) < order(&message))
+        {
             taken.push((message, at));
         }
     }
@@ -186,13 +233,22 @@ pub(crate) fn in_order(maps: Vec<(CellMap, Timestamp)>) -> Vec<(CellMap, Timesta
 }
 
 fn order(message: &CellMap) -> (u64, NodeName, u64) {
-    (message.map.epoch, message.map.aggregator.clone(), message.map.round)
+    (
+        message.map.epoch,
+        message.map.aggregator.clone(),
+        message.map.round,
+    )
 }
 
 /// Maps come in the order of epoch and round, each once.
 #[track_caller]
 pub(crate) fn assert_in_order(maps: &[(CellMap, Timestamp)]) {
     for pair in maps.windows(2) {
-        assert!(order(&pair[0].0) < order(&pair[1].0), "{:?} after {:?}", order(&pair[1].0), order(&pair[0].0));
+        assert!(
+            order(&pair[0].0) < order(&pair[1].0),
+            "{:?} after {:?}",
+            order(&pair[1].0),
+            order(&pair[0].0)
+        );
     }
 }

@@ -20,13 +20,19 @@ const REACTION_S: f64 = 0.5;
 const DECELERATION_MPS2: f64 = 4.0;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let numbers: Vec<f64> = std::env::args().skip(1).map(|text| text.parse()).collect::<Result<_, _>>()?;
+    let numbers: Vec<f64> = std::env::args()
+        .skip(1)
+        .map(|text| text.parse())
+        .collect::<Result<_, _>>()?;
     let [x_m, y_m, heading_deg, speed_mps] = numbers[..] else {
         return Err("usage: brake_planner X_M Y_M HEADING_DEG SPEED_MPS".into());
     };
     let pose = WirePose::new(x_m, y_m, heading_deg.to_radians());
     let stopping_m = speed_mps * REACTION_S + speed_mps.powi(2) / (2.0 * DECELERATION_MPS2);
-    let cell = Cell::connect(Settings { part: "planner".into(), ..Settings::default() })?;
+    let cell = Cell::connect(Settings {
+        part: "planner".into(),
+        ..Settings::default()
+    })?;
     let mut said = "";
     for map in cell.maps().timeout(MISSING) {
         let (decision, reason) = match map {
@@ -52,11 +58,16 @@ fn distance_ahead(map: &GlobalMap, own: &NodeName, pose: WirePose) -> Option<f64
     let age_s = now().since(map.fused_at_us).min(MISSING).as_secs_f64();
     let (sin, cos) = pose.heading_rad.sin_cos();
     // Vehicles that report their pose are in the map, this one too, maybe by a part of it: `euclid--lidar`.
-    let others =
-        map.objects.iter().filter(|object| object.vehicle.as_ref().map(NodeName::vehicle).as_ref() != Some(own));
+    let others = map
+        .objects
+        .iter()
+        .filter(|object| object.vehicle.as_ref().map(NodeName::vehicle).as_ref() != Some(own));
     let ahead = others.filter_map(|object| {
         let [east, north] = object.velocity_mps.unwrap_or_default();
-        let (dx, dy) = (object.x_m + age_s * east - pose.x_m, object.y_m + age_s * north - pose.y_m);
+        let (dx, dy) = (
+            object.x_m + age_s * east - pose.x_m,
+            object.y_m + age_s * north - pose.y_m,
+        );
         let (along, aside) = (dx * cos + dy * sin, dy * cos - dx * sin);
         let width_m = object.size_m.map_or(0.0, |[_, width]| width);
         (along > 0.0 && aside.abs() <= HALF_WIDTH_M + width_m / 2.0).then_some(along)

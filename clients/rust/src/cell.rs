@@ -10,8 +10,8 @@ use ecod::model::names::{LandmarkId, NodeName, PART_MARK};
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, Encoding, FieldOfView, GlobalMap, Limits, NodeStatus, ObjectReport, PerceivedObject, ReportKind,
-    Reputations, Topics, Verdicts, WirePose, encode,
+    CellDescription, Encoding, FieldOfView, GlobalMap, Limits, NodeStatus, ObjectReport,
+    PerceivedObject, ReportKind, Reputations, Topics, Verdicts, WirePose, encode,
 };
 use rumqttc::Transport;
 use rumqttc::v5::MqttOptions;
@@ -85,7 +85,14 @@ pub struct Frame {
 impl Frame {
     /// Objects of a frame that was captured now.
     pub fn new(objects: Vec<PerceivedObject>) -> Self {
-        Self { captured_at: SystemTime::now(), objects, pose: None, seen: None, view: None, frame_yaw_rate_radps: None }
+        Self {
+            captured_at: SystemTime::now(),
+            objects,
+            pose: None,
+            seen: None,
+            view: None,
+            frame_yaw_rate_radps: None,
+        }
     }
 }
 
@@ -133,13 +140,21 @@ impl Cell {
     /// broker lets the program in within the timeout.
     pub fn connect(settings: Settings) -> Result<Self, Error> {
         let invalid = |error: &dyn std::fmt::Display| Error::Invalid(error.to_string());
-        let part = if settings.part.is_empty() { String::new() } else { format!("{PART_MARK}{}", settings.part) };
+        let part = if settings.part.is_empty() {
+            String::new()
+        } else {
+            format!("{PART_MARK}{}", settings.part)
+        };
         let name = NodeName::new(settings.node + &part).map_err(|error| invalid(&error))?;
         let cell = NodeName::new(&settings.cell).map_err(|error| invalid(&error))?;
         let default_port = if settings.tls.is_some() { 8883 } else { 1883 };
         let address = broker_address(&settings.broker, default_port)?;
         // With TLS the host is compared with the name in the certificate, which has no brackets.
-        let host = if settings.tls.is_some() { address.host().trim_matches(['[', ']']) } else { address.host() };
+        let host = if settings.tls.is_some() {
+            address.host().trim_matches(['[', ']'])
+        } else {
+            address.host()
+        };
         // With certificates a cell's broker takes ids of this form only, by which nobody ends another's session. Without,
         // it takes them for nodes'.
         let mut run = Uuid::new_v4().simple().to_string();
@@ -164,8 +179,19 @@ impl Cell {
             options.set_transport(Transport::tls_with_config(tls.client()?.into()));
         }
         let topics = Topics::new(&cell);
-        let shared = ConnectionState::connect(address.to_string(), topics.clone(), options, settings.timeout)?;
-        Ok(Self { name, topics, shared, sent: Default::default(), timeout: settings.timeout })
+        let shared = ConnectionState::connect(
+            address.to_string(),
+            topics.clone(),
+            options,
+            settings.timeout,
+        )?;
+        Ok(Self {
+            name,
+            topics,
+            shared,
+            sent: Default::default(),
+            timeout: settings.timeout,
+        })
     }
 
     /// The name in which the program reports.
@@ -217,8 +243,15 @@ impl Cell {
     /// [`Error::Silent`] if nothing comes within the timeout: a node always tells the programs beside it, other brokers have
     /// nothing in a cell without a description. [`Error::Refused`] when the broker refuses.
     pub fn description(&self) -> Result<Arc<CellDescription>, Error> {
-        let mut descriptions = self.read("cell", |streams| &streams.descriptions, true).timeout(self.timeout);
-        let closed = || Err(Error::Silent(format!("the connection to {} is closed", self.shared.at)));
+        let mut descriptions = self
+            .read("cell", |streams| &streams.descriptions, true)
+            .timeout(self.timeout);
+        let closed = || {
+            Err(Error::Silent(format!(
+                "the connection to {} is closed",
+                self.shared.at
+            )))
+        };
         descriptions.next().unwrap_or_else(closed)
     }
 
@@ -229,11 +262,16 @@ impl Cell {
     pub fn origin(&self) -> Result<Option<GeographicOrigin>, Error> {
         let description = self.description()?;
         let invalid = |error: &dyn std::fmt::Display| {
-            Error::Invalid(format!("the description of the cell has no usable [origin]: {error}"))
+            Error::Invalid(format!(
+                "the description of the cell has no usable [origin]: {error}"
+            ))
         };
         let settings: toml::Table = description.text.parse().map_err(|error| invalid(&error))?;
-        let Some(origin) = settings.get("origin") else { return Ok(None) };
-        let origin: GeographicOrigin = origin.clone().try_into().map_err(|error| invalid(&error))?;
+        let Some(origin) = settings.get("origin") else {
+            return Ok(None);
+        };
+        let origin: GeographicOrigin =
+            origin.clone().try_into().map_err(|error| invalid(&error))?;
         origin.validate().map_err(|error| invalid(&error))?;
         Ok(Some(origin))
     }
@@ -253,8 +291,14 @@ impl Cell {
     /// # Errors
     /// As [`Cell::report`], and when an object names no location.
     pub fn vote(&self, frame: Frame) -> Result<bool, Error> {
-        if let Some(place) = frame.objects.iter().position(|object| object.landmark.is_none()) {
-            return Err(Error::Invalid(format!("not sent: objects[{place}] names no landmark, as a vote must")));
+        if let Some(place) = frame
+            .objects
+            .iter()
+            .position(|object| object.landmark.is_none())
+        {
+            return Err(Error::Invalid(format!(
+                "not sent: objects[{place}] names no landmark, as a vote must"
+            )));
         }
         self.send(ReportKind::VoteDetections, frame)
     }
@@ -269,34 +313,60 @@ impl Cell {
         self.shared.close();
     }
 
-    fn read<M>(&self, level: &str, stream: fn(&Streams) -> &MessageStream<M>, is_retained: bool) -> Messages<M> {
+    fn read<M>(
+        &self,
+        level: &str,
+        stream: fn(&Streams) -> &MessageStream<M>,
+        is_retained: bool,
+    ) -> Messages<M> {
         let filter = self.topics.filter(level);
         let mut state = self.shared.state();
         state.subscribe(&filter);
-        let number = if is_retained { 0 } else { stream(&state.streams).number() };
+        let number = if is_retained {
+            0
+        } else {
+            stream(&state.streams).number()
+        };
         drop(state);
-        Messages { shared: Arc::clone(&self.shared), filter, stream, number, timeout: None }
+        Messages {
+            shared: Arc::clone(&self.shared),
+            filter,
+            stream,
+            number,
+            timeout: None,
+        }
     }
 
     fn send(&self, kind: ReportKind, frame: Frame) -> Result<bool, Error> {
         let since_epoch = frame.captured_at.duration_since(SystemTime::UNIX_EPOCH);
-        let since_epoch = since_epoch.map_err(|_| Error::Invalid("not sent: captured_at is before 1970".to_owned()))?;
-        let Ok(mut sent) = self.sent.lock() else { return Ok(false) };
-        let Some(seq) = sent.get_mut(kind as usize) else { return Ok(false) };
+        let since_epoch = since_epoch
+            .map_err(|_| Error::Invalid("not sent: captured_at is before 1970".to_owned()))?;
+        let Ok(mut sent) = self.sent.lock() else {
+            return Ok(false);
+        };
+        let Some(seq) = sent.get_mut(kind as usize) else {
+            return Ok(false);
+        };
         let report = ObjectReport {
             pose: frame.pose,
             objects: frame.objects,
             seen: frame.seen,
             view: frame.view,
             frame_yaw_rate_radps: frame.frame_yaw_rate_radps,
-            ..ObjectReport::new(self.name.clone(), *seq + 1, Timestamp::default() + since_epoch)
+            ..ObjectReport::new(
+                self.name.clone(),
+                *seq + 1,
+                Timestamp::default() + since_epoch,
+            )
         };
         check(&report)?;
         let payload = encode(&report, Encoding::Json);
         let (bytes, at_most) = (payload.len(), Limits::default().payload_bytes);
         if bytes > at_most {
             let objects = report.objects.len();
-            return Err(Error::Invalid(format!("not sent: {bytes} bytes with {objects} objects, at most {at_most}")));
+            return Err(Error::Invalid(format!(
+                "not sent: {bytes} bytes with {objects} objects, at most {at_most}"
+            )));
         }
         let is_sent = self.publish(&self.topics.path(&kind.topic(self.name.clone())), payload)?;
         *seq += 1;
@@ -350,10 +420,17 @@ impl<M> Iterator for Messages<M> {
             let remedy = match state.is_connected() {
                 false => "no connection",
                 // A status comes with a change alone.
-                true if self.number > 0 && self.filter.ends_with("/nodes/+") => "nothing has changed since the last",
+                true if self.number > 0 && self.filter.ends_with("/nodes/+") => {
+                    "nothing has changed since the last"
+                }
                 true => "does a node lead the cell of this name?",
             };
-            let silence = || format!("nothing on {} from {} for {waited:.1?}; {remedy}", self.filter, self.shared.at);
+            let silence = || {
+                format!(
+                    "nothing on {} from {} for {waited:.1?}; {remedy}",
+                    self.filter, self.shared.at
+                )
+            };
             if self.timeout.is_some_and(|timeout| waited >= timeout) {
                 return Some(Err(Error::Silent(silence())));
             }
@@ -361,9 +438,19 @@ impl<M> Iterator for Messages<M> {
                 is_told = true;
                 // Maps never end, and a lost connection has a remedy; vehicles and other stations may have nothing to say.
                 let is_fault = !state.is_connected() || self.filter.contains("/global_");
-                log::log!(if is_fault { log::Level::Warn } else { log::Level::Debug }, "{}", silence());
+                log::log!(
+                    if is_fault {
+                        log::Level::Warn
+                    } else {
+                        log::Level::Debug
+                    },
+                    "{}",
+                    silence()
+                );
             }
-            let left = self.timeout.map_or(PATIENCE, |timeout| timeout.saturating_sub(waited).min(PATIENCE));
+            let left = self.timeout.map_or(PATIENCE, |timeout| {
+                timeout.saturating_sub(waited).min(PATIENCE)
+            });
             state = self.shared.wait(state, left);
         }
         None
@@ -378,10 +465,17 @@ pub fn now() -> Timestamp {
 /// Checks a report, and names the object that is not allowed.
 fn check(report: &ObjectReport) -> Result<(), Error> {
     let limits = Limits::default();
-    let Err(reason) = report.validate(&limits) else { return Ok(()) };
+    let Err(reason) = report.validate(&limits) else {
+        return Ok(());
+    };
     let is_at_fault = |object: &PerceivedObject| {
         let alone = ObjectReport::new(report.node.clone(), report.seq, report.captured_at_us);
-        ObjectReport { objects: vec![object.clone()], ..alone }.validate(&limits).is_err()
+        ObjectReport {
+            objects: vec![object.clone()],
+            ..alone
+        }
+        .validate(&limits)
+        .is_err()
     };
     let place = report.objects.iter().position(is_at_fault);
     let whose = place.map_or_else(String::new, |place| format!("objects[{place}]: "));
@@ -391,7 +485,8 @@ fn check(report: &ObjectReport) -> Result<(), Error> {
 /// The parts of HOST:PORT; the port may be absent.
 fn broker_address(text: &str, default_port: u16) -> Result<BrokerAddress, Error> {
     let address = text.parse::<BrokerAddress>();
-    let address = address.or_else(|error| format!("{text}:{default_port}").parse().map_err(|_| error));
+    let address =
+        address.or_else(|error| format!("{text}:{default_port}").parse().map_err(|_| error));
     address.map_err(|error| Error::Invalid(error.to_string()))
 }
 
@@ -399,6 +494,17 @@ fn broker_address(text: &str, default_port: u16) -> Result<BrokerAddress, Error>
 fn host_name() -> String {
     let system = rustix::system::uname();
     let host = system.nodename().to_string_lossy();
-    let allowed = |c: char| if c.is_ascii_alphanumeric() || c == '_' { c } else { '-' };
-    host.split('.').next().unwrap_or_default().chars().map(allowed).collect()
+    let allowed = |c: char| {
+        if c.is_ascii_alphanumeric() || c == '_' {
+            c
+        } else {
+            '-'
+        }
+    };
+    host.split('.')
+        .next()
+        .unwrap_or_default()
+        .chars()
+        .map(allowed)
+        .collect()
 }

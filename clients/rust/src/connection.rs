@@ -69,13 +69,29 @@ impl ConnectionState {
         options: MqttOptions,
         timeout: Duration,
     ) -> Result<Arc<Self>, Error> {
-        let shared = Arc::new(Self { at, topics, state: Mutex::default(), changed: Condvar::new() });
+        let shared = Arc::new(Self {
+            at,
+            topics,
+            state: Mutex::default(),
+            changed: Condvar::new(),
+        });
         let thread = Arc::clone(&shared);
-        let spawned = thread::Builder::new().name("ecod-client".to_owned()).spawn(move || thread.run(&options));
-        spawned.map_err(|error| Error::Unreachable(format!("no thread for the connection: {error}")))?;
-        let waited = shared.changed.wait_timeout_while(shared.state(), timeout, |state| state.login.is_none());
+        let spawned = thread::Builder::new()
+            .name("ecod-client".to_owned())
+            .spawn(move || thread.run(&options));
+        spawned.map_err(|error| {
+            Error::Unreachable(format!("no thread for the connection: {error}"))
+        })?;
+        let waited = shared
+            .changed
+            .wait_timeout_while(shared.state(), timeout, |state| state.login.is_none());
         let (mut state, _) = waited.unwrap_or_else(PoisonError::into_inner);
-        let late = || Err(Error::Unreachable(format!("{} does not answer the login within {timeout:?}", shared.at)));
+        let late = || {
+            Err(Error::Unreachable(format!(
+                "{} does not answer the login within {timeout:?}",
+                shared.at
+            )))
+        };
         let login = state.login.clone().unwrap_or_else(late);
         state.is_closing = login.is_err();
         drop(state);
@@ -88,8 +104,15 @@ impl ConnectionState {
     }
 
     /// Waits for a change, for at most so long.
-    pub(crate) fn wait<'a>(&self, state: MutexGuard<'a, State>, patience: Duration) -> MutexGuard<'a, State> {
-        self.changed.wait_timeout(state, patience).unwrap_or_else(PoisonError::into_inner).0
+    pub(crate) fn wait<'a>(
+        &self,
+        state: MutexGuard<'a, State>,
+        patience: Duration,
+    ) -> MutexGuard<'a, State> {
+        self.changed
+            .wait_timeout(state, patience)
+            .unwrap_or_else(PoisonError::into_inner)
+            .0
     }
 
     /// Sends what waits, and ends the connection and all loops over messages.
@@ -100,7 +123,9 @@ impl ConnectionState {
             && client.try_disconnect().is_ok()
         {
             self.changed.notify_all();
-            let ended = self.changed.wait_timeout_while(state, FLUSH_TIMEOUT, |state| !state.has_ended);
+            let ended = self
+                .changed
+                .wait_timeout_while(state, FLUSH_TIMEOUT, |state| !state.has_ended);
             drop(ended);
         }
         self.changed.notify_all();
@@ -116,12 +141,21 @@ impl ConnectionState {
             let lost = self.carry(&client, &mut connection);
             let mut state = self.state();
             if state.client.take().is_some() && !state.is_closing {
-                log::warn!("connection to {} lost: {lost}; trying again, reports are dropped until then", self.at);
+                log::warn!(
+                    "connection to {} lost: {lost}; trying again, reports are dropped until then",
+                    self.at
+                );
             }
             // A broker that lets the program in only to end the connection is not asked more and more often.
-            wait = if began.elapsed() > RETRY_MAX { RETRY_MIN } else { (2 * wait).min(RETRY_MAX) };
+            wait = if began.elapsed() > RETRY_MAX {
+                RETRY_MIN
+            } else {
+                (2 * wait).min(RETRY_MAX)
+            };
             let pause = wait.mul_f64(0.25 + f64::from(Uuid::new_v4().as_bytes()[0]) / 1024.0);
-            let waited = self.changed.wait_timeout_while(state, pause, |state| !state.is_closing);
+            let waited = self
+                .changed
+                .wait_timeout_while(state, pause, |state| !state.is_closing);
             let (mut state, _) = waited.unwrap_or_else(PoisonError::into_inner);
             if state.is_closing {
                 state.has_ended = true;
@@ -146,19 +180,31 @@ impl ConnectionState {
             let mut state = self.state();
             match event {
                 Event::Incoming(Incoming::ConnAck(_)) => state.begin(client),
-                Event::Incoming(Incoming::Publish(message)) => self.take(&mut state, &message.topic, &message.payload),
+                Event::Incoming(Incoming::Publish(message)) => {
+                    self.take(&mut state, &message.topic, &message.payload)
+                }
                 Event::Incoming(Incoming::SubAck(answer)) => {
-                    let refused =
-                        answer.return_codes.iter().find(|code| !matches!(code, SubscribeReasonCode::Success(_)));
+                    let refused = answer
+                        .return_codes
+                        .iter()
+                        .find(|code| !matches!(code, SubscribeReasonCode::Success(_)));
                     state.note_answer(answer.pkid, refused.map(|code| format!("{code:?}")));
                 }
                 Event::Incoming(Incoming::PubAck(answer)) => {
-                    let is_taken = matches!(answer.reason, PubAckReason::Success | PubAckReason::NoMatchingSubscribers);
-                    let text = answer.properties.and_then(|properties| properties.reason_string);
-                    let refusal = (!is_taken).then(|| text.unwrap_or_else(|| format!("{:?}", answer.reason)));
+                    let is_taken = matches!(
+                        answer.reason,
+                        PubAckReason::Success | PubAckReason::NoMatchingSubscribers
+                    );
+                    let text = answer
+                        .properties
+                        .and_then(|properties| properties.reason_string);
+                    let refusal =
+                        (!is_taken).then(|| text.unwrap_or_else(|| format!("{:?}", answer.reason)));
                     state.note_answer(answer.pkid, refusal);
                 }
-                Event::Outgoing(Outgoing::Publish(packet) | Outgoing::Subscribe(packet)) if packet != 0 => {
+                Event::Outgoing(Outgoing::Publish(packet) | Outgoing::Subscribe(packet))
+                    if packet != 0 =>
+                {
                     let asked = state.queued.pop_front();
                     asked.and_then(|asked| state.unanswered.insert(packet, asked));
                 }
@@ -178,7 +224,8 @@ impl ConnectionState {
     fn take(&self, state: &mut State, topic: &[u8], payload: &[u8]) {
         let text = std::str::from_utf8(topic).ok();
         let received = text.and_then(|topic| topic.strip_prefix(&self.topics.filter(RECEIVED)));
-        let receiver = received.and_then(|receiver| NodeName::new(receiver.strip_prefix('/')?).ok());
+        let receiver =
+            received.and_then(|receiver| NodeName::new(receiver.strip_prefix('/')?).ok());
         let taken = match receiver {
             Some(receiver) => state.streams.take_foreign(receiver, payload),
             None => {
@@ -208,7 +255,8 @@ impl ConnectionState {
             }
             _ => Error::Unreachable(format!(
                 "cannot log in at {}: {reason}; is a node or broker there that speaks MQTT 5, {}?",
-                self.at, "and do both speak TLS (then the port is 8883) or neither, with certificates of the cell"
+                self.at,
+                "and do both speak TLS (then the port is 8883) or neither, with certificates of the cell"
             )),
         };
         state.login.get_or_insert(Err(refusal));
@@ -226,7 +274,10 @@ impl State {
         self.queued.clear();
         self.unanswered.clear();
         self.denied.clear();
-        self.filters.clone().iter().for_each(|filter| self.subscribe(filter));
+        self.filters
+            .clone()
+            .iter()
+            .for_each(|filter| self.subscribe(filter));
     }
 
     pub(crate) fn is_connected(&self) -> bool {
@@ -244,10 +295,16 @@ impl State {
 
     /// Sends a message if that is possible at once; gives whether it is.
     pub(crate) fn publish(&mut self, topic: &str, payload: Vec<u8>) -> bool {
-        let Some(client) = &self.client else { return false };
+        let Some(client) = &self.client else {
+            return false;
+        };
         // The first message asks for an answer: nothing else says that the broker does not allow them.
         let is_question = !self.asked.contains(topic);
-        let qos = if is_question { QoS::AtLeastOnce } else { QoS::AtMostOnce };
+        let qos = if is_question {
+            QoS::AtLeastOnce
+        } else {
+            QoS::AtMostOnce
+        };
         let is_sent = client.try_publish(topic, qos, false, payload).is_ok();
         if is_sent && is_question {
             self.ask(topic);
@@ -260,10 +317,14 @@ impl State {
         if let Some(refusal) = &self.refusal {
             return Err(refusal.clone());
         }
-        let Some(reason) = self.denied.remove(topic) else { return Ok(()) };
+        let Some(reason) = self.denied.remove(topic) else {
+            return Ok(());
+        };
         self.asked.remove(topic);
         let remedy = "do name and certificate or user allow it?";
-        Err(Error::Refused(format!("the broker at {at} refuses {topic}: {reason}; {remedy}")))
+        Err(Error::Refused(format!(
+            "the broker at {at} refuses {topic}: {reason}; {remedy}"
+        )))
     }
 
     fn ask(&mut self, topic: &str) {
@@ -281,8 +342,12 @@ impl State {
 
 /// True if a broker that refuses a login so will refuse the next one.
 fn is_final(code: ConnectReturnCode) -> bool {
-    use ConnectReturnCode::{BadAuthenticationMethod, BadClientId, BadUserNamePassword, Banned, NotAuthorized};
-    use ConnectReturnCode::{ClientIdentifierNotValid, MalformedPacket, ProtocolError, RefusedProtocolVersion};
+    use ConnectReturnCode::{
+        BadAuthenticationMethod, BadClientId, BadUserNamePassword, Banned, NotAuthorized,
+    };
+    use ConnectReturnCode::{
+        ClientIdentifierNotValid, MalformedPacket, ProtocolError, RefusedProtocolVersion,
+    };
     matches!(
         code,
         BadAuthenticationMethod
@@ -301,7 +366,9 @@ fn is_final(code: ConnectReturnCode) -> bool {
 /// An error's text with those of its causes.
 fn with_causes(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
-    for cause in std::iter::successors(error.source(), |cause| cause.source()).map(ToString::to_string) {
+    for cause in
+        std::iter::successors(error.source(), |cause| cause.source()).map(ToString::to_string)
+    {
         if !text.contains(&cause) {
             text = format!("{text}: {cause}");
         }

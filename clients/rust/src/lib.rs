@@ -12,8 +12,9 @@ pub use ecod::model::names::{Label, LandmarkId, NodeName};
 pub use ecod::model::origin::{GeographicOrigin, GeographicPose, GeographicPosition};
 pub use ecod::model::time::Timestamp;
 pub use ecod::wire::{
-    CellDescription, FieldOfView, FusedObject, GlobalMap, LabelReading, LandmarkState, NodeState, NodeStatus,
-    ObjectReport, PerceivedObject, Reputation, Reputations, Role, Trouble, Verdict, Verdicts, WirePose,
+    CellDescription, FieldOfView, FusedObject, GlobalMap, LabelReading, LandmarkState, NodeState,
+    NodeStatus, ObjectReport, PerceivedObject, Reputation, Reputations, Role, Trouble, Verdict,
+    Verdicts, WirePose,
 };
 pub use error::Error;
 pub use streams::ForeignMessage;

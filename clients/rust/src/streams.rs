@@ -9,8 +9,8 @@ use ecod::leadership::timers::EPOCH_MEMORY;
 use ecod::model::epoch::Epoch;
 use ecod::model::names::NodeName;
 use ecod::wire::{
-    CellDescription, GlobalMap, Limits, NodeStatus, ObjectReport, Payload, RejectReason, Reputations, Topic, Verdicts,
-    decode, decode_report,
+    CellDescription, GlobalMap, Limits, NodeStatus, ObjectReport, Payload, RejectReason,
+    Reputations, Topic, Verdicts, decode, decode_report,
 };
 
 /// All payloads of one connection.
@@ -51,23 +51,29 @@ const UNNAMED: NodeName = NodeName::from_static("-");
 
 impl Streams {
     /// Takes a payload. One that is rejected changes nothing.
-    pub(crate) fn take(&mut self, topic: Option<Topic>, payload: &[u8], now: Instant) -> Result<(), RejectReason> {
+    pub(crate) fn take(
+        &mut self,
+        topic: Option<Topic>,
+        payload: &[u8],
+        now: Instant,
+    ) -> Result<(), RejectReason> {
         match topic {
-            Some(Topic::GlobalDetections) => {
-                self.maps.take(payload, now, |map| (map.epoch, Some(&map.aggregator), map.round))
-            }
-            Some(Topic::GlobalVerdicts) => {
-                self.verdicts.take(payload, now, |it| (it.epoch, Some(&it.aggregator), it.round))
-            }
-            Some(Topic::Reputations) => {
-                self.reputations.take(payload, now, |it| (it.epoch, it.aggregator.as_ref(), it.round))
-            }
+            Some(Topic::GlobalDetections) => self.maps.take(payload, now, |map| {
+                (map.epoch, Some(&map.aggregator), map.round)
+            }),
+            Some(Topic::GlobalVerdicts) => self.verdicts.take(payload, now, |it| {
+                (it.epoch, Some(&it.aggregator), it.round)
+            }),
+            Some(Topic::Reputations) => self.reputations.take(payload, now, |it| {
+                (it.epoch, it.aggregator.as_ref(), it.round)
+            }),
             Some(Topic::Cell) if payload.is_empty() => {
                 self.descriptions.newest.clear();
                 Ok(())
             }
             Some(Topic::Cell) => {
-                self.descriptions.put(None, decode(payload, &Limits::default())?);
+                self.descriptions
+                    .put(None, decode(payload, &Limits::default())?);
                 Ok(())
             }
             Some(Topic::Nodes(node)) if payload.is_empty() => {
@@ -92,18 +98,33 @@ impl Streams {
     }
 
     /// Takes a message of a station that is no node.
-    pub(crate) fn take_foreign(&mut self, receiver: NodeName, payload: &[u8]) -> Result<(), RejectReason> {
+    pub(crate) fn take_foreign(
+        &mut self,
+        receiver: NodeName,
+        payload: &[u8],
+    ) -> Result<(), RejectReason> {
         if payload.len() > Limits::default().payload_bytes {
             return Err(RejectReason::TooLarge);
         }
-        self.foreign.put(Some(receiver.clone()), ForeignMessage { receiver, payload: payload.to_vec() });
+        self.foreign.put(
+            Some(receiver.clone()),
+            ForeignMessage {
+                receiver,
+                payload: payload.to_vec(),
+            },
+        );
         Ok(())
     }
 }
 
 impl<M> Default for MessageStream<M> {
     fn default() -> Self {
-        Self { newest: BTreeMap::new(), number: 0, gate: EpochGate::default(), admitted_at: None }
+        Self {
+            newest: BTreeMap::new(),
+            number: 0,
+            gate: EpochGate::default(),
+            admitted_at: None,
+        }
     }
 }
 
@@ -120,11 +141,17 @@ impl<M> MessageStream<M> {
     {
         let message: M = decode(payload, &Limits::default())?;
         let (term, aggregator, round) = order(&message);
-        if self.admitted_at.is_some_and(|at| now.duration_since(at) >= EPOCH_MEMORY) {
+        if self
+            .admitted_at
+            .is_some_and(|at| now.duration_since(at) >= EPOCH_MEMORY)
+        {
             // The cell may have begun anew.
             self.gate = EpochGate::default();
         }
-        self.gate.admit(&Epoch::new(term, aggregator.cloned().unwrap_or(UNNAMED)), round)?;
+        self.gate.admit(
+            &Epoch::new(term, aggregator.cloned().unwrap_or(UNNAMED)),
+            round,
+        )?;
         self.admitted_at = Some(now);
         self.put(None, message);
         Ok(())
@@ -134,7 +161,11 @@ impl<M> MessageStream<M> {
         self.number += 1;
         self.newest.insert(node, (self.number, Arc::new(message)));
         if self.newest.len() > MAX_NODES {
-            let oldest = self.newest.iter().min_by_key(|(_, (number, _))| *number).map(|(node, _)| node.clone());
+            let oldest = self
+                .newest
+                .iter()
+                .min_by_key(|(_, (number, _))| *number)
+                .map(|(node, _)| node.clone());
             oldest.and_then(|node| self.newest.remove(&node));
         }
     }
@@ -146,6 +177,10 @@ impl<M> MessageStream<M> {
 
     /// The earliest of the newest payloads that came after the numbered one.
     pub(crate) fn after(&self, number: u64) -> Option<(u64, Arc<M>)> {
-        self.newest.values().filter(|(at, _)| *at > number).min_by_key(|(at, _)| *at).cloned()
+        self.newest
+            .values()
+            .filter(|(at, _)| *at > number)
+            .min_by_key(|(at, _)| *at)
+            .cloned()
     }
 }

@@ -30,39 +30,73 @@ impl Tls {
     pub const DOOR_NAME: &'static str = "door.ecod.internal";
 
     /// TLS with the door of any node, by the files of the program's own node.
-    pub fn of_door(ca: impl Into<PathBuf>, certificate: impl Into<PathBuf>, key: impl Into<PathBuf>) -> Self {
+    pub fn of_door(
+        ca: impl Into<PathBuf>,
+        certificate: impl Into<PathBuf>,
+        key: impl Into<PathBuf>,
+    ) -> Self {
         let broker_name = Some(Self::DOOR_NAME.to_owned());
-        Self { ca: ca.into(), identity: Some((certificate.into(), key.into())), broker_name }
+        Self {
+            ca: ca.into(),
+            identity: Some((certificate.into(), key.into())),
+            broker_name,
+        }
     }
 
     /// TLS with the broker of a node that may lead, by the files of the program's own node.
-    pub fn of_cell(ca: impl Into<PathBuf>, certificate: impl Into<PathBuf>, key: impl Into<PathBuf>) -> Self {
-        Self { broker_name: Some(Self::BROKER_NAME.to_owned()), ..Self::of_door(ca, certificate, key) }
+    pub fn of_cell(
+        ca: impl Into<PathBuf>,
+        certificate: impl Into<PathBuf>,
+        key: impl Into<PathBuf>,
+    ) -> Self {
+        Self {
+            broker_name: Some(Self::BROKER_NAME.to_owned()),
+            ..Self::of_door(ca, certificate, key)
+        }
     }
 
     pub(crate) fn client(&self) -> Result<ClientConfig, Error> {
-        let invalid =
-            |path: &Path, error: &dyn std::fmt::Display| Error::Invalid(format!("{}: {error}", path.display()));
+        let invalid = |path: &Path, error: &dyn std::fmt::Display| {
+            Error::Invalid(format!("{}: {error}", path.display()))
+        };
         let certificates = |path: &PathBuf| {
-            let certificates = CertificateDer::pem_file_iter(path).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+            let certificates = CertificateDer::pem_file_iter(path)
+                .and_then(Iterator::collect::<Result<Vec<_>, _>>);
             certificates.map_err(|error| invalid(path, &error))
         };
         let mut roots = RootCertStore::empty();
         for certificate in certificates(&self.ca)? {
-            roots.add(certificate).map_err(|error| invalid(&self.ca, &error))?;
+            roots
+                .add(certificate)
+                .map_err(|error| invalid(&self.ca, &error))?;
         }
         let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let verifier = WebPkiServerVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider)).build();
+        let verifier =
+            WebPkiServerVerifier::builder_with_provider(Arc::new(roots), Arc::clone(&provider))
+                .build();
         let verifier = verifier.map_err(|error| invalid(&self.ca, &error))?;
-        let name = self.broker_name.clone().map(ServerName::try_from).transpose();
-        let name = name.map_err(|error| Error::Invalid(format!("broker_name {:?}: {error}", self.broker_name)))?;
+        let name = self
+            .broker_name
+            .clone()
+            .map(ServerName::try_from)
+            .transpose();
+        let name = name.map_err(|error| {
+            Error::Invalid(format!("broker_name {:?}: {error}", self.broker_name))
+        })?;
         let verifier = Arc::new(NamedBroker { verifier, name });
-        let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions();
+        let builder =
+            ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions();
         let builder = builder.map_err(|error| Error::Invalid(error.to_string()))?;
-        let builder = builder.dangerous().with_custom_certificate_verifier(verifier);
-        let Some((certificate, key)) = &self.identity else { return Ok(builder.with_no_client_auth()) };
+        let builder = builder
+            .dangerous()
+            .with_custom_certificate_verifier(verifier);
+        let Some((certificate, key)) = &self.identity else {
+            return Ok(builder.with_no_client_auth());
+        };
         let secret = PrivateKeyDer::from_pem_file(key).map_err(|error| invalid(key, &error))?;
-        builder.with_client_auth_cert(certificates(certificate)?, secret).map_err(|error| invalid(key, &error))
+        builder
+            .with_client_auth_cert(certificates(certificate)?, secret)
+            .map_err(|error| invalid(key, &error))
     }
 }
 
@@ -83,7 +117,8 @@ impl ServerCertVerifier for NamedBroker {
         now: UnixTime,
     ) -> Result<ServerCertVerified, rustls::Error> {
         let name = self.name.as_ref().unwrap_or(host);
-        self.verifier.verify_server_cert(end_entity, intermediates, name, ocsp_response, now)
+        self.verifier
+            .verify_server_cert(end_entity, intermediates, name, ocsp_response, now)
     }
 
     fn verify_tls12_signature(
@@ -92,7 +127,8 @@ impl ServerCertVerifier for NamedBroker {
         certificate: &CertificateDer<'_>,
         signature: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        self.verifier.verify_tls12_signature(message, certificate, signature)
+        self.verifier
+            .verify_tls12_signature(message, certificate, signature)
     }
 
     fn verify_tls13_signature(
@@ -101,7 +137,8 @@ impl ServerCertVerifier for NamedBroker {
         certificate: &CertificateDer<'_>,
         signature: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        self.verifier.verify_tls13_signature(message, certificate, signature)
+        self.verifier
+            .verify_tls13_signature(message, certificate, signature)
     }
 
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {

@@ -17,8 +17,8 @@ use ecod_actors::platform::clock;
 use ecod_actors::transport::broker::{BrokerConfig, EmbeddedBroker, MqttBroker};
 use ecod_actors::transport::pki::{Authority, TlsConfig};
 use ecod_client::{
-    Cell, CellDescription, Error, Frame, GeographicPose, GlobalMap, NodeName, NodeState, PerceivedObject, Role,
-    Settings, Timestamp, Tls,
+    Cell, CellDescription, Error, Frame, GeographicPose, GlobalMap, NodeName, NodeState,
+    PerceivedObject, Role, Settings, Timestamp, Tls,
 };
 use rumqttc::{Client, MqttOptions, QoS};
 use tokio::runtime::Runtime;
@@ -66,7 +66,11 @@ impl Node {
         let runtime = Runtime::new().unwrap();
         let handle = runtime.block_on(node::start(config)).unwrap();
         let door = handle.listens_at().unwrap().to_string();
-        Self { runtime, handle: Some(handle), door }
+        Self {
+            runtime,
+            handle: Some(handle),
+            door,
+        }
     }
 
     fn settings(&self, node: &str) -> Settings {
@@ -83,17 +87,32 @@ impl Drop for Node {
 }
 
 fn settings(broker: &str, node: &str) -> Settings {
-    Settings { broker: broker.into(), cell: "lot-1".into(), node: node.into(), ..Settings::default() }
+    Settings {
+        broker: broker.into(),
+        cell: "lot-1".into(),
+        node: node.into(),
+        ..Settings::default()
+    }
 }
 
 fn car() -> PerceivedObject {
-    let at = PerceivedObject { landmark: Some("slot-0".into()), ..PerceivedObject::new("car", 0.9, 0.1, 0.2) };
-    PerceivedObject { covariance_m2: Some([0.01, 0.0, 0.01]), ..at }
+    let at = PerceivedObject {
+        landmark: Some("slot-0".into()),
+        ..PerceivedObject::new("car", 0.9, 0.1, 0.2)
+    };
+    PerceivedObject {
+        covariance_m2: Some([0.01, 0.0, 0.01]),
+        ..at
+    }
 }
 
 fn frame() -> Frame {
     let pose = Some(ecod_client::WirePose::new(1.0, 6.0, -1.57));
-    Frame { pose, seen: Some(vec!["slot-0".into(), "slot-1".into()]), ..Frame::new(vec![car()]) }
+    Frame {
+        pose,
+        seen: Some(vec!["slot-0".into(), "slot-1".into()]),
+        ..Frame::new(vec![car()])
+    }
 }
 
 /// Reports and votes until a map shows the car, seen by this node.
@@ -101,7 +120,9 @@ fn agreed(cell: &Cell, node: &str) -> std::sync::Arc<GlobalMap> {
     let began = Instant::now();
     for map in cell.maps().timeout(SOON) {
         let map = map.unwrap();
-        let [place, empty] = &map.landmarks[..] else { panic!("{map:?}") };
+        let [place, empty] = &map.landmarks[..] else {
+            panic!("{map:?}")
+        };
         let is_by = place.contributors.iter().any(|name| name.as_str() == node);
         if place.label.as_deref() == Some("car") && is_by && !empty.observers.is_empty() {
             return map;
@@ -123,7 +144,8 @@ fn a_node_takes_reports_and_its_messages_are_read() {
         assert_eq!(cell.name().as_str(), "euclid--rust");
         let map = agreed(&cell, "euclid");
         assert!(map.landmarks[0].confidence > 0.5 && map.landmarks[1].label.is_none());
-        let has_car = |verdicts: &ecod_client::Verdicts| verdicts.verdicts[0].label.as_deref() == Some("car");
+        let has_car =
+            |verdicts: &ecod_client::Verdicts| verdicts.verdicts[0].label.as_deref() == Some("car");
         let voted = cell.verdicts().timeout(SOON).find(|verdicts| {
             cell.vote(Frame::new(vec![car()])).unwrap();
             has_car(verdicts.as_ref().unwrap())
@@ -132,57 +154,139 @@ fn a_node_takes_reports_and_its_messages_are_read() {
         let reputations = cell.reputations().timeout(SOON).next().unwrap().unwrap();
         assert_eq!(reputations.aggregator, Some(NodeName::from_static("edge")));
         let status = cell.statuses().timeout(SOON).next().unwrap().unwrap();
-        assert_eq!((status.node.as_str(), status.role, status.state), ("edge", Role::Edge, NodeState::Aggregating));
+        assert_eq!(
+            (status.node.as_str(), status.role, status.state),
+            ("edge", Role::Edge, NodeState::Aggregating)
+        );
         assert!(cell.counts().is_empty(), "{:?}", cell.counts());
     }
 }
 
 fn tls_of(authority: &mut Authority, name: &'static str, role: Role) -> (TlsConfig, Tls) {
     let name = NodeName::from_static(name);
-    authority.issue(&name, role, Duration::from_secs(86_400), clock::now()).unwrap();
+    authority
+        .issue(&name, role, Duration::from_secs(86_400), clock::now())
+        .unwrap();
     let (certificate, key) = authority.files_of(&name);
     let tls = Tls::of_door(authority.ca(), &certificate, &key);
-    (TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None }, tls)
+    (
+        TlsConfig {
+            ca: authority.ca(),
+            certificate,
+            key,
+            revocation_list: None,
+            city: None,
+        },
+        tls,
+    )
 }
 
 #[test]
 fn with_certificates_a_program_speaks_for_its_node_alone() {
     let directory = tempfile::tempdir().unwrap();
-    let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot-1"), clock::now()).unwrap();
+    let mut authority = Authority::init(
+        directory.path(),
+        &NodeName::from_static("lot-1"),
+        clock::now(),
+    )
+    .unwrap();
     let (edge_files, edge_tls) = tls_of(&mut authority, "edge", Role::Edge);
     let (cav_files, cav_tls) = tls_of(&mut authority, "euclid", Role::Cav);
-    let edge = Node::start(NodeConfig { tls: Some(edge_files), ..config("edge", Role::Edge) });
-    let cav = Node::start(NodeConfig { tls: Some(cav_files), ..config("euclid", Role::Cav) });
+    let edge = Node::start(NodeConfig {
+        tls: Some(edge_files),
+        ..config("edge", Role::Edge)
+    });
+    let cav = Node::start(NodeConfig {
+        tls: Some(cav_files),
+        ..config("euclid", Role::Cav)
+    });
     let connect = |node: &Node, name: &str, tls: Option<&Tls>| {
-        Cell::connect(Settings { tls: tls.cloned(), timeout: Duration::from_secs(3), ..node.settings(name) })
+        Cell::connect(Settings {
+            tls: tls.cloned(),
+            timeout: Duration::from_secs(3),
+            ..node.settings(name)
+        })
     };
 
-    let beside = Cell::connect(Settings { tls: Some(edge_tls), ..edge.settings("edge") }).unwrap();
+    let beside = Cell::connect(Settings {
+        tls: Some(edge_tls),
+        ..edge.settings("edge")
+    })
+    .unwrap();
     agreed(&beside, "edge");
-    let vehicle =
-        Cell::connect(Settings { tls: Some(cav_tls.clone()), part: String::new(), ..edge.settings("euclid") });
+    let vehicle = Cell::connect(Settings {
+        tls: Some(cav_tls.clone()),
+        part: String::new(),
+        ..edge.settings("euclid")
+    });
     agreed(&vehicle.unwrap(), "euclid");
-    assert!(connect(&cav, "euclid", Some(&cav_tls)).is_ok(), "the door of a node that never leads");
+    assert!(
+        connect(&cav, "euclid", Some(&cav_tls)).is_ok(),
+        "the door of a node that never leads"
+    );
     let (certificate, key) = cav_tls.identity.clone().unwrap();
-    let at = [("ECOD_BROKER", &*cav.door), ("ECOD_CELL", "lot-1"), ("ECOD_NAME", "euclid")];
-    let files = [("ECOD_TLS__CA", &cav_tls.ca), ("ECOD_TLS__CERTIFICATE", &certificate), ("ECOD_TLS__KEY", &key)];
+    let at = [
+        ("ECOD_BROKER", &*cav.door),
+        ("ECOD_CELL", "lot-1"),
+        ("ECOD_NAME", "euclid"),
+    ];
+    let files = [
+        ("ECOD_TLS__CA", &cav_tls.ca),
+        ("ECOD_TLS__CERTIFICATE", &certificate),
+        ("ECOD_TLS__KEY", &key),
+    ];
     let mut planner = Command::new(example("brake_planner"));
-    let mut planner = planner.args(["0", "0", "0", "10"]).envs(at).envs(files).stdout(Stdio::piped()).spawn().unwrap();
-    let decided = BufReader::new(planner.stdout.take().unwrap()).lines().next().unwrap().unwrap();
-    assert_eq!(decided, "BRAKE: no map for 500ms", "the environment names the certificate");
+    let mut planner = planner
+        .args(["0", "0", "0", "10"])
+        .envs(at)
+        .envs(files)
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let decided = BufReader::new(planner.stdout.take().unwrap())
+        .lines()
+        .next()
+        .unwrap()
+        .unwrap();
+    assert_eq!(
+        decided, "BRAKE: no map for 500ms",
+        "the environment names the certificate"
+    );
     planner.kill().unwrap();
     planner.wait().unwrap();
     let leading = Tls::of_cell(&cav_tls.ca, certificate, key);
-    assert!(connect(&edge, "euclid", Some(&leading)).is_ok(), "the broker of a node that may lead");
+    assert!(
+        connect(&edge, "euclid", Some(&leading)).is_ok(),
+        "the broker of a node that may lead"
+    );
 
     let refused = connect(&edge, "gauss", Some(&cav_tls)).err().unwrap();
-    let Error::Refused(text) = &refused else { panic!("{refused}") };
-    assert!(text.contains(&edge.door) && text.contains("check node name"), "{text}");
-    let other_name = Tls { broker_name: Some("broker.example".into()), ..cav_tls.clone() };
-    let nobody = Tls { identity: None, ..cav_tls.clone() };
-    for (node, tls) in [(&edge, Some(&other_name)), (&edge, Some(&nobody)), (&edge, None), (&cav, Some(&leading))] {
+    let Error::Refused(text) = &refused else {
+        panic!("{refused}")
+    };
+    assert!(
+        text.contains(&edge.door) && text.contains("check node name"),
+        "{text}"
+    );
+    let other_name = Tls {
+        broker_name: Some("broker.example".into()),
+        ..cav_tls.clone()
+    };
+    let nobody = Tls {
+        identity: None,
+        ..cav_tls.clone()
+    };
+    for (node, tls) in [
+        (&edge, Some(&other_name)),
+        (&edge, Some(&nobody)),
+        (&edge, None),
+        (&cav, Some(&leading)),
+    ] {
         let error = connect(node, "euclid", tls).err().unwrap();
-        assert!(matches!(&error, Error::Unreachable(text) if text.contains(&node.door)), "{error}");
+        assert!(
+            matches!(&error, Error::Unreachable(text) if text.contains(&node.door)),
+            "{error}"
+        );
     }
 }
 
@@ -190,10 +294,16 @@ fn with_certificates_a_program_speaks_for_its_node_alone() {
 fn a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell() {
     let node = Node::start(config("edge", Role::Edge));
     let cell = Cell::connect(node.settings("edge")).unwrap();
-    assert_eq!((cell.origin().unwrap(), cell.description().unwrap().version), (None, 0));
+    assert_eq!(
+        (cell.origin().unwrap(), cell.description().unwrap().version),
+        (None, 0)
+    );
     let speaker = speaker(node.door.parse().unwrap());
-    let warsaw = "[origin]\nlatitude_deg = 52.2296756\nlongitude_deg = 21.0122287\nheight_m = 113\n";
-    speaker.publish(DESCRIPTION, QoS::AtLeastOnce, false, description(warsaw)).unwrap();
+    let warsaw =
+        "[origin]\nlatitude_deg = 52.2296756\nlongitude_deg = 21.0122287\nheight_m = 113\n";
+    speaker
+        .publish(DESCRIPTION, QoS::AtLeastOnce, false, description(warsaw))
+        .unwrap();
     let began = Instant::now();
     let origin = loop {
         match cell.origin().unwrap() {
@@ -205,11 +315,22 @@ fn a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell() {
     assert_eq!(cell.description().unwrap().set_by.as_str(), "edge");
     // As PROJ has it, for 12.4 m east and 3.1 m south.
     let (latitude_deg, longitude_deg) = (52.22964774062, 21.01241017960);
-    let pose = GeographicPose { latitude_deg, longitude_deg, height_m: None, azimuth_deg: 180.0 };
+    let pose = GeographicPose {
+        latitude_deg,
+        longitude_deg,
+        height_m: None,
+        azimuth_deg: 180.0,
+    };
     let position = origin.pose_to_map(&pose).unwrap().position;
-    assert!((position.x - 12.4).abs() < 0.001 && (position.y + 3.1).abs() < 0.001, "{position}");
+    assert!(
+        (position.x - 12.4).abs() < 0.001 && (position.y + 3.1).abs() < 0.001,
+        "{position}"
+    );
     let there = origin.to_wgs84(position.x, position.y, 0.0);
-    assert!((there.latitude_deg - latitude_deg).abs() < 1e-9 && (there.longitude_deg - longitude_deg).abs() < 1e-9);
+    assert!(
+        (there.latitude_deg - latitude_deg).abs() < 1e-9
+            && (there.longitude_deg - longitude_deg).abs() < 1e-9
+    );
     assert!((there.height_m - 113.0).abs() < 0.001);
 }
 
@@ -217,19 +338,40 @@ fn a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell() {
 fn a_cell_without_a_usable_description_says_so() {
     let (_broker, address) = broker();
     let patient = settings(&address.to_string(), "euclid");
-    let cell = Cell::connect(Settings { timeout: Duration::from_secs(3), ..patient.clone() }).unwrap();
+    let cell = Cell::connect(Settings {
+        timeout: Duration::from_secs(3),
+        ..patient.clone()
+    })
+    .unwrap();
     let silent = cell.origin().unwrap_err();
-    assert!(matches!(&silent, Error::Silent(text) if text.contains(DESCRIPTION)), "{silent}");
+    assert!(
+        matches!(&silent, Error::Silent(text) if text.contains(DESCRIPTION)),
+        "{silent}"
+    );
     let speaker = speaker(address);
-    let say = |payload| speaker.publish(DESCRIPTION, QoS::AtLeastOnce, true, payload).unwrap();
-    for text in ["[origin", "origin = 7", "[origin]\nlatitude_deg = 91\nlongitude_deg = 1\n"] {
+    let say = |payload| {
+        speaker
+            .publish(DESCRIPTION, QoS::AtLeastOnce, true, payload)
+            .unwrap()
+    };
+    for text in [
+        "[origin",
+        "origin = 7",
+        "[origin]\nlatitude_deg = 91\nlongitude_deg = 1\n",
+    ] {
         say(description(text));
         let began = Instant::now();
         while cell.description().is_ok_and(|present| present.text != text) {
             assert!(began.elapsed() < SOON);
         }
-        let invalid = Cell::connect(patient.clone()).unwrap().origin().unwrap_err();
-        assert!(matches!(&invalid, Error::Invalid(text) if text.contains("[origin]")), "{invalid}");
+        let invalid = Cell::connect(patient.clone())
+            .unwrap()
+            .origin()
+            .unwrap_err();
+        assert!(
+            matches!(&invalid, Error::Invalid(text) if text.contains("[origin]")),
+            "{invalid}"
+        );
     }
     say(Vec::new());
     let began = Instant::now();
@@ -237,7 +379,12 @@ fn a_cell_without_a_usable_description_says_so() {
         assert!(began.elapsed() < SOON, "it was withdrawn");
     }
     cell.close();
-    assert!(cell.description().unwrap_err().to_string().contains("closed"));
+    assert!(
+        cell.description()
+            .unwrap_err()
+            .to_string()
+            .contains("closed")
+    );
 }
 
 #[test]
@@ -251,7 +398,10 @@ fn what_the_door_refuses_the_program_learns() {
             Ok(_) => assert!(began.elapsed() < SOON),
         }
     };
-    assert!(matches!(&refused, Error::Refused(text) if text.contains("detections/gauss--rust")), "{refused}");
+    assert!(
+        matches!(&refused, Error::Refused(text) if text.contains("detections/gauss--rust")),
+        "{refused}"
+    );
     assert!(cell.report(frame()).is_ok(), "each refusal is told once");
 }
 
@@ -263,13 +413,18 @@ fn broker() -> (EmbeddedBroker, SocketAddr) {
 }
 
 fn speaker(broker: SocketAddr) -> Client {
-    let (client, mut connection) = Client::new(MqttOptions::new("speaker", "127.0.0.1", broker.port()), 64);
+    let (client, mut connection) =
+        Client::new(MqttOptions::new("speaker", "127.0.0.1", broker.port()), 64);
     std::thread::spawn(move || connection.iter().take_while(Result::is_ok).for_each(drop));
     client
 }
 
 fn map(epoch: u64, round: u64) -> Vec<u8> {
-    let map = GlobalMap::new(&Epoch::new(epoch, NodeName::from_static("edge")), round, Timestamp(1));
+    let map = GlobalMap::new(
+        &Epoch::new(epoch, NodeName::from_static("edge")),
+        round,
+        Timestamp(1),
+    );
     encode(&map, Encoding::Json)
 }
 
@@ -277,7 +432,16 @@ fn map(epoch: u64, round: u64) -> Vec<u8> {
 fn description(text: &str) -> Vec<u8> {
     let set_by = NodeName::from_static("edge");
     let hash = ContentHash::default();
-    encode(&CellDescription { schema: 1, version: 0, hash, set_by, text: text.to_owned() }, Encoding::Json)
+    encode(
+        &CellDescription {
+            schema: 1,
+            version: 0,
+            hash,
+            set_by,
+            text: text.to_owned(),
+        },
+        Encoding::Json,
+    )
 }
 
 const DESCRIPTION: &str = "ecod/v1/lot-1/cell";
@@ -291,12 +455,26 @@ fn only_later_rounds_are_given_and_the_newest_first() {
     let cell = Cell::connect(settings(&address.to_string(), "euclid")).unwrap();
     let mut maps = cell.maps().timeout(Duration::from_millis(100));
     let silent = maps.next().unwrap().unwrap_err();
-    assert!(matches!(&silent, Error::Silent(text) if text.contains(MAPS)), "{silent}");
+    assert!(
+        matches!(&silent, Error::Silent(text) if text.contains(MAPS)),
+        "{silent}"
+    );
     let mut maps = maps.timeout(SOON);
-    let say = |payload: Vec<u8>| speaker.publish(MAPS, QoS::AtLeastOnce, false, payload).unwrap();
+    let say = |payload: Vec<u8>| {
+        speaker
+            .publish(MAPS, QoS::AtLeastOnce, false, payload)
+            .unwrap()
+    };
     say(map(3, 5));
     assert_eq!(maps.next().unwrap().unwrap().round, 5);
-    for payload in [map(3, 4), map(3, 5), map(2, 9), b"{".to_vec(), map(3, 6), map(4, 1)] {
+    for payload in [
+        map(3, 4),
+        map(3, 5),
+        map(2, 9),
+        b"{".to_vec(),
+        map(3, 6),
+        map(4, 1),
+    ] {
         say(payload);
     }
     let last = maps.map(Result::unwrap).find(|map| map.epoch == 4).unwrap();
@@ -332,7 +510,10 @@ fn a_lost_broker_is_found_again() {
             speaker.publish(MAPS, QoS::AtMostOnce, false, map(1, round))
         })
     });
-    assert!(maps.next().unwrap().is_ok(), "the broker was asked for maps again");
+    assert!(
+        maps.next().unwrap().is_ok(),
+        "the broker was asked for maps again"
+    );
 }
 
 #[test]
@@ -340,22 +521,52 @@ fn what_no_cell_would_take_is_not_sent() {
     let (_broker, address) = broker();
     let cell = Cell::connect(settings(&address.to_string(), "euclid")).unwrap();
     let said = |outcome: Result<bool, Error>| outcome.unwrap_err().to_string();
-    let wrong = PerceivedObject { confidence: 2.0, ..car() };
-    let (good, nowhere) = (car(), PerceivedObject { landmark: None, ..car() });
+    let wrong = PerceivedObject {
+        confidence: 2.0,
+        ..car()
+    };
+    let (good, nowhere) = (
+        car(),
+        PerceivedObject {
+            landmark: None,
+            ..car()
+        },
+    );
     let frame = Frame::new(vec![good.clone(), wrong]);
-    assert_eq!(said(cell.report(frame)), "not sent: objects[1]: confidence_out_of_range");
-    let frame = Frame { captured_at: SystemTime::UNIX_EPOCH - Duration::from_secs(1), ..Frame::new(vec![]) };
+    assert_eq!(
+        said(cell.report(frame)),
+        "not sent: objects[1]: confidence_out_of_range"
+    );
+    let frame = Frame {
+        captured_at: SystemTime::UNIX_EPOCH - Duration::from_secs(1),
+        ..Frame::new(vec![])
+    };
     assert!(said(cell.report(frame)).contains("captured_at"));
-    assert!(said(cell.vote(Frame::new(vec![good, nowhere]))).contains("objects[1] names no landmark"));
-    for (broker, node, expected) in [("host:0", "euclid", "host:0"), ("a/b", "euclid", "a/b"), ("host", "a b", "a b")] {
+    assert!(
+        said(cell.vote(Frame::new(vec![good, nowhere]))).contains("objects[1] names no landmark")
+    );
+    for (broker, node, expected) in [
+        ("host:0", "euclid", "host:0"),
+        ("a/b", "euclid", "a/b"),
+        ("host", "a b", "a b"),
+    ] {
         let error = Cell::connect(settings(broker, node)).err().unwrap();
-        assert!(matches!(&error, Error::Invalid(text) if text.contains(expected)), "{error}");
+        assert!(
+            matches!(&error, Error::Invalid(text) if text.contains(expected)),
+            "{error}"
+        );
     }
     drop(cell);
     let missing = Tls::of_cell("missing.pem", "missing.pem", "missing.key");
-    let settings = Settings { tls: Some(missing), ..settings(&address.to_string(), "euclid") };
+    let settings = Settings {
+        tls: Some(missing),
+        ..settings(&address.to_string(), "euclid")
+    };
     let error = Cell::connect(settings).err().unwrap();
-    assert!(matches!(&error, Error::Invalid(text) if text.contains("missing.pem")), "{error}");
+    assert!(
+        matches!(&error, Error::Invalid(text) if text.contains("missing.pem")),
+        "{error}"
+    );
 }
 
 #[test]
@@ -363,9 +574,17 @@ fn nobody_at_the_address_is_said_at_once() {
     let (mut broker, address) = broker();
     broker.stop();
     let began = Instant::now();
-    let error = Cell::connect(settings(&address.to_string(), "euclid")).err().unwrap();
-    assert!(matches!(&error, Error::Unreachable(text) if text.contains(&address.to_string())), "{error}");
-    assert!(began.elapsed() < Duration::from_secs(8), "no waiting for the timeout");
+    let error = Cell::connect(settings(&address.to_string(), "euclid"))
+        .err()
+        .unwrap();
+    assert!(
+        matches!(&error, Error::Unreachable(text) if text.contains(&address.to_string())),
+        "{error}"
+    );
+    assert!(
+        began.elapsed() < Duration::from_secs(8),
+        "no waiting for the timeout"
+    );
 }
 
 /// The example, built with the tests.
@@ -377,7 +596,9 @@ fn example(name: &str) -> PathBuf {
 
 /// The program that a page of the documentation shows, if it is this example but for its first lines.
 fn is_shown(page: &str, example: &str) -> bool {
-    let read = |path: &str| std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap();
+    let read = |path: &str| {
+        std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
+    };
     let source = read(&format!("examples/{example}.rs"));
     let (_, program) = source.split_once("\n\n").unwrap();
     read(page).contains(&format!("```rust,no_run\n{program}```\n"))
@@ -397,13 +618,19 @@ fn the_documented_programs_do_what_they_say() {
         config.landmarks.clear();
         let node = Node::start(config);
         let cell = Cell::connect(node.settings("display")).unwrap();
-        let mut program =
-            Command::new(example(name)).env("ECOD_BROKER", &node.door).stdout(Stdio::piped()).spawn().unwrap();
+        let mut program = Command::new(example(name))
+            .env("ECOD_BROKER", &node.door)
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
         let began = Instant::now();
         let shows = |map: &GlobalMap| {
-            let by_euclid =
-                |object: &ecod_client::FusedObject| object.contributors.iter().any(|by| by.as_str() == "euclid");
-            map.objects.iter().any(|object| by_euclid(object) && (object.x_m - 12.4).abs() < 0.1)
+            let by_euclid = |object: &ecod_client::FusedObject| {
+                object.contributors.iter().any(|by| by.as_str() == "euclid")
+            };
+            map.objects
+                .iter()
+                .any(|object| by_euclid(object) && (object.x_m - 12.4).abs() < 0.1)
         };
         for map in cell.maps().timeout(SOON) {
             if shows(&map.unwrap()) {
@@ -415,7 +642,11 @@ fn the_documented_programs_do_what_they_say() {
             );
         }
         if says {
-            let line = BufReader::new(program.stdout.take().unwrap()).lines().next().unwrap().unwrap();
+            let line = BufReader::new(program.stdout.take().unwrap())
+                .lines()
+                .next()
+                .unwrap()
+                .unwrap();
             assert!(line.parse::<u64>().is_ok(), "{name}: {line}");
         }
         program.kill().unwrap();
@@ -431,23 +662,36 @@ fn the_planner_goes_brakes_for_what_is_ahead_and_brakes_without_maps() {
     let lidar = Cell::connect(node.settings("euclid")).unwrap();
     let mut planner = Command::new(example("brake_planner"))
         .args(["0", "0", "0", "10"])
-        .envs([("ECOD_BROKER", &*node.door), ("ECOD_CELL", "lot-1"), ("ECOD_NAME", "gauss")])
+        .envs([
+            ("ECOD_BROKER", &*node.door),
+            ("ECOD_CELL", "lot-1"),
+            ("ECOD_NAME", "gauss"),
+        ])
         .stdout(Stdio::piped())
         .spawn()
         .unwrap();
-    let mut lines = BufReader::new(planner.stdout.take().unwrap()).lines().map(Result::unwrap);
+    let mut lines = BufReader::new(planner.stdout.take().unwrap())
+        .lines()
+        .map(Result::unwrap);
     assert!(lines.any(|line| line == "GO: nothing is in the way"));
     let (sender, stop) = std::sync::mpsc::channel::<()>();
     let reporting = std::thread::spawn(move || {
         while stop.try_recv() == Err(std::sync::mpsc::TryRecvError::Empty) {
-            lidar.report(Frame::new(vec![PerceivedObject::new("car", 0.9, 12.0, 0.3)])).unwrap_or_default();
+            lidar
+                .report(Frame::new(vec![PerceivedObject::new(
+                    "car", 0.9, 12.0, 0.3,
+                )]))
+                .unwrap_or_default();
             std::thread::sleep(Duration::from_millis(100));
         }
     });
     assert!(lines.any(|line| line.starts_with("BRAKE: an object is 12.")));
     drop(sender);
     reporting.join().unwrap();
-    assert!(lines.any(|line| line == "GO: nothing is in the way"), "the car is gone");
+    assert!(
+        lines.any(|line| line == "GO: nothing is in the way"),
+        "the car is gone"
+    );
     drop(node);
     assert_eq!(lines.next().as_deref(), Some("BRAKE: no map for 500ms"));
     planner.kill().unwrap();

@@ -27,24 +27,35 @@ pub(super) struct Sightings {
 impl Sightings {
     /// Takes a report for the map.
     pub(super) fn observe(&mut self, report: &ObjectReport, now: Instant) {
-        self.own.retain(|_, (at, _)| now.duration_since(*at) < SIGHTED_FOR);
+        self.own
+            .retain(|_, (at, _)| now.duration_since(*at) < SIGHTED_FOR);
         if cpm::is_received(&report.node) {
             self.foreign = Some(now);
             return;
         }
         let objects = report.objects.iter().map(|object| [object.x_m, object.y_m]);
         // A vehicle that states its pose is an object itself.
-        let places = objects.chain(report.pose.map(|pose| [pose.x_m, pose.y_m])).collect();
+        let places = objects
+            .chain(report.pose.map(|pose| [pose.x_m, pose.y_m]))
+            .collect();
         self.own.insert(report.node.clone(), (now, places));
     }
 
     /// False for a place at which foreign stations alone can have detected an object.
     pub(super) fn is_sighted(&self, [x_m, y_m]: [f64; 2], now: Instant) -> bool {
-        let is_alone = self.foreign.is_none_or(|heard| now.duration_since(heard) >= FOREIGN_FOR);
-        let mut recent = self.own.values().filter(|(at, _)| now.duration_since(*at) < SIGHTED_FOR);
+        let is_alone = self
+            .foreign
+            .is_none_or(|heard| now.duration_since(heard) >= FOREIGN_FOR);
+        let mut recent = self
+            .own
+            .values()
+            .filter(|(at, _)| now.duration_since(*at) < SIGHTED_FOR);
         is_alone
-            || recent
-                .any(|(_, places)| places.iter().any(|[own_x, own_y]| (own_x - x_m).hypot(own_y - y_m) < SIGHTED_M))
+            || recent.any(|(_, places)| {
+                places
+                    .iter()
+                    .any(|[own_x, own_y]| (own_x - x_m).hypot(own_y - y_m) < SIGHTED_M)
+            })
     }
 }
 
@@ -58,19 +69,36 @@ mod tests {
     fn an_object_is_the_cells_own_while_a_vehicle_of_it_detects_it() {
         let report = |node: &'static str, x_m: f64| ObjectReport {
             objects: vec![PerceivedObject::new("car", 0.9, x_m, 0.0)],
-            ..ObjectReport::new(NodeName::from_static(node), 1, Timestamp(1_795_239_882_123_000))
+            ..ObjectReport::new(
+                NodeName::from_static(node),
+                1,
+                Timestamp(1_795_239_882_123_000),
+            )
         };
         let (start, mut sightings) = (Instant::now(), Sightings::default());
         let after = |seconds: u64| start + Duration::from_secs(seconds);
-        assert!(sightings.is_sighted([50.0, 0.0], start), "no other station is heard");
+        assert!(
+            sightings.is_sighted([50.0, 0.0], start),
+            "no other station is heard"
+        );
         sightings.observe(&report("edge--cpm-4711", 50.0), start);
         let pose = Some(WirePose::new(20.0, 0.0, 0.0));
-        sightings.observe(&ObjectReport { pose, ..report("edge--front", 10.0) }, start);
+        sightings.observe(
+            &ObjectReport {
+                pose,
+                ..report("edge--front", 10.0)
+            },
+            start,
+        );
         let own = |sightings: &Sightings, seconds| {
             [10.0, 14.0, 20.0, 50.0].map(|x| sightings.is_sighted([x, 0.0], after(seconds)))
         };
         assert_eq!(own(&sightings, 1), [true, true, true, false]);
         assert_eq!(own(&sightings, 3), [false; 4], "the cell has lost both");
-        assert_eq!(own(&sightings, 11), [true; 4], "the other station is silent, and its objects are gone");
+        assert_eq!(
+            own(&sightings, 11),
+            [true; 4],
+            "the other station is silent, and its objects are gone"
+        );
     }
 }

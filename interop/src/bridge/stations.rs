@@ -32,8 +32,14 @@ struct StationPlace {
 
 impl StationPlaces {
     /// Gives a station its place. Where there is none, a receiver with more stations than the others gives way.
-    pub(super) fn enter(&mut self, number: u32, receiver: &NodeName, now: Instant) -> Result<(), CpmRefusal> {
-        self.0.retain(|_, place| now.saturating_duration_since(place.heard_at) < STATION_RETENTION);
+    pub(super) fn enter(
+        &mut self,
+        number: u32,
+        receiver: &NodeName,
+        now: Instant,
+    ) -> Result<(), CpmRefusal> {
+        self.0
+            .retain(|_, place| now.saturating_duration_since(place.heard_at) < STATION_RETENTION);
         if let Some(place) = self.0.get_mut(&number) {
             if place.receiver != *receiver {
                 return Err(CpmRefusal::OtherReceiver);
@@ -44,14 +50,26 @@ impl StationPlaces {
         if self.0.len() >= MAX_OTHER_STATIONS {
             let counts = self.counts();
             let own = counts.get(receiver).copied().unwrap_or_default();
-            let most = counts.into_iter().max_by_key(|(_, count)| *count).filter(|(_, count)| *count > own + 1);
+            let most = counts
+                .into_iter()
+                .max_by_key(|(_, count)| *count)
+                .filter(|(_, count)| *count > own + 1);
             let of_most = most.and_then(|(most, _)| {
                 let places = self.0.iter().filter(|(_, place)| place.receiver == *most);
-                places.min_by_key(|(_, place)| place.heard_at).map(|(number, _)| *number)
+                places
+                    .min_by_key(|(_, place)| place.heard_at)
+                    .map(|(number, _)| *number)
             });
             self.0.remove(&of_most.ok_or(CpmRefusal::TooManyStations)?);
         }
-        self.0.insert(number, StationPlace { receiver: receiver.clone(), heard_at: now, due_at: now });
+        self.0.insert(
+            number,
+            StationPlace {
+                receiver: receiver.clone(),
+                heard_at: now,
+                due_at: now,
+            },
+        );
         Ok(())
     }
 
@@ -59,8 +77,15 @@ impl StationPlaces {
     pub(super) fn take_room(&mut self, number: u32, now: Instant) -> bool {
         let counts = self.counts();
         let receivers = counts.len();
-        let of_receiver = self.0.get(&number).and_then(|place| counts.get(&place.receiver)).copied().unwrap_or(1);
-        let Some(place) = self.0.get_mut(&number) else { return false };
+        let of_receiver = self
+            .0
+            .get(&number)
+            .and_then(|place| counts.get(&place.receiver))
+            .copied()
+            .unwrap_or(1);
+        let Some(place) = self.0.get_mut(&number) else {
+            return false;
+        };
         let interval = REPORT_INTERVAL * (receivers * of_receiver) as u32;
         let has_room = place.due_at.saturating_duration_since(now) <= interval / 2;
         if has_room {
@@ -98,7 +123,10 @@ mod tests {
         for number in 0..12 {
             places.enter(number, &EVIL, start).unwrap();
         }
-        assert_eq!(places.enter(12, &EVIL, start), Err(CpmRefusal::TooManyStations));
+        assert_eq!(
+            places.enter(12, &EVIL, start),
+            Err(CpmRefusal::TooManyStations)
+        );
         for number in 20..26 {
             places.enter(number, &HONEST, start).unwrap();
         }
@@ -108,14 +136,21 @@ mod tests {
             "half of the places are its share"
         );
         let later = start + STATION_RETENTION;
-        assert_eq!(places.enter(12, &EVIL, later), Ok(()), "silent ones give way");
+        assert_eq!(
+            places.enter(12, &EVIL, later),
+            Ok(()),
+            "silent ones give way"
+        );
     }
 
     #[test]
     fn a_station_is_of_the_receiver_that_brings_it() {
         let (mut places, start) = (StationPlaces::default(), Instant::now());
         places.enter(7, &HONEST, start).unwrap();
-        assert_eq!(places.enter(7, &EVIL, start), Err(CpmRefusal::OtherReceiver));
+        assert_eq!(
+            places.enter(7, &EVIL, start),
+            Err(CpmRefusal::OtherReceiver)
+        );
         assert_eq!(places.enter(7, &EVIL, start + STATION_RETENTION), Ok(()));
     }
 
@@ -128,11 +163,20 @@ mod tests {
             for number in 100..100 + others {
                 places.enter(number, of, start).unwrap();
             }
-            let times = (0..100).map(|n| start + Duration::from_millis(n * period_ms + 30 * (n % 2)));
+            let times =
+                (0..100).map(|n| start + Duration::from_millis(n * period_ms + 30 * (n % 2)));
             times.filter(|time| places.take_room(7, *time)).count()
         };
         assert_eq!(taken(100, 1, &HONEST), 100);
-        assert!((50..=52).contains(&taken(50, 1, &HONEST)), "{}", taken(50, 1, &HONEST));
-        assert_eq!(taken(100, 11, &EVIL), 100, "whatever another receiver brings");
+        assert!(
+            (50..=52).contains(&taken(50, 1, &HONEST)),
+            "{}",
+            taken(50, 1, &HONEST)
+        );
+        assert_eq!(
+            taken(100, 11, &EVIL),
+            100,
+            "whatever another receiver brings"
+        );
     }
 }

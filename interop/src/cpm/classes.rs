@@ -1,8 +1,9 @@
 //! Classes of road users, and their labels here.
 
 use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd::{
-    ObjectClass, OtherSubClass, TrafficParticipantType, VruProfileAndSubprofile, VruSubProfileAnimal,
-    VruSubProfileBicyclist as LightVehicle, VruSubProfileMotorcyclist, VruSubProfilePedestrian,
+    ObjectClass, OtherSubClass, TrafficParticipantType, VruProfileAndSubprofile,
+    VruSubProfileAnimal, VruSubProfileBicyclist as LightVehicle, VruSubProfileMotorcyclist,
+    VruSubProfilePedestrian,
 };
 
 /// Vehicles by `TrafficParticipantType`; the first label of a type is the one that a received message gets.
@@ -52,10 +53,15 @@ pub(super) fn label(class: &ObjectClass) -> &'static str {
             3 => "moped",
             4 => "motorcycle",
             13 => "animal",
-            _ => VEHICLES.iter().find(|(_, number)| number == kind).map_or("vehicle", |(name, _)| name),
+            _ => VEHICLES
+                .iter()
+                .find(|(_, number)| number == kind)
+                .map_or("vehicle", |(name, _)| name),
         },
         ObjectClass::vruSubClass(VruProfileAndSubprofile::pedestrian(_)) => "person",
-        ObjectClass::vruSubClass(VruProfileAndSubprofile::bicyclistAndLightVruVehicle(LightVehicle(profile))) => {
+        ObjectClass::vruSubClass(VruProfileAndSubprofile::bicyclistAndLightVruVehicle(
+            LightVehicle(profile),
+        )) => {
             match profile {
                 // Wheelchair user, roller skater, e-scooter, personal transporter: detectors see the person.
                 2 | 4..=6 => "person",
@@ -64,7 +70,9 @@ pub(super) fn label(class: &ObjectClass) -> &'static str {
                 _ => "bicycle",
             }
         }
-        ObjectClass::vruSubClass(VruProfileAndSubprofile::motorcyclist(VruSubProfileMotorcyclist(1))) => "moped",
+        ObjectClass::vruSubClass(VruProfileAndSubprofile::motorcyclist(
+            VruSubProfileMotorcyclist(1),
+        )) => "moped",
         ObjectClass::vruSubClass(VruProfileAndSubprofile::motorcyclist(_)) => "motorcycle",
         ObjectClass::vruSubClass(VruProfileAndSubprofile::animal(_)) => "animal",
         ObjectClass::groupSubClass(_) => "group",

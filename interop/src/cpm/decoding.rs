@@ -13,8 +13,8 @@ use ecod::wire::{Limits, PerceivedObject};
 
 use super::frame::MessageFrame;
 use super::{
-    COORDINATES_CM, CpmError, ITS_EPOCH_MS, MAX_BYTES, MESSAGE_ID, PROTOCOL_VERSION, ReceivedCpm, SIGMAS,
-    UNSTATED_COORDINATE, classes,
+    COORDINATES_CM, CpmError, ITS_EPOCH_MS, MAX_BYTES, MESSAGE_ID, PROTOCOL_VERSION, ReceivedCpm,
+    SIGMAS, UNSTATED_COORDINATE, classes,
 };
 
 /// Confidence of an object of which the station states none.
@@ -46,7 +46,8 @@ pub fn decode(bytes: &[u8], origin: &GeographicOrigin) -> Result<ReceivedCpm, Cp
     let management = &message.payload.management_container;
     let time_ms = ITS_EPOCH_MS + management.reference_time.0;
     let frame = MessageFrame::of(origin, &management.reference_position)?;
-    let position_error = frame.position_error(&management.reference_position.position_confidence_ellipse)?;
+    let position_error =
+        frame.position_error(&management.reference_position.position_confidence_ellipse)?;
     let segment = management.segmentation_info.as_ref();
     let (mut objects, mut all) = (Vec::new(), 0);
     for container in &message.payload.cpm_containers.0.0 {
@@ -54,7 +55,11 @@ pub fn decode(bytes: &[u8], origin: &GeographicOrigin) -> Result<ReceivedCpm, Cp
             let container: PerceivedObjectContainer = uper(container.container_data.as_bytes())?;
             let container = container.perceived_objects.0;
             all += container.len();
-            objects.extend(container.iter().filter_map(|object| perceived(object, &frame, position_error)));
+            objects.extend(
+                container
+                    .iter()
+                    .filter_map(|object| perceived(object, &frame, position_error)),
+            );
             if objects.len() > Limits::default().objects {
                 return Err(CpmError::TooManyObjects);
             }
@@ -87,7 +92,10 @@ fn perceived(
     let late_s = f64::from(delta_ms) / 1000.0;
     let [east_mps, north_mps] = velocity.unwrap_or_default();
     let (east, north) = (&object.position.x_coordinate, &object.position.y_coordinate);
-    let [x_m, y_m] = frame.to_cell([metres(east)? - east_mps * late_s, metres(north)? - north_mps * late_s]);
+    let [x_m, y_m] = frame.to_cell([
+        metres(east)? - east_mps * late_s,
+        metres(north)? - north_mps * late_s,
+    ]);
     let covariance = frame.variances_to_cell([variance(east), variance(north)]) + position_error;
     let classes = object.classification.iter().flat_map(|classes| &classes.0);
     let (mut scores, mut first) = (BTreeMap::<Label, f64>::new(), None);
@@ -99,10 +107,19 @@ fn perceived(
             *score = (*score + f64::from(class.confidence.0) / 100.0).min(1.0);
         }
     }
-    let best = scores.iter().max_by(|a, b| a.1.total_cmp(b.1)).map(|(label, score)| (label.clone(), *score));
+    let best = scores
+        .iter()
+        .max_by(|a, b| a.1.total_cmp(b.1))
+        .map(|(label, score)| (label.clone(), *score));
     let (label, score) = best.unzip();
-    let quality = object.object_perception_quality.as_ref().map(|quality| f64::from(quality.0) / 15.0);
-    let angle = object.angles.as_ref().and_then(|angles| radians(&angles.z_angle));
+    let quality = object
+        .object_perception_quality
+        .as_ref()
+        .map(|quality| f64::from(quality.0) / 15.0);
+    let angle = object
+        .angles
+        .as_ref()
+        .and_then(|angles| radians(&angles.z_angle));
     let size = object
         .object_dimension_x
         .as_ref()
@@ -123,7 +140,9 @@ fn perceived(
 /// A coordinate in metres; `None` for the codes of those out of range.
 fn metres(coordinate: &cdd::CartesianCoordinateWithConfidence) -> Option<f64> {
     let centimetres = coordinate.value.0;
-    COORDINATES_CM.contains(&centimetres).then(|| f64::from(centimetres) / 100.0)
+    COORDINATES_CM
+        .contains(&centimetres)
+        .then(|| f64::from(centimetres) / 100.0)
 }
 
 /// Variance of a coordinate in m². More than 40.94 m counts as 40.95 m.
@@ -139,16 +158,27 @@ fn velocity(velocity: &cdd::Velocity3dWithConfidence) -> Option<[f64; 2]> {
     match velocity {
         cdd::Velocity3dWithConfidence::cartesianVelocity(velocity) => {
             let component = |component: &cdd::VelocityComponent| {
-                let is_value = (-16_382..=16_381).contains(&component.value.0) && component.confidence.0 != WIDE_SPEED;
+                let is_value = (-16_382..=16_381).contains(&component.value.0)
+                    && component.confidence.0 != WIDE_SPEED;
                 is_value.then(|| f64::from(component.value.0) / 100.0)
             };
-            component(&velocity.x_velocity).zip(component(&velocity.y_velocity)).map(|(east, north)| [east, north])
+            component(&velocity.x_velocity)
+                .zip(component(&velocity.y_velocity))
+                .map(|(east, north)| [east, north])
         }
         cdd::Velocity3dWithConfidence::polarVelocity(velocity) => {
-            let cdd::Speed { speed_value: cdd::SpeedValue(speed), speed_confidence } = &velocity.velocity_magnitude;
+            let cdd::Speed {
+                speed_value: cdd::SpeedValue(speed),
+                speed_confidence,
+            } = &velocity.velocity_magnitude;
             let (sin, cos) = radians(&velocity.velocity_direction)?.sin_cos();
             let is_value = *speed < 16_382 && speed_confidence.0 != WIDE_SPEED;
-            is_value.then(|| [f64::from(*speed) / 100.0 * cos, f64::from(*speed) / 100.0 * sin])
+            is_value.then(|| {
+                [
+                    f64::from(*speed) / 100.0 * cos,
+                    f64::from(*speed) / 100.0 * sin,
+                ]
+            })
         }
     }
 }

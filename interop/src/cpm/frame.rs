@@ -50,23 +50,43 @@ impl MessageFrame {
     }
 
     /// The frame of a received message.
-    pub(super) fn of(cell: &GeographicOrigin, position: &cdd::ReferencePosition) -> Result<Self, CpmError> {
+    pub(super) fn of(
+        cell: &GeographicOrigin,
+        position: &cdd::ReferencePosition,
+    ) -> Result<Self, CpmError> {
         let (latitude, longitude) = (position.latitude.0, position.longitude.0);
         if latitude == NO_LATITUDE || longitude == NO_LONGITUDE {
             return Err(CpmError::NoPosition);
         }
         let altitude = position.altitude.altitude_value.0;
-        let height_m = if altitude == NO_ALTITUDE { cell.height_m } else { f64::from(altitude) / 100.0 };
+        let height_m = if altitude == NO_ALTITUDE {
+            cell.height_m
+        } else {
+            f64::from(altitude) / 100.0
+        };
         let (latitude_deg, longitude_deg) = (f64::from(latitude) / 1e7, f64::from(longitude) / 1e7);
-        Self::new(cell, GeographicPosition { latitude_deg, longitude_deg, height_m })
+        Self::new(
+            cell,
+            GeographicPosition {
+                latitude_deg,
+                longitude_deg,
+                height_m,
+            },
+        )
     }
 
     /// Covariance of a received reference position in the cell's frame.
     ///
     /// # Errors
     /// [`CpmError::NoPosition`] for an error out of range.
-    pub(super) fn position_error(&self, ellipse: &cdd::PosConfidenceEllipse) -> Result<Covariance, CpmError> {
-        let (major, minor) = (ellipse.semi_major_confidence.0, ellipse.semi_minor_confidence.0);
+    pub(super) fn position_error(
+        &self,
+        ellipse: &cdd::PosConfidenceEllipse,
+    ) -> Result<Covariance, CpmError> {
+        let (major, minor) = (
+            ellipse.semi_major_confidence.0,
+            ellipse.semi_minor_confidence.0,
+        );
         if major == WIDE_AXIS || minor == WIDE_AXIS {
             return Err(CpmError::NoPosition);
         }
@@ -79,16 +99,39 @@ impl MessageFrame {
         if direction >= 3600 {
             return Ok(Covariance::isotropic(sigma_m(major.max(minor))));
         }
-        let bearing_rad = self.heading_to_cell(FRAC_PI_2 - (f64::from(direction) / 10.0).to_radians());
-        Ok(Covariance::along_bearing(bearing_rad, sigma_m(major), sigma_m(minor)))
+        let bearing_rad =
+            self.heading_to_cell(FRAC_PI_2 - (f64::from(direction) / 10.0).to_radians());
+        Ok(Covariance::along_bearing(
+            bearing_rad,
+            sigma_m(major),
+            sigma_m(minor),
+        ))
     }
 
     fn new(cell: &GeographicOrigin, at: GeographicPosition) -> Result<Self, CpmError> {
-        let GeographicPosition { latitude_deg, longitude_deg, height_m } = at;
-        let east = GeographicPose { latitude_deg, longitude_deg, height_m: Some(height_m), azimuth_deg: 90.0 };
+        let GeographicPosition {
+            latitude_deg,
+            longitude_deg,
+            height_m,
+        } = at;
+        let east = GeographicPose {
+            latitude_deg,
+            longitude_deg,
+            height_m: Some(height_m),
+            azimuth_deg: 90.0,
+        };
         let east = cell.pose_to_map(&east).map_err(|_| CpmError::TooFar)?;
-        let reference = GeographicOrigin { latitude_deg, longitude_deg, height_m, rotation_deg: 0.0 };
-        Ok(Self { cell: *cell, reference, rotation_rad: -east.heading_rad })
+        let reference = GeographicOrigin {
+            latitude_deg,
+            longitude_deg,
+            height_m,
+            rotation_deg: 0.0,
+        };
+        Ok(Self {
+            cell: *cell,
+            reference,
+            rotation_rad: -east.heading_rad,
+        })
     }
 
     /// The reference position as a message states it. Its error is unavailable: a node does not know that of its origin or
@@ -118,7 +161,9 @@ impl MessageFrame {
 
     /// A position in the cell's frame.
     pub(super) fn to_cell(&self, [east_m, north_m]: [f64; 2]) -> [f64; 2] {
-        let local = self.cell.to_map(&self.reference.to_wgs84(east_m, north_m, 0.0));
+        let local = self
+            .cell
+            .to_map(&self.reference.to_wgs84(east_m, north_m, 0.0));
         [local.x, local.y]
     }
 
@@ -145,7 +190,9 @@ impl MessageFrame {
     /// Variances east and north of a covariance in the cell's frame.
     pub(super) fn variances_to_message(&self, covariance_m2: [f64; 3]) -> [f64; 2] {
         let turn = Rotation2::new(self.rotation_rad);
-        (turn * Covariance::from(covariance_m2).matrix() * turn.inverse()).diagonal().into()
+        (turn * Covariance::from(covariance_m2).matrix() * turn.inverse())
+            .diagonal()
+            .into()
     }
 
     /// The covariance in the cell's frame of variances east and north.

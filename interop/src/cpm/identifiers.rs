@@ -12,7 +12,9 @@ pub const RECEIVED_PART: &str = "cpm-";
 
 /// True if a node's name is that of a part which reports the objects of received messages.
 pub fn is_received(node: &NodeName) -> bool {
-    node.as_str().split_once(PART_MARK).is_some_and(|(_, part)| part.starts_with(RECEIVED_PART))
+    node.as_str()
+        .split_once(PART_MARK)
+        .is_some_and(|(_, part)| part.starts_with(RECEIVED_PART))
 }
 
 /// Station numbers of the nodes of a cell. Each part of a node, such as its second camera, is a station of its own.
@@ -41,7 +43,11 @@ const NUMBER_RETENTION: Duration = Duration::from_secs(60);
 impl StationIds {
     /// Numbers for a cell of this name.
     pub fn new(cell: NodeName) -> Self {
-        Self { cell, by_name: HashMap::new(), is_full: false }
+        Self {
+            cell,
+            by_name: HashMap::new(),
+            is_full: false,
+        }
     }
 
     /// The number of a node that is heard; `None` if its vehicle has [`MAX_PARTS`] other parts, or the cell 4096 other nodes, which
@@ -52,7 +58,11 @@ impl StationIds {
             return Some(known.number);
         }
         self.by_name.retain(|_, known| is_fresh(known, now));
-        let of_vehicle = self.by_name.keys().filter(|other| other.vehicle() == node.vehicle()).count();
+        let of_vehicle = self
+            .by_name
+            .keys()
+            .filter(|other| other.vehicle() == node.vehicle())
+            .count();
         if of_vehicle > MAX_PARTS || self.by_name.len() >= MAX_NUMBERED_NODES {
             if !std::mem::replace(&mut self.is_full, true) {
                 log::warn!(
@@ -62,19 +72,30 @@ impl StationIds {
             }
             return None;
         }
-        let name = Uuid::new_v5(&Uuid::NAMESPACE_URL, format!("{}/{node}", self.cell).as_bytes());
+        let name = Uuid::new_v5(
+            &Uuid::NAMESPACE_URL,
+            format!("{}/{node}", self.cell).as_bytes(),
+        );
         let used: HashSet<_> = self.by_name.values().map(|known| known.number).collect();
         let mut number = name.as_fields().0;
         while used.contains(&number) {
             number = number.wrapping_add(1);
         }
-        self.by_name.insert(node.clone(), NumberedStation { number, heard_at: now });
+        self.by_name.insert(
+            node.clone(),
+            NumberedStation {
+                number,
+                heard_at: now,
+            },
+        );
         Some(number)
     }
 
     /// True if a node that was heard lately has the number.
     pub fn contains(&self, number: u32, now: Instant) -> bool {
-        self.by_name.values().any(|known| known.number == number && is_fresh(known, now))
+        self.by_name
+            .values()
+            .any(|known| known.number == number && is_fresh(known, now))
     }
 }
 

@@ -19,10 +19,19 @@ impl Segments {
     /// # Errors
     /// [`CpmError::TooManyObjects`] if all segments together have more than a report may have; they are dropped.
     pub fn join(&mut self, received: ReceivedCpm) -> Result<Option<ReceivedCpm>, CpmError> {
-        let Some((number, total)) = received.segment else { return Ok(Some(received)) };
-        self.of_latest.retain(|_, segment| segment.captured_at == received.captured_at);
+        let Some((number, total)) = received.segment else {
+            return Ok(Some(received));
+        };
+        self.of_latest
+            .retain(|_, segment| segment.captured_at == received.captured_at);
         self.of_latest.insert(number, received);
-        if self.of_latest.values().map(|segment| segment.objects.len()).sum::<usize>() > Limits::default().objects {
+        if self
+            .of_latest
+            .values()
+            .map(|segment| segment.objects.len())
+            .sum::<usize>()
+            > Limits::default().objects
+        {
             self.of_latest.clear();
             return Err(CpmError::TooManyObjects);
         }

@@ -1,4 +1,9 @@
-#![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+#![allow(
+    clippy::indexing_slicing,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic
+)]
 
 use std::f64::consts::{PI, TAU};
 use std::time::{Duration, Instant};
@@ -20,32 +25,60 @@ use super::*;
 const NOW: Timestamp = Timestamp(1_795_239_882_123_000);
 
 fn origin(rotation_deg: f64) -> GeographicOrigin {
-    GeographicOrigin { latitude_deg: 52.2296756, longitude_deg: 21.0122287, height_m: 113.0, rotation_deg }
+    GeographicOrigin {
+        latitude_deg: 52.2296756,
+        longitude_deg: 21.0122287,
+        height_m: 113.0,
+        rotation_deg,
+    }
 }
 
 /// A cell with the sign "EMPTY".
 fn cell(rotation_deg: f64) -> CpmCell {
-    CpmCell { origin: origin(rotation_deg), vacancy_signs: BTreeSet::from(["EMPTY".into()]) }
+    CpmCell {
+        origin: origin(rotation_deg),
+        vacancy_signs: BTreeSet::from(["EMPTY".into()]),
+    }
 }
 
 fn report(objects: Vec<PerceivedObject>) -> ObjectReport {
-    ObjectReport { objects, ..ObjectReport::new(NodeName::from_static("euclid"), 1, NOW) }
+    ObjectReport {
+        objects,
+        ..ObjectReport::new(NodeName::from_static("euclid"), 1, NOW)
+    }
 }
 
 fn map(objects: Vec<FusedObject>, landmarks: Vec<LandmarkState>) -> GlobalMap {
     let epoch = Epoch::new(7, NodeName::from_static("edge"));
-    GlobalMap { landmarks, objects, ..GlobalMap::new(&epoch, 1, NOW) }
+    GlobalMap {
+        landmarks,
+        objects,
+        ..GlobalMap::new(&epoch, 1, NOW)
+    }
 }
 
 fn fused(id: u128, x_m: f64) -> FusedObject {
-    FusedObject::new(Uuid::from_u128(id), "car", 0.8, x_m, 0.0, Covariance::isotropic(0.04))
+    FusedObject::new(
+        Uuid::from_u128(id),
+        "car",
+        0.8,
+        x_m,
+        0.0,
+        Covariance::isotropic(0.04),
+    )
 }
 
 fn detection() -> impl Strategy<Value = PerceivedObject> {
     let position = (-500.0..500.0, -500.0..500.0);
     let motion = proptest::option::of([-60.0..60.0, -60.0..60.0]);
-    let label =
-        prop_oneof![Just("car"), Just("bus"), Just("person"), Just("bicycle"), Just("motorcycle"), Just("object")];
+    let label = prop_oneof![
+        Just("car"),
+        Just("bus"),
+        Just("person"),
+        Just("bicycle"),
+        Just("motorcycle"),
+        Just("object")
+    ];
     let shape = proptest::option::of([0.2..25.0, 0.2..25.0]);
     (
         label,
@@ -56,13 +89,17 @@ fn detection() -> impl Strategy<Value = PerceivedObject> {
         proptest::option::of(-PI..PI),
         shape,
     )
-        .prop_map(|(label, confidence, (x_m, y_m), variance, velocity_mps, heading_rad, size_m)| PerceivedObject {
-            covariance_m2: variance.map(|variance: f64| [variance, 0.0, variance]),
-            velocity_mps,
-            heading_rad,
-            size_m,
-            ..PerceivedObject::new(label, confidence, x_m, y_m)
-        })
+        .prop_map(
+            |(label, confidence, (x_m, y_m), variance, velocity_mps, heading_rad, size_m)| {
+                PerceivedObject {
+                    covariance_m2: variance.map(|variance: f64| [variance, 0.0, variance]),
+                    velocity_mps,
+                    heading_rad,
+                    size_m,
+                    ..PerceivedObject::new(label, confidence, x_m, y_m)
+                }
+            },
+        )
 }
 
 /// A number within a bound of the wire format, often at it.
@@ -76,15 +113,22 @@ fn extreme_detection() -> impl Strategy<Value = PerceivedObject> {
         proptest::option::of(up_to(7e19).prop_map(f64::abs)),
         proptest::option::of([up_to(1e4), up_to(1e4)]),
         proptest::option::of(up_to(1e6)),
-        proptest::option::of([up_to(102_400.0).prop_map(f64::abs), up_to(102_400.0).prop_map(f64::abs)]),
+        proptest::option::of([
+            up_to(102_400.0).prop_map(f64::abs),
+            up_to(102_400.0).prop_map(f64::abs),
+        ]),
     )
-        .prop_map(|((x_m, y_m, confidence), variance, velocity_mps, heading_rad, size_m)| PerceivedObject {
-            covariance_m2: variance.map(|variance| [variance, 0.0, variance]),
-            velocity_mps,
-            heading_rad,
-            size_m,
-            ..PerceivedObject::new("car", confidence, x_m, y_m)
-        })
+        .prop_map(
+            |((x_m, y_m, confidence), variance, velocity_mps, heading_rad, size_m)| {
+                PerceivedObject {
+                    covariance_m2: variance.map(|variance| [variance, 0.0, variance]),
+                    velocity_mps,
+                    heading_rad,
+                    size_m,
+                    ..PerceivedObject::new("car", confidence, x_m, y_m)
+                }
+            },
+        )
 }
 
 proptest! {
@@ -174,15 +218,28 @@ fn an_object_keeps_its_number_and_two_never_share_one() {
     // The first two bytes of all are equal.
     let all: Vec<_> = (1..=3).map(Uuid::from_u128).collect();
     let first = ids.assign(&all);
-    assert_eq!(all.iter().map(|id| first[id]).collect::<Vec<_>>(), [0, 1, 2]);
+    assert_eq!(
+        all.iter().map(|id| first[id]).collect::<Vec<_>>(),
+        [0, 1, 2]
+    );
     let second = ids.assign(&[all[2], Uuid::from_u128(4), all[1]]);
-    assert_eq!((second[&all[1]], second[&all[2]], second[&Uuid::from_u128(4)]), (1, 2, 0));
+    assert_eq!(
+        (
+            second[&all[1]],
+            second[&all[2]],
+            second[&Uuid::from_u128(4)]
+        ),
+        (1, 2, 0)
+    );
 }
 
 #[test]
 fn a_node_has_the_same_station_number_in_every_run() {
     let numbers = || StationIds::new(NodeName::from_static("lot-1"));
-    let (euclid, gauss) = (NodeName::from_static("euclid"), NodeName::from_static("gauss"));
+    let (euclid, gauss) = (
+        NodeName::from_static("euclid"),
+        NodeName::from_static("gauss"),
+    );
     let (mut one, mut other) = (numbers(), numbers());
     let now = Instant::now();
     let of_gauss = one.of(&gauss, now).unwrap();
@@ -203,77 +260,165 @@ fn a_map_has_its_objects_and_the_road_users_at_known_locations() {
         observers: Vec::new(),
         readings: Vec::new(),
     };
-    let places = vec![at("a", Some("truck")), at("b", Some("EMPTY")), at("c", None)];
-    let message =
-        encode_map(&map(vec![fused(1, 12.0)], places), &cell(0.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
+    let places = vec![
+        at("a", Some("truck")),
+        at("b", Some("EMPTY")),
+        at("c", None),
+    ];
+    let message = encode_map(
+        &map(vec![fused(1, 12.0)], places),
+        &cell(0.0),
+        3,
+        &mut ObjectIds::default(),
+        |_| true,
+    )
+    .unwrap();
     let objects = decode(&message.bytes, &origin(0.0)).unwrap().objects;
-    let labels: Vec<_> = objects.iter().map(|object| (object.label.as_str(), object.x_m.round())).collect();
+    let labels: Vec<_> = objects
+        .iter()
+        .map(|object| (object.label.as_str(), object.x_m.round()))
+        .collect();
     assert_eq!(labels, [("truck", 5.0), ("car", 12.0)]);
 }
 
 #[test]
 fn of_too_many_objects_the_surest_are_sent() {
-    let objects =
-        (0..300_u16).map(|number| FusedObject { confidence: f64::from(number) / 300.0, ..fused(number.into(), 1.0) });
+    let objects = (0..300_u16).map(|number| FusedObject {
+        confidence: f64::from(number) / 300.0,
+        ..fused(number.into(), 1.0)
+    });
     let large = map(objects.collect(), Vec::new());
     let message = encode_map(&large, &cell(0.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
     assert_eq!(message.left_out, 45);
     let received = decode(&message.bytes, &origin(0.0)).unwrap();
-    assert!(received.objects.len() == 255 && received.objects.iter().all(|object| object.confidence > 0.13));
-    assert!(message.bytes.len() < MAX_BYTES / 2, "{}", message.bytes.len());
+    assert!(
+        received.objects.len() == 255
+            && received
+                .objects
+                .iter()
+                .all(|object| object.confidence > 0.13)
+    );
+    assert!(
+        message.bytes.len() < MAX_BYTES / 2,
+        "{}",
+        message.bytes.len()
+    );
 }
 
 #[test]
 fn the_reference_position_is_where_most_objects_are() {
     let sent = |places: &[f64]| {
         let objects = (1..).zip(places).map(|(id, x_m)| fused(id, *x_m)).collect();
-        let message =
-            encode_map(&map(objects, Vec::new()), &cell(45.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
+        let message = encode_map(
+            &map(objects, Vec::new()),
+            &cell(45.0),
+            3,
+            &mut ObjectIds::default(),
+            |_| true,
+        )
+        .unwrap();
         let objects = decode(&message.bytes, &origin(45.0)).unwrap().objects;
-        (objects.iter().map(|object| object.x_m.round()).collect::<Vec<_>>(), message.left_out)
+        (
+            objects
+                .iter()
+                .map(|object| object.x_m.round())
+                .collect::<Vec<_>>(),
+            message.left_out,
+        )
     };
-    assert_eq!(sent(&[5000.0, 5800.0, 9000.0]), (vec![5000.0, 5800.0], 1), "far from the origin");
-    assert_eq!(sent(&[-890.0, 20.0, 890.0]), (vec![-890.0, 20.0, 890.0], 0), "all about the origin");
+    assert_eq!(
+        sent(&[5000.0, 5800.0, 9000.0]),
+        (vec![5000.0, 5800.0], 1),
+        "far from the origin"
+    );
+    assert_eq!(
+        sent(&[-890.0, 20.0, 890.0]),
+        (vec![-890.0, 20.0, 890.0], 0),
+        "all about the origin"
+    );
     for far_m in [3000.0, -3000.0, 1e8] {
-        assert_eq!(sent(&[far_m, 0.0]), (vec![0.0], 1), "one object that is far costs no other its place");
+        assert_eq!(
+            sent(&[far_m, 0.0]),
+            (vec![0.0], 1),
+            "one object that is far costs no other its place"
+        );
     }
 }
 
 #[test]
 fn messages_that_are_not_for_here_are_refused_by_reason() {
-    let message = encode_report(&report(Vec::new()), &cell(0.0), 1).unwrap().bytes;
-    let there = GeographicOrigin { latitude_deg: 48.0, ..origin(0.0) };
+    let message = encode_report(&report(Vec::new()), &cell(0.0), 1)
+        .unwrap()
+        .bytes;
+    let there = GeographicOrigin {
+        latitude_deg: 48.0,
+        ..origin(0.0)
+    };
     assert_eq!(decode(&message, &there), Err(CpmError::TooFar));
-    assert_eq!(decode(&message[..12], &origin(0.0)), Err(CpmError::Malformed));
-    assert_eq!(decode(&[2, 2, 0, 0], &origin(0.0)), Err(CpmError::OtherMessage));
-    assert_eq!(decode(&vec![0; MAX_BYTES + 1], &origin(0.0)), Err(CpmError::TooLarge));
-    let early = ObjectReport { captured_at_us: Timestamp(5), ..report(Vec::new()) };
+    assert_eq!(
+        decode(&message[..12], &origin(0.0)),
+        Err(CpmError::Malformed)
+    );
+    assert_eq!(
+        decode(&[2, 2, 0, 0], &origin(0.0)),
+        Err(CpmError::OtherMessage)
+    );
+    assert_eq!(
+        decode(&vec![0; MAX_BYTES + 1], &origin(0.0)),
+        Err(CpmError::TooLarge)
+    );
+    let early = ObjectReport {
+        captured_at_us: Timestamp(5),
+        ..report(Vec::new())
+    };
     assert_eq!(encode_report(&early, &cell(0.0), 1), Err(CpmError::NoTime));
-    let late = ObjectReport { captured_at_us: Timestamp((1 << 53) - 1), ..report(Vec::new()) };
-    assert_eq!(encode_report(&late, &cell(0.0), 1), Err(CpmError::Unencodable), "the year 2255");
+    let late = ObjectReport {
+        captured_at_us: Timestamp((1 << 53) - 1),
+        ..report(Vec::new())
+    };
+    assert_eq!(
+        encode_report(&late, &cell(0.0), 1),
+        Err(CpmError::Unencodable),
+        "the year 2255"
+    );
 }
 
 #[test]
 fn a_covariance_turns_with_the_frames() {
     // The cell's x axis points north.
     let quarter = origin(90.0);
-    let object = PerceivedObject { covariance_m2: Some([4.0, 0.0, 1.0]), ..PerceivedObject::new("car", 0.9, 3.0, 2.0) };
-    let message = encode_report(&report(vec![object]), &cell(90.0), 1).unwrap().bytes;
+    let object = PerceivedObject {
+        covariance_m2: Some([4.0, 0.0, 1.0]),
+        ..PerceivedObject::new("car", 0.9, 3.0, 2.0)
+    };
+    let message = encode_report(&report(vec![object]), &cell(90.0), 1)
+        .unwrap()
+        .bytes;
     let there = decode(&message, &quarter).unwrap().objects.remove(0);
     let [along_x, _, along_y] = there.covariance_m2.unwrap();
     let own = (5.0_f64 / 2.4477).powi(2);
-    assert!((along_x - own - 4.0).abs() < 0.03 && (along_y - own - 1.0).abs() < 0.03, "{along_x} {along_y}");
+    assert!(
+        (along_x - own - 4.0).abs() < 0.03 && (along_y - own - 1.0).abs() < 0.03,
+        "{along_x} {along_y}"
+    );
     let by_east = decode(&message, &origin(0.0)).unwrap().objects.remove(0);
     let [east, _, north] = by_east.covariance_m2.unwrap();
-    assert!((east - own - 1.0).abs() < 0.03 && (north - own - 4.0).abs() < 0.03, "{east} {north}");
+    assert!(
+        (east - own - 1.0).abs() < 0.03 && (north - own - 4.0).abs() < 0.03,
+        "{east} {north}"
+    );
 }
 
 /// The only object of a message as the standard has it.
 fn perceived(message: &EncodedCpm) -> cdd::PerceivedObject {
     let whole: CollectivePerceptionMessage = rasn::uper::decode(&message.bytes).unwrap();
     let containers = &whole.payload.cpm_containers.0.0;
-    let container = containers.iter().find(|container| container.container_id == PERCEIVED_OBJECT_CONTAINER).unwrap();
-    let container: PerceivedObjectContainer = rasn::uper::decode(container.container_data.as_bytes()).unwrap();
+    let container = containers
+        .iter()
+        .find(|container| container.container_id == PERCEIVED_OBJECT_CONTAINER)
+        .unwrap();
+    let container: PerceivedObjectContainer =
+        rasn::uper::decode(container.container_data.as_bytes()).unwrap();
     assert_eq!(container.perceived_objects.0.len(), 1);
     container.perceived_objects.0[0].clone()
 }
@@ -292,15 +437,33 @@ fn values_beyond_the_range_are_written_as_the_codes_that_say_so() {
         size_m: Some([40.0, 25.4]),
         ..car.clone()
     });
-    assert_eq!((wide.position.x_coordinate.confidence.0, wide.position.y_coordinate.confidence.0), (4095, 4095));
-    let Some(cdd::Velocity3dWithConfidence::cartesianVelocity(velocity)) = wide.velocity else { panic!() };
-    assert_eq!((velocity.x_velocity.value.0, velocity.y_velocity.value.0), (16_382, -16_383));
+    assert_eq!(
+        (
+            wide.position.x_coordinate.confidence.0,
+            wide.position.y_coordinate.confidence.0
+        ),
+        (4095, 4095)
+    );
+    let Some(cdd::Velocity3dWithConfidence::cartesianVelocity(velocity)) = wide.velocity else {
+        panic!()
+    };
+    assert_eq!(
+        (velocity.x_velocity.value.0, velocity.y_velocity.value.0),
+        (16_382, -16_383)
+    );
     assert_eq!(wide.object_dimension_x.map(|size| size.value.0), Some(255));
     assert_eq!(wide.object_dimension_y.map(|size| size.value.0), Some(254));
     // At the last centimetre, and at the codes beyond it.
     let here = WirePose::new(0.0, 0.0, 0.0);
-    let places = [1310.70, 1310.71, -1310.71, -1310.72].map(|x_m| PerceivedObject { x_m, y_m: 0.0, ..car.clone() });
-    let sent = ObjectReport { pose: Some(here), ..report(places.into()) };
+    let places = [1310.70, 1310.71, -1310.71, -1310.72].map(|x_m| PerceivedObject {
+        x_m,
+        y_m: 0.0,
+        ..car.clone()
+    });
+    let sent = ObjectReport {
+        pose: Some(here),
+        ..report(places.into())
+    };
     let message = encode_report(&sent, &cell(0.0), 1).unwrap();
     let objects = decode(&message.bytes, &origin(0.0)).unwrap().objects;
     assert_eq!((message.left_out, objects.len()), (2, 2));
@@ -308,31 +471,69 @@ fn values_beyond_the_range_are_written_as_the_codes_that_say_so() {
 
 #[test]
 fn without_a_heading_no_box_is_stated() {
-    let car = PerceivedObject { size_m: Some([4.5, 1.8]), ..PerceivedObject::new("car", 0.9, 4.0, 5.0) };
-    let turned = written(PerceivedObject { heading_rad: Some(1.0), ..car.clone() });
+    let car = PerceivedObject {
+        size_m: Some([4.5, 1.8]),
+        ..PerceivedObject::new("car", 0.9, 4.0, 5.0)
+    };
+    let turned = written(PerceivedObject {
+        heading_rad: Some(1.0),
+        ..car.clone()
+    });
     assert!(turned.object_dimension_x.is_some() && turned.object_dimension_y.is_some());
     let unknown = written(car);
-    assert!(unknown.object_dimension_x.is_none() && unknown.object_dimension_y.is_none() && unknown.angles.is_none());
+    assert!(
+        unknown.object_dimension_x.is_none()
+            && unknown.object_dimension_y.is_none()
+            && unknown.angles.is_none()
+    );
 }
 
 #[test]
 fn labels_of_one_class_add_up() {
-    let scores = [("car".into(), 0.4), ("dog".into(), 0.25), ("cat".into(), 0.25), ("cup".into(), 0.1)].into();
-    let classes = written(PerceivedObject { scores, ..PerceivedObject::new("car", 0.4, 1.0, 0.0) }).classification;
-    let percents: Vec<_> = classes.unwrap().0.iter().map(|class| class.confidence.0).collect();
+    let scores = [
+        ("car".into(), 0.4),
+        ("dog".into(), 0.25),
+        ("cat".into(), 0.25),
+        ("cup".into(), 0.1),
+    ]
+    .into();
+    let classes = written(PerceivedObject {
+        scores,
+        ..PerceivedObject::new("car", 0.4, 1.0, 0.0)
+    })
+    .classification;
+    let percents: Vec<_> = classes
+        .unwrap()
+        .0
+        .iter()
+        .map(|class| class.confidence.0)
+        .collect();
     assert_eq!(percents, [50, 40, 10]);
 }
 
 #[test]
 fn an_object_that_is_no_longer_seen_is_dated_and_placed_as_it_was_last_seen() {
-    let coasting = |age_s| FusedObject { age_s: Some(age_s), velocity_mps: Some([10.0, 0.0]), ..fused(1, 50.0) };
+    let coasting = |age_s| FusedObject {
+        age_s: Some(age_s),
+        velocity_mps: Some([10.0, 0.0]),
+        ..fused(1, 50.0)
+    };
     let message = |age_s| {
         let map = map(vec![coasting(age_s)], Vec::new());
         encode_map(&map, &cell(0.0), 3, &mut ObjectIds::default(), |_| true).unwrap()
     };
     let old = perceived(&message(0.8));
-    assert_eq!((old.measurement_delta_time.0, old.position.x_coordinate.value.0), (-800, 4200));
-    let there = decode(&message(0.8).bytes, &origin(0.0)).unwrap().objects.remove(0);
+    assert_eq!(
+        (
+            old.measurement_delta_time.0,
+            old.position.x_coordinate.value.0
+        ),
+        (-800, 4200)
+    );
+    let there = decode(&message(0.8).bytes, &origin(0.0))
+        .unwrap()
+        .objects
+        .remove(0);
     assert!((there.x_m - 50.0).abs() < 0.01, "{there:?}");
     assert_eq!(perceived(&message(30.0)).measurement_delta_time.0, -2048);
     let ghost = decode(&message(1.2).bytes, &origin(0.0)).unwrap();
@@ -342,9 +543,19 @@ fn an_object_that_is_no_longer_seen_is_dated_and_placed_as_it_was_last_seen() {
 #[test]
 fn objects_that_the_cell_does_not_know_by_itself_are_not_sent() {
     let map = map(vec![fused(1, 10.0), fused(2, 20.0)], Vec::new());
-    let message = encode_map(&map, &cell(0.0), 3, &mut ObjectIds::default(), |[x_m, _]| x_m > 15.0).unwrap();
+    let message = encode_map(
+        &map,
+        &cell(0.0),
+        3,
+        &mut ObjectIds::default(),
+        |[x_m, _]| x_m > 15.0,
+    )
+    .unwrap();
     let objects = decode(&message.bytes, &origin(0.0)).unwrap().objects;
-    assert_eq!((objects.len(), objects[0].x_m.round(), message.left_out), (1, 20.0, 0));
+    assert_eq!(
+        (objects.len(), objects[0].x_m.round(), message.left_out),
+        (1, 20.0, 0)
+    );
 }
 
 #[test]
@@ -352,40 +563,90 @@ fn vacancy_signs_are_no_objects() {
     let read = |label: &str| PerceivedObject::new(label, 0.9, 4.0, 5.0);
     let sent = report(vec![read("EMPTY"), read("MNOP101"), read("car")]);
     let message = encode_report(&sent, &cell(0.0), 1).unwrap();
-    let labels: Vec<_> =
-        decode(&message.bytes, &origin(0.0)).unwrap().objects.into_iter().map(|object| object.label).collect();
-    assert_eq!((labels, message.left_out), (vec!["object".into(), "car".into()], 0));
-    let stray = FusedObject { label: "EMPTY".into(), ..fused(1, 3.0) };
-    let message =
-        encode_map(&map(vec![stray], Vec::new()), &cell(0.0), 3, &mut ObjectIds::default(), |_| true).unwrap();
-    assert!(decode(&message.bytes, &origin(0.0)).unwrap().objects.is_empty());
+    let labels: Vec<_> = decode(&message.bytes, &origin(0.0))
+        .unwrap()
+        .objects
+        .into_iter()
+        .map(|object| object.label)
+        .collect();
+    assert_eq!(
+        (labels, message.left_out),
+        (vec!["object".into(), "car".into()], 0)
+    );
+    let stray = FusedObject {
+        label: "EMPTY".into(),
+        ..fused(1, 3.0)
+    };
+    let message = encode_map(
+        &map(vec![stray], Vec::new()),
+        &cell(0.0),
+        3,
+        &mut ObjectIds::default(),
+        |_| true,
+    )
+    .unwrap();
+    assert!(
+        decode(&message.bytes, &origin(0.0))
+            .unwrap()
+            .objects
+            .is_empty()
+    );
 }
 
 #[test]
 fn parts_that_report_received_messages_are_told_from_others() {
     let is_received = |name: &'static str| is_received(&NodeName::from_static(name));
     assert!(is_received("edge--cpm-4711"));
-    assert!(!["edge", "edge--cpm", "edge--ros2", "cpm-1", "euclid--cpmlike"].into_iter().any(is_received));
+    assert!(
+        ![
+            "edge",
+            "edge--cpm",
+            "edge--ros2",
+            "cpm-1",
+            "euclid--cpmlike"
+        ]
+        .into_iter()
+        .any(is_received)
+    );
 }
 
 #[test]
 fn there_are_station_numbers_for_so_many_names_that_are_heard() {
-    let (mut numbers, start) = (StationIds::new(NodeName::from_static("lot-1")), Instant::now());
+    let (mut numbers, start) = (
+        StationIds::new(NodeName::from_static("lot-1")),
+        Instant::now(),
+    );
     let name = |index: u32| NodeName::new(format!("node-{index}")).unwrap();
-    let all: BTreeSet<_> = (0..4096).map(|index| numbers.of(&name(index), start).unwrap()).collect();
+    let all: BTreeSet<_> = (0..4096)
+        .map(|index| numbers.of(&name(index), start).unwrap())
+        .collect();
     assert_eq!((all.len(), numbers.of(&name(4096), start)), (4096, None));
     let later = start + Duration::from_secs(59);
     let of_seven = numbers.of(&name(7), later).unwrap();
     let much_later = start + Duration::from_secs(61);
-    assert!(numbers.of(&name(4096), much_later).is_some(), "silent nodes make room");
+    assert!(
+        numbers.of(&name(4096), much_later).is_some(),
+        "silent nodes make room"
+    );
     assert!(numbers.contains(of_seven, much_later));
-    assert!(!numbers.contains(of_seven, later + Duration::from_secs(61)), "a silent node's number is no echo");
+    assert!(
+        !numbers.contains(of_seven, later + Duration::from_secs(61)),
+        "a silent node's number is no echo"
+    );
 }
 
 #[test]
 fn a_vehicle_that_invents_parts_takes_no_others_numbers() {
-    let (mut numbers, now) = (StationIds::new(NodeName::from_static("lot-1")), Instant::now());
+    let (mut numbers, now) = (
+        StationIds::new(NodeName::from_static("lot-1")),
+        Instant::now(),
+    );
     let part = |index: u32| NodeName::new(format!("evil--{index}")).unwrap();
-    assert_eq!((0..500).filter_map(|index| numbers.of(&part(index), now)).count(), 17);
+    assert_eq!(
+        (0..500)
+            .filter_map(|index| numbers.of(&part(index), now))
+            .count(),
+        17
+    );
     assert!(numbers.of(&NodeName::from_static("euclid"), now).is_some());
 }

@@ -15,8 +15,8 @@ use ecod_client::{Frame, Label};
 use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
 
 use crate::ros2::{
-    CameraInfo, Detection2DArray, Detection3D, Detection3DArray, Header, ObjectHypothesis, ObjectHypothesisWithPose,
-    PoseStamped, RosPose,
+    CameraInfo, Detection2DArray, Detection3D, Detection3DArray, Header, ObjectHypothesis,
+    ObjectHypothesisWithPose, PoseStamped, RosPose,
 };
 
 /// A detector's camera.
@@ -35,8 +35,16 @@ pub struct RosCamera {
 impl Default for RosCamera {
     /// A camera without a pose, and the pixel noise of neural detectors.
     fn default() -> Self {
-        let projection = ProjectionConfig { pixel_sigma_px: 3.0, ..ProjectionConfig::default() };
-        Self { pose: None, mount: Mount::default(), projection, labels: BTreeMap::new() }
+        let projection = ProjectionConfig {
+            pixel_sigma_px: 3.0,
+            ..ProjectionConfig::default()
+        };
+        Self {
+            pose: None,
+            mount: Mount::default(),
+            projection,
+            labels: BTreeMap::new(),
+        }
     }
 }
 
@@ -47,13 +55,17 @@ pub enum InputRefusal {
     #[error("a message that cannot be decoded")]
     Malformed,
     /// Positions relative to a camera whose pose at that time is not known.
-    #[error("a frame other than `map` without --pose of its camera, or a stamp far from those on --pose-topic")]
+    #[error(
+        "a frame other than `map` without --pose of its camera, or a stamp far from those on --pose-topic"
+    )]
     NoPose,
     /// A pose of the camera that is none in the cell's frame.
     #[error("a pose of the camera that is not in the frame `map`, or has no orientation")]
     BadPose,
     /// A pose of the camera with the stamp of another time, or out of order.
-    #[error("a pose of the camera that is not later than the one before, or more than 10 s from this machine's time")]
+    #[error(
+        "a pose of the camera that is not later than the one before, or more than 10 s from this machine's time"
+    )]
     BadPoseTime,
     /// Boxes in pictures whose optics are not known yet.
     #[error("boxes before the first message on --camera-info")]
@@ -88,13 +100,19 @@ pub(super) struct RefusedInput {
 
 impl InputRefusal {
     pub(super) fn with(self, detail: impl Display) -> RefusedInput {
-        RefusedInput { refusal: self, detail: format!(": {detail}") }
+        RefusedInput {
+            refusal: self,
+            detail: format!(": {detail}"),
+        }
     }
 }
 
 impl From<InputRefusal> for RefusedInput {
     fn from(refusal: InputRefusal) -> Self {
-        Self { refusal, detail: String::new() }
+        Self {
+            refusal,
+            detail: String::new(),
+        }
     }
 }
 
@@ -111,26 +129,48 @@ impl RosCamera {
     ) -> Result<Placed, RefusedInput> {
         let (captured_at, pose) = self.at(&detections.header, poses)?;
         let to_map = self.to_map(&detections.header, pose)?;
-        let objects = detections.detections.iter().map(|detection| self.object(detection, &to_map));
+        let objects = detections
+            .detections
+            .iter()
+            .map(|detection| self.object(detection, &to_map));
         Ok(self.frame(captured_at, pose, objects))
     }
 
     /// The time of a header, and the camera's pose then.
-    fn at(&self, header: &Header, poses: Option<&PoseHistory>) -> Result<(Timestamp, Option<Pose>), RefusedInput> {
+    fn at(
+        &self,
+        header: &Header,
+        poses: Option<&PoseHistory>,
+    ) -> Result<(Timestamp, Option<Pose>), RefusedInput> {
         let captured_at = header.time().ok_or(InputRefusal::BadTime)?;
-        Ok((captured_at, poses.map_or(self.pose, |poses| poses.at(captured_at))))
+        Ok((
+            captured_at,
+            poses.map_or(self.pose, |poses| poses.at(captured_at)),
+        ))
     }
 
-    fn object(&self, detection: &Detection3D, to_map: &ToMap) -> Result<PerceivedObject, RefusedInput> {
+    fn object(
+        &self,
+        detection: &Detection3D,
+        to_map: &ToMap,
+    ) -> Result<PerceivedObject, RefusedInput> {
         let unplaced = self.unplaced(&detection.results)?;
-        let RosPose { position, orientation } = detection.bbox.center;
+        let RosPose {
+            position,
+            orientation,
+        } = detection.bbox.center;
         let [x_m, y_m] = to_map.position(&Vector3::new(position.x, position.y, position.z));
-        let covariance = detection.results.first().map(|result| &result.pose.covariance);
+        let covariance = detection
+            .results
+            .first()
+            .map(|result| &result.pose.covariance);
         let covariance_m2 = covariance.and_then(|covariance| to_map.covariance(covariance));
         let size = detection.bbox.size;
         // An optical frame's boxes are not upright ones, and a box that is not turned may mean that nothing is known.
         let has_size = !to_map.is_optical && size.x > 0.0 && size.y > 0.0;
-        let turn = orientation.rotation().filter(|turn| has_size && turn.angle() > 0.0);
+        let turn = orientation
+            .rotation()
+            .filter(|turn| has_size && turn.angle() > 0.0);
         Ok(PerceivedObject {
             x_m,
             y_m,
@@ -154,59 +194,109 @@ impl RosCamera {
             match object {
                 Ok(object) => match object.check_fields() {
                     Ok(_) => placed.push(object),
-                    Err((field, flaw)) => refused.push(InputRefusal::Report.with(format!("{field}: {flaw}"))),
+                    Err((field, flaw)) => {
+                        refused.push(InputRefusal::Report.with(format!("{field}: {flaw}")))
+                    }
                 },
                 Err(refused_input) => refused.push(refused_input),
             }
         }
         let pose = pose.map(|pose| self.mount.stated_pose(&pose));
-        (Frame { captured_at, pose, ..Frame::new(placed) }, refused)
+        (
+            Frame {
+                captured_at,
+                pose,
+                ..Frame::new(placed)
+            },
+            refused,
+        )
     }
 
     /// An object without a place: label and confidence of the best hypothesis, and those of all if there are several.
-    fn unplaced(&self, results: &[ObjectHypothesisWithPose]) -> Result<PerceivedObject, RefusedInput> {
+    fn unplaced(
+        &self,
+        results: &[ObjectHypothesisWithPose],
+    ) -> Result<PerceivedObject, RefusedInput> {
         let mut scores = BTreeMap::new();
-        for ObjectHypothesis { class_id, score } in results.iter().map(|result| &result.hypothesis) {
+        for ObjectHypothesis { class_id, score } in results.iter().map(|result| &result.hypothesis)
+        {
             if !(0.0..=1.0).contains(score) {
                 return Err(InputRefusal::Score.with(format!("{score} of {class_id:?}")));
             }
             // Several classes may have one label, and independent scores a sum above one.
             let label = self.labels.get(class_id).unwrap_or(class_id).as_str();
             let sum = scores.entry(Label::from(label)).or_insert(0.0);
-            *sum = if results.len() == 1 { *score } else { (*sum + score).min(1.0) };
+            *sum = if results.len() == 1 {
+                *score
+            } else {
+                (*sum + score).min(1.0)
+            };
         }
         let best = scores.iter().max_by(|a, b| a.1.total_cmp(b.1));
-        let (label, confidence) = best.map(|(label, score)| (label.clone(), *score)).ok_or(InputRefusal::NoClass)?;
+        let (label, confidence) = best
+            .map(|(label, score)| (label.clone(), *score))
+            .ok_or(InputRefusal::NoClass)?;
         if results.len() == 1 {
             scores.clear();
         }
-        Ok(PerceivedObject { label, confidence, scores, ..PerceivedObject::default() })
+        Ok(PerceivedObject {
+            label,
+            confidence,
+            scores,
+            ..PerceivedObject::default()
+        })
     }
 
     fn to_map(&self, header: &Header, pose: Option<Pose>) -> Result<ToMap, RefusedInput> {
         if header.frame_id == "map" {
-            return Ok(ToMap { origin: Pose::new(0.0, 0.0, 0.0), turn: Matrix3::identity(), is_optical: false });
+            return Ok(ToMap {
+                origin: Pose::new(0.0, 0.0, 0.0),
+                turn: Matrix3::identity(),
+                is_optical: false,
+            });
         }
-        let origin = pose.ok_or_else(|| InputRefusal::NoPose.with(format!("{:?}", header.frame_id)))?;
-        let is_optical = ["_optical", "_optical_frame"].iter().any(|suffix| header.frame_id.ends_with(suffix));
+        let origin =
+            pose.ok_or_else(|| InputRefusal::NoPose.with(format!("{:?}", header.frame_id)))?;
+        let is_optical = ["_optical", "_optical_frame"]
+            .iter()
+            .any(|suffix| header.frame_id.ends_with(suffix));
         // From x ahead, y left, z up to x right, y down, z ahead.
         let body_to_optical = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
-        let to_optical = if is_optical { Matrix3::identity() } else { body_to_optical };
+        let to_optical = if is_optical {
+            Matrix3::identity()
+        } else {
+            body_to_optical
+        };
         let heading = Rotation3::from_axis_angle(&Vector3::z_axis(), origin.heading_rad);
-        Ok(ToMap { origin, turn: heading * self.mount.to_level() * to_optical, is_optical })
+        Ok(ToMap {
+            origin,
+            turn: heading * self.mount.to_level() * to_optical,
+            is_optical,
+        })
     }
 }
 
 /// Time and pose of a camera, whose x axis is its own (REP 103).
 pub(super) fn pose_in_map(stamped: &PoseStamped) -> Result<(Timestamp, Pose), RefusedInput> {
     let at = stamped.header.time().ok_or(InputRefusal::BadPoseTime)?;
-    let RosPose { position, orientation } = stamped.pose;
+    let RosPose {
+        position,
+        orientation,
+    } = stamped.pose;
     let ahead = orientation.rotation().map(|turn| turn * Vector3::x());
     let bad = || InputRefusal::BadPose.with(format!("{stamped:?}"));
-    let ahead = ahead.filter(|_| stamped.header.frame_id == "map").ok_or_else(bad)?;
+    let ahead = ahead
+        .filter(|_| stamped.header.frame_id == "map")
+        .ok_or_else(bad)?;
     let pose = Pose::new(position.x, position.y, ahead.y.atan2(ahead.x));
-    let is_finite = [position.x, position.y, pose.heading_rad].into_iter().all(f64::is_finite);
-    if is_finite { Ok((at, pose)) } else { Err(bad()) }
+    let is_finite = [position.x, position.y, pose.heading_rad]
+        .into_iter()
+        .all(f64::is_finite);
+    if is_finite {
+        Ok((at, pose))
+    } else {
+        Err(bad())
+    }
 }
 
 /// Places boxes in pictures of which the distortion has been removed, by the rules of [`RosCamera::place`].
@@ -217,7 +307,8 @@ pub(super) fn place_in_pictures(
     poses: Option<&PoseHistory>,
 ) -> Result<Placed, RefusedInput> {
     let (captured_at, pose) = camera.at(&detections.header, poses)?;
-    let pose = pose.ok_or_else(|| InputRefusal::NoPose.with(format!("{:?}", detections.header.frame_id)))?;
+    let pose =
+        pose.ok_or_else(|| InputRefusal::NoPose.with(format!("{:?}", detections.header.frame_id)))?;
     let intrinsics = optics.ok_or(InputRefusal::NoOptics)?.intrinsics()?;
     let projection = Projection::new(camera.projection.clone(), intrinsics, camera.mount);
     let objects = detections.detections.iter().map(|detection| {
@@ -250,17 +341,42 @@ impl CameraInfo {
     fn intrinsics(&self) -> Result<Intrinsics, RefusedInput> {
         let [fx, _, cx, _, _, fy, cy, ..] = self.p;
         let [raw_fx, _, raw_cx, _, raw_fy, raw_cy, ..] = self.k;
-        let (fx, fy, cx, cy) = if fx > 0.0 { (fx, fy, cx, cy) } else { (raw_fx, raw_fy, raw_cx, raw_cy) };
+        let (fx, fy, cx, cy) = if fx > 0.0 {
+            (fx, fy, cx, cy)
+        } else {
+            (raw_fx, raw_fy, raw_cx, raw_cy)
+        };
         let (columns, rows) = (self.binning_x.max(1), self.binning_y.max(1));
         let of_region = |part: u32, whole: u32| if part > 0 { part } else { whole };
-        let (width, height) =
-            (of_region(self.roi.width, self.width) / columns, of_region(self.roi.height, self.height) / rows);
-        let (fx, cx) = (fx / f64::from(columns), (cx - f64::from(self.roi.x_offset)) / f64::from(columns));
-        let (fy, cy) = (fy / f64::from(rows), (cy - f64::from(self.roi.y_offset)) / f64::from(rows));
-        let is_usable = fx > 0.0 && fy > 0.0 && cx.is_finite() && cy.is_finite() && width > 0 && height > 0;
-        let unusable =
-            || InputRefusal::BadOptics.with(format!("{width}x{height} pixels, fx {fx}, fy {fy}, cx {cx}, cy {cy}"));
-        is_usable.then_some(Intrinsics { width, height, fx, fy, cx, cy }).ok_or_else(unusable)
+        let (width, height) = (
+            of_region(self.roi.width, self.width) / columns,
+            of_region(self.roi.height, self.height) / rows,
+        );
+        let (fx, cx) = (
+            fx / f64::from(columns),
+            (cx - f64::from(self.roi.x_offset)) / f64::from(columns),
+        );
+        let (fy, cy) = (
+            fy / f64::from(rows),
+            (cy - f64::from(self.roi.y_offset)) / f64::from(rows),
+        );
+        let is_usable =
+            fx > 0.0 && fy > 0.0 && cx.is_finite() && cy.is_finite() && width > 0 && height > 0;
+        let unusable = || {
+            InputRefusal::BadOptics.with(format!(
+                "{width}x{height} pixels, fx {fx}, fy {fy}, cx {cx}, cy {cy}"
+            ))
+        };
+        is_usable
+            .then_some(Intrinsics {
+                width,
+                height,
+                fx,
+                fy,
+                cx,
+                cy,
+            })
+            .ok_or_else(unusable)
     }
 }
 
@@ -274,7 +390,10 @@ struct ToMap {
 impl ToMap {
     fn position(&self, point: &Vector3<f64>) -> [f64; 2] {
         let turned = self.turn * point;
-        [self.origin.position.x + turned.x, self.origin.position.y + turned.y]
+        [
+            self.origin.position.x + turned.x,
+            self.origin.position.y + turned.y,
+        ]
     }
 
     fn heading(&self, direction: &Vector3<f64>) -> f64 {
@@ -285,8 +404,12 @@ impl ToMap {
     /// `[xx, xy, yy]` in m²; `None` if nothing is stated: all zeros, or a negative variance.
     fn covariance(&self, [x, y, z, ..]: &[[f64; 6]; 6]) -> Option<[f64; 3]> {
         let rows = [x, y, z].map(|[a, b, c, ..]| [*a, *b, *c]);
-        let stated =
-            Matrix3::from_fn(|row, column| rows.get(row).and_then(|row| row.get(column)).copied().unwrap_or(0.0));
+        let stated = Matrix3::from_fn(|row, column| {
+            rows.get(row)
+                .and_then(|row| row.get(column))
+                .copied()
+                .unwrap_or(0.0)
+        });
         let turned = self.turn * stated * self.turn.transpose();
         let [xx, xy, yy] = [turned.m11, turned.m12, turned.m22];
         (xx > 0.0 && yy > 0.0).then_some([xx, xy, yy])

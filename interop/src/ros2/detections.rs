@@ -4,7 +4,8 @@ use ecod::wire::{GlobalMap, ObjectReport};
 use serde::{Deserialize, Serialize};
 
 use super::messages::{
-    Definition, HEADER, Header, POINT, POSE, QUATERNION, RosMessage, RosPose, RosQuaternion, RosVector, TIME, VECTOR,
+    Definition, HEADER, Header, POINT, POSE, QUATERNION, RosMessage, RosPose, RosQuaternion,
+    RosVector, TIME, VECTOR,
 };
 use crate::object::CellObject;
 
@@ -50,7 +51,14 @@ pub(crate) struct Detection3D {
 pub(super) fn pose(object: &CellObject<'_>) -> RosPose {
     let [x, y] = object.position_m;
     let orientation = RosQuaternion::of(0.0, 0.0, object.heading_rad.unwrap_or(0.0));
-    RosPose { position: RosVector { x, y, z: HEIGHT_M / 2.0 }, orientation }
+    RosPose {
+        position: RosVector {
+            x,
+            y,
+            z: HEIGHT_M / 2.0,
+        },
+        orientation,
+    }
 }
 
 pub(super) fn size(object: &CellObject<'_>) -> RosVector {
@@ -62,20 +70,47 @@ pub(super) fn size(object: &CellObject<'_>) -> RosVector {
 fn detection(object: &CellObject<'_>, existence: f64, header: &Header, id: String) -> Detection3D {
     let mut covariance = [[0.0; 6]; 6];
     for (index, row) in covariance.iter_mut().enumerate() {
-        row.iter_mut().skip(index).take(1).for_each(|variance| *variance = UNKNOWN_VARIANCE);
+        row.iter_mut()
+            .skip(index)
+            .take(1)
+            .for_each(|variance| *variance = UNKNOWN_VARIANCE);
     }
-    if let (Some([xx, xy, yy]), [[a, b, ..], [c, d, ..], ..]) = (object.covariance_m2, &mut covariance) {
+    if let (Some([xx, xy, yy]), [[a, b, ..], [c, d, ..], ..]) =
+        (object.covariance_m2, &mut covariance)
+    {
         (*a, *b, *c, *d) = (xx, xy, xy, yy);
     }
-    let weighted = object.scores.iter().map(|(label, score)| (label, score * existence));
-    let scores: Vec<_> =
-        if object.scores.is_empty() { vec![(object.label, object.confidence)] } else { weighted.collect() };
-    let results = scores.into_iter().map(|(label, score)| ObjectHypothesisWithPose {
-        hypothesis: ObjectHypothesis { class_id: label.to_string(), score },
-        pose: PoseWithCovariance { pose: pose(object), covariance },
-    });
-    let bbox = BoundingBox3D { center: pose(object), size: size(object) };
-    Detection3D { header: header.clone(), results: results.collect(), bbox, id }
+    let weighted = object
+        .scores
+        .iter()
+        .map(|(label, score)| (label, score * existence));
+    let scores: Vec<_> = if object.scores.is_empty() {
+        vec![(object.label, object.confidence)]
+    } else {
+        weighted.collect()
+    };
+    let results = scores
+        .into_iter()
+        .map(|(label, score)| ObjectHypothesisWithPose {
+            hypothesis: ObjectHypothesis {
+                class_id: label.to_string(),
+                score,
+            },
+            pose: PoseWithCovariance {
+                pose: pose(object),
+                covariance,
+            },
+        });
+    let bbox = BoundingBox3D {
+        center: pose(object),
+        size: size(object),
+    };
+    Detection3D {
+        header: header.clone(),
+        results: results.collect(),
+        bbox,
+        id,
+    }
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -87,19 +122,27 @@ pub(crate) struct Detection3DArray {
 impl Detection3DArray {
     pub(super) fn of_map(map: &GlobalMap) -> Self {
         let header = Header::in_map(map.fused_at_us);
-        let detections =
-            CellObject::all_of(map).map(|(object, id)| detection(&object, object.confidence, &header, id)).collect();
+        let detections = CellObject::all_of(map)
+            .map(|(object, id)| detection(&object, object.confidence, &header, id))
+            .collect();
         Self { header, detections }
     }
 
     pub(super) fn of_report(report: &ObjectReport) -> Self {
         let header = Header::in_map(report.captured_at_us);
         let detections = report.objects.iter().map(|object| {
-            let id = object.landmark.as_ref().map(ToString::to_string).unwrap_or_default();
+            let id = object
+                .landmark
+                .as_ref()
+                .map(ToString::to_string)
+                .unwrap_or_default();
             // Of a detector, scores are confidences as they are.
             detection(&object.into(), 1.0, &header, id)
         });
-        Self { detections: detections.collect(), header }
+        Self {
+            detections: detections.collect(),
+            header,
+        }
     }
 }
 
@@ -120,9 +163,18 @@ impl Definition for Detection3DArray {
             "vision_msgs/ObjectHypothesisWithPose",
             "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
         ),
-        ("vision_msgs/ObjectHypothesis", "string class_id\nfloat64 score\n"),
-        ("vision_msgs/BoundingBox3D", "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n"),
-        ("geometry_msgs/PoseWithCovariance", "geometry_msgs/Pose pose\nfloat64[36] covariance\n"),
+        (
+            "vision_msgs/ObjectHypothesis",
+            "string class_id\nfloat64 score\n",
+        ),
+        (
+            "vision_msgs/BoundingBox3D",
+            "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+        ),
+        (
+            "geometry_msgs/PoseWithCovariance",
+            "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
+        ),
         POSE,
         POINT,
         QUATERNION,

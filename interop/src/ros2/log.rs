@@ -91,9 +91,17 @@ impl<W: Write + Seek> RosLog<W> {
     /// # Errors
     /// [`ConversionError`] if the output cannot be written.
     pub fn new(output: W) -> Result<Self, ConversionError> {
-        let options = WriteOptions::new().profile("ros2").compression(Some(Compression::Zstd));
-        let output = RosLogWriter { writer: Writer::with_options(output, options)?, channels: BTreeMap::new() };
-        Ok(Self { output, done: Conversion::default() })
+        let options = WriteOptions::new()
+            .profile("ros2")
+            .compression(Some(Compression::Zstd));
+        let output = RosLogWriter {
+            writer: Writer::with_options(output, options)?,
+            channels: BTreeMap::new(),
+        };
+        Ok(Self {
+            output,
+            done: Conversion::default(),
+        })
     }
 
     /// Writes the messages of a log.
@@ -101,8 +109,9 @@ impl<W: Write + Seek> RosLog<W> {
     /// # Errors
     /// [`ConversionError`] if this is no log, or the output cannot be written.
     pub fn add(&mut self, mut log: impl Read) -> Result<(), ConversionError> {
-        let options =
-            LinearReaderOptions::default().with_skip_end_magic(true).with_record_length_limit(MAX_RECORD_BYTES);
+        let options = LinearReaderOptions::default()
+            .with_skip_end_magic(true)
+            .with_record_length_limit(MAX_RECORD_BYTES);
         let mut reader = LinearReader::new_with_options(options);
         let (mut topics, mut is_complete) = (HashMap::<u16, String>::new(), false);
         while let Some(event) = reader.next_event() {
@@ -112,7 +121,10 @@ impl<W: Write + Seek> RosLog<W> {
                     reader.notify_read(read);
                     continue;
                 }
-                Ok(LinearReadEvent::Record { opcode: op::DATA_END, .. }) => {
+                Ok(LinearReadEvent::Record {
+                    opcode: op::DATA_END,
+                    ..
+                }) => {
                     is_complete = true;
                     break;
                 }
@@ -123,8 +135,14 @@ impl<W: Write + Seek> RosLog<W> {
             match record {
                 Ok(Record::Channel(channel)) => drop(topics.insert(channel.id, channel.topic)),
                 Ok(Record::Message { header, data }) => {
-                    let topic = topics.get(&header.channel_id).map(String::as_str).unwrap_or_default();
-                    let at = Stamps { log: header.log_time, publish: header.publish_time };
+                    let topic = topics
+                        .get(&header.channel_id)
+                        .map(String::as_str)
+                        .unwrap_or_default();
+                    let at = Stamps {
+                        log: header.log_time,
+                        publish: header.publish_time,
+                    };
                     self.put(topic, at, &data)?;
                 }
                 Ok(_) => {}
@@ -140,7 +158,10 @@ impl<W: Write + Seek> RosLog<W> {
 
     fn put(&mut self, topic: &str, at: Stamps, data: &[u8]) -> Result<(), ConversionError> {
         let (kind, name) = topic.split_once('/').unwrap_or((topic, ""));
-        let mut output = TimedOutput { output: &mut self.output, at };
+        let mut output = TimedOutput {
+            output: &mut self.output,
+            at,
+        };
         let is_written = match kind {
             "global_detections" => output.map(data)?,
             "detections" => output.report(name, data)?,
@@ -151,7 +172,11 @@ impl<W: Write + Seek> RosLog<W> {
                 return Ok(());
             }
         };
-        *(if is_written { &mut self.done.written } else { &mut self.done.unusable }) += 1;
+        *(if is_written {
+            &mut self.done.written
+        } else {
+            &mut self.done.unusable
+        }) += 1;
         Ok(())
     }
 
@@ -161,7 +186,11 @@ impl<W: Write + Seek> RosLog<W> {
     /// [`ConversionError`] if it cannot be written, or no message of a node's log was found.
     pub fn finish(mut self) -> Result<Conversion, ConversionError> {
         self.output.writer.finish()?;
-        if self.done.written == 0 { Err(ConversionError::Empty(self.done.passed_over)) } else { Ok(self.done) }
+        if self.done.written == 0 {
+            Err(ConversionError::Empty(self.done.passed_over))
+        } else {
+            Ok(self.done)
+        }
     }
 }
 
@@ -185,31 +214,71 @@ struct TimedOutput<'a, W: Write + Seek> {
 
 impl<W: Write + Seek> TimedOutput<'_, W> {
     fn map(&mut self, data: &[u8]) -> Result<bool, ConversionError> {
-        let Ok(map) = decode::<GlobalMap>(data, &Limits::default()) else { return Ok(false) };
+        let Ok(map) = decode::<GlobalMap>(data, &Limits::default()) else {
+            return Ok(false);
+        };
         put_map(&map, self).map(|()| true)
     }
 
     fn report(&mut self, node: &str, data: &[u8]) -> Result<bool, ConversionError> {
-        let Ok(node) = NodeName::new(node) else { return Ok(false) };
-        let Ok(report) = decode_report(data, &node, &Limits::default()) else { return Ok(false) };
+        let Ok(node) = NodeName::new(node) else {
+            return Ok(false);
+        };
+        let Ok(report) = decode_report(data, &node, &Limits::default()) else {
+            return Ok(false);
+        };
         put_report(&report, self).map(|()| true)
     }
 
     fn image(&mut self, camera: &str, data: &[u8]) -> Result<bool, ConversionError> {
-        let Ok(image) = serde_json::from_slice::<LoggedImage>(data) else { return Ok(false) };
-        let Ok(bytes) = STANDARD.decode(image.data) else { return Ok(false) };
-        let Some(header) = self.header(&image.frame_id) else { return Ok(false) };
-        self.put(&camera_topic(camera, "compressed"), &RosImage { header, format: image.format, data: bytes })?;
+        let Ok(image) = serde_json::from_slice::<LoggedImage>(data) else {
+            return Ok(false);
+        };
+        let Ok(bytes) = STANDARD.decode(image.data) else {
+            return Ok(false);
+        };
+        let Some(header) = self.header(&image.frame_id) else {
+            return Ok(false);
+        };
+        self.put(
+            &camera_topic(camera, "compressed"),
+            &RosImage {
+                header,
+                format: image.format,
+                data: bytes,
+            },
+        )?;
         Ok(true)
     }
 
     fn optics(&mut self, camera: &str, data: &[u8]) -> Result<bool, ConversionError> {
-        let Ok(LoggedOptics { frame_id, width, height, distortion_model, d, k, r, p }) = serde_json::from_slice(data)
+        let Ok(LoggedOptics {
+            frame_id,
+            width,
+            height,
+            distortion_model,
+            d,
+            k,
+            r,
+            p,
+        }) = serde_json::from_slice(data)
         else {
             return Ok(false);
         };
-        let Some(header) = self.header(&frame_id) else { return Ok(false) };
-        let info = CameraInfo { header, height, width, distortion_model, d, k, r, p, ..CameraInfo::default() };
+        let Some(header) = self.header(&frame_id) else {
+            return Ok(false);
+        };
+        let info = CameraInfo {
+            header,
+            height,
+            width,
+            distortion_model,
+            d,
+            k,
+            r,
+            p,
+            ..CameraInfo::default()
+        };
         self.put(&camera_topic(camera, "camera_info"), &info)?;
         Ok(true)
     }
@@ -218,7 +287,10 @@ impl<W: Write + Seek> TimedOutput<'_, W> {
     fn header(&self, frame: &str) -> Option<Header> {
         let node = NodeName::new(frame.strip_suffix("/optical").unwrap_or(frame)).ok()?;
         let stamp = RosTime::of(Timestamp(self.at.publish / 1000));
-        Some(Header { stamp, frame_id: format!("{}_camera_optical", ros_name(&node)) })
+        Some(Header {
+            stamp,
+            frame_id: format!("{}_camera_optical", ros_name(&node)),
+        })
     }
 }
 
@@ -233,7 +305,11 @@ fn camera_topic(camera: &str, kind: &str) -> String {
 impl<W: Write + Seek> RosSink for TimedOutput<'_, W> {
     type Error = ConversionError;
 
-    fn put<M: Serialize + Definition>(&mut self, topic: &str, message: &M) -> Result<(), ConversionError> {
+    fn put<M: Serialize + Definition>(
+        &mut self,
+        topic: &str,
+        message: &M,
+    ) -> Result<(), ConversionError> {
         let RosLogWriter { writer, channels } = self.output;
         let channel_id = match channels.get(topic) {
             Some(id) => *id,
@@ -247,8 +323,16 @@ impl<W: Write + Seek> RosSink for TimedOutput<'_, W> {
         // CDR, little-endian.
         let mut data = vec![0, 1, 0, 0];
         data.extend(encode(message)?);
-        let Stamps { log: log_time, publish: publish_time } = self.at;
-        let header = MessageHeader { channel_id, sequence: 0, log_time, publish_time };
+        let Stamps {
+            log: log_time,
+            publish: publish_time,
+        } = self.at;
+        let header = MessageHeader {
+            channel_id,
+            sequence: 0,
+            log_time,
+            publish_time,
+        };
         Ok(writer.write_to_known_channel(&header, &data)?)
     }
 }

@@ -6,8 +6,8 @@ use serde::Serialize;
 use super::camera::{IMAGE, RosImage};
 use super::detections::{HEIGHT_M, pose, size};
 use super::messages::{
-    Definition, HEADER, Header, POINT, POSE, QUATERNION, RosMessage, RosPose, RosQuaternion, RosTime, RosVector, TIME,
-    VECTOR,
+    Definition, HEADER, Header, POINT, POSE, QUATERNION, RosMessage, RosPose, RosQuaternion,
+    RosTime, RosVector, TIME, VECTOR,
 };
 use crate::object::CellObject;
 
@@ -61,7 +61,10 @@ pub(super) struct MarkerArray {
 impl MarkerArray {
     /// Boxes and labels of all objects, in place of those before; opaque are those that are certain.
     pub(super) fn of_map(map: &GlobalMap) -> Self {
-        let none = RosPose { position: RosVector::default(), orientation: RosQuaternion::of(0.0, 0.0, 0.0) };
+        let none = RosPose {
+            position: RosVector::default(),
+            orientation: RosQuaternion::of(0.0, 0.0, 0.0),
+        };
         let marker = |ns: &str, id: i32| Marker {
             header: Header::in_map(map.fused_at_us),
             ns: ns.to_owned(),
@@ -83,18 +86,49 @@ impl MarkerArray {
             mesh_file: MeshFile::default(),
             mesh_use_embedded_materials: false,
         };
-        let mut markers = vec![Marker { action: DELETE_ALL, ..marker("objects", 0) }];
+        let mut markers = vec![Marker {
+            action: DELETE_ALL,
+            ..marker("objects", 0)
+        }];
         for ((object, _), number) in CellObject::all_of(map).zip(1..) {
             let pose = pose(&object);
             // Ghosts are faint.
             let a = object.confidence as f32;
             let mut above = pose;
             above.position.z = HEIGHT_M + 0.5;
-            let scale = RosVector { z: 0.5, ..RosVector::default() };
-            let (box_color, color) = (ColorRGBA { r: 0.2, g: 0.6, b: 1.0, a }, ColorRGBA { r: 1.0, g: 1.0, b: 1.0, a });
+            let scale = RosVector {
+                z: 0.5,
+                ..RosVector::default()
+            };
+            let (box_color, color) = (
+                ColorRGBA {
+                    r: 0.2,
+                    g: 0.6,
+                    b: 1.0,
+                    a,
+                },
+                ColorRGBA {
+                    r: 1.0,
+                    g: 1.0,
+                    b: 1.0,
+                    a,
+                },
+            );
             let text = object.label.to_string();
-            markers.push(Marker { pose, scale: size(&object), color: box_color, ..marker("objects", number) });
-            markers.push(Marker { kind: TEXT, pose: above, scale, color, text, ..marker("labels", number) });
+            markers.push(Marker {
+                pose,
+                scale: size(&object),
+                color: box_color,
+                ..marker("objects", number)
+            });
+            markers.push(Marker {
+                kind: TEXT,
+                pose: above,
+                scale,
+                color,
+                text,
+                ..marker("labels", number)
+            });
         }
         Self { markers }
     }
@@ -115,10 +149,16 @@ impl Definition for MarkerArray {
              sensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[] uv_coordinates\nstring text\n\
              string mesh_resource\nvisualization_msgs/MeshFile mesh_file\nbool mesh_use_embedded_materials\n",
         ),
-        ("std_msgs/ColorRGBA", "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n"),
+        (
+            "std_msgs/ColorRGBA",
+            "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n",
+        ),
         ("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec\n"),
         ("visualization_msgs/UVCoordinate", "float32 u\nfloat32 v\n"),
-        ("visualization_msgs/MeshFile", "string filename\nuint8[] data\n"),
+        (
+            "visualization_msgs/MeshFile",
+            "string filename\nuint8[] data\n",
+        ),
         ("sensor_msgs/CompressedImage", IMAGE),
         HEADER,
         TIME,

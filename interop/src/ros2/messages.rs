@@ -20,8 +20,12 @@ pub(crate) trait Definition: RosMessage {
     /// The definition as MCAP has it: the fields, and those of each message inside.
     fn definition() -> String {
         let rule = "=".repeat(80);
-        let inside = Self::INSIDE.iter().map(|(name, fields)| format!("{rule}\nMSG: {name}\n{fields}"));
-        std::iter::once(Self::FIELDS.to_owned()).chain(inside).collect()
+        let inside = Self::INSIDE
+            .iter()
+            .map(|(name, fields)| format!("{rule}\nMSG: {name}\n{fields}"));
+        std::iter::once(Self::FIELDS.to_owned())
+            .chain(inside)
+            .collect()
     }
 }
 
@@ -30,14 +34,22 @@ pub(crate) fn encode<M: Serialize>(message: &M) -> Result<Vec<u8>, cdr_encoding:
     cdr_encoding::to_vec::<M, byteorder::LittleEndian>(message)
 }
 
-pub(super) const HEADER: (&str, &str) = ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n");
+pub(super) const HEADER: (&str, &str) = (
+    "std_msgs/Header",
+    "builtin_interfaces/Time stamp\nstring frame_id\n",
+);
 pub(super) const TIME: (&str, &str) = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n");
-pub(super) const POSE: (&str, &str) =
-    ("geometry_msgs/Pose", "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n");
+pub(super) const POSE: (&str, &str) = (
+    "geometry_msgs/Pose",
+    "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+);
 pub(super) const POINT: (&str, &str) = ("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z\n");
-pub(super) const QUATERNION: (&str, &str) =
-    ("geometry_msgs/Quaternion", "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n");
-pub(super) const VECTOR: (&str, &str) = ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n");
+pub(super) const QUATERNION: (&str, &str) = (
+    "geometry_msgs/Quaternion",
+    "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+);
+pub(super) const VECTOR: (&str, &str) =
+    ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n");
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RosTime {
@@ -55,7 +67,10 @@ impl RosTime {
     pub(super) fn of(time: Timestamp) -> Self {
         let micros = time.micros();
         let sec = i32::try_from(micros / 1_000_000).unwrap_or(i32::MAX);
-        Self { sec, nanosec: (micros % 1_000_000) as u32 * 1000 }
+        Self {
+            sec,
+            nanosec: (micros % 1_000_000) as u32 * 1000,
+        }
     }
 }
 
@@ -70,11 +85,18 @@ impl Header {
     #[cfg(feature = "dds")]
     pub(crate) fn time(&self) -> Option<Timestamp> {
         let micros = self.stamp.micros()?;
-        Some(if micros > 0 { Timestamp(micros) } else { ecod_client::now() })
+        Some(if micros > 0 {
+            Timestamp(micros)
+        } else {
+            ecod_client::now()
+        })
     }
 
     pub(super) fn in_map(time: Timestamp) -> Self {
-        Self { stamp: RosTime::of(time), frame_id: "map".to_owned() }
+        Self {
+            stamp: RosTime::of(time),
+            frame_id: "map".to_owned(),
+        }
     }
 }
 
@@ -97,13 +119,21 @@ impl RosQuaternion {
     /// The rotation; `None` if it is none, as when all is zero.
     #[cfg(feature = "dds")]
     pub(crate) fn rotation(&self) -> Option<UnitQuaternion<f64>> {
-        UnitQuaternion::try_new(nalgebra::Quaternion::new(self.w, self.x, self.y, self.z), 1e-6)
+        UnitQuaternion::try_new(
+            nalgebra::Quaternion::new(self.w, self.x, self.y, self.z),
+            1e-6,
+        )
     }
 
     /// A turn by the heading, then by pitch and roll about the axes so turned.
     pub(super) fn of(roll_rad: f64, pitch_rad: f64, heading_rad: f64) -> Self {
         let turn = UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, heading_rad);
-        Self { x: turn.i, y: turn.j, z: turn.k, w: turn.w }
+        Self {
+            x: turn.i,
+            y: turn.j,
+            z: turn.k,
+            w: turn.w,
+        }
     }
 }
 

@@ -3,8 +3,8 @@
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::transport::mqtt::{BrokerAddress, Security};
 use rumqttc::{
-    AsyncClient, Event, EventLoop, MqttOptions, NetworkOptions, Packet, QoS, SubscribeFilter, TlsConfiguration,
-    Transport,
+    AsyncClient, Event, EventLoop, MqttOptions, NetworkOptions, Packet, QoS, SubscribeFilter,
+    TlsConfiguration, Transport,
 };
 
 /// A broker, and what it and the cell behind it ask of clients: TLS, a user's name and password, signed payloads.
@@ -34,7 +34,11 @@ pub enum AccessError {
 impl BrokerAccess {
     /// To a broker that asks for nothing.
     pub fn open(broker: BrokerAddress) -> Self {
-        Self { broker, login: None, security: Security::default() }
+        Self {
+            broker,
+            login: None,
+            security: Security::default(),
+        }
     }
 
     /// As a node with this configuration; the files that it names are read.
@@ -45,9 +49,21 @@ impl BrokerAccess {
         if config.tls.is_some() && config.mqtt.broker.as_ref() != Some(&broker) {
             return Err(AccessError::Closed(broker));
         }
-        let password = config.mqtt.password.as_ref().map_or("", |password| password.reveal());
-        let login = config.mqtt.user.as_ref().map(|user| (user.clone(), password.to_owned()));
-        Ok(Self { broker, login, security: config.security()? })
+        let password = config
+            .mqtt
+            .password
+            .as_ref()
+            .map_or("", |password| password.reveal());
+        let login = config
+            .mqtt
+            .user
+            .as_ref()
+            .map(|user| (user.clone(), password.to_owned()));
+        Ok(Self {
+            broker,
+            login,
+            security: config.security()?,
+        })
     }
 
     /// The payload as it travels on a topic.
@@ -57,7 +73,9 @@ impl BrokerAccess {
 
     /// The payload of what came; who sealed it is not asked.
     pub(super) fn unseal<'a>(&self, received: &'a [u8]) -> &'a [u8] {
-        received.get(self.security.envelope_bytes()..).unwrap_or_default()
+        received
+            .get(self.security.envelope_bytes()..)
+            .unwrap_or_default()
     }
 
     /// A connected client that is subscribed to the topics.
@@ -67,16 +85,23 @@ impl BrokerAccess {
         topics: &[&str],
     ) -> Result<(AsyncClient, EventLoop), rumqttc::ConnectionError> {
         let trust = self.security.tls(&self.broker);
-        let trust = trust.map_err(|error| rumqttc::ConnectionError::Io(std::io::Error::other(error)))?;
+        let trust =
+            trust.map_err(|error| rumqttc::ConnectionError::Io(std::io::Error::other(error)))?;
         // The parser of names takes no brackets.
-        let host = if trust.is_some() { self.broker.host().trim_matches(['[', ']']) } else { self.broker.host() };
+        let host = if trust.is_some() {
+            self.broker.host().trim_matches(['[', ']'])
+        } else {
+            self.broker.host()
+        };
         let mut options = MqttOptions::new(client_id, host, self.broker.port());
         options.set_max_packet_size(MAX_PACKET_BYTES, MAX_PACKET_BYTES);
         if let Some((user, password)) = &self.login {
             options.set_credentials(user, password);
         }
         if let Some(trust) = trust {
-            options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(trust.client())));
+            options.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(
+                trust.client(),
+            )));
         }
         let (client, mut events) = AsyncClient::new(options, 1024);
         let mut network = NetworkOptions::new();
@@ -85,7 +110,9 @@ impl BrokerAccess {
         loop {
             match events.poll().await? {
                 Event::Incoming(Packet::ConnAck(_)) => {
-                    let filters = topics.iter().map(|topic| SubscribeFilter::new((*topic).to_owned(), QoS::AtMostOnce));
+                    let filters = topics
+                        .iter()
+                        .map(|topic| SubscribeFilter::new((*topic).to_owned(), QoS::AtMostOnce));
                     client.try_subscribe_many(filters).unwrap_or_default();
                 }
                 Event::Incoming(Packet::SubAck(_)) => return Ok((client, events)),
@@ -121,16 +148,27 @@ mod tests {
             }),
             ..NodeConfig::default()
         };
-        let error = BrokerAccess::of(address("10.0.0.2:8883"), &config).unwrap_err().to_string();
-        assert!(error.contains("10.0.0.2:8883") && error.contains("one vehicle only"), "{error}");
+        let error = BrokerAccess::of(address("10.0.0.2:8883"), &config)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("10.0.0.2:8883") && error.contains("one vehicle only"),
+            "{error}"
+        );
         config.mqtt.broker = Some(address("10.0.0.9:8883"));
-        assert!(matches!(BrokerAccess::of(address("10.0.0.2:8883"), &config), Err(AccessError::Closed(_))));
+        assert!(matches!(
+            BrokerAccess::of(address("10.0.0.2:8883"), &config),
+            Err(AccessError::Closed(_))
+        ));
     }
 
     #[test]
     fn what_is_signed_is_read_without_its_signature() {
         let mut config = NodeConfig {
-            membership: MembershipConfig { key: Some(Secret::new("correct horse battery")), ..Default::default() },
+            membership: MembershipConfig {
+                key: Some(Secret::new("correct horse battery")),
+                ..Default::default()
+            },
             ..NodeConfig::default()
         };
         let open = BrokerAccess::of(address("10.0.0.2:1883"), &config).unwrap();
@@ -138,7 +176,10 @@ mod tests {
         config.mqtt.sign = true;
         let signing = BrokerAccess::of(address("10.0.0.2:1883"), &config).unwrap();
         let sealed = signing.seal("a/b", b"{}".to_vec());
-        assert_eq!(sealed.len(), ecod_actors::transport::mqtt::ENVELOPE_BYTES + 2);
+        assert_eq!(
+            sealed.len(),
+            ecod_actors::transport::mqtt::ENVELOPE_BYTES + 2
+        );
         assert_eq!(signing.unseal(&sealed), b"{}");
         assert_eq!(signing.unseal(b"{}"), b"");
     }

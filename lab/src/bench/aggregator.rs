@@ -36,7 +36,8 @@ impl OwnAggregator {
     /// When it cannot be started or ends.
     pub async fn start(program: &Path, records: bool) -> anyhow::Result<Self> {
         let directory = std::env::temp_dir().join(format!("ecod-bench-{}", std::process::id()));
-        fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
+        fs::create_dir_all(&directory)
+            .with_context(|| format!("cannot make {}", directory.display()))?;
         let (broker, page) = (free_address()?, free_address()?);
         let mut config = NodeConfig {
             name: Some(NodeName::from_static("edge")),
@@ -64,7 +65,12 @@ impl OwnAggregator {
             votes: true,
             aggregator: process.pid(),
         };
-        Ok(Self { process, directory, target, page })
+        Ok(Self {
+            process,
+            directory,
+            target,
+            page,
+        })
     }
 
     /// Target of the measurement.

@@ -20,7 +20,9 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{Encoding, GlobalMap, Limits, ObjectReport, ReportKind, Role, Topic, Topics, decode, encode};
+use ecod::wire::{
+    Encoding, GlobalMap, Limits, ObjectReport, ReportKind, Role, Topic, Topics, decode, encode,
+};
 use ecod_actors::messages::newest::ReceivedMap;
 use ecod_actors::node::config::NodeConfig;
 use ecod_actors::platform::clock;
@@ -57,9 +59,16 @@ impl DoorFigures {
     /// Names, figures and what they may be at most.
     pub fn goals(&self) -> [(&'static str, f64, f64); 4] {
         let later_us = self.report_at_door.p50_us - self.report_at_leader.p50_us;
-        let missing_percent = self.report_at_door.missing_percent().max(self.report_at_leader.missing_percent());
+        let missing_percent = self
+            .report_at_door
+            .missing_percent()
+            .max(self.report_at_leader.missing_percent());
         [
-            ("door_behind_node_p99_ms", self.behind_node.p99_us / 1000.0, 1.0),
+            (
+                "door_behind_node_p99_ms",
+                self.behind_node.p99_us / 1000.0,
+                1.0,
+            ),
             ("report_at_door_hops_more", later_us / self.hop_us, 1.0),
             ("reports_missing_percent", missing_percent, 1.0),
             ("door_mb", self.door_mb, 4.0),
@@ -94,19 +103,30 @@ const LAST_MAP: Duration = Duration::from_secs(1);
 /// When a node cannot be started or ends, or no map comes.
 pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorFigures> {
     let directory = std::env::temp_dir().join(format!("ecod-doors-{}", std::process::id()));
-    fs::create_dir_all(&directory).with_context(|| format!("cannot make {}", directory.display()))?;
-    let edge = NodeConfig { landmarks: load::landmarks(), ..configuration("edge", Role::Edge) };
+    fs::create_dir_all(&directory)
+        .with_context(|| format!("cannot make {}", directory.display()))?;
+    let edge = NodeConfig {
+        landmarks: load::landmarks(),
+        ..configuration("edge", Role::Edge)
+    };
     let mut edge = NodeProcess::start(program, &edge, &directory)?;
     let leader = serves(&mut edge).await?;
     let mut vehicle = configuration(VEHICLE, Role::Cav);
-    vehicle.membership.seeds = vec![timeout(PATIENCE, edge.address("looking for nodes")).await??.to_string()];
+    vehicle.membership.seeds = vec![
+        timeout(PATIENCE, edge.address("looking for nodes"))
+            .await??
+            .to_string(),
+    ];
     let (resident_mb, door_mb) = idle_memory(program, &vehicle, &directory).await?;
     let map_log = directory.join("maps.jsonl");
     vehicle.map_log = Some(map_log.clone());
     let mut vehicle = NodeProcess::start(program, &vehicle, &directory)?;
     let door = serves(&mut vehicle).await?;
 
-    let [at_door, at_leader] = [DoorWatcher::connect(door).await?, DoorWatcher::connect(leader).await?];
+    let [at_door, at_leader] = [
+        DoorWatcher::connect(door).await?,
+        DoorWatcher::connect(leader).await?,
+    ];
     at_door.first_map().await?;
     let [mut report_at_door, mut report_at_leader] = [Latencies::default(), Latencies::default()];
     for _ in 0..TURNS {
@@ -115,16 +135,30 @@ pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorF
         report_at_door.add(&report(door, &format!("{VEHICLE}--bench"), turn, &at_leader).await?);
     }
     let behind_node = behind_node(&map_log, &at_door)?;
-    let load = two_hop::TwoHopLoad { messages: 500, ..two_hop::TwoHopLoad::default() };
-    let hop_us = two_hop::raw(&door.into(), load).await?.value_at_quantile(0.5) as f64 / 2000.0;
+    let load = two_hop::TwoHopLoad {
+        messages: 500,
+        ..two_hop::TwoHopLoad::default()
+    };
+    let hop_us = two_hop::raw(&door.into(), load)
+        .await?
+        .value_at_quantile(0.5) as f64
+        / 2000.0;
     vehicle.stop().await;
     edge.stop().await;
     if let Err(error) = fs::remove_dir_all(&directory) {
         tracing::warn!(directory = %directory.display(), %error, "directory stays");
     }
-    let [report_at_door, report_at_leader] = [report_at_door, report_at_leader].map(|way| way.quantiles());
+    let [report_at_door, report_at_leader] =
+        [report_at_door, report_at_leader].map(|way| way.quantiles());
     let behind_node = behind_node.quantiles();
-    Ok(DoorFigures { behind_node, report_at_door, report_at_leader, hop_us, resident_mb, door_mb })
+    Ok(DoorFigures {
+        behind_node,
+        report_at_door,
+        report_at_leader,
+        hop_us,
+        resident_mb,
+        door_mb,
+    })
 }
 
 fn configuration(name: &'static str, role: Role) -> NodeConfig {
@@ -155,7 +189,11 @@ async fn serves(node: &mut NodeProcess) -> anyhow::Result<SocketAddr> {
 }
 
 /// Memory of an idle vehicle with a door, and the part of it that is the door's, in megabytes: medians.
-async fn idle_memory(program: &Path, vehicle: &NodeConfig, directory: &Path) -> anyhow::Result<(f64, f64)> {
+async fn idle_memory(
+    program: &Path,
+    vehicle: &NodeConfig,
+    directory: &Path,
+) -> anyhow::Result<(f64, f64)> {
     let mut resident = [Vec::new(), Vec::new()];
     for _ in 0..IDLE_RUNS {
         for (has_door, resident) in [true, false].into_iter().zip(&mut resident) {
@@ -196,10 +234,16 @@ impl DoorWatcher {
     async fn connect(broker: SocketAddr) -> anyhow::Result<Self> {
         let topic = topics().path(&Topic::GlobalDetections);
         let id = format!("ecod-bench-watcher-{}", broker.port());
-        let (client, events) = BrokerAccess::open(broker.into()).subscribed(&id, &[&topic]).await?;
+        let (client, events) = BrokerAccess::open(broker.into())
+            .subscribed(&id, &[&topic])
+            .await?;
         let maps = Arc::<Mutex<Vec<DoorArrival>>>::default();
         let task = tokio::spawn(watch(events, Arc::clone(&maps))).abort_handle();
-        Ok(Self { _client: client, maps, task })
+        Ok(Self {
+            _client: client,
+            maps,
+            task,
+        })
     }
 
     async fn first_map(&self) -> anyhow::Result<()> {
@@ -212,7 +256,10 @@ impl DoorWatcher {
     }
 
     fn maps(&self) -> Vec<DoorArrival> {
-        self.maps.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.maps
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 }
 
@@ -225,11 +272,25 @@ impl Drop for DoorWatcher {
 async fn watch(mut events: EventLoop, maps: Arc<Mutex<Vec<DoorArrival>>>) {
     while let Ok(event) = events.poll().await {
         let at = clock::now();
-        let Event::Incoming(Packet::Publish(publish)) = event else { continue };
+        let Event::Incoming(Packet::Publish(publish)) = event else {
+            continue;
+        };
         if let Ok(map) = decode::<GlobalMap>(&publish.payload, &Limits::default()) {
-            let GlobalMap { epoch, round, oldest_capture_us: oldest_capture, .. } = map;
-            let arrival = DoorArrival { epoch, round, oldest_capture, at };
-            maps.lock().unwrap_or_else(PoisonError::into_inner).push(arrival);
+            let GlobalMap {
+                epoch,
+                round,
+                oldest_capture_us: oldest_capture,
+                ..
+            } = map;
+            let arrival = DoorArrival {
+                epoch,
+                round,
+                oldest_capture,
+                at,
+            };
+            maps.lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .push(arrival);
         }
     }
 }
@@ -248,7 +309,9 @@ async fn report(
     let name = NodeName::new(name)?;
     let topic = topics().path(&ReportKind::Detections.topic(name.clone()));
     let id = format!("ecod-bench-{name}");
-    let (client, mut events) = BrokerAccess::open(broker.into()).subscribed(&id, &[QUIET]).await?;
+    let (client, mut events) = BrokerAccess::open(broker.into())
+        .subscribed(&id, &[QUIET])
+        .await?;
     let poll = tokio::spawn(async move { while events.poll().await.is_ok() {} });
     let mut ticks = tokio::time::interval(PERIOD);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -263,7 +326,12 @@ async fn report(
             captured_at_us: captured_at,
             ..load::report(0, &load::landmarks())
         };
-        client.try_publish(&topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json))?;
+        client.try_publish(
+            &topic,
+            QoS::AtMostOnce,
+            false,
+            encode(&report, Encoding::Json),
+        )?;
         if begun.elapsed() > WARM_UP {
             sent.push(captured_at);
         }
@@ -273,8 +341,14 @@ async fn report(
     let (maps, mut latencies) = (watcher.maps(), Latencies::default());
     for captured_at in sent {
         // The leader's estimate of a clock is not exact to the microsecond.
-        let rests_on = |map: &&DoorArrival| map.oldest_capture.is_some_and(|oldest| oldest + PERIOD / 2 > captured_at);
-        let answer = maps.iter().filter(|map| map.at >= captured_at).find(rests_on);
+        let rests_on = |map: &&DoorArrival| {
+            map.oldest_capture
+                .is_some_and(|oldest| oldest + PERIOD / 2 > captured_at)
+        };
+        let answer = maps
+            .iter()
+            .filter(|map| map.at >= captured_at)
+            .find(rests_on);
         latencies.take_time(answer.map(|map| map.at.since(captured_at)), LAST_MAP);
     }
     Ok(latencies)
@@ -284,25 +358,47 @@ async fn report(
 fn behind_node(map_log: &Path, at_door: &DoorWatcher) -> anyhow::Result<Latencies> {
     // Before the log: the node writes a map there before its door passes it on.
     let at_door = at_door.maps();
-    let text = fs::read_to_string(map_log).with_context(|| format!("cannot read {}", map_log.display()))?;
-    let received = text.lines().filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
-    let received: HashMap<_, _> = received.map(|map| ((map.map.epoch, map.map.round), map.received_at)).collect();
-    let delay = |DoorArrival { epoch, round, at, .. }: &DoorArrival| {
-        let received_at =
-            received.get(&(*epoch, *round)).context("a program has a map that its node did not accept")?;
+    let text = fs::read_to_string(map_log)
+        .with_context(|| format!("cannot read {}", map_log.display()))?;
+    let received = text
+        .lines()
+        .filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
+    let received: HashMap<_, _> = received
+        .map(|map| ((map.map.epoch, map.map.round), map.received_at))
+        .collect();
+    let delay = |DoorArrival {
+                     epoch, round, at, ..
+                 }: &DoorArrival| {
+        let received_at = received
+            .get(&(*epoch, *round))
+            .context("a program has a map that its node did not accept")?;
         Ok(at.micros_from(*received_at))
     };
-    delays(&at_door.iter().map(delay).collect::<anyhow::Result<Vec<_>>>()?)
+    delays(
+        &at_door
+            .iter()
+            .map(delay)
+            .collect::<anyhow::Result<Vec<_>>>()?,
+    )
 }
 
 /// These microseconds as times, unless too many of them are negative: the cell's time, by which the log is dated, is ahead
 /// of this machine's clock then.
 fn delays(micros: &[i64]) -> anyhow::Result<Latencies> {
     let early = micros.iter().filter(|delay| **delay < 0).count();
-    ensure!(100 * early <= micros.len(), "clocks differ: {early} of {} maps before the node had them", micros.len());
+    ensure!(
+        100 * early <= micros.len(),
+        "clocks differ: {early} of {} maps before the node had them",
+        micros.len()
+    );
     let mut latencies = Latencies::default();
     for delay in micros {
-        latencies.take_time(Some(Duration::from_micros((*delay).try_into().unwrap_or_default())), LAST_MAP);
+        latencies.take_time(
+            Some(Duration::from_micros(
+                (*delay).try_into().unwrap_or_default(),
+            )),
+            LAST_MAP,
+        );
     }
     Ok(latencies)
 }
@@ -324,7 +420,13 @@ mod tests {
     #[test]
     fn reports_that_never_reach_a_map_miss_a_goal() {
         let missed = |missing| {
-            let way = Quantiles { p50_us: 100.0, p99_us: 200.0, p999_us: 300.0, n: 200, missing: 0 };
+            let way = Quantiles {
+                p50_us: 100.0,
+                p99_us: 200.0,
+                p999_us: 300.0,
+                n: 200,
+                missing: 0,
+            };
             let report_at_door = Quantiles { missing, ..way };
             let (behind_node, report_at_leader) = (way, way);
             let figures = DoorFigures {
@@ -335,7 +437,10 @@ mod tests {
                 resident_mb: 20.0,
                 door_mb: 1.0,
             };
-            let over = figures.goals().into_iter().filter(|(_, figure, goal)| figure > goal);
+            let over = figures
+                .goals()
+                .into_iter()
+                .filter(|(_, figure, goal)| figure > goal);
             over.map(|(name, ..)| name).collect::<Vec<_>>()
         };
         assert!(missed(2).is_empty());

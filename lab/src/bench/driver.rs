@@ -32,20 +32,29 @@ pub(super) struct Sent {
 }
 
 /// Sends everything on schedule.
-pub(super) fn drive(schedule: Schedule, load: Load, target: &Target, mut senders: Vec<Sender>) -> Sent {
+pub(super) fn drive(
+    schedule: Schedule,
+    load: Load,
+    target: &Target,
+    mut senders: Vec<Sender>,
+) -> Sent {
     // Without it Linux lets a thread sleep 50 µs longer than asked; a kernel that refuses only costs that.
     if let Err(error) = nix::sys::prctl::set_timerslack(1) {
         tracing::debug!(%error, "timer slack stays");
     }
     let mut sent = Sent::default();
-    let last = u32::try_from(senders.len().saturating_sub(1)).unwrap_or(u32::MAX).max(1);
+    let last = u32::try_from(senders.len().saturating_sub(1))
+        .unwrap_or(u32::MAX)
+        .max(1);
     for tick in 0..load.ticks() {
         let payload = |(report, topic): &mut (ObjectReport, String)| {
             (report.seq, report.captured_at_us) = (tick.into(), schedule.captured_at(tick));
             target.access.seal(topic, encode(report, target.encoding))
         };
-        let payloads: Vec<Vec<Vec<u8>>> =
-            senders.iter_mut().map(|sender| sender.messages.iter_mut().map(payload).collect()).collect();
+        let payloads: Vec<Vec<Vec<u8>>> = senders
+            .iter_mut()
+            .map(|sender| sender.messages.iter_mut().map(payload).collect())
+            .collect();
         let mut send = |begin: Instant, bare: bool, payloads: Vec<Vec<Vec<u8>>>| {
             wait_until(begin);
             sent.latest = sent.latest.max(begin.elapsed());
@@ -55,15 +64,26 @@ pub(super) fn drive(schedule: Schedule, load: Load, target: &Target, mut senders
                 }
                 for ((_, topic), payload) in sender.messages.iter().zip(payloads) {
                     let topic = if bare { &sender.bare_topic } else { topic };
-                    let taken = sender.client.try_publish(topic, QoS::AtMostOnce, false, payload);
+                    let taken = sender
+                        .client
+                        .try_publish(topic, QoS::AtMostOnce, false, payload);
                     sent.refused += u64::from(taken.is_err());
                 }
             }
         };
         let begin = schedule.begin(tick);
-        let stamp = |payloads: &Vec<Vec<u8>>| payloads.iter().cloned().map(|bytes| stamped(tick, bytes)).collect();
+        let stamp = |payloads: &Vec<Vec<u8>>| {
+            payloads
+                .iter()
+                .cloned()
+                .map(|bytes| stamped(tick, bytes))
+                .collect()
+        };
         let bare = load.bare.then(|| payloads.iter().map(stamp).collect());
-        sent.report_bytes = payloads.last().and_then(|payloads| payloads.last()).map_or(0, Vec::len);
+        sent.report_bytes = payloads
+            .last()
+            .and_then(|payloads| payloads.last())
+            .map_or(0, Vec::len);
         send(begin, false, payloads);
         if let Some(payloads) = bare {
             send(begin + schedule.period() / 2, true, payloads);

@@ -49,7 +49,9 @@ impl Echo {
     ) -> anyhow::Result<Self> {
         let (stop, stopped) = oneshot::channel();
         let (ready, started) = oneshot::channel();
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()?;
         let serve = async move {
             // An aggregator gets its own maps back too.
             let filters = [&*format!("{OUT}/+"), BACK];
@@ -61,8 +63,12 @@ impl Echo {
             ready.send(Ok(())).unwrap_or_default();
             let mut arrived = BTreeMap::<u32, usize>::new();
             while let Ok(event) = events.poll().await {
-                let Event::Incoming(Packet::Publish(publish)) = event else { continue };
-                let Some(tick) = tick_of(&publish.payload).filter(|_| publish.topic != BACK) else { continue };
+                let Event::Incoming(Packet::Publish(publish)) = event else {
+                    continue;
+                };
+                let Some(tick) = tick_of(&publish.payload).filter(|_| publish.topic != BACK) else {
+                    continue;
+                };
                 let count = arrived.entry(tick).or_default();
                 *count += 1;
                 if *count == packets {
@@ -71,19 +77,23 @@ impl Echo {
                     for bytes in answer_bytes.all().into_iter().take(1 + usize::from(votes)) {
                         let answer = stamped(tick, vec![0; bytes]);
                         // A refusal shows as a missing answer.
-                        client.try_publish(BACK, QoS::AtMostOnce, false, answer).unwrap_or_default();
+                        client
+                            .try_publish(BACK, QoS::AtMostOnce, false, answer)
+                            .unwrap_or_default();
                     }
                 }
             }
         };
-        thread::Builder::new().name("bench-echo".into()).spawn(move || {
-            runtime.block_on(async {
-                tokio::select! {
-                    () = serve => {}
-                    _ = stopped => {}
-                }
-            });
-        })?;
+        thread::Builder::new()
+            .name("bench-echo".into())
+            .spawn(move || {
+                runtime.block_on(async {
+                    tokio::select! {
+                        () = serve => {}
+                        _ = stopped => {}
+                    }
+                });
+            })?;
         started.await.context("the echo ended at once")??;
         Ok(Self { _stop: stop })
     }
@@ -98,5 +108,7 @@ pub(super) fn stamped(tick: u32, mut bytes: Vec<u8>) -> Vec<u8> {
 
 /// The tick in the first four bytes.
 pub(super) fn tick_of(payload: &[u8]) -> Option<u32> {
-    payload.first_chunk().map(|bytes| u32::from_le_bytes(*bytes))
+    payload
+        .first_chunk()
+        .map(|bytes| u32::from_le_bytes(*bytes))
 }

@@ -49,7 +49,10 @@ impl Quantiles {
 
 impl Default for Latencies {
     fn default() -> Self {
-        Self { histogram: latencies(), missing: 0 }
+        Self {
+            histogram: latencies(),
+            missing: 0,
+        }
     }
 }
 
@@ -71,7 +74,8 @@ impl Latencies {
     pub(super) fn take_time(&mut self, taken: Option<Duration>, waited: Duration) {
         self.missing += u64::from(taken.is_none());
         let nanos = taken.unwrap_or(waited).as_nanos();
-        self.histogram.saturating_record(u64::try_from(nanos).unwrap_or(u64::MAX));
+        self.histogram
+            .saturating_record(u64::try_from(nanos).unwrap_or(u64::MAX));
     }
 
     /// Usual quantiles of the distribution.

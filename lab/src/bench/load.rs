@@ -27,12 +27,21 @@ pub struct Load {
 impl Load {
     /// Reports and votes of this many vehicles ten times a second, all at once, beside the bare way.
     pub fn new(vehicles: usize, duration: Duration) -> Self {
-        Self { vehicles, period: Duration::from_millis(100), spread: Duration::ZERO, duration, bare: true, votes: true }
+        Self {
+            vehicles,
+            period: Duration::from_millis(100),
+            spread: Duration::ZERO,
+            duration,
+            bare: true,
+            votes: true,
+        }
     }
 
     /// Number of reports of every vehicle, at least two.
     pub(super) fn ticks(&self) -> u32 {
-        u32::try_from(self.duration.as_micros() / self.period.as_micros().max(1)).unwrap_or(u32::MAX).max(2)
+        u32::try_from(self.duration.as_micros() / self.period.as_micros().max(1))
+            .unwrap_or(u32::MAX)
+            .max(2)
     }
 
     /// Ticks that are not counted.
@@ -46,7 +55,9 @@ const OBJECTS: usize = 10;
 
 /// A lot of 32 spots, for a cell of the benchmark's own.
 pub fn landmarks() -> Vec<LandmarkConfig> {
-    (0..32).map(|index| LandmarkConfig::at(format!("slot-{index}"), 3.0 * f64::from(index), 0.0)).collect()
+    (0..32)
+        .map(|index| LandmarkConfig::at(format!("slot-{index}"), 3.0 * f64::from(index), 0.0))
+        .collect()
 }
 
 /// Report of one vehicle on ten neighbouring locations: an object at each, and that all were in view. In a cell that
@@ -74,8 +85,17 @@ pub(super) fn vote(vehicle: usize, landmarks: &[LandmarkConfig]) -> ObjectReport
 }
 
 fn spots(vehicle: usize, known: &[LandmarkConfig]) -> Vec<LandmarkConfig> {
-    let lot = if known.is_empty() { landmarks() } else { known.to_vec() };
-    lot.iter().cycle().skip(vehicle % lot.len()).take(OBJECTS.min(lot.len())).cloned().collect()
+    let lot = if known.is_empty() {
+        landmarks()
+    } else {
+        known.to_vec()
+    };
+    lot.iter()
+        .cycle()
+        .skip(vehicle % lot.len())
+        .take(OBJECTS.min(lot.len()))
+        .cloned()
+        .collect()
 }
 
 /// The vehicle's name.
@@ -103,7 +123,13 @@ mod tests {
     fn votes_name_the_spots_of_the_report() {
         let vote = vote(3, &landmarks());
         assert_eq!(vote.objects[0].landmark.as_deref(), Some("slot-3"));
-        let at = |report: &ObjectReport| report.objects.iter().map(|object| object.x_m).collect::<Vec<_>>();
+        let at = |report: &ObjectReport| {
+            report
+                .objects
+                .iter()
+                .map(|object| object.x_m)
+                .collect::<Vec<_>>()
+        };
         assert_eq!(at(&vote), at(&report(3, &landmarks())));
     }
 
@@ -111,7 +137,12 @@ mod tests {
     fn a_cell_without_locations_has_objects_all_the_same() {
         let report = report(5, &[]);
         assert_eq!((report.objects.len(), report.seen), (OBJECTS, None));
-        assert!(vote(5, &[]).objects.iter().all(|object| object.landmark.is_some()));
+        assert!(
+            vote(5, &[])
+                .objects
+                .iter()
+                .all(|object| object.landmark.is_some())
+        );
     }
 
     #[test]

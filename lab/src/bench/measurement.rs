@@ -53,7 +53,10 @@ const LEAD_IN: Duration = Duration::from_millis(300);
 /// # Errors
 /// When the broker cannot be reached or no map comes.
 pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure> {
-    let load = Load { votes: load.votes && target.votes, ..load };
+    let load = Load {
+        votes: load.votes && target.votes,
+        ..load
+    };
     let answer_bytes = Arc::new(AnswerBytes::default());
     let common = Arc::new(Common {
         access: target.access.clone(),
@@ -66,7 +69,13 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure>
     let _echo = match load.bare {
         true => {
             let packets = load.vehicles * (1 + usize::from(load.votes));
-            let echo = Echo::start(target.access.clone(), packets, Arc::clone(&answer_bytes), load.votes).await;
+            let echo = Echo::start(
+                target.access.clone(),
+                packets,
+                Arc::clone(&answer_bytes),
+                load.votes,
+            )
+            .await;
             Some(echo.with_context(at_broker)?)
         }
         false => None,
@@ -76,22 +85,35 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure>
         let report = load::report(index, &target.landmarks);
         let id = format!("ecod-bench-{}", report.node);
         let connected = BenchVehicle::connect(&id, load.ticks() as usize, &common).await;
-        let vehicle =
-            connected.with_context(|| format!("vehicle {index} of {}", load.vehicles)).with_context(at_broker)?;
+        let vehicle = connected
+            .with_context(|| format!("vehicle {index} of {}", load.vehicles))
+            .with_context(at_broker)?;
         let topic = |kind: ReportKind| common.topics.path(&kind.topic(report.node.clone()));
         let bare_topic = format!("{OUT}/{}", report.node);
-        let vote = load.votes.then(|| (load::vote(index, &target.landmarks), topic(ReportKind::VoteDetections)));
+        let vote = load.votes.then(|| {
+            (
+                load::vote(index, &target.landmarks),
+                topic(ReportKind::VoteDetections),
+            )
+        });
         let topic = topic(ReportKind::Detections);
         let messages = vote.into_iter().chain([(report, topic)]).collect();
-        senders.push(Sender { client: vehicle.client.clone(), messages, bare_topic });
+        senders.push(Sender {
+            client: vehicle.client.clone(),
+            messages,
+            bare_topic,
+        });
         vehicles.push(vehicle);
     }
     let mut has_map = common.has_map.subscribe();
     let first_map = tokio::time::timeout(PATIENCE, has_map.wait_for(|has_map| *has_map)).await;
     first_map.context("no map came: nobody leads the cell, or it has another name")??;
 
-    let schedule = *common.schedule.get_or_init(|| Schedule::starting_in(LEAD_IN, load.period));
-    let meters = [target.aggregator, Some(std::process::id())].map(|pid| pid.map(UsageMeter::start));
+    let schedule = *common
+        .schedule
+        .get_or_init(|| Schedule::starting_in(LEAD_IN, load.period));
+    let meters =
+        [target.aggregator, Some(std::process::id())].map(|pid| pid.map(UsageMeter::start));
     let sent = on_a_thread(schedule, load, target.clone(), senders).await?;
     let [aggregator, own] = meters.map(|meter| meter.map(UsageMeter::stop));
     let (cell, bare) = gather(&vehicles, schedule, load).await;
@@ -109,10 +131,20 @@ pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure>
     })
 }
 
-async fn on_a_thread(schedule: Schedule, load: Load, target: Target, senders: Vec<Sender>) -> anyhow::Result<Sent> {
+async fn on_a_thread(
+    schedule: Schedule,
+    load: Load,
+    target: Target,
+    senders: Vec<Sender>,
+) -> anyhow::Result<Sent> {
     let (done, sent) = oneshot::channel();
-    let drive = move || done.send(drive(schedule, load, &target, senders)).unwrap_or_default();
-    thread::Builder::new().name("bench-driver".into()).spawn(drive)?;
+    let drive = move || {
+        done.send(drive(schedule, load, &target, senders))
+            .unwrap_or_default()
+    };
+    thread::Builder::new()
+        .name("bench-driver".into())
+        .spawn(drive)?;
     sent.await.context("the sending thread ended")
 }
 
@@ -125,10 +157,14 @@ async fn gather(vehicles: &[BenchVehicle], schedule: Schedule, load: Load) -> (A
     let waited_until = Instant::now();
     let (mut cell, mut bare) = (Answers::default(), Answers::default());
     for vehicle in vehicles {
-        let arrivals = vehicle.arrivals.lock().unwrap_or_else(PoisonError::into_inner);
+        let arrivals = vehicle
+            .arrivals
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         let warm_up = load.warm_up();
         let take = |answers: &mut Answers, Came { map, verdict }: &Came, later: Duration| {
-            for (tick, (map, verdict)) in (0..).zip(map.iter().zip(verdict)).skip(warm_up as usize) {
+            for (tick, (map, verdict)) in (0..).zip(map.iter().zip(verdict)).skip(warm_up as usize)
+            {
                 let due = schedule.begin(tick) + load.spread + later;
                 answers.map.take(due, *map, waited_until);
                 if load.votes {
@@ -145,7 +181,10 @@ async fn gather(vehicles: &[BenchVehicle], schedule: Schedule, load: Load) -> (A
 }
 
 fn is_done(vehicle: &BenchVehicle, load: Load) -> bool {
-    let arrivals = vehicle.arrivals.lock().unwrap_or_else(PoisonError::into_inner);
+    let arrivals = vehicle
+        .arrivals
+        .lock()
+        .unwrap_or_else(PoisonError::into_inner);
     let came = |arrivals: &[Option<Instant>]| arrivals.last().is_some_and(Option::is_some);
     let all_came = |ways: &Came| came(&ways.map) && (!load.votes || came(&ways.verdict));
     all_came(&arrivals.cell) && (!load.bare || all_came(&arrivals.bare))

@@ -31,18 +31,26 @@ pub async fn fetch(page: SocketAddr) -> anyhow::Result<PageFigures> {
     let begun = Instant::now();
     let mut bytes = 0;
     for path in dashboard::page_paths() {
-        bytes += body(page, path, None).await.with_context(|| format!("http://{page}{path}"))?;
+        bytes += body(page, path, None)
+            .await
+            .with_context(|| format!("http://{page}{path}"))?;
     }
-    let picture = body(page, "/api/events", Some(EVENT_END)).await.context("the first picture")?;
+    let picture = body(page, "/api/events", Some(EVENT_END))
+        .await
+        .context("the first picture")?;
     ensure!(picture > EVENT_END.len(), "the first picture is empty");
-    Ok(PageFigures { bytes, first_picture: begun.elapsed() })
+    Ok(PageFigures {
+        bytes,
+        first_picture: begun.elapsed(),
+    })
 }
 
 /// The length of an answer's body, up to and with `end` if it has one.
 async fn body(page: SocketAddr, path: &str, end: Option<&[u8]>) -> anyhow::Result<usize> {
     let read = async {
         let mut stream = TcpStream::connect(page).await?;
-        let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
+        let request =
+            format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
         stream.write_all(request.as_bytes()).await?;
         let (mut answer, mut head) = (Vec::new(), None);
         while stream.read_buf(&mut answer).await? > 0 {
@@ -52,13 +60,23 @@ async fn body(page: SocketAddr, path: &str, end: Option<&[u8]>) -> anyhow::Resul
                 break;
             }
         }
-        ensure!(answer.starts_with(b"HTTP/1.1 200 "), "{}", String::from_utf8_lossy(&answer[..answer.len().min(40)]));
+        ensure!(
+            answer.starts_with(b"HTTP/1.1 200 "),
+            "{}",
+            String::from_utf8_lossy(&answer[..answer.len().min(40)])
+        );
         Ok(answer.len() - head.unwrap_or(answer.len()))
     };
-    tokio::time::timeout(PATIENCE, read).await.context("no answer")?
+    tokio::time::timeout(PATIENCE, read)
+        .await
+        .context("no answer")?
 }
 
 /// The end of the first of these bytes.
 fn place(text: &[u8], wanted: &[u8]) -> Option<usize> {
-    Some(text.windows(wanted.len()).position(|bytes| bytes == wanted)? + wanted.len())
+    Some(
+        text.windows(wanted.len())
+            .position(|bytes| bytes == wanted)?
+            + wanted.len(),
+    )
 }

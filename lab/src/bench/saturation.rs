@@ -78,7 +78,10 @@ pub async fn search(
     let mut steps: Vec<Step> = Vec::new();
     let mut vehicles = least;
     loop {
-        let load = Load { bare: false, ..Load::new(vehicles, duration) };
+        let load = Load {
+            bare: false,
+            ..Load::new(vehicles, duration)
+        };
         let mut step = Step::new(vehicles, target, &measure(target, load).await?);
         tell(&step)?;
         if !step.carried {
@@ -86,15 +89,32 @@ pub async fn search(
             tell(&step)?;
         }
         steps.push(step);
-        let carried = steps.iter().filter(|step| step.carried).map(|step| step.vehicles).max();
-        let failed = steps.iter().filter(|step| !step.carried).map(|step| step.vehicles).min();
+        let carried = steps
+            .iter()
+            .filter(|step| step.carried)
+            .map(|step| step.vehicles)
+            .max();
+        let failed = steps
+            .iter()
+            .filter(|step| !step.carried)
+            .map(|step| step.vehicles)
+            .min();
         vehicles = match (carried, failed) {
             (Some(carried), None) if carried < most => (2 * carried).min(most),
-            (Some(carried), Some(failed)) if failed - carried > (carried / 8).max(1) => carried.midpoint(failed),
+            (Some(carried), Some(failed)) if failed - carried > (carried / 8).max(1) => {
+                carried.midpoint(failed)
+            }
             (most_vehicles, _) => {
-                let first_failed = steps.iter().filter(|step| !step.carried).min_by_key(|step| step.vehicles);
+                let first_failed = steps
+                    .iter()
+                    .filter(|step| !step.carried)
+                    .min_by_key(|step| step.vehicles);
                 let first_saturated = first_failed.map(Step::blame);
-                return Ok(Saturation { most_vehicles, first_saturated, steps });
+                return Ok(Saturation {
+                    most_vehicles,
+                    first_saturated,
+                    steps,
+                });
             }
         };
     }
@@ -104,7 +124,8 @@ impl Step {
     fn new(vehicles: usize, target: &Target, measured: &BenchFigure) -> Self {
         let map = measured.cell.map.quantiles();
         let verdict = target.votes.then(|| measured.cell.verdict.quantiles());
-        let is_carried = |latency: &Quantiles| latency.missing == 0 && latency.p99_us < LIMIT.as_micros() as f64;
+        let is_carried =
+            |latency: &Quantiles| latency.missing == 0 && latency.p99_us < LIMIT.as_micros() as f64;
         Self {
             vehicles,
             carried: is_carried(&map) && verdict.iter().all(is_carried),
@@ -120,7 +141,12 @@ impl Step {
 
     /// Bottleneck: the load itself, if it did not go out as it should, and then a processor.
     fn blame(&self) -> String {
-        let Self { refused, sent_late_ms, shares, .. } = self;
+        let Self {
+            refused,
+            sent_late_ms,
+            shares,
+            ..
+        } = self;
         let busiest = shares.busiest();
         if *refused == 0 && *sent_late_ms <= MAX_LATE_MS {
             return busiest;
@@ -137,30 +163,52 @@ impl Shares {
     pub fn of(measured: &BenchFigure) -> Self {
         let aggregator = measured.aggregator.as_ref().map(|aggregator| {
             let broker = aggregator.percent_of(BROKER_THREAD);
-            AggregatorShares { broker, fusion: aggregator.percent() - broker }
+            AggregatorShares {
+                broker,
+                fusion: aggregator.percent() - broker,
+            }
         });
-        Self { aggregator, vehicles: measured.vehicles.percent() }
+        Self {
+            aggregator,
+            vehicles: measured.vehicles.percent(),
+        }
     }
 
     /// Exhausted processor: a single thread with a core of its own, or all cores, and who takes most of them.
     fn busiest(self) -> String {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let all_cores = BUSY_PERCENT * cores as f64;
-        let Self { aggregator, vehicles } = self;
+        let Self {
+            aggregator,
+            vehicles,
+        } = self;
         let Some(AggregatorShares { broker, fusion }) = aggregator else {
             return if vehicles > all_cores {
-                format!("all {cores} cores of this machine, by the simulated vehicles, {vehicles:.0} % of a core")
+                format!(
+                    "all {cores} cores of this machine, by the simulated vehicles, {vehicles:.0} % of a core"
+                )
             } else {
-                format!("unknown, not this machine: its vehicles took {vehicles:.0} % of a core, of {cores} cores")
+                format!(
+                    "unknown, not this machine: its vehicles took {vehicles:.0} % of a core, of {cores} cores"
+                )
             };
         };
         if broker > BUSY_PERCENT {
             return format!("broker, {broker:.0} % of a core with its one thread");
         }
-        let parts = [("broker", broker), ("aggregator", fusion), ("simulated vehicles", vehicles)];
-        let (most, percent) = parts.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(("nothing", 0.0));
+        let parts = [
+            ("broker", broker),
+            ("aggregator", fusion),
+            ("simulated vehicles", vehicles),
+        ];
+        let (most, percent) = parts
+            .into_iter()
+            .max_by(|a, b| a.1.total_cmp(&b.1))
+            .unwrap_or(("nothing", 0.0));
         if broker + fusion + vehicles > all_cores {
-            format!("all {cores} cores of this machine, most of it by {most}, {percent:.0} % of a core")
+            format!(
+                "all {cores} cores of this machine, most of it by {most}, {percent:.0} % of a core"
+            )
         } else {
             format!("no processor: {most} is busiest with {percent:.0} % of a core")
         }
@@ -181,7 +229,10 @@ mod tests {
     use crate::bench::latency::Latencies;
 
     fn shares(broker: f64, fusion: f64, vehicles: f64) -> Shares {
-        Shares { aggregator: Some(AggregatorShares { broker, fusion }), vehicles }
+        Shares {
+            aggregator: Some(AggregatorShares { broker, fusion }),
+            vehicles,
+        }
     }
 
     fn step(refused: u64, sent_late_ms: f64, shares: Shares) -> Step {
@@ -203,8 +254,16 @@ mod tests {
     #[test]
     fn whoever_is_at_its_end_is_named() {
         assert!(shares(95.0, 10.0, 20.0).busiest().starts_with("broker"));
-        assert!(shares(60.0, 10.0, 1e4).busiest().contains("simulated vehicles"));
-        assert!(shares(5.0, 10.0, 2.0).busiest().starts_with("no processor: aggregator"));
+        assert!(
+            shares(60.0, 10.0, 1e4)
+                .busiest()
+                .contains("simulated vehicles")
+        );
+        assert!(
+            shares(5.0, 10.0, 2.0)
+                .busiest()
+                .starts_with("no processor: aggregator")
+        );
     }
 
     #[test]
@@ -214,7 +273,8 @@ mod tests {
         for (refused, late) in [(1, 0.0), (0, 11.0)] {
             let words = blame(refused, late);
             assert!(
-                words.starts_with("the simulated vehicles themselves") && words.contains("broker, 95 %"),
+                words.starts_with("the simulated vehicles themselves")
+                    && words.contains("broker, 95 %"),
                 "{words}"
             );
         }
@@ -222,7 +282,17 @@ mod tests {
 
     #[test]
     fn of_a_cell_elsewhere_nothing_is_claimed() {
-        let elsewhere = |vehicles| step(0, 0.0, Shares { aggregator: None, vehicles }).blame();
+        let elsewhere = |vehicles| {
+            step(
+                0,
+                0.0,
+                Shares {
+                    aggregator: None,
+                    vehicles,
+                },
+            )
+            .blame()
+        };
         assert!(elsewhere(30.0).starts_with("unknown, not this machine"));
         assert!(elsewhere(1e5).starts_with("all "));
     }

@@ -17,7 +17,11 @@ pub(super) struct Schedule {
 impl Schedule {
     /// The first tick is `wait` from now.
     pub(super) fn starting_in(wait: Duration, period: Duration) -> Self {
-        Self { start: Instant::now() + wait, start_at: clock::now() + wait, period }
+        Self {
+            start: Instant::now() + wait,
+            start_at: clock::now() + wait,
+            period,
+        }
     }
 
     pub(super) fn period(&self) -> Duration {
@@ -55,7 +59,10 @@ mod tests {
     #[test]
     fn a_capture_time_tells_its_tick() {
         let schedule = Schedule::starting_in(Duration::ZERO, Duration::from_millis(100));
-        assert_eq!(schedule.begin(3) - schedule.begin(0), Duration::from_millis(300));
+        assert_eq!(
+            schedule.begin(3) - schedule.begin(0),
+            Duration::from_millis(300)
+        );
         for tick in [0, 1, 77] {
             let captured = schedule.captured_at(tick);
             assert_eq!(schedule.tick_captured_at(captured), Some(tick));
@@ -65,6 +72,9 @@ mod tests {
                 "a clock that is a little off"
             );
         }
-        assert_eq!(schedule.tick_captured_at(schedule.captured_at(0) - Duration::from_secs(1)), None);
+        assert_eq!(
+            schedule.tick_captured_at(schedule.captured_at(0) - Duration::from_secs(1)),
+            None
+        );
     }
 }

@@ -25,7 +25,11 @@ pub struct TwoHopLoad {
 impl Default for TwoHopLoad {
     /// 10 s of a report of ten objects every 10 ms.
     fn default() -> Self {
-        Self { messages: 1000, interval: Duration::from_millis(10), payload_bytes: 1500 }
+        Self {
+            messages: 1000,
+            interval: Duration::from_millis(10),
+            payload_bytes: 1500,
+        }
     }
 }
 
@@ -62,16 +66,28 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// # Errors
 /// [`TwoHopError`] when the broker cannot be reached or loses messages.
 pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u64>, TwoHopError> {
-    let error = |source| TwoHopError::Connection { broker: broker.clone(), source: Box::new(source) };
+    let error = |source| TwoHopError::Connection {
+        broker: broker.clone(),
+        source: Box::new(source),
+    };
     let access = BrokerAccess::open(broker.clone());
-    let (echoer, echo_events) = access.subscribed("ecod-bench-echo", &[OUT]).await.map_err(error)?;
-    let (sender, events) = access.subscribed("ecod-bench", &[BACK]).await.map_err(error)?;
+    let (echoer, echo_events) = access
+        .subscribed("ecod-bench-echo", &[OUT])
+        .await
+        .map_err(error)?;
+    let (sender, events) = access
+        .subscribed("ecod-bench", &[BACK])
+        .await
+        .map_err(error)?;
     let (arrivals, mut arrived) = mpsc::unbounded_channel();
     let echo = tokio::spawn(each_message(echo_events, move |publish| {
-        echoer.try_publish(BACK, QoS::AtMostOnce, false, publish.payload).is_ok()
+        echoer
+            .try_publish(BACK, QoS::AtMostOnce, false, publish.payload)
+            .is_ok()
     }));
-    let receive =
-        tokio::spawn(each_message(events, move |publish| arrivals.send((publish.payload, Instant::now())).is_ok()));
+    let receive = tokio::spawn(each_message(events, move |publish| {
+        arrivals.send((publish.payload, Instant::now())).is_ok()
+    }));
 
     let mut ticks = tokio::time::interval(load.interval);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Burst);
@@ -83,7 +99,9 @@ pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u
         // Not when the tick was due: the timer's millisecond is not the broker's, and publishing never waits.
         sent.push(Instant::now());
         // A refusal shows as a missing message.
-        sender.try_publish(OUT, QoS::AtMostOnce, false, payload).unwrap_or_default();
+        sender
+            .try_publish(OUT, QoS::AtMostOnce, false, payload)
+            .unwrap_or_default();
     }
     let mut histogram = latencies();
     let mut back = 0;
@@ -91,7 +109,9 @@ pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u
         && let Ok(Some((payload, at))) = tokio::time::timeout(PATIENCE, arrived.recv()).await
     {
         back += 1;
-        let index = payload.first_chunk().map_or(0, |bytes| u32::from_le_bytes(*bytes));
+        let index = payload
+            .first_chunk()
+            .map_or(0, |bytes| u32::from_le_bytes(*bytes));
         if index >= load.messages / 10
             && let Some(sent) = sent.get(index as usize)
         {
@@ -102,7 +122,11 @@ pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u
     receive.abort();
     let missing = load.messages - back;
     if missing > 0 {
-        return Err(TwoHopError::Missing { broker: broker.clone(), missing, messages: load.messages });
+        return Err(TwoHopError::Missing {
+            broker: broker.clone(),
+            missing,
+            messages: load.messages,
+        });
     }
     Ok(histogram)
 }

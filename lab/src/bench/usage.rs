@@ -26,16 +26,28 @@ pub struct Usage {
 impl UsageMeter {
     /// Counts from now.
     pub fn start(pid: u32) -> Self {
-        Self { pid, begun: Instant::now(), before: threads(pid) }
+        Self {
+            pid,
+            begun: Instant::now(),
+            before: threads(pid),
+        }
     }
 
     /// Usage until now; threads that ended in between are not counted.
     pub fn stop(self) -> Usage {
         let span = self.begun.elapsed().as_secs_f64();
-        let [resident_bytes, anonymous_bytes] = ["VmRSS:", "RssAnon:"].map(|key| memory_bytes(self.pid, key));
-        let mut usage = Usage { resident_bytes, anonymous_bytes, ..Usage::default() };
+        let [resident_bytes, anonymous_bytes] =
+            ["VmRSS:", "RssAnon:"].map(|key| memory_bytes(self.pid, key));
+        let mut usage = Usage {
+            resident_bytes,
+            anonymous_bytes,
+            ..Usage::default()
+        };
         for (thread, (name, time)) in threads(self.pid) {
-            let before = self.before.get(&thread).map_or(Duration::ZERO, |(_, time)| *time);
+            let before = self
+                .before
+                .get(&thread)
+                .map_or(Duration::ZERO, |(_, time)| *time);
             let percent = 100.0 * time.saturating_sub(before).as_secs_f64() / span;
             *usage.threads.entry(name).or_default() += percent;
         }
@@ -57,10 +69,15 @@ impl Usage {
 
 /// Names and processor times of the threads; none when the process is gone.
 fn threads(pid: u32) -> BTreeMap<u32, (String, Duration)> {
-    let Ok(tasks) = fs::read_dir(format!("/proc/{pid}/task")) else { return BTreeMap::new() };
+    let Ok(tasks) = fs::read_dir(format!("/proc/{pid}/task")) else {
+        return BTreeMap::new();
+    };
     let thread = |entry: fs::DirEntry| {
         let number = entry.file_name().to_str()?.parse().ok()?;
-        let name = fs::read_to_string(entry.path().join("comm")).ok()?.trim_end().to_owned();
+        let name = fs::read_to_string(entry.path().join("comm"))
+            .ok()?
+            .trim_end()
+            .to_owned();
         // Nanoseconds on a processor, nanoseconds of waiting for one, time slices.
         let times = fs::read_to_string(entry.path().join("schedstat")).ok()?;
         let nanos = times.split_whitespace().next()?.parse().ok()?;
@@ -71,8 +88,16 @@ fn threads(pid: u32) -> BTreeMap<u32, (String, Duration)> {
 
 fn memory_bytes(pid: u32, key: &str) -> u64 {
     let text = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
-    let line = text.lines().find_map(|line| line.strip_prefix(key)).unwrap_or_default();
-    let kilobytes: u64 = line.trim().trim_end_matches("kB").trim_end().parse().unwrap_or(0);
+    let line = text
+        .lines()
+        .find_map(|line| line.strip_prefix(key))
+        .unwrap_or_default();
+    let kilobytes: u64 = line
+        .trim()
+        .trim_end_matches("kB")
+        .trim_end()
+        .parse()
+        .unwrap_or(0);
     kilobytes * 1024
 }
 
@@ -84,7 +109,10 @@ mod tests {
     fn a_thread_that_works_shows_by_its_name() {
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
         let work = move || while stopped.try_recv() == Err(std::sync::mpsc::TryRecvError::Empty) {};
-        let worker = std::thread::Builder::new().name("busy-bee".into()).spawn(work).unwrap();
+        let worker = std::thread::Builder::new()
+            .name("busy-bee".into())
+            .spawn(work)
+            .unwrap();
         let meter = UsageMeter::start(std::process::id());
         std::thread::sleep(Duration::from_millis(200));
         let usage = meter.stop();

@@ -35,7 +35,10 @@ pub(super) struct Came {
 
 impl Came {
     fn none(ticks: usize) -> Self {
-        Self { map: vec![None; ticks], verdict: vec![None; ticks] }
+        Self {
+            map: vec![None; ticks],
+            verdict: vec![None; ticks],
+        }
     }
 }
 
@@ -64,12 +67,25 @@ impl BenchVehicle {
         ticks: usize,
         common: &Arc<Common>,
     ) -> Result<Self, rumqttc::ConnectionError> {
-        let topics = [Topic::GlobalDetections, Topic::GlobalVerdicts].map(|topic| common.topics.path(&topic));
+        let topics = [Topic::GlobalDetections, Topic::GlobalVerdicts]
+            .map(|topic| common.topics.path(&topic));
         let [map_topic, verdict_topic] = &topics;
-        let (client, events) = common.access.subscribed(id, &[map_topic, verdict_topic, BACK]).await?;
+        let (client, events) = common
+            .access
+            .subscribed(id, &[map_topic, verdict_topic, BACK])
+            .await?;
         let arrivals = Arc::new(Mutex::new(Arrivals::none(ticks)));
-        let task = tokio::spawn(receive(events, topics, Arc::clone(&arrivals), Arc::clone(common)));
-        Ok(Self { client, arrivals, task: task.abort_handle() })
+        let task = tokio::spawn(receive(
+            events,
+            topics,
+            Arc::clone(&arrivals),
+            Arc::clone(common),
+        ));
+        Ok(Self {
+            client,
+            arrivals,
+            task: task.abort_handle(),
+        })
     }
 }
 
@@ -79,22 +95,35 @@ impl Drop for BenchVehicle {
     }
 }
 
-async fn receive(mut events: EventLoop, topics: [String; 2], arrivals: Arc<Mutex<Arrivals>>, common: Arc<Common>) {
+async fn receive(
+    mut events: EventLoop,
+    topics: [String; 2],
+    arrivals: Arc<Mutex<Arrivals>>,
+    common: Arc<Common>,
+) {
     let [map_topic, verdict_topic] = topics;
     while let Ok(event) = events.poll().await {
         let at = Instant::now();
-        let Event::Incoming(Packet::Publish(Publish { topic, payload, .. })) = event else { continue };
+        let Event::Incoming(Packet::Publish(Publish { topic, payload, .. })) = event else {
+            continue;
+        };
         if topic == map_topic {
             common.answer_bytes.map.store(payload.len(), Relaxed);
-            common.has_map.send_if_modified(|has_map| !std::mem::replace(has_map, true));
+            common
+                .has_map
+                .send_if_modified(|has_map| !std::mem::replace(has_map, true));
         } else if topic == verdict_topic {
             common.answer_bytes.verdict.store(payload.len(), Relaxed);
         }
-        let Some(schedule) = common.schedule.get() else { continue };
+        let Some(schedule) = common.schedule.get() else {
+            continue;
+        };
         let mut arrivals = arrivals.lock().unwrap_or_else(PoisonError::into_inner);
         if topic == map_topic {
             if let Some(head) = MapHead::of(common.access.unseal(&payload))
-                && let Some(tick) = head.oldest_capture.and_then(|oldest| schedule.tick_captured_at(oldest))
+                && let Some(tick) = head
+                    .oldest_capture
+                    .and_then(|oldest| schedule.tick_captured_at(oldest))
             {
                 arrivals.map(head.round, tick, at);
             }
@@ -110,7 +139,12 @@ async fn receive(mut events: EventLoop, topics: [String; 2], arrivals: Arc<Mutex
 
 impl Arrivals {
     fn none(ticks: usize) -> Self {
-        Self { cell: Came::none(ticks), bare: Came::none(ticks), open: [0; 2], answered_in: 0 }
+        Self {
+            cell: Came::none(ticks),
+            bare: Came::none(ticks),
+            open: [0; 2],
+            answered_in: 0,
+        }
     }
 
     /// A map came that rests on no report of before `tick`: it answers that and all before.
@@ -140,7 +174,9 @@ impl Arrivals {
     /// An answer of the bare way came; the first to a tick stands for the map, the second for the verdicts.
     fn echo(&mut self, tick: u32, at: Instant) {
         let Came { map, verdict } = &mut self.bare;
-        if let (Some(map), Some(verdict)) = (map.get_mut(tick as usize), verdict.get_mut(tick as usize)) {
+        if let (Some(map), Some(verdict)) =
+            (map.get_mut(tick as usize), verdict.get_mut(tick as usize))
+        {
             *(if map.is_none() { map } else { verdict }) = Some(at);
         }
     }
@@ -158,9 +194,15 @@ impl MapHead {
     fn of(map: &[u8]) -> Option<Self> {
         if map.first() != Some(&b'{') {
             let map = decode::<GlobalMap>(map, &Limits::default()).ok()?;
-            return Some(Self { round: map.round, oldest_capture: map.oldest_capture_us });
+            return Some(Self {
+                round: map.round,
+                oldest_capture: map.oldest_capture_us,
+            });
         }
-        Some(Self { round: number(map, ROUND)?, oldest_capture: number(map, OLDEST_CAPTURE).map(Timestamp) })
+        Some(Self {
+            round: number(map, ROUND)?,
+            oldest_capture: number(map, OLDEST_CAPTURE).map(Timestamp),
+        })
     }
 }
 
@@ -175,8 +217,12 @@ fn round_of_verdicts(verdicts: &[u8]) -> Option<u64> {
 fn number(json: &[u8], key: &[u8]) -> Option<u64> {
     let head = json.get(..HEAD_BYTES).unwrap_or(json);
     let at = head.windows(key.len()).position(|window| window == key)?;
-    let digits = head[at + key.len()..].iter().map_while(|byte| char::from(*byte).to_digit(10));
-    digits.map(u64::from).reduce(|number, digit| number.saturating_mul(10).saturating_add(digit))
+    let digits = head[at + key.len()..]
+        .iter()
+        .map_while(|byte| char::from(*byte).to_digit(10));
+    digits
+        .map(u64::from)
+        .reduce(|number, digit| number.saturating_mul(10).saturating_add(digit))
 }
 
 const HEAD_BYTES: usize = 512;
@@ -196,15 +242,24 @@ mod tests {
         let (largest, fused_at) = (u64::MAX >> 11, Timestamp(1_732_154_400_200_000));
         let epoch = Epoch::new(largest, NodeName::from_static("edge"));
         let oldest_capture_us = Some(Timestamp(1_732_154_400_123_456));
-        let mut map = GlobalMap { oldest_capture_us, ..GlobalMap::new(&epoch, largest, fused_at) };
+        let mut map = GlobalMap {
+            oldest_capture_us,
+            ..GlobalMap::new(&epoch, largest, fused_at)
+        };
         let verdicts = Verdicts::new(&epoch, 4711, fused_at, Vec::new());
         for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
-            let head = MapHead { round: map.round, oldest_capture: map.oldest_capture_us };
+            let head = MapHead {
+                round: map.round,
+                oldest_capture: map.oldest_capture_us,
+            };
             assert_eq!(MapHead::of(&encode(&map, encoding)), Some(head));
             assert_eq!(round_of_verdicts(&encode(&verdicts, encoding)), Some(4711));
         }
         map.oldest_capture_us = None;
-        let head = MapHead { round: map.round, oldest_capture: None };
+        let head = MapHead {
+            round: map.round,
+            oldest_capture: None,
+        };
         assert_eq!(MapHead::of(&encode(&map, Encoding::Json)), Some(head));
     }
 
@@ -218,12 +273,21 @@ mod tests {
         arrivals.verdict(6, times[2]);
         assert_eq!(arrivals.cell.verdict, [None; 4], "of before the round");
         arrivals.verdict(7, times[3]);
-        assert_eq!(arrivals.cell.map[..3], [Some(times[1]), Some(times[1]), None]);
-        assert_eq!(arrivals.cell.verdict[..3], [Some(times[3]), Some(times[3]), None]);
+        assert_eq!(
+            arrivals.cell.map[..3],
+            [Some(times[1]), Some(times[1]), None]
+        );
+        assert_eq!(
+            arrivals.cell.verdict[..3],
+            [Some(times[3]), Some(times[3]), None]
+        );
         arrivals.map(8, 2, times[4]);
         arrivals.map(9, 2, times[4]);
         arrivals.verdict(8, times[5]);
-        assert_eq!(arrivals.cell.verdict[1..], [Some(times[3]), Some(times[5]), None]);
+        assert_eq!(
+            arrivals.cell.verdict[1..],
+            [Some(times[3]), Some(times[5]), None]
+        );
     }
 
     #[test]
@@ -234,6 +298,9 @@ mod tests {
             arrivals.echo(0, at);
         }
         arrivals.echo(1, times[0]);
-        assert_eq!((arrivals.bare.map[0], arrivals.bare.verdict[0]), (Some(times[0]), Some(times[1])));
+        assert_eq!(
+            (arrivals.bare.map[0], arrivals.bare.verdict[0]),
+            (Some(times[0]), Some(times[1]))
+        );
     }
 }

@@ -131,7 +131,10 @@ const SEARCH_SPAN: Duration = Duration::from_secs(4);
 pub(super) fn run(arguments: &BenchArguments) -> Result<(), Failure> {
     let runtime = tokio::runtime::Runtime::new().context("no threads for the vehicles")?;
     Ok(runtime.block_on(async {
-        let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+        let (mut interrupt, mut terminate) = (
+            signal(SignalKind::interrupt())?,
+            signal(SignalKind::terminate())?,
+        );
         tokio::select! {
             outcome = bench(arguments) => outcome,
             _ = interrupt.recv() => bail!("interrupted"),
@@ -144,14 +147,19 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
     allow_many_connections();
     let mut figures = Figures::default();
     if let Some(target) = arguments.running_cell()? {
-        print(&format!("cell {} through the broker at {}\n", target.cell, target.access.broker))?;
+        print(&format!(
+            "cell {} through the broker at {}\n",
+            target.cell, target.access.broker
+        ))?;
         compare(&target, arguments, &mut figures).await?;
         saturate(&target, arguments, &mut figures).await?;
     } else if arguments.doors {
         doors(&node_program()?, arguments, &mut figures).await?;
     } else {
         let program = node_program()?;
-        print("an aggregator of this program's own with its embedded broker, in a process of its own, on loopback\n")?;
+        print(
+            "an aggregator of this program's own with its embedded broker, in a process of its own, on loopback\n",
+        )?;
         if arguments.costs {
             costs(&program, arguments, &mut figures).await?;
         } else {
@@ -163,7 +171,10 @@ async fn bench(arguments: &BenchArguments) -> anyhow::Result<()> {
     }
     print("\n")?;
     for (name, Goal { figure, goal, met }) in &figures.goals {
-        print(&format!("{name}: {figure:.2}, goal {goal}: {}\n", if *met { "met" } else { "MISSED" }))?;
+        print(&format!(
+            "{name}: {figure:.2}, goal {goal}: {}\n",
+            if *met { "met" } else { "MISSED" }
+        ))?;
     }
     if let Some(path) = &arguments.out {
         save(path, arguments.section(), &figures)?;
@@ -186,11 +197,20 @@ impl BenchArguments {
 
     /// The running cell to be measured, if it is to be one.
     fn running_cell(&self) -> anyhow::Result<Option<Target>> {
-        let config = self.config.as_deref().map(NodeConfig::load_cell).transpose()?;
-        let named = self.connect.clone().or_else(|| config.as_ref()?.mqtt.broker.clone());
+        let config = self
+            .config
+            .as_deref()
+            .map(NodeConfig::load_cell)
+            .transpose()?;
+        let named = self
+            .connect
+            .clone()
+            .or_else(|| config.as_ref()?.mqtt.broker.clone());
         let Some(broker) = named else {
             if config.is_some() {
-                bail!("the configuration names no `mqtt.broker`: give --connect HOST:PORT, the aggregator's");
+                bail!(
+                    "the configuration names no `mqtt.broker`: give --connect HOST:PORT, the aggregator's"
+                );
             }
             return Ok(None);
         };
@@ -202,19 +222,46 @@ impl BenchArguments {
         }
         let access = BrokerAccess::of(broker, &config)?;
         // By packets, not every round has verdicts.
-        let votes = config.fusion.algorithms.vote() && config.fusion.vote.mode == VoteMode::Weighted;
+        let votes =
+            config.fusion.algorithms.vote() && config.fusion.vote.mode == VoteMode::Weighted;
         let cell = self.cell.clone().unwrap_or(config.cell);
         let (landmarks, encoding) = (config.landmarks, config.mqtt.encoding);
-        Ok(Some(Target { access, cell, landmarks, encoding, votes, aggregator: None }))
+        Ok(Some(Target {
+            access,
+            cell,
+            landmarks,
+            encoding,
+            votes,
+            aggregator: None,
+        }))
     }
 }
 
 /// The cell beside the bare way, for each number of vehicles.
-async fn compare(target: &Target, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
+async fn compare(
+    target: &Target,
+    arguments: &BenchArguments,
+    figures: &mut Figures,
+) -> anyhow::Result<()> {
     let spread = Duration::from_millis(arguments.spread_ms);
-    let mut rows = vec![row(["vehicles", "answer", "way", "p50 µs", "p99 µs", "p99.9 µs", "n", "missing"])];
+    let mut rows = vec![row([
+        "vehicles",
+        "answer",
+        "way",
+        "p50 µs",
+        "p99 µs",
+        "p99.9 µs",
+        "n",
+        "missing",
+    ])];
     for vehicles in arguments.cavs.iter().map(|vehicles| usize::from(*vehicles)) {
-        let load = Load { spread, ..Load::new(vehicles, Duration::from_secs(arguments.seconds) / PASSES as u32) };
+        let load = Load {
+            spread,
+            ..Load::new(
+                vehicles,
+                Duration::from_secs(arguments.seconds) / PASSES as u32,
+            )
+        };
         let (mut cell, mut bare) = (Answers::default(), Answers::default());
         let mut last = None;
         for _ in 0..PASSES {
@@ -229,12 +276,35 @@ async fn compare(target: &Target, arguments: &BenchArguments, figures: &mut Figu
         for (answer, ways) in [("map", Some(&map)), ("verdict", verdict.as_ref())] {
             let Some(ways) = ways else { continue };
             ways.tell(vehicles, answer, &mut rows);
-            figures.goal(format!("vehicles_{vehicles}_{answer}_p50_ratio"), ways.p50_ratio, MAX_RATIO);
-            figures.goal(format!("vehicles_{vehicles}_{answer}_p99_ratio"), ways.p99_ratio, MAX_RATIO);
+            figures.goal(
+                format!("vehicles_{vehicles}_{answer}_p50_ratio"),
+                ways.p50_ratio,
+                MAX_RATIO,
+            );
+            figures.goal(
+                format!("vehicles_{vehicles}_{answer}_p99_ratio"),
+                ways.p99_ratio,
+                MAX_RATIO,
+            );
         }
-        let BenchFigure { report_bytes, map_bytes, verdict_bytes, refused, latest, .. } = last;
+        let BenchFigure {
+            report_bytes,
+            map_bytes,
+            verdict_bytes,
+            refused,
+            latest,
+            ..
+        } = last;
         let sent_late_us = latest.as_micros();
-        let comparison = Comparison { map, verdict, report_bytes, map_bytes, verdict_bytes, refused, sent_late_us };
+        let comparison = Comparison {
+            map,
+            verdict,
+            report_bytes,
+            map_bytes,
+            verdict_bytes,
+            refused,
+            sent_late_us,
+        };
         figures.vehicles.insert(vehicles, comparison);
     }
     print(&format!("\n{}", columns(&rows)))
@@ -243,15 +313,33 @@ async fn compare(target: &Target, arguments: &BenchArguments, figures: &mut Figu
 impl Ways {
     fn of(cell: &Latencies, bare: &Latencies) -> Self {
         let (cell, bare) = (cell.quantiles(), bare.quantiles());
-        Self { cell, bare, p50_ratio: cell.p50_us / bare.p50_us, p99_ratio: cell.p99_us / bare.p99_us }
+        Self {
+            cell,
+            bare,
+            p50_ratio: cell.p50_us / bare.p50_us,
+            p99_ratio: cell.p99_us / bare.p99_us,
+        }
     }
 
     fn tell(&self, vehicles: usize, answer: &str, rows: &mut Vec<Vec<String>>) {
         for (way, quantiles) in [("cell", self.cell), ("bare", self.bare)] {
-            let Quantiles { p50_us, p99_us, p999_us, n, missing } = quantiles;
+            let Quantiles {
+                p50_us,
+                p99_us,
+                p999_us,
+                n,
+                missing,
+            } = quantiles;
             let numbers = [p50_us, p99_us, p999_us].map(|us| format!("{us:.0}"));
             let counts = [n.to_string(), missing.to_string()];
-            rows.push([row([&vehicles.to_string(), answer, way]), numbers.to_vec(), counts.to_vec()].concat());
+            rows.push(
+                [
+                    row([&vehicles.to_string(), answer, way]),
+                    numbers.to_vec(),
+                    counts.to_vec(),
+                ]
+                .concat(),
+            );
         }
         let ratios = [self.p50_ratio, self.p99_ratio].map(|ratio| format!("{ratio:.2}"));
         rows.push(row(["", "", "ratio", &ratios[0], &ratios[1]]));
@@ -262,22 +350,34 @@ fn row<const N: usize>(cells: [&str; N]) -> Vec<String> {
     cells.map(str::to_owned).to_vec()
 }
 
-async fn saturate(target: &Target, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
+async fn saturate(
+    target: &Target,
+    arguments: &BenchArguments,
+    figures: &mut Figures,
+) -> anyhow::Result<()> {
     if arguments.no_saturate {
         return Ok(());
     }
-    print("\nvehicles    map ms p50, p99   verdict ms p50, p99   missing  refused  late ms   map kB  verdict kB  ")?;
+    print(
+        "\nvehicles    map ms p50, p99   verdict ms p50, p99   missing  refused  late ms   map kB  verdict kB  ",
+    )?;
     print("broker %  aggregator %  vehicles %\n")?;
     let tell = |step: &Step| {
         let times = |latency: Option<Quantiles>| {
-            let [p50, p99] = [latency.map(|latency| latency.p50_us), latency.map(|latency| latency.p99_us)].map(in_ms);
+            let [p50, p99] = [
+                latency.map(|latency| latency.p50_us),
+                latency.map(|latency| latency.p99_us),
+            ]
+            .map(in_ms);
             format!("{p50:>9} {p99:>8}")
         };
         let missing = step.map.missing + step.verdict.map_or(0, |verdict| verdict.missing);
-        let [map_kb, verdict_kb] = [step.map_bytes, step.verdict_bytes].map(|bytes| bytes as f64 / 1000.0);
+        let [map_kb, verdict_kb] =
+            [step.map_bytes, step.verdict_bytes].map(|bytes| bytes as f64 / 1000.0);
         let watched = step.shares.aggregator;
-        let percent =
-            |part: fn(AggregatorShares) -> f64| watched.map_or("-".into(), |parts| format!("{:.0}", part(parts)));
+        let percent = |part: fn(AggregatorShares) -> f64| {
+            watched.map_or("-".into(), |parts| format!("{:.0}", part(parts)))
+        };
         let [broker, fusion] = [percent(|parts| parts.broker), percent(|parts| parts.fusion)];
         print(&format!(
             "{:>8} {}    {} {missing:>9} {:>8} {:>8.1} {map_kb:>8.1} {verdict_kb:>11.1} {broker:>9} {fusion:>13} {:>11.0}\n",
@@ -291,8 +391,13 @@ async fn saturate(target: &Target, arguments: &BenchArguments, figures: &mut Fig
     };
     let most = usize::from(arguments.up_to);
     let found = saturation::search(target, [SEARCH_FROM, most], SEARCH_SPAN, tell).await?;
-    let carried = found.most_vehicles.map_or_else(|| "none".to_owned(), |vehicles| vehicles.to_string());
-    print(&format!("most vehicles with p99 below {:?}: {carried}\n", saturation::LIMIT))?;
+    let carried = found
+        .most_vehicles
+        .map_or_else(|| "none".to_owned(), |vehicles| vehicles.to_string());
+    print(&format!(
+        "most vehicles with p99 below {:?}: {carried}\n",
+        saturation::LIMIT
+    ))?;
     match &found.first_saturated {
         Some(first) => print(&format!("saturated first: {first}\n"))?,
         None => print(&format!("nothing saturated up to {most} vehicles\n"))?,
@@ -307,8 +412,16 @@ fn in_ms(us: Option<f64>) -> String {
 
 /// Costs of a node without camera, with the dashboard on and nobody looking, and of recording; then how soon
 /// somebody who looks sees something.
-async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
-    let load = Load { bare: false, votes: false, ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds)) };
+async fn costs(
+    program: &Path,
+    arguments: &BenchArguments,
+    figures: &mut Figures,
+) -> anyhow::Result<()> {
+    let load = Load {
+        bare: false,
+        votes: false,
+        ..Load::new(COST_VEHICLES, Duration::from_secs(arguments.seconds))
+    };
     let (mut usages, mut looked) = (Vec::new(), None);
     for records in [false, true] {
         let mut aggregator = OwnAggregator::start(program, records).await?;
@@ -319,17 +432,41 @@ async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures
         aggregator.stop().await;
         usages.push(measured.aggregator.context("the aggregator ended")?);
     }
-    let [plain, recording] = &usages[..] else { bail!("two nodes were measured") };
+    let [plain, recording] = &usages[..] else {
+        bail!("two nodes were measured")
+    };
     let resident_mb = plain.resident_bytes as f64 / 1e6;
     let added = recording.percent() - plain.percent();
-    print(&format!("\nan aggregator with {COST_VEHICLES} vehicles: {resident_mb:.1} MB, "))?;
-    print(&format!("{:.1} % of a core, recording {added:.1} % more\n", plain.percent()))?;
-    figures.goal(format!("vehicles_{COST_VEHICLES}_resident_mb"), resident_mb, 25.0);
-    figures.goal(format!("vehicles_{COST_VEHICLES}_cpu_percent"), plain.percent(), 5.0);
-    figures.goal(format!("vehicles_{COST_VEHICLES}_recording_cpu_percent"), added, 5.0);
+    print(&format!(
+        "\nan aggregator with {COST_VEHICLES} vehicles: {resident_mb:.1} MB, "
+    ))?;
+    print(&format!(
+        "{:.1} % of a core, recording {added:.1} % more\n",
+        plain.percent()
+    ))?;
+    figures.goal(
+        format!("vehicles_{COST_VEHICLES}_resident_mb"),
+        resident_mb,
+        25.0,
+    );
+    figures.goal(
+        format!("vehicles_{COST_VEHICLES}_cpu_percent"),
+        plain.percent(),
+        5.0,
+    );
+    figures.goal(
+        format!("vehicles_{COST_VEHICLES}_recording_cpu_percent"),
+        added,
+        5.0,
+    );
     let looked = looked.context("nobody looked")?;
-    let (page_kb, first_picture_ms) = (looked.bytes as f64 / 1e3, looked.first_picture.as_secs_f64() * 1e3);
-    print(&format!("its page: {page_kb:.1} kB uncompressed, first picture after {first_picture_ms:.1} ms\n"))?;
+    let (page_kb, first_picture_ms) = (
+        looked.bytes as f64 / 1e3,
+        looked.first_picture.as_secs_f64() * 1e3,
+    );
+    print(&format!(
+        "its page: {page_kb:.1} kB uncompressed, first picture after {first_picture_ms:.1} ms\n"
+    ))?;
     figures.goal("page_kb".into(), page_kb, 150.0);
     figures.goal("page_first_picture_ms".into(), first_picture_ms, 1000.0);
     figures.costs = Some(json!({
@@ -348,21 +485,51 @@ async fn costs(program: &Path, arguments: &BenchArguments, figures: &mut Figures
 }
 
 /// The door of a vehicle: what programs wait longer than their node, and what it costs.
-async fn doors(program: &Path, arguments: &BenchArguments, figures: &mut Figures) -> anyhow::Result<()> {
+async fn doors(
+    program: &Path,
+    arguments: &BenchArguments,
+    figures: &mut Figures,
+) -> anyhow::Result<()> {
     print("an edge and a vehicle with a door, each in a process of its own, on loopback\n\n")?;
-    let measured = crate::bench::doors::measure(program, Duration::from_secs(arguments.seconds)).await?;
+    let measured =
+        crate::bench::doors::measure(program, Duration::from_secs(arguments.seconds)).await?;
     let mut rows = vec![row(["way", "p50 µs", "p99 µs", "p99.9 µs", "n", "missing"])];
     let ways = [
         ("map at the node -> at its door", measured.behind_node),
         ("report at a door -> map", measured.report_at_door),
-        ("report at the leader's broker -> map", measured.report_at_leader),
+        (
+            "report at the leader's broker -> map",
+            measured.report_at_leader,
+        ),
     ];
-    for (way, Quantiles { p50_us, p99_us, p999_us, n, missing }) in ways {
+    for (
+        way,
+        Quantiles {
+            p50_us,
+            p99_us,
+            p999_us,
+            n,
+            missing,
+        },
+    ) in ways
+    {
         let numbers = [p50_us, p99_us, p999_us].map(|us| format!("{us:.0}"));
-        rows.push([row([way]), numbers.to_vec(), row([&n.to_string(), &missing.to_string()])].concat());
+        rows.push(
+            [
+                row([way]),
+                numbers.to_vec(),
+                row([&n.to_string(), &missing.to_string()]),
+            ]
+            .concat(),
+        );
     }
     print(&columns(&rows))?;
-    let DoorFigures { hop_us, resident_mb, door_mb, .. } = measured;
+    let DoorFigures {
+        hop_us,
+        resident_mb,
+        door_mb,
+        ..
+    } = measured;
     print(&format!(
         "one hop {hop_us:.0} µs; an idle vehicle {resident_mb:.1} MB, of which the door {door_mb:.1} MB\n"
     ))?;
@@ -376,7 +543,10 @@ async fn doors(program: &Path, arguments: &BenchArguments, figures: &mut Figures
 /// Figures of the page as a browser gets it while the vehicles report.
 async fn look(aggregator: &mut OwnAggregator) -> anyhow::Result<page::PageFigures> {
     let address = aggregator.page();
-    let load = Load { bare: false, ..Load::new(COST_VEHICLES, LOOK) };
+    let load = Load {
+        bare: false,
+        ..Load::new(COST_VEHICLES, LOOK)
+    };
     let looked = async {
         tokio::time::sleep(LOOK / 2).await;
         page::fetch(address).await
@@ -388,13 +558,22 @@ async fn look(aggregator: &mut OwnAggregator) -> anyhow::Result<page::PageFigure
 
 impl Figures {
     fn goal(&mut self, name: String, figure: f64, goal: f64) {
-        self.goals.insert(name, Goal { figure, goal, met: figure <= goal });
+        self.goals.insert(
+            name,
+            Goal {
+                figure,
+                goal,
+                met: figure <= goal,
+            },
+        );
     }
 }
 
 /// Replaces the section and keeps the others.
 fn save(path: &Path, section: &str, figures: &Figures) -> anyhow::Result<()> {
-    let read = std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
+    let read = std::fs::read(path)
+        .ok()
+        .and_then(|bytes| serde_json::from_slice(&bytes).ok());
     let mut sections: Map<String, Value> = read.unwrap_or_default();
     sections.insert(section.into(), serde_json::to_value(figures)?);
     super::write_json(path, &sections)
@@ -402,8 +581,8 @@ fn save(path: &Path, section: &str, figures: &Figures) -> anyhow::Result<()> {
 
 /// Every vehicle is a descriptor here and another at the broker, which inherits the limit.
 fn allow_many_connections() {
-    let raised =
-        getrlimit(Resource::RLIMIT_NOFILE).and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
+    let raised = getrlimit(Resource::RLIMIT_NOFILE)
+        .and_then(|(_, most)| setrlimit(Resource::RLIMIT_NOFILE, most, most));
     if let Err(error) = raised {
         tracing::warn!(%error, "the limit of open files stays");
     }

@@ -33,18 +33,36 @@ pub(super) struct ConvertArguments {
 }
 
 fn of_vehicle(text: &str) -> Result<(NodeName, PathBuf), String> {
-    let (name, file) = text.split_once('=').ok_or("is not NAME=FILE, such as euclid=det.txt")?;
-    Ok((NodeName::new(name).map_err(|error| error.to_string())?, file.into()))
+    let (name, file) = text
+        .split_once('=')
+        .ok_or("is not NAME=FILE, such as euclid=det.txt")?;
+    Ok((
+        NodeName::new(name).map_err(|error| error.to_string())?,
+        file.into(),
+    ))
 }
 
 pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
-    let ConvertArguments { format, vehicle, config, frame_rate, output } = arguments;
-    if let Some((other, _)) = config.iter().find(|(name, _)| vehicle.iter().all(|(vehicle, _)| vehicle != name)) {
-        return Err(Failure::usage(anyhow!("--config is of {other}, of which no --vehicle is given")));
+    let ConvertArguments {
+        format,
+        vehicle,
+        config,
+        frame_rate,
+        output,
+    } = arguments;
+    if let Some((other, _)) = config
+        .iter()
+        .find(|(name, _)| vehicle.iter().all(|(vehicle, _)| vehicle != name))
+    {
+        return Err(Failure::usage(anyhow!(
+            "--config is of {other}, of which no --vehicle is given"
+        )));
     }
     let mut names = BTreeSet::new();
     if let Some((name, _)) = vehicle.iter().find(|(name, _)| !names.insert(name)) {
-        return Err(Failure::usage(anyhow!("--vehicle names {name} twice: a vehicle has one file or directory")));
+        return Err(Failure::usage(anyhow!(
+            "--vehicle names {name} twice: a vehicle has one file or directory"
+        )));
     }
     let mut inputs = Vec::new();
     for (_, path) in vehicle {
@@ -52,7 +70,10 @@ pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
     }
     let mut of_vehicles = Vec::new();
     for (name, path) in vehicle {
-        let config = config.iter().find(|(of, _)| of == name).map(|(_, path)| path.as_path());
+        let config = config
+            .iter()
+            .find(|(of, _)| of == name)
+            .map(|(_, path)| path.as_path());
         of_vehicles.push((name, read(*format, path, camera(config)?.as_ref())?));
     }
     // A vehicle's only file is the first sequence, whatever its name, if no vehicle has several.
@@ -73,7 +94,9 @@ pub(super) fn run(arguments: &ConvertArguments) -> Result<(), Failure> {
         return Err(anyhow!("no file has a frame").into());
     }
     if reports.iter().all(|report| report.objects.is_empty()) {
-        eprintln!("no report has an object: classes count by the exact names of the form, and boxes need a place");
+        eprintln!(
+            "no report has an object: classes count by the exact names of the form, and boxes need a place"
+        );
     }
     reports.sort_by_key(|report| report.captured_at_us);
     let mut sink = lines::create(output, &inputs).map_err(Failure::usage)?;

@@ -62,11 +62,17 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let program = node_program()?;
     let runtime = tokio::runtime::Runtime::new().context("no threads for the demo")?;
     let results_file = arguments.out.join("result.json");
-    fs::create_dir_all(&arguments.out).with_context(|| format!("cannot make {}", arguments.out.display()))?;
+    fs::create_dir_all(&arguments.out)
+        .with_context(|| format!("cannot make {}", arguments.out.display()))?;
     check_writable(&results_file)?;
     let count = scenes.len() + usize::from(with_street);
     let in_street = with_street.then(|| Street::default().cameras.len());
-    let most = scenes.iter().map(|scene| scene.cavs.len()).chain(in_street).max().unwrap_or(0);
+    let most = scenes
+        .iter()
+        .map(|scene| scene.cavs.len())
+        .chain(in_street)
+        .max()
+        .unwrap_or(0);
     print(&format!(
         "a cell on this machine: 1 edge, killed half-way, {most} nodes that see, report and may lead, {count} scenes\n\n"
     ))?;
@@ -75,8 +81,20 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     let mut results = Vec::with_capacity(scenes.len());
     for (index, scene) in scenes.into_iter().enumerate() {
         let directory = arguments.out.join(file_name(&scene.name));
-        let demo = Demo { program: &program, testbed: &testbed, scene, duration, directory: &directory, dashboard };
-        print(&format!("[{}/{count}] {}: starting {} processes\n", index + 1, scene.name, scene.cavs.len() + 1))?;
+        let demo = Demo {
+            program: &program,
+            testbed: &testbed,
+            scene,
+            duration,
+            directory: &directory,
+            dashboard,
+        };
+        print(&format!(
+            "[{}/{count}] {}: starting {} processes\n",
+            index + 1,
+            scene.name,
+            scene.cavs.len() + 1
+        ))?;
         let outcome = runtime.block_on(until_signalled(demo.run(tell)));
         let outcome = outcome.with_context(|| format!("scene {}", scene.name))?;
         print(&format!(
@@ -86,20 +104,38 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
             outcome.median_age.as_secs_f64() * 1e3,
         ))?;
         print(&leaders(&outcome.terms, outcome.from, "spots"))?;
-        let picture = arguments.out.join(format!("{}.svg", file_name(&scene.name)));
-        let svg = birdseye(&testbed, scene, &detections(&outcome), outcome.last_map.as_ref()).context("picture")?;
+        let picture = arguments
+            .out
+            .join(format!("{}.svg", file_name(&scene.name)));
+        let svg = birdseye(
+            &testbed,
+            scene,
+            &detections(&outcome),
+            outcome.last_map.as_ref(),
+        )
+        .context("picture")?;
         fs::write(&picture, svg).with_context(|| format!("cannot write {}", picture.display()))?;
         results.push(outcome.result);
     }
     let street = if let Some(cameras) = in_street {
         let processes = cameras + 1;
-        print(&format!("[{count}/{count}] {STREET}: starting {processes} processes and {cameras} network cameras\n"))?;
+        print(&format!(
+            "[{count}/{count}] {STREET}: starting {processes} processes and {cameras} network cameras\n"
+        ))?;
         let directory = arguments.out.join(STREET);
-        let demo = StreetDemo { program: &program, duration, directory: &directory, dashboard };
-        let outcome = runtime.block_on(until_signalled(demo.run(tell))).context("the street")?;
+        let demo = StreetDemo {
+            program: &program,
+            duration,
+            directory: &directory,
+            dashboard,
+        };
+        let outcome = runtime
+            .block_on(until_signalled(demo.run(tell)))
+            .context("the street")?;
         print(&leaders(&outcome.terms, outcome.from, "objects"))?;
         let film = arguments.out.join(format!("{STREET}.svg"));
-        fs::write(&film, &outcome.film).with_context(|| format!("cannot write {}", film.display()))?;
+        fs::write(&film, &outcome.film)
+            .with_context(|| format!("cannot write {}", film.display()))?;
         Some(outcome.result)
     } else {
         None
@@ -110,8 +146,17 @@ pub(super) fn run(arguments: &DemoArguments) -> Result<(), Failure> {
     if let Some(street) = &street {
         print(&format!("\n{}", street_table(street)))?;
     }
-    write_json(&results_file, &DemoResults { scenes: &results, street })?;
-    Ok(print(&format!("\npictures, results, configurations and logs: {}\n", arguments.out.display()))?)
+    write_json(
+        &results_file,
+        &DemoResults {
+            scenes: &results,
+            street,
+        },
+    )?;
+    Ok(print(&format!(
+        "\npictures, results, configurations and logs: {}\n",
+        arguments.out.display()
+    ))?)
 }
 
 /// The file of results.
@@ -128,7 +173,10 @@ fn tell(progress: Progress) -> anyhow::Result<()> {
         News::EdgeKilled => "the edge is killed".to_owned(),
         News::EdgeStarted => "the edge is started again".to_owned(),
     };
-    print(&format!("        {:4.1} s, {news}\n", progress.elapsed.as_secs_f64()))
+    print(&format!(
+        "        {:4.1} s, {news}\n",
+        progress.elapsed.as_secs_f64()
+    ))
 }
 
 /// Terms of all leaders: times, accuracy, and gap for the vehicles.
@@ -152,16 +200,22 @@ fn leaders(terms: &[JudgedTerm], start: Timestamp, judged: &str) -> String {
 
 /// Table of what each node knows of the street, alone and with the cell.
 fn street_table(street: &StreetResult) -> String {
-    let columns =
-        |known: &KnownShare| format!("{:5.1} {:8.1} % {:7.1} %", known.known, known.precision_pct, known.recall_pct);
+    let columns = |known: &KnownShare| {
+        format!(
+            "{:5.1} {:8.1} % {:7.1} %",
+            known.known, known.precision_pct, known.recall_pct
+        )
+    };
     let rows = street.alone.iter().zip(street.with_cell.values());
-    let rows = rows.map(|((node, alone), cell)| format!("{node:<8}{}   {}\n", columns(alone), columns(cell)));
-    let hidden = street
-        .seen_only_by
-        .iter()
-        .map(|(node, people)| format!("people who were seen only by {node} for a while: {people}\n"));
+    let rows = rows
+        .map(|((node, alone), cell)| format!("{node:<8}{}   {}\n", columns(alone), columns(cell)));
+    let hidden = street.seen_only_by.iter().map(|(node, people)| {
+        format!("people who were seen only by {node} for a while: {people}\n")
+    });
     let failover = match (&street.took_over, street.failover_gap_ms) {
-        (Some(leader), Some(gap)) => format!("{leader} led after it, first map {gap} ms after the last one before"),
+        (Some(leader), Some(gap)) => {
+            format!("{leader} led after it, first map {gap} ms after the last one before")
+        }
         (Some(leader), None) => format!("{leader} led already"),
         (None, _) => "nobody led after it".to_owned(),
     };
@@ -181,7 +235,10 @@ fn street_table(street: &StreetResult) -> String {
 
 /// Runs a scene; SIGINT and SIGTERM end it and, with it, its processes.
 async fn until_signalled<T>(scene: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let (mut interrupt, mut terminate) = (
+        signal(SignalKind::interrupt())?,
+        signal(SignalKind::terminate())?,
+    );
     tokio::select! {
         outcome = scene => outcome,
         _ = interrupt.recv() => bail!("interrupted"),
@@ -191,7 +248,13 @@ async fn until_signalled<T>(scene: impl Future<Output = anyhow::Result<T>>) -> a
 
 /// A scene's name as the name of a file.
 fn file_name(scene: &str) -> String {
-    let allowed = |c: char| if c.is_alphanumeric() || c == '-' { c } else { '_' };
+    let allowed = |c: char| {
+        if c.is_alphanumeric() || c == '-' {
+            c
+        } else {
+            '_'
+        }
+    };
     scene.chars().map(allowed).collect()
 }
 
@@ -199,7 +262,12 @@ fn file_name(scene: &str) -> String {
 fn detections(outcome: &DemoResult) -> Vec<(ecod::model::names::NodeName, Point2<f64>)> {
     let placed = |observed: &crate::demo::ObservedReport| {
         let node = observed.report.node.clone();
-        observed.report.objects.iter().map(move |o| (node.clone(), Point2::new(o.x_m, o.y_m))).collect::<Vec<_>>()
+        observed
+            .report
+            .objects
+            .iter()
+            .map(move |o| (node.clone(), Point2::new(o.x_m, o.y_m)))
+            .collect::<Vec<_>>()
     };
     outcome.reports.iter().flat_map(placed).collect()
 }

@@ -70,9 +70,20 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     let path = &arguments.truth;
     if let Some(out) = &arguments.out {
         let reports = arguments.reports.iter();
-        let mut inputs: Vec<_> = [path, &arguments.input].into_iter().chain(reports).cloned().collect();
-        for directory in [path, &arguments.input].into_iter().filter(|input| input.is_dir()) {
-            let files = arguments.format.map(|format| format.files(directory)).transpose().map_err(Failure::usage)?;
+        let mut inputs: Vec<_> = [path, &arguments.input]
+            .into_iter()
+            .chain(reports)
+            .cloned()
+            .collect();
+        for directory in [path, &arguments.input]
+            .into_iter()
+            .filter(|input| input.is_dir())
+        {
+            let files = arguments
+                .format
+                .map(|format| format.files(directory))
+                .transpose()
+                .map_err(Failure::usage)?;
             inputs.extend(files.unwrap_or_default());
         }
         lines::check_apart(out, &inputs).map_err(Failure::usage)?;
@@ -80,7 +91,8 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     if let Some(format) = arguments.format {
         return tracks::run_files(arguments, format);
     }
-    let text = bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()));
+    let text =
+        bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()));
     let text = text.map_err(Failure::usage)?;
     if TrackTruth::is_in(&text) {
         return tracks::run(arguments, &text);
@@ -91,7 +103,10 @@ pub(super) fn run(arguments: &EvalArguments) -> Result<(), Failure> {
     let mut evaluation = Evaluation::new(truth.map_err(Failure::usage)?).with_synonyms(synonyms);
     if !config.landmarks.is_empty() {
         let gate = config.fusion.pace.gate();
-        evaluation = evaluation.with_landmarks(LandmarkIndex::new(config.landmarks.clone(), gate.radius_m), gate);
+        evaluation = evaluation.with_landmarks(
+            LandmarkIndex::new(config.landmarks.clone(), gate.radius_m),
+            gate,
+        );
     }
     read_output(&arguments.input, |line| evaluation.fused(&line))?;
     if let Some(reports) = &arguments.reports {
@@ -115,7 +130,10 @@ fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failu
             _ => return unreadable.add(number, "it is neither a map nor verdicts"),
         };
         if let FusedLine::Map(GlobalMap { objects, .. }) = &line
-            && let Some((place, reason)) = objects.iter().enumerate().find_map(|(n, o)| Some((n, o.validate().err()?)))
+            && let Some((place, reason)) = objects
+                .iter()
+                .enumerate()
+                .find_map(|(n, o)| Some((n, o.validate().err()?)))
         {
             return unreadable.add(number, format!("objects[{place}]: {reason}"));
         }
@@ -123,17 +141,25 @@ fn read_output(path: &Path, mut take: impl FnMut(FusedLine)) -> Result<(), Failu
         read += 1;
     })?;
     unreadable.print(path);
-    if read == 0 { Err(anyhow!("there is no map and no verdict in {}", path.display()).into()) } else { Ok(()) }
+    if read == 0 {
+        Err(anyhow!("there is no map and no verdict in {}", path.display()).into())
+    } else {
+        Ok(())
+    }
 }
 
-fn read_reports(evaluation: &mut Evaluation, path: &Path, config: &ReplayConfig) -> Result<(), Failure> {
+fn read_reports(
+    evaluation: &mut Evaluation,
+    path: &Path,
+    config: &ReplayConfig,
+) -> Result<(), Failure> {
     let mut unreadable = UnreadableLines::default();
-    each_line(path, config.limits.payload_bytes, |number, line| {
-        match line.map(|line| read_report(line, &config.limits)) {
-            Some(Ok((kind, report))) => evaluation.report(kind, &report),
-            Some(Err(flaw)) => unreadable.add(number, flaw),
-            None => unreadable.add(number, RejectReason::TooLarge),
-        }
+    each_line(path, config.limits.payload_bytes, |number, line| match line
+        .map(|line| read_report(line, &config.limits))
+    {
+        Some(Ok((kind, report))) => evaluation.report(kind, &report),
+        Some(Err(flaw)) => unreadable.add(number, flaw),
+        None => unreadable.add(number, RejectReason::TooLarge),
     })?;
     unreadable.print(path);
     Ok(())
@@ -156,17 +182,28 @@ impl UnreadableLines {
 
     fn print(&self, path: &Path) {
         if self.lines > 0 {
-            eprintln!("{}: {} lines cannot be used, the first is {}", path.display(), self.lines, self.first);
+            eprintln!(
+                "{}: {} lines cannot be used, the first is {}",
+                path.display(),
+                self.lines,
+                self.first
+            );
         }
     }
 }
 
 /// Gives every line that is not blank to `take`, with its number from 1; `None` for one that is too large.
-fn each_line(path: &Path, limit: usize, mut take: impl FnMut(u64, Option<&[u8]>)) -> Result<(), Failure> {
+fn each_line(
+    path: &Path,
+    limit: usize,
+    mut take: impl FnMut(u64, Option<&[u8]>),
+) -> Result<(), Failure> {
     let mut source = lines::open(path).map_err(Failure::usage)?;
     let mut line = Vec::new();
     for number in 1.. {
-        match read_line(&mut source, limit, &mut line).with_context(|| format!("cannot read {}", path.display()))? {
+        match read_line(&mut source, limit, &mut line)
+            .with_context(|| format!("cannot read {}", path.display()))?
+        {
             LineRead::End => break,
             LineRead::TooLarge => take(number, None),
             LineRead::Whole if line.trim_ascii().is_empty() => {}
@@ -178,17 +215,42 @@ fn each_line(path: &Path, limit: usize, mut take: impl FnMut(u64, Option<&[u8]>)
 
 fn table(result: &EvalResult) -> String {
     let algorithms = [("PACE", &result.pace), ("VOTE", &result.vote)];
-    let judged = algorithms.iter().filter_map(|(name, scores)| Some((*name, scores.as_ref()?)));
-    let mut rows =
-        vec![header(&["", "lines", "items", "accuracy %", "coverage %", "labelled %", "all lines %", "majority %"])];
+    let judged = algorithms
+        .iter()
+        .filter_map(|(name, scores)| Some((*name, scores.as_ref()?)));
+    let mut rows = vec![header(&[
+        "",
+        "lines",
+        "items",
+        "accuracy %",
+        "coverage %",
+        "labelled %",
+        "all lines %",
+        "majority %",
+    ])];
     rows.extend(judged.clone().map(|(name, scores)| summary(name, scores)));
     let mut text = columns(&rows);
     for (name, scores) in judged {
         if !scores.vehicles.is_empty() {
-            let mut rows = vec![header(&["alone", "votes", "right %", "coverage %", "accuracy %"])];
+            let mut rows = vec![header(&[
+                "alone",
+                "votes",
+                "right %",
+                "coverage %",
+                "accuracy %",
+            ])];
             rows.extend(scores.vehicles.iter().map(|(node, alone)| {
-                let shares = [alone.vote_accuracy_pct, alone.coverage_pct, alone.accuracy_pct].map(percent);
-                [vec![node.to_string(), alone.votes.to_string()], shares.to_vec()].concat()
+                let shares = [
+                    alone.vote_accuracy_pct,
+                    alone.coverage_pct,
+                    alone.accuracy_pct,
+                ]
+                .map(percent);
+                [
+                    vec![node.to_string(), alone.votes.to_string()],
+                    shares.to_vec(),
+                ]
+                .concat()
             }));
             text += &format!("\n{name}, every vehicle\n{}", columns(&rows));
         }
@@ -201,11 +263,25 @@ fn table(result: &EvalResult) -> String {
 fn recall(name: &str, scores: &Scores) -> String {
     let mut classes: Vec<_> = scores.recall.iter().collect();
     classes.sort_by_key(|class| std::cmp::Reverse(class.items));
-    let row = |class: &&ClassRecall| vec![name_of(&class.truth), class.items.to_string(), percent(class.recall_pct)];
+    let row = |class: &&ClassRecall| {
+        vec![
+            name_of(&class.truth),
+            class.items.to_string(),
+            percent(class.recall_pct),
+        ]
+    };
     let mut rows = vec![header(&["truth", "items", "recall %"])];
     rows.extend(classes.iter().take(MAX_ROWS).map(row));
-    rows.push(vec!["mean".into(), String::new(), percent(scores.mean_recall_pct)]);
-    format!("\n{name}, every class\n{}{}", columns(&rows), rest(classes.len()))
+    rows.push(vec![
+        "mean".into(),
+        String::new(),
+        percent(scores.mean_recall_pct),
+    ]);
+    format!(
+        "\n{name}, every class\n{}{}",
+        columns(&rows),
+        rest(classes.len())
+    )
 }
 
 fn name_of(label: &Option<Label>) -> String {
@@ -215,7 +291,11 @@ fn name_of(label: &Option<Label>) -> String {
 /// What follows a table of which [`MAX_ROWS`] rows are printed.
 fn rest(rows: usize) -> String {
     let more = rows.saturating_sub(MAX_ROWS);
-    if more > 0 { format!("and {more} more\n") } else { String::new() }
+    if more > 0 {
+        format!("and {more} more\n")
+    } else {
+        String::new()
+    }
 }
 
 fn header(cells: &[&str]) -> Vec<String> {
@@ -223,7 +303,11 @@ fn header(cells: &[&str]) -> Vec<String> {
 }
 
 fn summary(name: &str, scores: &Scores) -> Vec<String> {
-    let counts = vec![name.to_owned(), scores.lines.to_string(), scores.items.to_string()];
+    let counts = vec![
+        name.to_owned(),
+        scores.lines.to_string(),
+        scores.items.to_string(),
+    ];
     [counts, scores.shares_pct().map(percent).to_vec()].concat()
 }
 
@@ -231,6 +315,15 @@ fn confusion(name: &str, scores: &Scores) -> String {
     let mut cells: Vec<_> = scores.confusion.iter().collect();
     cells.sort_by_key(|cell| std::cmp::Reverse(cell.count));
     let mut rows = vec![header(&["truth", "said", "items"])];
-    rows.extend(cells.iter().take(MAX_ROWS).map(|c| vec![name_of(&c.truth), name_of(&c.said), c.count.to_string()]));
-    format!("\n{name}, truth and what was said\n{}{}", columns(&rows), rest(cells.len()))
+    rows.extend(
+        cells
+            .iter()
+            .take(MAX_ROWS)
+            .map(|c| vec![name_of(&c.truth), name_of(&c.said), c.count.to_string()]),
+    );
+    format!(
+        "\n{name}, truth and what was said\n{}{}",
+        columns(&rows),
+        rest(cells.len())
+    )
 }

@@ -9,20 +9,32 @@ use crate::eval::formats::{FileFormat, Sequence, StandingCamera};
 
 /// Parses frames a second.
 pub(super) fn frame_rate(text: &str) -> Result<f64, String> {
-    let rate = text.parse().ok().filter(|rate| (0.01..=1000.0).contains(rate));
+    let rate = text
+        .parse()
+        .ok()
+        .filter(|rate| (0.01..=1000.0).contains(rate));
     rate.ok_or_else(|| "is no number from 0.01 to 1000".to_owned())
 }
 
 /// The camera in a vehicle's configuration.
 pub(super) fn camera(config: Option<&Path>) -> Result<Option<StandingCamera>, Failure> {
-    let load = |path: &Path| StandingCamera::load(path).with_context(|| format!("camera of {}", path.display()));
+    let load = |path: &Path| {
+        StandingCamera::load(path).with_context(|| format!("camera of {}", path.display()))
+    };
     config.map(load).transpose().map_err(Failure::usage)
 }
 
 /// Reads a file, or all of a directory, and says which boxes have no place.
-pub(super) fn read(format: FileFormat, path: &Path, camera: Option<&StandingCamera>) -> Result<Vec<Sequence>, Failure> {
+pub(super) fn read(
+    format: FileFormat,
+    path: &Path,
+    camera: Option<&StandingCamera>,
+) -> Result<Vec<Sequence>, Failure> {
     let sequences = format.read(path, camera).map_err(Failure::usage)?;
-    for Sequence { name, discarded, .. } in &sequences {
+    for Sequence {
+        name, discarded, ..
+    } in &sequences
+    {
         for (reason, boxes) in discarded {
             eprintln!("{name}: {boxes} boxes have no place on the ground: {reason}");
         }

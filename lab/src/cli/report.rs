@@ -24,13 +24,16 @@ pub(super) struct LogReportArguments {
 
 pub(super) fn run(arguments: &LogReportArguments) -> Result<(), Failure> {
     let truth = arguments.truth.as_deref();
-    let report = truth.map_or_else(|| Ok(Report::default()), judged).map_err(Failure::usage)?;
+    let report = truth
+        .map_or_else(|| Ok(Report::default()), judged)
+        .map_err(Failure::usage)?;
     page(&arguments.page, report, truth, "ecod-lab")
 }
 
 /// A report that judges by the truth in this file.
 fn judged(path: &Path) -> anyhow::Result<Report> {
-    let text = bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let text =
+        bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;
     let truth = || format!("truth {}", path.display());
     Ok(if TrackTruth::is_in(&text) {
         judged_by_tracks(TrackTruth::parse(&text).with_context(truth)?)

@@ -21,17 +21,22 @@ pub(super) struct StreetArguments {
 
 pub(super) fn run(arguments: &StreetArguments) -> Result<(), Failure> {
     let street = Street::default();
-    fs::create_dir_all(&arguments.out).with_context(|| format!("cannot make {}", arguments.out.display()))?;
+    fs::create_dir_all(&arguments.out)
+        .with_context(|| format!("cannot make {}", arguments.out.display()))?;
     for camera in fixed_cameras(&street) {
         video::write(&street, camera, &arguments.out.join(video_of(camera)))?;
         let file = arguments.out.join(format!("{}.toml", camera.name));
-        fs::write(&file, config(&street, camera)?).with_context(|| format!("cannot write {}", file.display()))?;
+        fs::write(&file, config(&street, camera)?)
+            .with_context(|| format!("cannot write {}", file.display()))?;
     }
     Ok(())
 }
 
 fn fixed_cameras(street: &Street) -> impl Iterator<Item = &StreetCamera> {
-    street.cameras.iter().filter(|camera| !street.drives(camera))
+    street
+        .cameras
+        .iter()
+        .filter(|camera| !street.drives(camera))
 }
 
 fn video_of(camera: &StreetCamera) -> String {
@@ -39,8 +44,13 @@ fn video_of(camera: &StreetCamera) -> String {
 }
 
 fn config(street: &Street, camera: &StreetCamera) -> anyhow::Result<String> {
-    let source = SourceConfig::Video { path: video_of(camera).into(), looping: true };
-    camera_node(street, camera, source, None).to_toml_changed().context("the configuration cannot be written as TOML")
+    let source = SourceConfig::Video {
+        path: video_of(camera).into(),
+        looping: true,
+    };
+    camera_node(street, camera, source, None)
+        .to_toml_changed()
+        .context("the configuration cannot be written as TOML")
 }
 
 #[cfg(test)]
@@ -51,8 +61,16 @@ mod tests {
     fn the_configurations_of_the_bundled_street_are_those_of_its_cameras() {
         let street = Street::default();
         for camera in fixed_cameras(&street) {
-            let file = format!("{}/../examples/street/{}.toml", env!("CARGO_MANIFEST_DIR"), camera.name);
-            assert_eq!(fs::read_to_string(&file).unwrap(), config(&street, camera).unwrap(), "{file}");
+            let file = format!(
+                "{}/../examples/street/{}.toml",
+                env!("CARGO_MANIFEST_DIR"),
+                camera.name
+            );
+            assert_eq!(
+                fs::read_to_string(&file).unwrap(),
+                config(&street, camera).unwrap(),
+                "{file}"
+            );
         }
     }
 }

@@ -62,7 +62,10 @@ pub(super) struct Results<'a, T = SceneResult> {
 }
 
 fn percent(text: &str) -> Result<f64, String> {
-    let percent = text.parse().ok().filter(|percent| (0.0..=100.0).contains(percent));
+    let percent = text
+        .parse()
+        .ok()
+        .filter(|percent| (0.0..=100.0).contains(percent));
     percent.ok_or_else(|| "must be a number from 0 to 100".to_owned())
 }
 
@@ -76,7 +79,9 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     }
     if arguments.reports.is_some() {
         let scenes = arguments.scenes.display();
-        return Err(Failure::usage(anyhow!("--reports is for recorded detections, and {scenes} has scenes to render")));
+        return Err(Failure::usage(anyhow!(
+            "--reports is for recorded detections, and {scenes} has scenes to render"
+        )));
     }
     let testbed = read(&arguments.scenes).map_err(Failure::usage)?;
     let scenes = select(&testbed, arguments.scene.as_deref()).map_err(Failure::usage)?;
@@ -85,10 +90,19 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     }
     let mut results = Vec::with_capacity(scenes.len());
     for scene in scenes {
-        let trial = Trial { testbed: &testbed, scene, verdicts: arguments.verdicts, seed: arguments.seed };
+        let trial = Trial {
+            testbed: &testbed,
+            scene,
+            verdicts: arguments.verdicts,
+            seed: arguments.seed,
+        };
         let frames = trial.frames_per_verdict() * arguments.verdicts * scene.cavs.len() as u64;
         let bar = progress(frames, &scene.name);
-        results.push(trial.run(|| bar.inc(1)).with_context(|| format!("scene {}", scene.name))?);
+        results.push(
+            trial
+                .run(|| bar.inc(1))
+                .with_context(|| format!("scene {}", scene.name))?,
+        );
         bar.finish_and_clear();
         // After each scene: what was judged stays, whatever becomes of the rest.
         if let Some(out) = &arguments.out {
@@ -100,11 +114,18 @@ pub(super) fn run(arguments: &TestbedArguments) -> Result<(), Failure> {
     let least_occupied = arguments.occupied_at_least.unwrap_or(least);
     for scene in &results {
         if scene.pace_accuracy_pct < least {
-            return Err(anyhow!("scene {}: fewer than {least} % of the spots are right", scene.name).into());
+            return Err(anyhow!(
+                "scene {}: fewer than {least} % of the spots are right",
+                scene.name
+            )
+            .into());
         }
         if scene.occupied_accuracy_pct.unwrap_or(100.0) < least_occupied {
             let name = &scene.name;
-            return Err(anyhow!("scene {name}: fewer than {least_occupied} % of the occupied spots are right").into());
+            return Err(anyhow!(
+                "scene {name}: fewer than {least_occupied} % of the occupied spots are right"
+            )
+            .into());
         }
     }
     Ok(())
@@ -120,17 +141,41 @@ fn read_text(path: &Path) -> anyhow::Result<String> {
 }
 
 /// The named scene, or all.
-pub(super) fn select<'a>(testbed: &'a Testbed, name: Option<&str>) -> anyhow::Result<Vec<&'a Scene>> {
-    let Some(name) = name else { return Ok(testbed.scenes.iter().collect()) };
-    let known = || testbed.scenes.iter().map(|scene| scene.name.as_str()).collect::<Vec<_>>().join(", ");
-    Ok(vec![testbed.scene(name).with_context(|| format!("no scene {name:?}; there are {}", known()))?])
+pub(super) fn select<'a>(
+    testbed: &'a Testbed,
+    name: Option<&str>,
+) -> anyhow::Result<Vec<&'a Scene>> {
+    let Some(name) = name else {
+        return Ok(testbed.scenes.iter().collect());
+    };
+    let known = || {
+        testbed
+            .scenes
+            .iter()
+            .map(|scene| scene.name.as_str())
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
+    Ok(vec![testbed.scene(name).with_context(|| {
+        format!("no scene {name:?}; there are {}", known())
+    })?])
 }
 
 /// Finds out before a long run that its results cannot be written; leaves nothing behind.
 pub(super) fn check_writable(path: &Path) -> anyhow::Result<()> {
     let was_there = path.exists();
-    let opened = fs::File::options().create(true).append(true).open(path).map(drop);
-    let checked = opened.and_then(|()| if was_there { Ok(()) } else { fs::remove_file(path) });
+    let opened = fs::File::options()
+        .create(true)
+        .append(true)
+        .open(path)
+        .map(drop);
+    let checked = opened.and_then(|()| {
+        if was_there {
+            Ok(())
+        } else {
+            fs::remove_file(path)
+        }
+    });
     checked.with_context(|| format!("cannot write {}", path.display()))
 }
 

@@ -34,10 +34,21 @@ pub(super) fn judged_terms<'a>(
         let mut before: Option<(Epoch, Timestamp)> = None;
         for ReceivedMap { received_at, map } in maps {
             let epoch = Epoch::new(map.epoch, map.aggregator.clone());
-            let waited = before.filter(|(last, _)| *last != epoch).map(|(_, at)| received_at.since(at));
+            let waited = before
+                .filter(|(last, _)| *last != epoch)
+                .map(|(_, at)| received_at.since(at));
             let (term, rounds) = terms.entry(epoch.clone()).or_insert_with(|| {
                 let (from, until) = (*received_at, *received_at);
-                (JudgedTerm { epoch: epoch.clone(), from, until, gap: None, right_pct: 0.0 }, BTreeMap::new())
+                (
+                    JudgedTerm {
+                        epoch: epoch.clone(),
+                        from,
+                        until,
+                        gap: None,
+                        right_pct: 0.0,
+                    },
+                    BTreeMap::new(),
+                )
             });
             term.from = term.from.min(*received_at);
             term.until = term.until.max(*received_at);
@@ -63,18 +74,39 @@ mod tests {
 
     fn taken(leader: &str, epoch: u64, round: u64, at_ms: u64) -> ReceivedMap {
         let received_at = Timestamp(at_ms * 1000);
-        let map = GlobalMap::new(&Epoch::new(epoch, NodeName::new(leader).unwrap()), round, received_at);
-        ReceivedMap { received_at, map: Arc::new(map) }
+        let map = GlobalMap::new(
+            &Epoch::new(epoch, NodeName::new(leader).unwrap()),
+            round,
+            received_at,
+        );
+        ReceivedMap {
+            received_at,
+            map: Arc::new(map),
+        }
     }
 
     #[test]
     fn the_gap_of_a_term_is_that_of_the_vehicle_that_waited_longest() {
-        let quick = [taken("edge", 1, 1, 0), taken("edge", 1, 2, 100), taken("euclid", 2, 3, 210)];
-        let slow = [taken("edge", 1, 1, 5), taken("euclid", 2, 4, 320), taken("edge", 3, 5, 400)];
+        let quick = [
+            taken("edge", 1, 1, 0),
+            taken("edge", 1, 2, 100),
+            taken("euclid", 2, 3, 210),
+        ];
+        let slow = [
+            taken("edge", 1, 1, 5),
+            taken("euclid", 2, 4, 320),
+            taken("edge", 3, 5, 400),
+        ];
         let terms = judged_terms([&quick[..], &slow[..]], |maps| maps.len() as f64);
         let told = |term: &JudgedTerm| {
             let (from, until) = (term.from.micros() / 1000, term.until.micros() / 1000);
-            (term.epoch.to_string(), from, until, term.gap.map(|gap| gap.as_millis()), term.right_pct)
+            (
+                term.epoch.to_string(),
+                from,
+                until,
+                term.gap.map(|gap| gap.as_millis()),
+                term.right_pct,
+            )
         };
         let expected = [
             ("edge@1".to_owned(), 0, 100, None, 2.0),

@@ -8,7 +8,9 @@ use ecod::model::time::Timestamp;
 use ecod::wire::{NodeStatus, ObjectReport, Role};
 use ecod_actors::actors::gateway::{Gateway, GatewayArguments};
 use ecod_actors::messages::gateway::GatewayMessage;
-use ecod_actors::transport::mqtt::{BrokerAddress, Delivery, Incoming, MqttConfig, Security, SubscriptionRole};
+use ecod_actors::transport::mqtt::{
+    BrokerAddress, Delivery, Incoming, MqttConfig, Security, SubscriptionRole,
+};
 use ractor::{Actor, ActorRef};
 use tokio::task::JoinHandle;
 use uuid::Uuid;
@@ -37,15 +39,23 @@ struct Seen {
 }
 
 impl ReportCollector {
-    pub(super) async fn start(cell: NodeName, brokers: Vec<BrokerAddress>, name: NodeName) -> anyhow::Result<Self> {
+    pub(super) async fn start(
+        cell: NodeName,
+        brokers: Vec<BrokerAddress>,
+        name: NodeName,
+    ) -> anyhow::Result<Self> {
         let seen: Arc<Mutex<Seen>> = Arc::default();
         let kept = Arc::clone(&seen);
-        let status = NodeStatus::starting(name, Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
+        let status =
+            NodeStatus::starting(name, Uuid::now_v7(), Role::Cav, env!("CARGO_PKG_VERSION"));
         let arguments = GatewayArguments {
             cell,
             role: SubscriptionRole::Candidate,
             status,
-            mqtt: MqttConfig { retry_max_ms: 200, ..MqttConfig::default() },
+            mqtt: MqttConfig {
+                retry_max_ms: 200,
+                ..MqttConfig::default()
+            },
             security: Security::default(),
             clock: Default::default(),
             counters: Arc::default(),
@@ -55,12 +65,21 @@ impl ReportCollector {
         };
         let (gateway, ended) = Actor::spawn(None, Gateway, arguments).await?;
         gateway.cast(GatewayMessage::SetBrokers { addresses: brokers })?;
-        Ok(Self { gateway, ended, seen })
+        Ok(Self {
+            gateway,
+            ended,
+            seen,
+        })
     }
 
     /// Number of vehicles that have reported.
     pub(super) fn reporters(&self) -> usize {
-        lock(&self.seen).reports.iter().map(|observed| observed.report.node.clone()).collect::<BTreeSet<_>>().len()
+        lock(&self.seen)
+            .reports
+            .iter()
+            .map(|observed| observed.report.node.clone())
+            .collect::<BTreeSet<_>>()
+            .len()
     }
 
     /// Whose map came last.
@@ -85,10 +104,22 @@ impl ReportCollector {
 
 impl Seen {
     /// A vehicle sends each report to leader and standby; one is kept.
-    fn take(&mut self, Delivery { message, received_at, .. }: Delivery) {
+    fn take(
+        &mut self,
+        Delivery {
+            message,
+            received_at,
+            ..
+        }: Delivery,
+    ) {
         match message {
-            Incoming::Report { report, .. } if self.known.insert((report.node.clone(), report.seq)) => {
-                self.reports.push(ObservedReport { report, received_at });
+            Incoming::Report { report, .. }
+                if self.known.insert((report.node.clone(), report.seq)) =>
+            {
+                self.reports.push(ObservedReport {
+                    report,
+                    received_at,
+                });
             }
             Incoming::Map(map) => self.leader = Some(map.aggregator.clone()),
             _ => {}

@@ -75,15 +75,31 @@ pub(super) struct Stage<'a> {
 
 impl<'a> Stage<'a> {
     /// A stage for so many nodes; nothing of an earlier cell stays in the directory.
-    pub(super) fn new(program: &'a Path, directory: &'a Path, nodes: usize) -> anyhow::Result<Self> {
-        fs::create_dir_all(directory).with_context(|| format!("cannot make {}", directory.display()))?;
+    pub(super) fn new(
+        program: &'a Path,
+        directory: &'a Path,
+        nodes: usize,
+    ) -> anyhow::Result<Self> {
+        fs::create_dir_all(directory)
+            .with_context(|| format!("cannot make {}", directory.display()))?;
         let state = directory.join("state");
         if state.exists() {
-            fs::remove_dir_all(&state).with_context(|| format!("cannot remove {}", state.display()))?;
+            fs::remove_dir_all(&state)
+                .with_context(|| format!("cannot remove {}", state.display()))?;
         }
-        let free = |_| Ok(NodeAddresses { broker: free_address()?, gossip: free_address()?, poses: free_address()? });
+        let free = |_| {
+            Ok(NodeAddresses {
+                broker: free_address()?,
+                gossip: free_address()?,
+                poses: free_address()?,
+            })
+        };
         let addresses = (0..nodes).map(free).collect::<anyhow::Result<_>>()?;
-        Ok(Self { program, directory, addresses })
+        Ok(Self {
+            program,
+            directory,
+            addresses,
+        })
     }
 
     /// Where a node may receive its poses; the edge is number 0.
@@ -101,36 +117,56 @@ impl<'a> Stage<'a> {
         duration: Duration,
         progress: impl Fn(Progress) -> anyhow::Result<()>,
     ) -> anyhow::Result<Played> {
-        let edge = configs.first().and_then(|edge| edge.name.clone()).context("no edge")?;
-        let cell = configs.first().map(|edge| edge.cell.clone()).context("no cell")?;
+        let edge = configs
+            .first()
+            .and_then(|edge| edge.name.clone())
+            .context("no edge")?;
+        let cell = configs
+            .first()
+            .map(|edge| edge.cell.clone())
+            .context("no cell")?;
         let mut nodes = Vec::with_capacity(configs.len());
         for (index, mut config) in configs.into_iter().enumerate() {
             // The first vehicle's page: the edge is killed half-way.
-            config.dashboard =
-                DashboardConfig { enabled: index == 1, listen: Some(dashboard), ..DashboardConfig::default() };
+            config.dashboard = DashboardConfig {
+                enabled: index == 1,
+                listen: Some(dashboard),
+                ..DashboardConfig::default()
+            };
             if index > 0 {
                 config.role = Role::Auto;
                 config.map_log = config.name.as_ref().map(|name| self.map_log_file(name));
             }
             nodes.push(self.start_node(config, index)?);
         }
-        let brokers = self.addresses.iter().map(|node| node.broker.into()).collect();
+        let brokers = self
+            .addresses
+            .iter()
+            .map(|node| node.broker.into())
+            .collect();
         let collector = ReportCollector::start(cell, brokers, observer).await?;
         let watched = watch(&mut nodes, &collector, &edge, duration, progress).await;
         for node in nodes.iter_mut().rev() {
             node.stop().await;
         }
         let reports = collector.stop().await;
-        Ok(Played { reports, ..watched? })
+        Ok(Played {
+            reports,
+            ..watched?
+        })
     }
 
     /// The maps that a vehicle got, in order.
     pub(super) fn map_log(&self, vehicle: &NodeName) -> anyhow::Result<Vec<ReceivedMap>> {
         let path = self.map_log_file(vehicle);
-        let text = fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let text =
+            fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
         let lines = text.lines().enumerate();
         lines
-            .map(|(n, line)| serde_json::from_str(line).with_context(|| format!("{}, line {}", path.display(), n + 1)))
+            .map(|(n, line)| {
+                serde_json::from_str(line)
+                    .with_context(|| format!("{}, line {}", path.display(), n + 1))
+            })
             .collect()
     }
 
@@ -145,12 +181,25 @@ impl<'a> Stage<'a> {
         }
         let membership = MembershipConfig {
             bind: Some(self.addresses[index].gossip),
-            seeds: self.addresses.iter().map(|node| node.gossip.to_string()).collect(),
+            seeds: self
+                .addresses
+                .iter()
+                .map(|node| node.gossip.to_string())
+                .collect(),
             ..config.membership
         };
         let listen = Some(self.addresses[index].broker);
         let state_dir = Some(self.directory.join("state"));
-        NodeProcess::start(self.program, &NodeConfig { listen, state_dir, membership, ..config }, self.directory)
+        NodeProcess::start(
+            self.program,
+            &NodeConfig {
+                listen,
+                state_dir,
+                membership,
+                ..config
+            },
+            self.directory,
+        )
     }
 }
 
@@ -169,21 +218,34 @@ async fn watch(
         if clock::now().since(started) > START_TIMEOUT {
             let (reporters, leader) = (collector.reporters(), collector.leader());
             let leader = leader.map_or_else(|| "nobody".to_owned(), |leader| leader.to_string());
-            bail!("after {START_TIMEOUT:?} {reporters} of {vehicles} vehicles report and {leader} leads");
+            bail!(
+                "after {START_TIMEOUT:?} {reporters} of {vehicles} vehicles report and {leader} leads"
+            );
         }
         check(nodes)?;
         tokio::time::sleep(Duration::from_millis(50)).await;
     }
     tokio::time::sleep(SETTLING).await;
     let from = clock::now();
-    let mut played = Played { reports: Vec::new(), from, until: from, killed_at: None, restarted_at: None };
+    let mut played = Played {
+        reports: Vec::new(),
+        from,
+        until: from,
+        killed_at: None,
+        restarted_at: None,
+    };
     let (kill_at, restart_at) = (from + duration / 2, from + duration / 2 + EDGE_GONE);
     let mut next_progress = from;
     while clock::now().since(from) < duration {
         tokio::time::sleep(Duration::from_millis(50)).await;
         check(nodes)?;
         let (now, edge) = (clock::now(), &mut nodes[0]);
-        let tell = |news| progress(Progress { elapsed: now.since(from), news });
+        let tell = |news| {
+            progress(Progress {
+                elapsed: now.since(from),
+                news,
+            })
+        };
         if played.killed_at.is_none() && now >= kill_at {
             edge.kill().await?;
             played.killed_at = Some(now);

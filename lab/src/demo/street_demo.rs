@@ -109,7 +109,10 @@ impl StreetDemo<'_> {
     ///
     /// # Errors
     /// When a node does not start or ends early, `progress` fails, or a file cannot be written; all nodes are stopped in any case.
-    pub async fn run(&self, progress: impl Fn(Progress) -> anyhow::Result<()>) -> anyhow::Result<StreetOutcome> {
+    pub async fn run(
+        &self,
+        progress: impl Fn(Progress) -> anyhow::Result<()>,
+    ) -> anyhow::Result<StreetOutcome> {
         let street = Arc::new(Street::default());
         let start = clock::now();
         let mut cameras = Vec::new();
@@ -117,17 +120,25 @@ impl StreetDemo<'_> {
             cameras.push(NetworkCamera::start(&street, number, start).await?);
         }
         let stage = Stage::new(self.program, self.directory, street.cameras.len() + 1)?;
-        let mut configs = vec![NodeConfig { name: Some(edge_name()), role: Role::Edge, ..cell() }];
+        let mut configs = vec![NodeConfig {
+            name: Some(edge_name()),
+            role: Role::Edge,
+            ..cell()
+        }];
         let mut driving = Vec::new();
         for (number, (camera, served)) in street.cameras.iter().zip(&cameras).enumerate() {
-            let poses = street.drives(camera).then(|| stage.pose_address(number + 1));
+            let poses = street
+                .drives(camera)
+                .then(|| stage.pose_address(number + 1));
             driving.extend(poses.map(|address| (number, address)));
             let source = SourceConfig::Url { url: served.url() };
             configs.push(camera_node(&street, camera, source, poses));
         }
         let localisation = tokio::spawn(send_poses(Arc::clone(&street), driving, start));
         let observer = NodeName::from_static("observer");
-        let played = stage.play(configs, self.dashboard, observer, self.duration, progress).await;
+        let played = stage
+            .play(configs, self.dashboard, observer, self.duration, progress)
+            .await;
         localisation.abort();
         let mut pictures = Vec::new();
         for camera in cameras {
@@ -138,7 +149,12 @@ impl StreetDemo<'_> {
         for camera in &street.cameras {
             logs.push((camera.name.clone(), stage.map_log(&camera.name)?));
         }
-        let judge = Judge { street: &street, start, from: played.from, until: played.until };
+        let judge = Judge {
+            street: &street,
+            start,
+            from: played.from,
+            until: played.until,
+        };
         let terms = judge.terms(&logs);
         let result = judge.result(&played, &logs, &terms);
         let (first, log) = logs.first().context("no camera")?;
@@ -149,18 +165,30 @@ impl StreetDemo<'_> {
             edge: edge_name(),
             maps: log.iter().map(known).collect(),
             alone: alone.iter().map(known).collect(),
-            reports: played.reports.iter().map(|observed| &*observed.report).collect(),
+            reports: played
+                .reports
+                .iter()
+                .map(|observed| &*observed.report)
+                .collect(),
             pictures: &pictures,
             killed_at: played.killed_at.context("the edge was not killed")?,
             restarted_at: played.restarted_at,
             ends: [played.from, played.until],
         };
-        Ok(StreetOutcome { from: played.from, film: film.draw(), terms, result })
+        Ok(StreetOutcome {
+            from: played.from,
+            film: film.draw(),
+            terms,
+            result,
+        })
     }
 }
 
 fn known(line: &ReceivedMap) -> KnownMap<'_> {
-    KnownMap { known_at: line.received_at, map: &line.map }
+    KnownMap {
+        known_at: line.received_at,
+        map: &line.map,
+    }
 }
 
 fn edge_name() -> NodeName {
@@ -170,16 +198,31 @@ fn edge_name() -> NodeName {
 /// Configuration that all nodes share. They gossip on loopback, where they meet no other cell of this machine.
 fn cell() -> NodeConfig {
     let membership = MembershipConfig {
-        multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
+        multicast: MulticastConfig {
+            enabled: false,
+            ..MulticastConfig::default()
+        },
         ..MembershipConfig::default()
     };
-    NodeConfig { membership, cell: NodeName::from_static("street"), fusion: fusion(), ..NodeConfig::default() }
+    NodeConfig {
+        membership,
+        cell: NodeName::from_static("street"),
+        fusion: fusion(),
+        ..NodeConfig::default()
+    }
 }
 
 /// A round for every frame.
 fn fusion() -> FusionConfig {
-    let round = RoundConfig { period_s: 1.0 / FRAMES_PER_S, ..RoundConfig::default() };
-    FusionConfig { algorithms: Algorithms::Pace, round, ..FusionConfig::default() }
+    let round = RoundConfig {
+        period_s: 1.0 / FRAMES_PER_S,
+        ..RoundConfig::default()
+    };
+    FusionConfig {
+        algorithms: Algorithms::Pace,
+        round,
+        ..FusionConfig::default()
+    }
 }
 
 /// Configuration of the node of a camera that shows `source`; `poses` is where one that drives hears where it is.
@@ -190,9 +233,16 @@ pub(crate) fn camera_node(
     poses: Option<SocketAddr>,
 ) -> NodeConfig {
     let optics = Street::optics();
-    let Mount { height_m, pitch_rad, .. } = camera.mount;
+    let Mount {
+        height_m,
+        pitch_rad,
+        ..
+    } = camera.mount;
     let pose = street.pose(camera, 0.0);
-    let pass = |stretch| Pass { stretch_x: stretch, stretch_y: stretch };
+    let pass = |stretch| Pass {
+        stretch_x: stretch,
+        stretch_y: stretch,
+    };
     let config = CameraConfig {
         name: None,
         source,
@@ -203,7 +253,11 @@ pub(crate) fn camera_node(
             horizontal_fov_deg: optics.horizontal_field_of_view().to_degrees(),
             ..OpticsConfig::default()
         },
-        mount: MountConfig { height_m, pitch_deg: pitch_rad.to_degrees(), ..MountConfig::default() },
+        mount: MountConfig {
+            height_m,
+            pitch_deg: pitch_rad.to_degrees(),
+            ..MountConfig::default()
+        },
         // A third pass reads little more in these pictures, and takes most of the time.
         detector: DetectorConfig::Placard(PlacardConfig {
             passes: vec![pass(1.0), pass(2.0)],
@@ -241,7 +295,11 @@ fn projection(street: &Street) -> ProjectionConfig {
 }
 
 /// Sends the poses of the cameras that drive to their nodes, as a vehicle's localisation does; never ends by itself.
-async fn send_poses(street: Arc<Street>, driving: Vec<(usize, SocketAddr)>, start: Timestamp) -> anyhow::Result<()> {
+async fn send_poses(
+    street: Arc<Street>,
+    driving: Vec<(usize, SocketAddr)>,
+    start: Timestamp,
+) -> anyhow::Result<()> {
     let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
     let mut ticks = tokio::time::interval(POSE_PERIOD);
     loop {
@@ -270,17 +328,38 @@ struct Judge<'a> {
 }
 
 impl Judge<'_> {
-    fn result(&self, played: &Played, logs: &[(NodeName, Vec<ReceivedMap>)], terms: &[JudgedTerm]) -> StreetResult {
+    fn result(
+        &self,
+        played: &Played,
+        logs: &[(NodeName, Vec<ReceivedMap>)],
+        terms: &[JudgedTerm],
+    ) -> StreetResult {
         let names = || self.street.cameras.iter().map(|camera| &camera.name);
-        let alone = names().map(|name| (name.clone(), self.share(&self.alone(name, &played.reports))));
-        let with_cell = logs.iter().map(|(name, log)| (name.clone(), self.share(log)));
+        let alone =
+            names().map(|name| (name.clone(), self.share(&self.alone(name, &played.reports))));
+        let with_cell = logs
+            .iter()
+            .map(|(name, log)| (name.clone(), self.share(log)));
         let mut seen_only_by: BTreeMap<NodeName, std::collections::BTreeSet<u32>> = BTreeMap::new();
-        for ReceivedMap { map, .. } in logs.iter().flat_map(|(_, log)| log).filter(|line| self.is_judged(&line.map)) {
-            let truth = self.street.truth(map.fused_at_us.since(self.start).as_secs_f64());
-            for object in map.objects.iter().filter(|object| object.confidence >= DEFAULT_THRESHOLD) {
+        for ReceivedMap { map, .. } in logs
+            .iter()
+            .flat_map(|(_, log)| log)
+            .filter(|line| self.is_judged(&line.map))
+        {
+            let truth = self
+                .street
+                .truth(map.fused_at_us.since(self.start).as_secs_f64());
+            for object in map
+                .objects
+                .iter()
+                .filter(|object| object.confidence >= DEFAULT_THRESHOLD)
+            {
                 let place = Point2::new(object.x_m, object.y_m);
-                let near = truth.iter().filter(|known| known.label == object.label && known.label.as_str() == "person");
-                let near = near.map(|known| (nalgebra::distance(&known.position, &place), known.id));
+                let near = truth.iter().filter(|known| {
+                    known.label == object.label && known.label.as_str() == "person"
+                });
+                let near =
+                    near.map(|known| (nalgebra::distance(&known.position, &place), known.id));
                 let nearest = near.filter(|(distance_m, _)| *distance_m <= MATCH_DISTANCE_M / 2.0);
                 let nearest = nearest.min_by(|a, b| a.0.total_cmp(&b.0));
                 if let ([node], Some((_, id))) = (object.contributors.as_slice(), nearest) {
@@ -289,7 +368,9 @@ impl Judge<'_> {
             }
         }
         let killed_at = played.killed_at.unwrap_or(self.until);
-        let after = terms.iter().find(|term| term.until > killed_at && term.epoch.leader != edge_name());
+        let after = terms
+            .iter()
+            .find(|term| term.until > killed_at && term.epoch.leader != edge_name());
         StreetResult {
             objects: self.street.truth(0.0).len(),
             alone: alone.collect(),
@@ -300,7 +381,10 @@ impl Judge<'_> {
                 .filter(|term| term.from >= killed_at)
                 .and_then(|term| term.gap)
                 .map(|gap| gap.as_millis() as u64),
-            seen_only_by: seen_only_by.into_iter().map(|(node, people)| (node, people.len())).collect(),
+            seen_only_by: seen_only_by
+                .into_iter()
+                .map(|(node, people)| (node, people.len()))
+                .collect(),
         }
     }
 
@@ -311,13 +395,22 @@ impl Judge<'_> {
     /// The maps that a node would have made of its own reports.
     fn alone(&self, name: &NodeName, reports: &[ObservedReport]) -> Vec<ReceivedMap> {
         let mut aggregator = Aggregator::new(name.clone(), 1, fusion(), Vec::new(), self.start);
-        let own = reports.iter().filter(|observed| observed.report.node == *name);
+        let own = reports
+            .iter()
+            .filter(|observed| observed.report.node == *name);
         let mut maps = Vec::new();
-        for ObservedReport { report, received_at } in own {
+        for ObservedReport {
+            report,
+            received_at,
+        } in own
+        {
             if let Ok(Some(Fused { map: Some(map), .. })) =
                 aggregator.report(ReportKind::Detections, report, *received_at)
             {
-                maps.push(ReceivedMap { received_at: *received_at, map: Arc::new(map) });
+                maps.push(ReceivedMap {
+                    received_at: *received_at,
+                    map: Arc::new(map),
+                });
             }
         }
         maps
@@ -327,10 +420,17 @@ impl Judge<'_> {
     fn terms(&self, logs: &[(NodeName, Vec<ReceivedMap>)]) -> Vec<JudgedTerm> {
         let logs: Vec<Vec<ReceivedMap>> = logs
             .iter()
-            .map(|(_, log)| log.iter().filter(|line| self.is_judged(&line.map)).cloned().collect())
+            .map(|(_, log)| {
+                log.iter()
+                    .filter(|line| self.is_judged(&line.map))
+                    .cloned()
+                    .collect()
+            })
             .collect();
         judged_terms(logs.iter().map(Vec::as_slice), |maps| {
-            let frames = maps.iter().map(|map| self.frame(map.fused_at_us, Some(map), &mut HashMap::new()));
+            let frames = maps
+                .iter()
+                .map(|map| self.frame(map.fused_at_us, Some(map), &mut HashMap::new()));
             share(&frames.collect::<Vec<_>>()).recall_pct
         })
     }
@@ -339,7 +439,10 @@ impl Judge<'_> {
     fn share(&self, maps: &[ReceivedMap]) -> KnownShare {
         let (mut frames, mut at, mut next, mut ids) = (Vec::new(), self.from, 0, HashMap::new());
         while at <= self.until {
-            next += maps[next..].iter().take_while(|line| line.received_at <= at).count();
+            next += maps[next..]
+                .iter()
+                .take_while(|line| line.received_at <= at)
+                .count();
             let newest = next.checked_sub(1).map(|place| &maps[place]);
             let known = newest.filter(|line| at.since(line.received_at) < FORGOTTEN);
             frames.push(self.frame(at, known.map(|line| &*line.map), &mut ids));
@@ -348,16 +451,33 @@ impl Judge<'_> {
         share(&frames)
     }
 
-    fn frame(&self, at: Timestamp, map: Option<&GlobalMap>, ids: &mut HashMap<uuid::Uuid, u32>) -> ScoredFrame {
-        let said = map.into_iter().flat_map(|map| &map.objects).map(|object| SaidObject::of(object, ids));
-        ScoredFrame { said: said.collect(), truth: self.street.truth(at.since(self.start).as_secs_f64()) }
+    fn frame(
+        &self,
+        at: Timestamp,
+        map: Option<&GlobalMap>,
+        ids: &mut HashMap<uuid::Uuid, u32>,
+    ) -> ScoredFrame {
+        let said = map
+            .into_iter()
+            .flat_map(|map| &map.objects)
+            .map(|object| SaidObject::of(object, ids));
+        ScoredFrame {
+            said: said.collect(),
+            truth: self.street.truth(at.since(self.start).as_secs_f64()),
+        }
     }
 }
 
 fn share(frames: &[ScoredFrame]) -> KnownShare {
     let scores = score(frames).at_default;
     let matches = scores.matches as f64;
-    let percent = |of: u64| if of == 0 { 0.0 } else { 100.0 * matches / of as f64 };
+    let percent = |of: u64| {
+        if of == 0 {
+            0.0
+        } else {
+            100.0 * matches / of as f64
+        }
+    };
     KnownShare {
         known: matches / frames.len().max(1) as f64,
         precision_pct: percent(scores.matches + scores.false_alarms),
@@ -387,7 +507,11 @@ mod tests {
         for camera in &street.cameras {
             for at_s in [0.5, 4.0, 7.5, 11.0] {
                 let image = view.render(&street, camera, at_s).unwrap();
-                let frame = CameraFrame { image, captured_at: Timestamp::default(), seq: 0 };
+                let frame = CameraFrame {
+                    image,
+                    captured_at: Timestamp::default(),
+                    seq: 0,
+                };
                 let detections = detector.detect(&frame).unwrap();
                 let vehicle_camera = VehicleCamera {
                     node: camera.name.clone(),
@@ -397,22 +521,44 @@ mod tests {
                     landmarks: Arc::new(LandmarkIndex::new(Vec::new(), 1.0)),
                 };
                 let gate = PaceConfig::default().gate();
-                let mut perception = Perception::new(vehicle_camera, projection(&street), ViewConfig::default(), gate);
+                let mut perception = Perception::new(
+                    vehicle_camera,
+                    projection(&street),
+                    ViewConfig::default(),
+                    gate,
+                );
                 let report = perception.report(detections, Timestamp::default());
                 for object in &report.objects {
-                    *read.entry((camera.name.clone(), object.label.clone())).or_default() += 1;
+                    *read
+                        .entry((camera.name.clone(), object.label.clone()))
+                        .or_default() += 1;
                     let place = Point2::new(object.x_m, object.y_m);
-                    let truth = street.truth(at_s).into_iter().filter(|known| known.label == object.label);
-                    let error_m =
-                        truth.map(|known| nalgebra::distance(&known.position, &place)).fold(f64::MAX, f64::min);
+                    let truth = street
+                        .truth(at_s)
+                        .into_iter()
+                        .filter(|known| known.label == object.label);
+                    let error_m = truth
+                        .map(|known| nalgebra::distance(&known.position, &place))
+                        .fold(f64::MAX, f64::min);
                     // Half of a car's placards, and what the corners of a small code may be off.
-                    let allowed_m = 0.8 + 0.05 * nalgebra::distance(&place, &street.pose(camera, at_s).position);
+                    let allowed_m = 0.8
+                        + 0.05 * nalgebra::distance(&place, &street.pose(camera, at_s).position);
                     let (name, label) = (&camera.name, &object.label);
-                    assert!(error_m < allowed_m, "{name} places a {label} {error_m:.2} m off at {at_s} s");
+                    assert!(
+                        error_m < allowed_m,
+                        "{name} places a {label} {error_m:.2} m off at {at_s} s"
+                    );
                 }
             }
         }
-        let people = read.keys().filter(|(_, label)| label.as_str() == "person").count();
-        assert_eq!(people, street.cameras.len(), "each camera reads somebody: {read:?}");
+        let people = read
+            .keys()
+            .filter(|(_, label)| label.as_str() == "person")
+            .count();
+        assert_eq!(
+            people,
+            street.cameras.len(),
+            "each camera reads somebody: {read:?}"
+        );
     }
 }

@@ -39,11 +39,14 @@ pub fn found(report: &ObjectReport) -> Vec<FoundObject> {
         score: object.confidence,
         position: Point2::new(object.x_m, object.y_m),
     });
-    let own = report.pose.filter(|_| report.moving != Some(false)).map(|pose| FoundObject {
-        label: Label::new_static("car"),
-        score: 1.0,
-        position: Point2::new(pose.x_m, pose.y_m),
-    });
+    let own = report
+        .pose
+        .filter(|_| report.moving != Some(false))
+        .map(|pose| FoundObject {
+            label: Label::new_static("car"),
+            score: 1.0,
+            position: Point2::new(pose.x_m, pose.y_m),
+        });
     objects.chain(own).collect()
 }
 
@@ -62,7 +65,10 @@ impl LatestReports {
 
     /// Objects that all vehicles found.
     pub fn union(&self, now: Timestamp) -> Vec<FoundObject> {
-        let fresh = self.0.values().filter(|(captured, _)| now.since(*captured) <= MAX_AGE);
+        let fresh = self
+            .0
+            .values()
+            .filter(|(captured, _)| now.since(*captured) <= MAX_AGE);
         fresh.flat_map(|(_, found)| found.iter().cloned()).collect()
     }
 }
@@ -72,7 +78,11 @@ pub fn suppressed(mut found: Vec<FoundObject>) -> Vec<FoundObject> {
     found.sort_by(|a, b| b.score.total_cmp(&a.score));
     let mut kept: Vec<FoundObject> = Vec::new();
     for candidate in found {
-        let limit_m = if candidate.label == "car" { SAME_CAR_M } else { SAME_OTHER_M };
+        let limit_m = if candidate.label == "car" {
+            SAME_CAR_M
+        } else {
+            SAME_OTHER_M
+        };
         let is_same = |other: &FoundObject| {
             other.label == candidate.label && (other.position - candidate.position).norm() < limit_m
         };
@@ -106,7 +116,11 @@ impl NearestTracker {
         let mut pairs = Vec::new();
         for (number, track) in self.tracks.iter().enumerate() {
             let expected = track.position + track.velocity * at.since(track.at).as_secs_f64();
-            for (place, object) in found.iter().enumerate().filter(|(_, object)| object.label == track.label) {
+            for (place, object) in found
+                .iter()
+                .enumerate()
+                .filter(|(_, object)| object.label == track.label)
+            {
                 let distance_m = (object.position - expected).norm();
                 if distance_m < GATE_M {
                     pairs.push((distance_m, number, place));
@@ -131,7 +145,13 @@ impl NearestTracker {
         identified.collect()
     }
 
-    fn begin(&mut self, at: Timestamp, FoundObject { label, position, .. }: &FoundObject) -> u32 {
+    fn begin(
+        &mut self,
+        at: Timestamp,
+        FoundObject {
+            label, position, ..
+        }: &FoundObject,
+    ) -> u32 {
         let id = self.identities;
         self.identities += 1;
         self.tracks.push(NearestTrack {

@@ -104,11 +104,21 @@ impl Sequence {
         last: u64,
     ) -> impl Iterator<Item = ObjectReport> {
         (self.first..=last).map(move |frame| {
-            let objects =
-                self.frames.get(&frame).into_iter().flatten().map(|object| object.perceived.clone()).collect();
+            let objects = self
+                .frames
+                .get(&frame)
+                .into_iter()
+                .flatten()
+                .map(|object| object.perceived.clone())
+                .collect();
             let at = time_of(number, frame, frame_rate_hz);
             let moving = self.pose.map(|_| false);
-            ObjectReport { objects, pose: self.pose, moving, ..ObjectReport::new(node.clone(), frame, at) }
+            ObjectReport {
+                objects,
+                pose: self.pose,
+                moving,
+                ..ObjectReport::new(node.clone(), frame, at)
+            }
         })
     }
 }
@@ -135,40 +145,79 @@ impl FileFormat {
             return Ok(vec![path.to_owned()]);
         }
         let ending = if self == Self::Coco { "json" } else { "txt" };
-        let entries = fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?;
-        let has_ending = |file: &PathBuf| file.extension().is_some_and(|extension| extension == ending);
-        let mut files: Vec<PathBuf> =
-            entries.filter_map(Result::ok).map(|entry| entry.path()).filter(has_ending).collect();
+        let entries =
+            fs::read_dir(path).with_context(|| format!("cannot read {}", path.display()))?;
+        let has_ending = |file: &PathBuf| {
+            file.extension()
+                .is_some_and(|extension| extension == ending)
+        };
+        let mut files: Vec<PathBuf> = entries
+            .filter_map(Result::ok)
+            .map(|entry| entry.path())
+            .filter(has_ending)
+            .collect();
         files.sort_by_cached_key(|file| file.file_stem().map(OsStr::to_owned));
-        if files.is_empty() { bail!("there is no .{ending} file in {}", path.display()) } else { Ok(files) }
+        if files.is_empty() {
+            bail!("there is no .{ending} file in {}", path.display())
+        } else {
+            Ok(files)
+        }
     }
 
     /// Reads a file, or all of a directory with the ending of the form. Boxes are those of `camera`.
     ///
     /// # Errors
     /// Naming file, line and field.
-    pub fn read(self, path: &Path, camera: Option<&StandingCamera>) -> anyhow::Result<Vec<Sequence>> {
+    pub fn read(
+        self,
+        path: &Path,
+        camera: Option<&StandingCamera>,
+    ) -> anyhow::Result<Vec<Sequence>> {
         if self == Self::Kitti && camera.is_some() {
             bail!("positions of KITTI are those of its vehicle: they need no --config");
         }
         let files = self.files(path)?;
         let parse = |file: &PathBuf| {
-            let text = bounded_file::read_text(file).with_context(|| format!("cannot read {}", file.display()))?;
-            self.parse(&text, camera.is_some()).with_context(|| file.display().to_string())
+            let text = bounded_file::read_text(file)
+                .with_context(|| format!("cannot read {}", file.display()))?;
+            self.parse(&text, camera.is_some())
+                .with_context(|| file.display().to_string())
         };
-        let mut parsed = files.iter().map(parse).collect::<anyhow::Result<Vec<_>>>()?;
+        let mut parsed = files
+            .iter()
+            .map(parse)
+            .collect::<anyhow::Result<Vec<_>>>()?;
         as_probabilities(&mut parsed);
-        Ok(files.iter().zip(parsed).map(|(file, frames)| self.sequence(file, frames, camera)).collect())
+        Ok(files
+            .iter()
+            .zip(parsed)
+            .map(|(file, frames)| self.sequence(file, frames, camera))
+            .collect())
     }
 
-    fn sequence(self, file: &Path, parsed: ParsedFrames, camera: Option<&StandingCamera>) -> Sequence {
-        let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    fn sequence(
+        self,
+        file: &Path,
+        parsed: ParsedFrames,
+        camera: Option<&StandingCamera>,
+    ) -> Sequence {
+        let name = file
+            .file_stem()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
         let first = match self {
             Self::Kitti => 0,
             Self::Mot => 1,
             Self::Coco => parsed.keys().next().copied().unwrap_or_default(),
         };
-        let sequence = Sequence { name, first, frames: Frames::new(), pose: None, discarded: BTreeMap::new() };
+        let sequence = Sequence {
+            name,
+            first,
+            frames: Frames::new(),
+            pose: None,
+            discarded: BTreeMap::new(),
+        };
         standing_camera::placed(parsed, camera, sequence)
     }
 
@@ -183,16 +232,29 @@ impl FileFormat {
 
     fn lines(self, text: &str, has_camera: bool) -> Result<ParsedFrames, LineError> {
         let mut frames = ParsedFrames::new();
-        for (number, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
+        for (number, line) in text
+            .lines()
+            .enumerate()
+            .filter(|(_, line)| !line.trim().is_empty())
+        {
             let cells = Cells::new(number + 1, line);
-            let object = if self == Self::Kitti { kitti::object(&cells)? } else { mot::object(&cells, has_camera)? };
+            let object = if self == Self::Kitti {
+                kitti::object(&cells)?
+            } else {
+                mot::object(&cells, has_camera)?
+            };
             if let Some((frame, object)) = object {
                 if let FilePlace::Ground(place) = object.place
                     && let Err((field, _)) =
-                        PerceivedObject::new(object.label.clone(), 1.0, place.x, place.y).check_fields()
+                        PerceivedObject::new(object.label.clone(), 1.0, place.x, place.y)
+                            .check_fields()
                 {
                     let fault = format!("({}, {}) is out of bounds", place.x, place.y);
-                    return Err(LineError { line: number + 1, field: format!("position ({field})"), fault });
+                    return Err(LineError {
+                        line: number + 1,
+                        field: format!("position ({field})"),
+                        fault,
+                    });
                 }
                 frames.entry(frame).or_default().push(object);
             }
@@ -220,12 +282,18 @@ pub fn sequence_at(time: Timestamp) -> usize {
 ///
 /// # Errors
 /// Naming the sequence.
-pub fn check_lengths<'a>(sequences: impl IntoIterator<Item = &'a Sequence>, frame_rate_hz: f64) -> anyhow::Result<()> {
-    let lasts_on = |sequence: &&Sequence| sequence_at(time_of(0, sequence.last(), frame_rate_hz)) > 0;
+pub fn check_lengths<'a>(
+    sequences: impl IntoIterator<Item = &'a Sequence>,
+    frame_rate_hz: f64,
+) -> anyhow::Result<()> {
+    let lasts_on =
+        |sequence: &&Sequence| sequence_at(time_of(0, sequence.last(), frame_rate_hz)) > 0;
     match sequences.into_iter().find(lasts_on) {
         Some(Sequence { name, .. }) => {
             let seconds = SEQUENCE_US / 1_000_000;
-            bail!("{name} lasts for more than the {seconds} s of one of several sequences; give its file by itself")
+            bail!(
+                "{name} lasts for more than the {seconds} s of one of several sequences; give its file by itself"
+            )
         }
         None => Ok(()),
     }
@@ -241,14 +309,17 @@ fn as_probabilities(files: &mut [ParsedFrames]) {
     let objects = files.iter_mut().flat_map(BTreeMap::values_mut).flatten();
     let mut scores: Vec<&mut f64> = objects.map(|object| &mut object.score).collect();
     if scores.iter().any(|score| !(0.0..=1.0).contains(&**score)) {
-        scores.iter_mut().for_each(|score| **score = 1.0 / (1.0 + (-compressed(**score)).exp()));
+        scores
+            .iter_mut()
+            .for_each(|score| **score = 1.0 / (1.0 + (-compressed(**score)).exp()));
     }
 }
 
 fn compressed(log_odds: f64) -> f64 {
     let beyond = (log_odds.abs() - LARGE_LOG_ODDS).max(0.0) / LARGE_LOG_ODDS;
     let most = MAX_LOG_ODDS - LARGE_LOG_ODDS;
-    log_odds.clamp(-LARGE_LOG_ODDS, LARGE_LOG_ODDS) + log_odds.signum() * most * (1.0 - 1.0 / (1.0 + beyond))
+    log_odds.clamp(-LARGE_LOG_ODDS, LARGE_LOG_ODDS)
+        + log_odds.signum() * most * (1.0 - 1.0 / (1.0 + beyond))
 }
 
 /// The cells of a line, separated by commas or else by blanks.
@@ -261,13 +332,26 @@ struct Cells<'a> {
 impl<'a> Cells<'a> {
     fn new(line: usize, text: &'a str) -> Self {
         let has_commas = text.contains(',');
-        let cells =
-            if has_commas { text.split(',').map(str::trim).collect() } else { text.split_ascii_whitespace().collect() };
-        Self { line, cells, has_commas }
+        let cells = if has_commas {
+            text.split(',').map(str::trim).collect()
+        } else {
+            text.split_ascii_whitespace().collect()
+        };
+        Self {
+            line,
+            cells,
+            has_commas,
+        }
     }
 
     fn text(&self, column: usize, name: &str) -> Result<&'a str, LineError> {
-        let missing = || self.error(column, name, format!("is missing, there are {} columns", self.cells.len()));
+        let missing = || {
+            self.error(
+                column,
+                name,
+                format!("is missing, there are {} columns", self.cells.len()),
+            )
+        };
         self.cells.get(column - 1).copied().ok_or_else(missing)
     }
 
@@ -282,15 +366,24 @@ impl<'a> Cells<'a> {
     fn integer(&self, column: usize, name: &str) -> Result<i64, LineError> {
         let number = self.number(column, name)?;
         let is_whole = number.fract() == 0.0 && number.abs() < 1e15;
-        if is_whole { Ok(number as i64) } else { Err(self.error(column, name, format!("{number} is no whole number"))) }
+        if is_whole {
+            Ok(number as i64)
+        } else {
+            Err(self.error(column, name, format!("{number} is no whole number")))
+        }
     }
 
     fn frame(&self) -> Result<u64, LineError> {
         let frame = self.integer(1, "frame")?;
-        frame_number(frame).ok_or_else(|| self.error(1, "frame", format!("{frame} is out of bounds")))
+        frame_number(frame)
+            .ok_or_else(|| self.error(1, "frame", format!("{frame} is out of bounds")))
     }
 
     fn error(&self, column: usize, name: &str, fault: String) -> LineError {
-        LineError { line: self.line, field: format!("column {column} ({name})"), fault }
+        LineError {
+            line: self.line,
+            field: format!("column {column} ({name})"),
+            fault,
+        }
     }
 }

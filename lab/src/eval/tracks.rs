@@ -180,7 +180,10 @@ pub fn score(frames: &[ScoredFrame]) -> TrackScores {
         class_ap_pct,
         best_f1_pct: best.map(|best| 100.0 * best.f1),
         best_moda_pct: precision::best_moda_pct(frames),
-        at_best_f1: at_threshold(frames, best.map_or(DEFAULT_THRESHOLD, |best| best.threshold)),
+        at_best_f1: at_threshold(
+            frames,
+            best.map_or(DEFAULT_THRESHOLD, |best| best.threshold),
+        ),
         at_default: at_threshold(frames, DEFAULT_THRESHOLD),
         calibration: calibration::judge(frames),
     }
@@ -188,8 +191,16 @@ pub fn score(frames: &[ScoredFrame]) -> TrackScores {
 
 fn at_threshold(frames: &[ScoredFrame], threshold: f64) -> ThresholdScores {
     let kept = |frame: &ScoredFrame| {
-        let said = frame.said.iter().filter(|said| said.score >= threshold).cloned().collect();
-        ScoredFrame { truth: frame.truth.clone(), said }
+        let said = frame
+            .said
+            .iter()
+            .filter(|said| said.score >= threshold)
+            .cloned()
+            .collect();
+        ScoredFrame {
+            truth: frame.truth.clone(),
+            said,
+        }
     };
     let frames: Vec<ScoredFrame> = frames.iter().map(kept).collect();
     let clear = clear::judge(&frames);
@@ -237,7 +248,12 @@ impl TrackEvaluation {
     /// Nothing read yet.
     pub fn new(truth: TrackTruth) -> Self {
         let reach_us = (REACH * truth.period_us() as f64) as i64;
-        Self { maps: vec![None; truth.frames().len()], truth, reach_us, ids: HashMap::new() }
+        Self {
+            maps: vec![None; truth.frames().len()],
+            truth,
+            reach_us,
+            ids: HashMap::new(),
+        }
     }
 
     /// Takes the next map.
@@ -252,10 +268,15 @@ impl TrackEvaluation {
     pub fn said(&mut self, at: Timestamp, said: &[SaidObject]) {
         let frames = self.truth.frames();
         let first = frames.partition_point(|frame| at.micros_from(frame.at) > self.reach_us);
-        let near = frames[first..].iter().take_while(|frame| frame.at.micros_from(at) <= self.reach_us);
+        let near = frames[first..]
+            .iter()
+            .take_while(|frame| frame.at.micros_from(at) <= self.reach_us);
         for (frame, nearest) in near.zip(&mut self.maps[first..]) {
             let distance = |time: Timestamp| frame.at.micros_from(time).abs();
-            if nearest.as_ref().is_none_or(|(other, _)| distance(*other) >= distance(at)) {
+            if nearest
+                .as_ref()
+                .is_none_or(|(other, _)| distance(*other) >= distance(at))
+            {
                 *nearest = Some((at, said.to_owned()));
             }
         }
@@ -269,14 +290,29 @@ impl TrackEvaluation {
             .into_iter()
             .enumerate()
             .map(|(number, map)| match map {
-                Some((at, said)) => ScoredFrame { truth: self.truth.at(number, at), said },
-                None => ScoredFrame { truth: self.truth.frames()[number].objects.clone(), said: Vec::new() },
+                Some((at, said)) => ScoredFrame {
+                    truth: self.truth.at(number, at),
+                    said,
+                },
+                None => ScoredFrame {
+                    truth: self.truth.frames()[number].objects.clone(),
+                    said: Vec::new(),
+                },
             })
             .collect();
-        let mut scores = TrackScores { frames_with_map: with_map, ..score(&frames) };
+        let mut scores = TrackScores {
+            frames_with_map: with_map,
+            ..score(&frames)
+        };
         if !self.truth.has_identities() {
             for at in [&mut scores.at_best_f1, &mut scores.at_default] {
-                *at = ThresholdScores { id_switches: 0, fragments: 0, mota_pct: None, idf1_pct: None, ..*at };
+                *at = ThresholdScores {
+                    id_switches: 0,
+                    fragments: 0,
+                    mota_pct: None,
+                    idf1_pct: None,
+                    ..*at
+                };
                 (at.hota_pct, at.deta_pct, at.assa_pct, at.loca_pct) = (None, None, None, None);
             }
         }
@@ -286,7 +322,8 @@ impl TrackEvaluation {
     /// Takes what the files of a benchmark say, frame by frame.
     pub fn sequences(&mut self, sequences: &[Sequence], frame_rate_hz: f64) {
         let times: Vec<Timestamp> = self.truth.frames().iter().map(|frame| frame.at).collect();
-        let mut said: BTreeMap<Timestamp, Vec<SaidObject>> = times.into_iter().map(|at| (at, Vec::new())).collect();
+        let mut said: BTreeMap<Timestamp, Vec<SaidObject>> =
+            times.into_iter().map(|at| (at, Vec::new())).collect();
         let mut ids: HashMap<(usize, i64), u32> = HashMap::new();
         // Detections have no identity: none goes on.
         let mut next = 0;
@@ -295,7 +332,9 @@ impl TrackEvaluation {
                 let objects = objects.iter().map(|object| {
                     next += 1;
                     SaidObject {
-                        id: object.id.map_or(next, |id| *ids.entry((number, id)).or_insert(next)),
+                        id: object
+                            .id
+                            .map_or(next, |id| *ids.entry((number, id)).or_insert(next)),
                         label: object.perceived.label.clone(),
                         score: object.perceived.confidence,
                         existence: None,

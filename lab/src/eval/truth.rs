@@ -70,13 +70,24 @@ impl Truth {
     /// [`TruthError`] naming the location and what is wrong with it.
     pub fn parse(text: &str) -> Result<Self, TruthError> {
         let text = text.trim_start_matches('\u{feff}');
-        let truth = if text.trim_start().starts_with('{') { Self::from_json(text)? } else { Self::from_csv(text)? };
-        if truth.landmarks.is_empty() { Err(TruthError::Empty) } else { Ok(truth) }
+        let truth = if text.trim_start().starts_with('{') {
+            Self::from_json(text)?
+        } else {
+            Self::from_csv(text)?
+        };
+        if truth.landmarks.is_empty() {
+            Err(TruthError::Empty)
+        } else {
+            Ok(truth)
+        }
     }
 
     fn from_json(text: &str) -> Result<Self, TruthError> {
-        let value: Value = serde_json::from_str(text).map_err(|error| TruthError::NeitherForm(error.to_string()))?;
-        let whole = value.as_object().ok_or_else(|| TruthError::NeitherForm("not an object".into()))?;
+        let value: Value = serde_json::from_str(text)
+            .map_err(|error| TruthError::NeitherForm(error.to_string()))?;
+        let whole = value
+            .as_object()
+            .ok_or_else(|| TruthError::NeitherForm("not an object".into()))?;
         let inner = whole.get("landmarks").and_then(Value::as_object);
         let empty = match whole.get("empty").filter(|_| inner.is_some()) {
             None => BTreeSet::from([Label::new_static(VACANT)]),
@@ -90,47 +101,90 @@ impl Truth {
     }
 
     fn from_csv(text: &str) -> Result<Self, TruthError> {
-        let mut table = csv::ReaderBuilder::new().trim(csv::Trim::All).flexible(true).from_reader(text.as_bytes());
+        let mut table = csv::ReaderBuilder::new()
+            .trim(csv::Trim::All)
+            .flexible(true)
+            .from_reader(text.as_bytes());
         let broken = |error: csv::Error| TruthError::NeitherForm(error.to_string());
-        if !table.headers().map_err(broken)?.iter().eq(["item", "truth"]) {
-            let found: String = text.lines().next().unwrap_or_default().chars().take(MAX_NAME_BYTES).collect();
-            return Err(TruthError::NeitherForm(format!("the first line is {found:?}")));
+        if !table
+            .headers()
+            .map_err(broken)?
+            .iter()
+            .eq(["item", "truth"])
+        {
+            let found: String = text
+                .lines()
+                .next()
+                .unwrap_or_default()
+                .chars()
+                .take(MAX_NAME_BYTES)
+                .collect();
+            return Err(TruthError::NeitherForm(format!(
+                "the first line is {found:?}"
+            )));
         }
         let mut landmarks: BTreeMap<LandmarkId, Vec<LabelSpan>> = BTreeMap::new();
         for row in table.records() {
             let row = row.map_err(broken)?;
             let item = row.get(0).unwrap_or_default();
             let truth = match row.len() {
-                2 => Some(&row[1]).filter(|truth| !truth.is_empty()).map(Label::new),
+                2 => Some(&row[1])
+                    .filter(|truth| !truth.is_empty())
+                    .map(Label::new),
                 0 | 1 => return Err(location(item, "has no second column")),
-                _ => return Err(location(item, "has more than two columns: quote what has a comma in it")),
+                _ => {
+                    return Err(location(
+                        item,
+                        "has more than two columns: quote what has a comma in it",
+                    ));
+                }
             };
             if let Some(truth) = truth.as_ref().filter(|truth| !is_label(truth)) {
-                return Err(location(item, format!("is {truth:?}, no label: is a quotation mark missing?")));
+                return Err(location(
+                    item,
+                    format!("is {truth:?}, no label: is a quotation mark missing?"),
+                ));
             }
-            let span = vec![LabelSpan { from: Timestamp(0), accepted: vec![truth] }];
-            if landmarks.insert(name(item)?, span.clone()).is_some_and(|earlier| earlier != span) {
+            let span = vec![LabelSpan {
+                from: Timestamp(0),
+                accepted: vec![truth],
+            }];
+            if landmarks
+                .insert(name(item)?, span.clone())
+                .is_some_and(|earlier| earlier != span)
+            {
                 return Err(location(item, "is given twice and differs"));
             }
         }
-        Ok(Self { landmarks, empty: BTreeSet::from([Label::new_static(VACANT)]) })
+        Ok(Self {
+            landmarks,
+            empty: BTreeSet::from([Label::new_static(VACANT)]),
+        })
     }
 
     /// Truth at a location, with the position of its span among the location's; `None` where none is known.
     pub(super) fn at(&self, landmark: &LandmarkId, time: Timestamp) -> Option<(usize, &LabelSpan)> {
         let spans = self.landmarks.get(landmark)?;
-        spans.iter().enumerate().rev().find(|(_, span)| span.from <= time)
+        spans
+            .iter()
+            .enumerate()
+            .rev()
+            .find(|(_, span)| span.from <= time)
     }
 
     /// Every span of every location.
     pub(super) fn spans(&self) -> impl Iterator<Item = (&LandmarkId, usize, &LabelSpan)> {
-        self.landmarks.iter().flat_map(|(id, spans)| spans.iter().enumerate().map(move |(n, span)| (id, n, span)))
+        self.landmarks
+            .iter()
+            .flat_map(|(id, spans)| spans.iter().enumerate().map(move |(n, span)| (id, n, span)))
     }
 
     /// True if the label, or none, is right.
     pub(super) fn accepts(&self, span: &LabelSpan, label: Option<&Label>) -> bool {
         let said_empty = label.is_some_and(|label| self.empty.contains(label));
-        span.accepted.iter().any(|right| right.as_ref() == label || (right.is_none() && said_empty))
+        span.accepted
+            .iter()
+            .any(|right| right.as_ref() == label || (right.is_none() && said_empty))
     }
 }
 
@@ -142,17 +196,29 @@ struct SpanFields {
 }
 
 fn spans(landmark: &str, value: &Value) -> Result<Vec<LabelSpan>, TruthError> {
-    let timed = value.as_array().filter(|items| items.iter().any(Value::is_object));
+    let timed = value
+        .as_array()
+        .filter(|items| items.iter().any(Value::is_object));
     let Some(timed) = timed else {
-        return Ok(vec![LabelSpan { from: Timestamp(0), accepted: accepted(landmark, value)? }]);
+        return Ok(vec![LabelSpan {
+            from: Timestamp(0),
+            accepted: accepted(landmark, value)?,
+        }]);
     };
     let mut spans = Vec::with_capacity(timed.len());
     for item in timed {
-        let SpanFields { from_us, label } =
-            SpanFields::deserialize(item).map_err(|error| location(landmark, format!("cannot be read: {error}")))?;
-        spans.push(LabelSpan { from: from_us, accepted: accepted(landmark, &label)? });
+        let SpanFields { from_us, label } = SpanFields::deserialize(item)
+            .map_err(|error| location(landmark, format!("cannot be read: {error}")))?;
+        spans.push(LabelSpan {
+            from: from_us,
+            accepted: accepted(landmark, &label)?,
+        });
     }
-    if spans.is_sorted_by(|a, b| a.from < b.from) { Ok(spans) } else { Err(location(landmark, "goes back in time")) }
+    if spans.is_sorted_by(|a, b| a.from < b.from) {
+        Ok(spans)
+    } else {
+        Err(location(landmark, "goes back in time"))
+    }
 }
 
 fn accepted(landmark: &str, value: &Value) -> Result<Vec<Option<Label>>, TruthError> {
@@ -160,7 +226,10 @@ fn accepted(landmark: &str, value: &Value) -> Result<Vec<Option<Label>>, TruthEr
         Value::Null => Ok(None),
         Value::String(label) => Ok(Some(Label::new(label))),
         Value::Number(_) | Value::Bool(_) => Ok(Some(Label::new(value.to_string()))),
-        other => Err(location(landmark, format!("has {other} where a label or null is expected"))),
+        other => Err(location(
+            landmark,
+            format!("has {other} where a label or null is expected"),
+        )),
     };
     match value {
         Value::Array(values) if values.is_empty() => Err(location(landmark, "is an empty list")),
@@ -173,12 +242,18 @@ fn name(landmark: &str) -> Result<LandmarkId, TruthError> {
     if (1..=MAX_NAME_BYTES).contains(&landmark.len()) {
         Ok(LandmarkId::new(landmark))
     } else {
-        Err(location(landmark, format!("has a name that is not 1 to {MAX_NAME_BYTES} bytes long")))
+        Err(location(
+            landmark,
+            format!("has a name that is not 1 to {MAX_NAME_BYTES} bytes long"),
+        ))
     }
 }
 
 fn location(landmark: &str, reason: impl Into<String>) -> TruthError {
-    TruthError::Location { landmark: landmark.chars().take(MAX_NAME_BYTES).collect(), reason: reason.into() }
+    TruthError::Location {
+        landmark: landmark.chars().take(MAX_NAME_BYTES).collect(),
+        reason: reason.into(),
+    }
 }
 
 #[cfg(test)]
@@ -199,17 +274,29 @@ mod tests {
         .unwrap();
         assert!(right(&truth, "a", 5, Some("cup")) && !right(&truth, "a", 5, None));
         assert!(
-            right(&truth, "b", 5, None) && right(&truth, "b", 5, Some("EMPTY")) && !right(&truth, "b", 5, Some("x"))
+            right(&truth, "b", 5, None)
+                && right(&truth, "b", 5, Some("EMPTY"))
+                && !right(&truth, "b", 5, Some("x"))
         );
         assert!(right(&truth, "c", 5, Some("vase")) && right(&truth, "c", 5, Some("sports ball")));
-        assert!(truth.at(&"d".into(), Timestamp(9)).is_none() && truth.at(&"e".into(), Timestamp(9)).is_none());
         assert!(
-            right(&truth, "d", 19, Some("cup")) && right(&truth, "d", 20, None) && right(&truth, "d", 20, Some("hole"))
+            truth.at(&"d".into(), Timestamp(9)).is_none()
+                && truth.at(&"e".into(), Timestamp(9)).is_none()
+        );
+        assert!(
+            right(&truth, "d", 19, Some("cup"))
+                && right(&truth, "d", 20, None)
+                && right(&truth, "d", 20, Some("hole"))
         );
         let table = Truth::parse("item,truth\r\na,1\r\nb,2\r\n");
         assert_eq!(Truth::parse("\u{feff}{\"a\": \"1\", \"b\": \"2\"}"), table);
         assert_eq!(Truth::parse("{\"a\": 1, \"b\": [2]}"), table);
-        assert!(right(&Truth::parse("{\"a\": true}").unwrap(), "a", 0, Some("true")));
+        assert!(right(
+            &Truth::parse("{\"a\": true}").unwrap(),
+            "a",
+            0,
+            Some("true")
+        ));
         let quoted = Truth::parse("item, truth\n\"a, b\",\"say \"\"cup\"\"\"\n\nc,\n").unwrap();
         assert!(right(&quoted, "a, b", 0, Some("say \"cup\"")) && right(&quoted, "c", 0, None));
         let other = Truth::parse(r#"{"landmarks": {"a": null}, "empty": "free"}"#).unwrap();
@@ -229,8 +316,14 @@ mod tests {
             ("item,truth\na,1,2", "`a` has more than two columns"),
             (r#"{"a": {}}"#, "`a` has {}"),
             (r#"{"a": []}"#, "`a` is an empty list"),
-            (r#"{"a": [{"from_us": 2, "label": "x"}, {"from_us": 2, "label": "y"}]}"#, "`a` goes back in time"),
-            (r#"{"a": [{"from_us": -2, "label": "x"}]}"#, "`a` cannot be read"),
+            (
+                r#"{"a": [{"from_us": 2, "label": "x"}, {"from_us": 2, "label": "y"}]}"#,
+                "`a` goes back in time",
+            ),
+            (
+                r#"{"a": [{"from_us": -2, "label": "x"}]}"#,
+                "`a` cannot be read",
+            ),
         ] {
             let error = Truth::parse(text).unwrap_err().to_string();
             assert!(error.contains(part), "{text}: {error}");

@@ -46,7 +46,12 @@ impl Votes {
     }
 
     pub(super) fn count(&mut self, node: &NodeName, item: Item, label: &Label, right: bool) {
-        let ballot = self.items.entry(item).or_default().entry(node.clone()).or_default();
+        let ballot = self
+            .items
+            .entry(item)
+            .or_default()
+            .entry(node.clone())
+            .or_default();
         let said = ballot.entry(label.clone()).or_default();
         said.votes += 1;
         said.right = right;
@@ -57,29 +62,55 @@ impl Votes {
         for (id, number, span) in truth.spans() {
             all += 1;
             let mut sums = Ballot::new();
-            for (label, said) in self.items.get(&(id.clone(), number)).into_iter().flatten().flat_map(|(_, b)| b) {
+            for (label, said) in self
+                .items
+                .get(&(id.clone(), number))
+                .into_iter()
+                .flatten()
+                .flat_map(|(_, b)| b)
+            {
                 let sum = sums.entry(label.clone()).or_default();
-                *sum = Said { votes: sum.votes + said.votes, right: said.right };
+                *sum = Said {
+                    votes: sum.votes + said.votes,
+                    right: said.right,
+                };
             }
-            right += chance(&sums).unwrap_or_else(|| f64::from(u8::from(truth.accepts(span, None))));
+            right +=
+                chance(&sums).unwrap_or_else(|| f64::from(u8::from(truth.accepts(span, None))));
         }
-        if self.is_empty() { None } else { percent(right, all) }
+        if self.is_empty() {
+            None
+        } else {
+            percent(right, all)
+        }
     }
 
     pub(super) fn vehicles(&self, truth: &Truth) -> BTreeMap<NodeName, VehicleScores> {
         let (mut all, mut standing, mut free) = (0, 0, 0);
         for (_, _, span) in truth.spans() {
             all += 1;
-            *(if truth.accepts(span, None) { &mut free } else { &mut standing }) += 1;
+            *(if truth.accepts(span, None) {
+                &mut free
+            } else {
+                &mut standing
+            }) += 1;
         }
         let mut sums: BTreeMap<&NodeName, Sum> = BTreeMap::new();
         for (id, number, span) in truth.spans() {
             for (node, ballot) in self.items.get(&(id.clone(), number)).into_iter().flatten() {
                 let sum = sums.entry(node).or_default();
                 sum.votes += ballot.values().map(|said| said.votes).sum::<u64>();
-                sum.right_votes += ballot.values().filter(|said| said.right).map(|said| said.votes).sum::<u64>();
+                sum.right_votes += ballot
+                    .values()
+                    .filter(|said| said.right)
+                    .map(|said| said.votes)
+                    .sum::<u64>();
                 sum.right_items += chance(ballot).unwrap_or(0.0);
-                *(if truth.accepts(span, None) { &mut sum.free } else { &mut sum.standing }) += 1;
+                *(if truth.accepts(span, None) {
+                    &mut sum.free
+                } else {
+                    &mut sum.standing
+                }) += 1;
             }
         }
         let scores = |sum: Sum| VehicleScores {
@@ -89,7 +120,9 @@ impl Votes {
             // Silence is right where nothing stands.
             accuracy_pct: percent(sum.right_items + (free - sum.free) as f64, all),
         };
-        sums.into_iter().map(|(node, sum)| (node.clone(), scores(sum))).collect()
+        sums.into_iter()
+            .map(|(node, sum)| (node.clone(), scores(sum)))
+            .collect()
     }
 }
 
@@ -118,8 +151,17 @@ pub(super) fn place<'a>(
     let index = match &object.landmark {
         Some(id) => landmarks.position_of(id)?,
         None => {
-            let covariance = object.covariance().unwrap_or(Covariance::isotropic(gate.radius_m / gate.sigmas));
-            landmarks.best(&object.label, &Point2::new(object.x_m, object.y_m), &covariance, gate)?.landmark
+            let covariance = object
+                .covariance()
+                .unwrap_or(Covariance::isotropic(gate.radius_m / gate.sigmas));
+            landmarks
+                .best(
+                    &object.label,
+                    &Point2::new(object.x_m, object.y_m),
+                    &covariance,
+                    gate,
+                )?
+                .landmark
         }
     };
     landmarks.landmarks().get(index)

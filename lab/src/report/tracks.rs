@@ -23,11 +23,26 @@ const AT_THRESHOLD: [&str; 13] = [
 /// reliability of each stated probability.
 pub(crate) fn tables(scores: &TrackScores) -> Vec<Vec<Vec<String>>> {
     let distances = AP_DISTANCES_M.map(|distance| format!("AP@{distance} %"));
-    let row = |name: &str, objects: String, said: String, ap: &[Option<f64>; AP_DISTANCES_M.len()]| {
-        [name.to_owned(), objects, said].into_iter().chain(ap.map(percent)).collect::<Vec<_>>()
-    };
-    let mut precision = vec![["", "objects", "said"].map(str::to_owned).into_iter().chain(distances).collect()];
-    precision.push(row("all", scores.objects.to_string(), scores.said.to_string(), &scores.ap_pct));
+    let row =
+        |name: &str, objects: String, said: String, ap: &[Option<f64>; AP_DISTANCES_M.len()]| {
+            [name.to_owned(), objects, said]
+                .into_iter()
+                .chain(ap.map(percent))
+                .collect::<Vec<_>>()
+        };
+    let mut precision = vec![
+        ["", "objects", "said"]
+            .map(str::to_owned)
+            .into_iter()
+            .chain(distances)
+            .collect(),
+    ];
+    precision.push(row(
+        "all",
+        scores.objects.to_string(),
+        scores.said.to_string(),
+        &scores.ap_pct,
+    ));
     if scores.class_ap_pct.len() > 1 {
         let of_class = scores.class_ap_pct.iter();
         precision.extend(of_class.map(|(label, ap)| row(label, String::new(), String::new(), ap)));
@@ -38,17 +53,34 @@ pub(crate) fn tables(scores: &TrackScores) -> Vec<Vec<Vec<String>>> {
         at("default", None, &scores.at_default),
     ];
     let calibration = &scores.calibration;
-    let stated = [("confidence", Some(&calibration.confidence)), ("existence", calibration.existence.as_ref())];
-    let reliability = stated.into_iter().filter_map(|(name, of)| Some(self::reliability(name, of?)));
-    [precision, thresholds].into_iter().chain(reliability).collect()
+    let stated = [
+        ("confidence", Some(&calibration.confidence)),
+        ("existence", calibration.existence.as_ref()),
+    ];
+    let reliability = stated
+        .into_iter()
+        .filter_map(|(name, of)| Some(self::reliability(name, of?)));
+    [precision, thresholds]
+        .into_iter()
+        .chain(reliability)
+        .collect()
 }
 
 /// One row for each bin of a reliability diagram, the expected calibration error last.
 fn reliability(name: &str, of: &Reliability) -> Vec<Vec<String>> {
-    let mut rows = vec![[name, "stated %", "right %", "objects"].map(str::to_owned).to_vec()];
+    let mut rows = vec![
+        [name, "stated %", "right %", "objects"]
+            .map(str::to_owned)
+            .to_vec(),
+    ];
     rows.extend(of.bins.iter().map(|bin| {
         let shares = [bin.stated_pct, bin.right_pct].map(|share| percent(Some(share)));
-        [vec![String::new()], shares.to_vec(), vec![bin.objects.to_string()]].concat()
+        [
+            vec![String::new()],
+            shares.to_vec(),
+            vec![bin.objects.to_string()],
+        ]
+        .concat()
     }));
     rows.push(vec!["calibration error %".into(), percent(of.ece_pct)]);
     rows
@@ -56,13 +88,25 @@ fn reliability(name: &str, of: &Reliability) -> Vec<Vec<String>> {
 
 /// Warning about frames without a map.
 pub(crate) fn without_map(scores: &TrackScores) -> Option<String> {
-    let TrackScores { frames, frames_with_map, .. } = scores;
+    let TrackScores {
+        frames,
+        frames_with_map,
+        ..
+    } = scores;
     let missing = frames - frames_with_map;
-    (missing > 0).then(|| format!("{missing} of {frames} frames have no map: their objects are missed"))
+    (missing > 0)
+        .then(|| format!("{missing} of {frames} frames have no map: their objects are missed"))
 }
 
 fn at(name: &str, best_f1_pct: Option<f64>, scores: &ThresholdScores) -> Vec<String> {
-    let ThresholdScores { matches, false_alarms, misses, id_switches, fragments, .. } = scores;
+    let ThresholdScores {
+        matches,
+        false_alarms,
+        misses,
+        id_switches,
+        fragments,
+        ..
+    } = scores;
     let f1 = best_f1_pct.or_else(|| {
         let all = 2 * matches + false_alarms + misses;
         (all > 0).then(|| 200.0 * *matches as f64 / all as f64)
@@ -79,7 +123,11 @@ fn at(name: &str, best_f1_pct: Option<f64>, scores: &ThresholdScores) -> Vec<Str
         scores.loca_pct,
     ];
     let named = [name.to_owned(), format!("{:.3}", scores.threshold)];
-    named.into_iter().chain(shares.map(percent)).chain([id_switches, fragments].map(u64::to_string)).collect()
+    named
+        .into_iter()
+        .chain(shares.map(percent))
+        .chain([id_switches, fragments].map(u64::to_string))
+        .collect()
 }
 
 /// A share in percent; a dash where there is none.

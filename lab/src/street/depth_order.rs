@@ -12,7 +12,8 @@ pub(super) fn depth_order(eye: &Point2<f64>, footprints: &[[Point2<f64>; 4]]) ->
     while !remaining.is_empty() {
         let hides_nothing = |place: &usize| {
             let mut others = remaining.iter().filter(|other| *other != place);
-            others.all(|other| is_nearer(eye, &footprints[*place], &footprints[*other]) != Some(true))
+            others
+                .all(|other| is_nearer(eye, &footprints[*place], &footprints[*other]) != Some(true))
         };
         let next = remaining.iter().position(hides_nothing).unwrap_or(0);
         order.push(remaining.remove(next));
@@ -46,22 +47,36 @@ mod tests {
     use super::*;
 
     fn rectangle(x: f64, y: f64, length: f64, width: f64) -> [Point2<f64>; 4] {
-        super::super::corners(&ecod::model::geometry::Pose::new(x, y, 0.0), Point2::origin(), length, width)
+        super::super::corners(
+            &ecod::model::geometry::Pose::new(x, y, 0.0),
+            Point2::origin(),
+            length,
+            width,
+        )
     }
 
     #[test]
     fn a_long_van_hides_a_pedestrian_whose_middle_is_nearer() {
         // Seen along the van: its middle is farther away than the pedestrian behind its tail.
         let eye = Point2::new(-10.0, -1.5);
-        let (van, pedestrian) = (rectangle(0.0, 0.0, 12.0, 2.0), rectangle(-3.0, 1.5, 0.5, 0.5));
+        let (van, pedestrian) = (
+            rectangle(0.0, 0.0, 12.0, 2.0),
+            rectangle(-3.0, 1.5, 0.5, 0.5),
+        );
         assert!((middle(&pedestrian) - eye).norm() < (middle(&van) - eye).norm());
         assert_eq!(depth_order(&eye, &[van, pedestrian]), [1, 0]);
-        assert_eq!(depth_order(&Point2::new(-10.0, 5.0), &[van, pedestrian]), [0, 1], "seen from the other side");
+        assert_eq!(
+            depth_order(&Point2::new(-10.0, 5.0), &[van, pedestrian]),
+            [0, 1],
+            "seen from the other side"
+        );
     }
 
     #[test]
     fn a_row_is_painted_from_its_far_end() {
-        let row: Vec<_> = [5.0, 15.0, 10.0].map(|x| rectangle(x, 0.0, 4.0, 2.0)).into();
+        let row: Vec<_> = [5.0, 15.0, 10.0]
+            .map(|x| rectangle(x, 0.0, 4.0, 2.0))
+            .into();
         assert_eq!(depth_order(&Point2::new(0.0, 0.5), &row), [1, 2, 0]);
     }
 }

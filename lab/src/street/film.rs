@@ -78,17 +78,24 @@ const ALARM: &str = "#d1420f";
 impl Film<'_> {
     /// Draws it.
     pub fn draw(&self) -> String {
-        let first = self.killed_at.shifted(-(BEFORE.as_micros() as i64)).max(self.ends[0]);
+        let first = self
+            .killed_at
+            .shifted(-(BEFORE.as_micros() as i64))
+            .max(self.ends[0]);
         let last = (self.killed_at + AFTER).min(self.ends[1]);
         let steps = (last.since(first).as_micros() / STEP.as_micros()).max(1) as u32;
-        let scene = FilmScene { film: self, times: (0..=steps).map(|step| first + STEP * step).collect() };
+        let scene = FilmScene {
+            film: self,
+            times: (0..=steps).map(|step| first + STEP * step).collect(),
+        };
         scene.draw().to_string() + "\n"
     }
 
     /// The newest map at a time, unless it is too old.
     fn known(maps: &[KnownMap<'_>], at: Timestamp) -> Option<usize> {
         let next = maps.partition_point(|map| map.known_at <= at);
-        next.checked_sub(1).filter(|place| at.since(maps[*place].known_at) < FORGOTTEN)
+        next.checked_sub(1)
+            .filter(|place| at.since(maps[*place].known_at) < FORGOTTEN)
     }
 }
 
@@ -101,7 +108,10 @@ struct FilmScene<'a> {
 impl FilmScene<'_> {
     fn draw(&self) -> Document {
         let street = self.film.street;
-        let (width, street_px) = (2.0 * (MARGIN_PX + HALF_M[0] * PX_PER_M), 2.0 * HALF_M[1] * PX_PER_M);
+        let (width, street_px) = (
+            2.0 * (MARGIN_PX + HALF_M[0] * PX_PER_M),
+            2.0 * HALF_M[1] * PX_PER_M,
+        );
         let pictures_top = TOP_PX + street_px + 34.0;
         let height = pictures_top + self.picture_px()[1] + MARGIN_PX;
         let mut document = page(width, height, 14)
@@ -122,15 +132,26 @@ impl FilmScene<'_> {
             document = document.add(self.pictures(number, camera, color, pictures_top));
         }
         let words = "Grey: what is there. Rings: what each node knows through the cell; green: several told of it.";
-        document.add(Text::new(words).set("x", MARGIN_PX).set("y", pictures_top - 12.0).set("fill", FAINT))
+        document.add(
+            Text::new(words)
+                .set("x", MARGIN_PX)
+                .set("y", pictures_top - 12.0)
+                .set("fill", FAINT),
+        )
     }
 
     fn cameras(&self) -> impl Iterator<Item = (&StreetCamera, &'static str)> {
-        self.film.street.cameras.iter().zip(VEHICLE_COLORS.into_iter().cycle())
+        self.film
+            .street
+            .cameras
+            .iter()
+            .zip(VEHICLE_COLORS.into_iter().cycle())
     }
 
     fn color_of(&self, node: &NodeName) -> &'static str {
-        self.cameras().find(|(camera, _)| camera.name == *node).map_or(FAINT, |(_, color)| color)
+        self.cameras()
+            .find(|(camera, _)| camera.name == *node)
+            .map_or(FAINT, |(_, color)| color)
     }
 
     /// Seconds of the street.
@@ -139,31 +160,47 @@ impl FilmScene<'_> {
     }
 
     fn duration(&self) -> String {
-        format!("{}s", round(STEP.as_secs_f64() * (self.times.len() - 1) as f64))
+        format!(
+            "{}s",
+            round(STEP.as_secs_f64() * (self.times.len() - 1) as f64)
+        )
     }
 
     /// The leader, the fate of the edge, and the number of known objects.
     fn title(&self, width: f64) -> Group {
         let film = self.film;
-        let who = film.street.cameras.first().map_or("a vehicle", |camera| camera.name.as_str());
+        let who = film
+            .street
+            .cameras
+            .first()
+            .map_or("a vehicle", |camera| camera.name.as_str());
         let all = film.street.truth(0.0).len();
         let count = |maps: &[KnownMap<'_>], at| {
             let map = Film::known(maps, at).map(|place| maps[place].map);
             let is_known = |truth: &TrueObject| {
                 map.into_iter().flat_map(shown).any(|object| {
                     let place = Point2::new(object.x_m, object.y_m);
-                    object.label == truth.label && nalgebra::distance(&place, &truth.position) <= MATCH_DISTANCE_M
+                    object.label == truth.label
+                        && nalgebra::distance(&place, &truth.position) <= MATCH_DISTANCE_M
                 })
             };
-            film.street.truth(self.seconds(at)).iter().filter(|truth| is_known(truth)).count()
+            film.street
+                .truth(self.seconds(at))
+                .iter()
+                .filter(|truth| is_known(truth))
+                .count()
         };
         let counts = |at| {
             let (alone, cell) = (count(&film.alone, at), count(&film.maps, at));
             format!("{who} knows {cell} of {all} with the cell, {alone} alone")
         };
         let leader = |at: Timestamp| {
-            let leader = Film::known(&film.maps, at).map(|place| film.maps[place].map.aggregator.to_string());
-            format!("{} makes the map", leader.unwrap_or_else(|| "nobody".to_owned()))
+            let leader = Film::known(&film.maps, at)
+                .map(|place| film.maps[place].map.aggregator.to_string());
+            format!(
+                "{} makes the map",
+                leader.unwrap_or_else(|| "nobody".to_owned())
+            )
         };
         let edge = |at: Timestamp| match film.restarted_at {
             _ if at < film.killed_at => String::new(),
@@ -188,7 +225,10 @@ impl FilmScene<'_> {
             )
             .add(
                 self.switched(counts)
-                    .set("transform", format!("translate({} 36)", round(width - MARGIN_PX)))
+                    .set(
+                        "transform",
+                        format!("translate({} 36)", round(width - MARGIN_PX)),
+                    )
                     .set("text-anchor", "end")
                     .set("font-size", 16),
             )
@@ -196,18 +236,26 @@ impl FilmScene<'_> {
 
     /// A text that changes.
     fn switched(&self, text: impl Fn(Timestamp) -> String) -> Group {
-        let texts: Vec<String> = self.times[..self.times.len() - 1].iter().map(|at| text(*at)).collect();
+        let texts: Vec<String> = self.times[..self.times.len() - 1]
+            .iter()
+            .map(|at| text(*at))
+            .collect();
         let distinct: BTreeSet<&String> = texts.iter().filter(|text| !text.is_empty()).collect();
         distinct.into_iter().fold(Group::new(), |group, text| {
             let is_shown = texts.iter().map(|shown| shown == text);
-            group.add(Text::new(text.as_str()).set("visibility", "hidden").add(self.visible(is_shown)))
+            group.add(
+                Text::new(text.as_str())
+                    .set("visibility", "hidden")
+                    .add(self.visible(is_shown)),
+            )
         })
     }
 
     /// Something that is shown from some moments to the next.
     fn visible(&self, is_shown: impl Iterator<Item = bool>) -> Animate {
         let shown: Vec<bool> = is_shown.collect();
-        let changes = (0..shown.len()).filter(|place| *place == 0 || shown[*place] != shown[*place - 1]);
+        let changes =
+            (0..shown.len()).filter(|place| *place == 0 || shown[*place] != shown[*place - 1]);
         let (mut values, mut times) = (Vec::new(), Vec::new());
         for place in changes {
             values.push(if shown[place] { "visible" } else { "hidden" });
@@ -221,12 +269,15 @@ impl FilmScene<'_> {
     }
 
     fn animate(&self, animation: Animate) -> Animate {
-        animation.set("dur", self.duration()).set("repeatCount", "indefinite")
+        animation
+            .set("dur", self.duration())
+            .set("repeatCount", "indefinite")
     }
 
     /// Something that goes where it is at each moment, and turns if it has to.
     fn moving(&self, what: Group, poses: &[Pose], turns: bool) -> Group {
-        let same = |of: fn(&Pose, &Pose) -> bool| poses.windows(2).all(|pair| of(&pair[0], &pair[1]));
+        let same =
+            |of: fn(&Pose, &Pose) -> bool| poses.windows(2).all(|pair| of(&pair[0], &pair[1]));
         let mut turned = 0.0;
         let mut last = poses.first().map_or(0.0, |pose| pose.heading_rad);
         let degrees = poses.iter().map(|pose| {
@@ -247,19 +298,37 @@ impl FilmScene<'_> {
                 .set("values", values.join(";"))
                 .set("dur", self.duration())
                 .set("repeatCount", "indefinite");
-            if is_still { group.add(what) } else { group.add(animation).add(what) }
+            if is_still {
+                group.add(what)
+            } else {
+                group.add(animation).add(what)
+            }
         };
         let what = if turns {
-            group(what, "rotate", degrees.collect(), same(|a, b| a.heading_rad == b.heading_rad))
+            group(
+                what,
+                "rotate",
+                degrees.collect(),
+                same(|a, b| a.heading_rad == b.heading_rad),
+            )
         } else {
             what
         };
-        group(what, "translate", places.collect(), same(|a, b| a.position == b.position))
+        group(
+            what,
+            "translate",
+            places.collect(),
+            same(|a, b| a.position == b.position),
+        )
     }
 
     /// Something true, pale: what is known of it is drawn over it.
     fn body(&self, body: &StreetBody) -> Group {
-        let poses: Vec<Pose> = self.times.iter().map(|at| body.route.at(self.seconds(*at))).collect();
+        let poses: Vec<Pose> = self
+            .times
+            .iter()
+            .map(|at| body.route.at(self.seconds(*at)))
+            .collect();
         let (middle, [length_m, width_m]) = body.extent();
         let rectangle = |length_m: f64, width_m: f64| {
             Rectangle::new()
@@ -270,30 +339,51 @@ impl FilmScene<'_> {
         };
         let what = match body.label.as_deref() {
             Some("person") => Group::new().add(Circle::new().set("r", 7).set("fill", "#5a5a5a")),
-            Some(_) => Group::new().add(rectangle(length_m, width_m).set("rx", 8).set("fill", "#b9bfc4")),
+            Some(_) => Group::new().add(
+                rectangle(length_m, width_m)
+                    .set("rx", 8)
+                    .set("fill", "#b9bfc4"),
+            ),
             None => Group::new().add(rectangle(length_m, width_m).set("fill", "#8d8377")),
         };
         self.moving(what, &poses, true)
     }
 
     fn poses(&self, camera: &StreetCamera) -> Vec<Pose> {
-        self.times.iter().map(|at| self.film.street.pose(camera, self.seconds(*at))).collect()
+        self.times
+            .iter()
+            .map(|at| self.film.street.pose(camera, self.seconds(*at)))
+            .collect()
     }
 
     fn cone(&self, camera: &StreetCamera, color: &'static str) -> Group {
         let half_rad = Street::optics().horizontal_field_of_view() / 2.0;
         let radius = CONE_M * PX_PER_M;
-        let (x, y) = (round(radius * half_rad.cos()), round(radius * half_rad.sin()));
+        let (x, y) = (
+            round(radius * half_rad.cos()),
+            round(radius * half_rad.sin()),
+        );
         let outline = format!("M0 0L{x} {y}A{radius} {radius} 0 0 0 {x} {}Z", -y);
-        let cone = Path::new().set("d", outline).set("fill", color).set("fill-opacity", 0.22);
+        let cone = Path::new()
+            .set("d", outline)
+            .set("fill", color)
+            .set("fill-opacity", 0.22);
         self.moving(Group::new().add(cone), &self.poses(camera), true)
     }
 
     fn camera_name(&self, camera: &StreetCamera, color: &'static str) -> Group {
-        let name =
-            Text::new(camera.name.as_str()).set("y", -14).set("text-anchor", "middle").set("font-weight", "bold");
-        let name = name.set("stroke", "white").set("stroke-width", 3).set("paint-order", "stroke");
-        let dot = Circle::new().set("r", 6).set("fill", color).set("stroke", INK);
+        let name = Text::new(camera.name.as_str())
+            .set("y", -14)
+            .set("text-anchor", "middle")
+            .set("font-weight", "bold");
+        let name = name
+            .set("stroke", "white")
+            .set("stroke-width", 3)
+            .set("paint-order", "stroke");
+        let dot = Circle::new()
+            .set("r", 6)
+            .set("fill", color)
+            .set("stroke", INK);
         self.moving(Group::new().add(dot).add(name), &self.poses(camera), false)
     }
 
@@ -302,12 +392,17 @@ impl FilmScene<'_> {
         let moments = &self.times;
         let mut seen: BTreeMap<uuid::Uuid, Vec<Option<&FusedObject>>> = BTreeMap::new();
         for (number, at) in moments.iter().enumerate() {
-            let Some(place) = Film::known(&self.film.maps, *at) else { continue };
+            let Some(place) = Film::known(&self.film.maps, *at) else {
+                continue;
+            };
             for object in shown(self.film.maps[place].map) {
-                seen.entry(object.id).or_insert_with(|| vec![None; moments.len()])[number] = Some(object);
+                seen.entry(object.id)
+                    .or_insert_with(|| vec![None; moments.len()])[number] = Some(object);
             }
         }
-        seen.into_values().fold(Group::new(), |group, objects| group.add(self.known_object(&objects)))
+        seen.into_values().fold(Group::new(), |group, objects| {
+            group.add(self.known_object(&objects))
+        })
     }
 
     fn known_object(&self, objects: &[Option<&FusedObject>]) -> Group {
@@ -316,23 +411,45 @@ impl FilmScene<'_> {
             .iter()
             .map(|object| {
                 last = object.or(last);
-                last.map_or(Pose::new(0.0, 0.0, 0.0), |object| Pose::new(object.x_m, object.y_m, 0.0))
+                last.map_or(Pose::new(0.0, 0.0, 0.0), |object| {
+                    Pose::new(object.x_m, object.y_m, 0.0)
+                })
             })
             .collect();
         let shown = &objects[..objects.len() - 1];
-        let is_person = shown.iter().flatten().any(|object| object.label.as_str() == "person");
+        let is_person = shown
+            .iter()
+            .flatten()
+            .any(|object| object.label.as_str() == "person");
         let radius = if is_person { 12 } else { 24 };
-        let mut kinds: BTreeSet<Option<&NodeName>> =
-            shown.iter().flatten().map(|object| only_witness(object)).collect();
+        let mut kinds: BTreeSet<Option<&NodeName>> = shown
+            .iter()
+            .flatten()
+            .map(|object| only_witness(object))
+            .collect();
         let mut what = Group::new();
         while let Some(witness) = kinds.pop_first() {
-            let is_shown = shown.iter().map(|object| object.is_some_and(|object| only_witness(object) == witness));
+            let is_shown = shown
+                .iter()
+                .map(|object| object.is_some_and(|object| only_witness(object) == witness));
             let color = witness.map_or(SHARED, |node| self.color_of(node));
-            let ring = Circle::new().set("r", radius).set("fill", "none").set("stroke", color).set("stroke-width", 4);
-            let mut kind = Group::new().set("visibility", "hidden").add(self.visible(is_shown)).add(ring);
+            let ring = Circle::new()
+                .set("r", radius)
+                .set("fill", "none")
+                .set("stroke", color)
+                .set("stroke-width", 4);
+            let mut kind = Group::new()
+                .set("visibility", "hidden")
+                .add(self.visible(is_shown))
+                .add(ring);
             if let Some(node) = witness.filter(|_| is_person) {
-                let words = Text::new(format!("seen only by {node}")).set("y", 26).set("text-anchor", "middle");
-                let words = words.set("font-size", 12).set("stroke", "white").set("stroke-width", 3);
+                let words = Text::new(format!("seen only by {node}"))
+                    .set("y", 26)
+                    .set("text-anchor", "middle");
+                let words = words
+                    .set("font-size", 12)
+                    .set("stroke", "white")
+                    .set("stroke-width", 3);
                 kind = kind.add(words.set("paint-order", "stroke"));
             }
             what = what.add(kind);
@@ -348,51 +465,110 @@ impl FilmScene<'_> {
     }
 
     /// The pictures of a camera, with a box around each placard that its node has placed.
-    fn pictures(&self, number: usize, camera: &StreetCamera, color: &'static str, top: f64) -> Group {
+    fn pictures(
+        &self,
+        number: usize,
+        camera: &StreetCamera,
+        color: &'static str,
+        top: f64,
+    ) -> Group {
         let [width, height] = self.picture_px();
         let left = MARGIN_PX + number as f64 * (width + 8.0);
         let (first, last) = (self.times[0], self.times[self.times.len() - 1]);
         let moments = (last.since(first).as_micros() / PICTURE_STEP.as_micros()).max(1) as usize;
-        let pictures = self.film.pictures.get(number).map(Vec::as_slice).unwrap_or_default();
-        let mut group = Group::new().set("transform", format!("translate({} {})", round(left), round(top)));
+        let pictures = self
+            .film
+            .pictures
+            .get(number)
+            .map(Vec::as_slice)
+            .unwrap_or_default();
+        let mut group = Group::new().set(
+            "transform",
+            format!("translate({} {})", round(left), round(top)),
+        );
         let mut before = None;
         for moment in 0..moments {
             let at = first + PICTURE_STEP * moment as u32;
             let next = pictures.partition_point(|picture| picture.taken_at <= at);
-            let Some(place) = next.checked_sub(1).filter(|place| before != Some(*place)) else { continue };
+            let Some(place) = next.checked_sub(1).filter(|place| before != Some(*place)) else {
+                continue;
+            };
             before = Some(place);
             let picture = &pictures[place];
             let data = format!("data:image/jpeg;base64,{}", STANDARD.encode(&picture.jpeg));
-            let image = Image::new().set("href", data).set("width", round(width)).set("height", round(height));
+            let image = Image::new()
+                .set("href", data)
+                .set("width", round(width))
+                .set("height", round(height));
             // Until the next one is shown.
             let is_shown = (0..moments).map(|other| other >= moment);
-            let boxes = self.boxes(camera, picture, width / f64::from(Street::optics().width), color);
-            group =
-                group.add(Group::new().set("visibility", "hidden").add(self.visible(is_shown)).add(image).add(boxes));
+            let boxes = self.boxes(
+                camera,
+                picture,
+                width / f64::from(Street::optics().width),
+                color,
+            );
+            group = group.add(
+                Group::new()
+                    .set("visibility", "hidden")
+                    .add(self.visible(is_shown))
+                    .add(image)
+                    .add(boxes),
+            );
         }
-        let frame = Rectangle::new().set("width", round(width)).set("height", round(height)).set("fill", "none");
-        let name = Text::new(camera.name.as_str()).set("x", 8).set("y", 18).set("font-weight", "bold");
+        let frame = Rectangle::new()
+            .set("width", round(width))
+            .set("height", round(height))
+            .set("fill", "none");
+        let name = Text::new(camera.name.as_str())
+            .set("x", 8)
+            .set("y", 18)
+            .set("font-weight", "bold");
         group
             .add(frame.set("stroke", color).set("stroke-width", 3))
-            .add(name.set("stroke", "white").set("stroke-width", 3).set("paint-order", "stroke"))
+            .add(
+                name.set("stroke", "white")
+                    .set("stroke-width", 3)
+                    .set("paint-order", "stroke"),
+            )
     }
 
-    fn boxes(&self, camera: &StreetCamera, picture: &KeptPicture, scale: f64, color: &'static str) -> Group {
+    fn boxes(
+        &self,
+        camera: &StreetCamera,
+        picture: &KeptPicture,
+        scale: f64,
+        color: &'static str,
+    ) -> Group {
         let street = self.film.street;
-        let group = Group::new().set("fill", "none").set("stroke", color).set("stroke-width", 3);
-        let mut own = self.film.reports.iter().filter(|report| report.node == camera.name);
+        let group = Group::new()
+            .set("fill", "none")
+            .set("stroke", color)
+            .set("stroke-width", 3);
+        let mut own = self
+            .film
+            .reports
+            .iter()
+            .filter(|report| report.node == camera.name);
         // The report of this picture: the capture is the receipt of the picture by the node.
-        let of_picture =
-            |report: &&&ObjectReport| (0..150_000).contains(&report.captured_at_us.micros_from(picture.taken_at));
-        let Some(report) = own.find(of_picture) else { return group };
+        let of_picture = |report: &&&ObjectReport| {
+            (0..150_000).contains(&report.captured_at_us.micros_from(picture.taken_at))
+        };
+        let Some(report) = own.find(of_picture) else {
+            return group;
+        };
         let at_s = self.seconds(picture.taken_at);
         let sight = StreetSight::new(street.pose(camera, at_s), &camera.mount);
         report.objects.iter().fold(group, |group, object| {
             let place = Point2::new(object.x_m, object.y_m);
-            let Some(placard) = street.placard_near(&place, at_s) else { return group };
+            let Some(placard) = street.placard_near(&place, at_s) else {
+                return group;
+            };
             let [bottom_m, top_m] = placard.heights_m;
             let middle = sight.point(&place, (bottom_m + top_m) / 2.0);
-            let Some(pixel) = Street::optics().project(&middle) else { return group };
+            let Some(pixel) = Street::optics().project(&middle) else {
+                return group;
+            };
             let code = CODE_MODULES as f64 / (CODE_MODULES + 2 * QUIET_MODULES) as f64;
             let side = scale * Street::optics().fx * placard.width_m * code / middle.z;
             let (x, y) = (scale * pixel.x - side / 2.0, scale * pixel.y - side / 2.0);
@@ -405,16 +581,21 @@ impl FilmScene<'_> {
 impl Street {
     /// The placards of what stands nearest to a place.
     fn placard_near(&self, place: &Point2<f64>, at_s: f64) -> Option<&Solid> {
-        let worn =
-            self.bodies.iter().filter_map(|body| Some((body, body.solids.iter().find(|solid| solid.is_placard)?)));
+        let worn = self
+            .bodies
+            .iter()
+            .filter_map(|body| Some((body, body.solids.iter().find(|solid| solid.is_placard)?)));
         let far = |body: &StreetBody| nalgebra::distance(&body.route.at(at_s).position, place);
-        worn.min_by(|a, b| far(a.0).total_cmp(&far(b.0))).map(|(_, placard)| placard)
+        worn.min_by(|a, b| far(a.0).total_cmp(&far(b.0)))
+            .map(|(_, placard)| placard)
     }
 }
 
 /// The objects of a map that are shown.
 fn shown(map: &GlobalMap) -> impl Iterator<Item = &FusedObject> {
-    map.objects.iter().filter(|object| object.confidence >= DEFAULT_THRESHOLD)
+    map.objects
+        .iter()
+        .filter(|object| object.confidence >= DEFAULT_THRESHOLD)
 }
 
 /// The node that alone told of an object.
@@ -426,10 +607,19 @@ fn only_witness(object: &FusedObject) -> Option<&NodeName> {
 }
 
 /// A rectangle on the ground: its middle, its length and width.
-fn rectangle([x_m, y_m]: [f64; 2], [length_m, width_m]: [f64; 2], color: &'static str) -> Rectangle {
+fn rectangle(
+    [x_m, y_m]: [f64; 2],
+    [length_m, width_m]: [f64; 2],
+    color: &'static str,
+) -> Rectangle {
     let (x, y) = px(&Point2::new(x_m - length_m / 2.0, y_m + width_m / 2.0));
     let [width, height] = [length_m, width_m].map(|metres| round(metres * PX_PER_M));
-    Rectangle::new().set("x", round(x)).set("y", round(y)).set("width", width).set("height", height).set("fill", color)
+    Rectangle::new()
+        .set("x", round(x))
+        .set("y", round(y))
+        .set("width", width)
+        .set("height", height)
+        .set("fill", color)
 }
 
 /// All that is shown of the street.
@@ -438,13 +628,22 @@ fn frame(color: &'static str) -> Rectangle {
 }
 
 fn ground() -> Group {
-    Group::new().add(frame("#f1efec")).add(rectangle([0.0, 1.1], [36.0, 9.8], "#dcdddf")).add(
-        (-8..=8)
-            .fold(Group::new(), |group, dash| group.add(rectangle([2.0 * f64::from(dash), 0.0], [1.0, 0.12], "white"))),
-    )
+    Group::new()
+        .add(frame("#f1efec"))
+        .add(rectangle([0.0, 1.1], [36.0, 9.8], "#dcdddf"))
+        .add((-8..=8).fold(Group::new(), |group, dash| {
+            group.add(rectangle(
+                [2.0 * f64::from(dash), 0.0],
+                [1.0, 0.12],
+                "white",
+            ))
+        }))
 }
 
 /// Where a place is in the picture.
 fn px(place: &Point2<f64>) -> (f64, f64) {
-    (MARGIN_PX + (place.x + HALF_M[0]) * PX_PER_M, TOP_PX + (HALF_M[1] - place.y) * PX_PER_M)
+    (
+        MARGIN_PX + (place.x + HALF_M[0]) * PX_PER_M,
+        TOP_PX + (HALF_M[1] - place.y) * PX_PER_M,
+    )
 }

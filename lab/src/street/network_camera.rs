@@ -75,24 +75,48 @@ impl NetworkCamera {
     ///
     /// # Errors
     /// When no port is free, or a placard cannot be drawn.
-    pub async fn start(street: &Arc<Street>, number: usize, start: Timestamp) -> anyhow::Result<Self> {
+    pub async fn start(
+        street: &Arc<Street>,
+        number: usize,
+        start: Timestamp,
+    ) -> anyhow::Result<Self> {
         let socket = TcpSocket::new_v4()?;
         // A slow vehicle is to miss pictures, not to get old ones.
         socket.set_send_buffer_size(SEND_BUFFER)?;
-        socket.bind((Ipv4Addr::LOCALHOST, 0).into()).context("no free port on loopback")?;
+        socket
+            .bind((Ipv4Addr::LOCALHOST, 0).into())
+            .context("no free port on loopback")?;
         let listener = socket.listen(8)?;
         let address = listener.local_addr()?;
         let (newest, pictures) = watch::channel(Jpeg::default());
-        let (ended, kept) = (Arc::<AtomicBool>::default(), Arc::<Mutex<Vec<KeptPicture>>>::default());
+        let (ended, kept) = (
+            Arc::<AtomicBool>::default(),
+            Arc::<Mutex<Vec<KeptPicture>>>::default(),
+        );
         let phase = number as f64 / street.cameras.len() as f64;
         let view = StreetView::new(street)?;
-        let shoot = Shooting { street: Arc::clone(street), number, view, start, phase, newest };
+        let shoot = Shooting {
+            street: Arc::clone(street),
+            number,
+            view,
+            start,
+            phase,
+            newest,
+        };
         let thread = spawn_blocking({
             let (ended, kept) = (Arc::clone(&ended), Arc::clone(&kept));
             move || shoot.run(&ended, &kept)
         });
-        let end = EndOnDrop { ended, server: tokio::spawn(serve(listener, pictures)) };
-        Ok(Self { address, end, kept, thread })
+        let end = EndOnDrop {
+            ended,
+            server: tokio::spawn(serve(listener, pictures)),
+        };
+        Ok(Self {
+            address,
+            end,
+            kept,
+            thread,
+        })
     }
 
     /// The camera's address.
@@ -106,8 +130,12 @@ impl NetworkCamera {
     /// When a picture could not be rendered.
     pub async fn stop(self) -> anyhow::Result<Vec<KeptPicture>> {
         drop(self.end);
-        self.thread.await.context("a camera of the street has failed")??;
-        Ok(std::mem::take(&mut *self.kept.lock().unwrap_or_else(PoisonError::into_inner)))
+        self.thread
+            .await
+            .context("a camera of the street has failed")??;
+        Ok(std::mem::take(
+            &mut *self.kept.lock().unwrap_or_else(PoisonError::into_inner),
+        ))
     }
 }
 
@@ -139,9 +167,21 @@ impl Shooting {
             let picture = sensor.expose(&still, frame)?;
             let jpeg = encode(&picture, QUALITY)?;
             let mut small = Mat::default();
-            resize(&picture, &mut small, Size::new(KEPT_PX[0], KEPT_PX[1]), 0.0, 0.0, INTER_AREA)?;
-            let small = KeptPicture { taken_at, jpeg: encode(&small, KEPT_QUALITY)? };
-            kept.lock().unwrap_or_else(PoisonError::into_inner).push(small);
+            resize(
+                &picture,
+                &mut small,
+                Size::new(KEPT_PX[0], KEPT_PX[1]),
+                0.0,
+                0.0,
+                INTER_AREA,
+            )?;
+            let small = KeptPicture {
+                taken_at,
+                jpeg: encode(&small, KEPT_QUALITY)?,
+            };
+            kept.lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .push(small);
             takes = clock::now().since(began);
             thread::sleep(taken_at.since(clock::now()));
             if clock::now().since(taken_at) < LATEST {
@@ -155,7 +195,12 @@ impl Shooting {
 
 fn encode(picture: &Mat, quality: i32) -> opencv::Result<Vec<u8>> {
     let mut jpeg = Vector::new();
-    imencode(".jpg", picture, &mut jpeg, &Vector::from_slice(&[IMWRITE_JPEG_QUALITY, quality]))?;
+    imencode(
+        ".jpg",
+        picture,
+        &mut jpeg,
+        &Vector::from_slice(&[IMWRITE_JPEG_QUALITY, quality]),
+    )?;
     Ok(jpeg.into())
 }
 
@@ -171,10 +216,17 @@ async fn send(mut client: TcpStream, mut pictures: watch::Receiver<Jpeg>) -> std
     client.set_nodelay(true)?;
     let mut request = [0; 1024];
     let _ = client.read(&mut request).await?;
-    client.write_all(b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=picture\r\n\r\n").await?;
+    client
+        .write_all(
+            b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=picture\r\n\r\n",
+        )
+        .await?;
     while pictures.changed().await.is_ok() {
         let jpeg = Jpeg::clone(&pictures.borrow_and_update());
-        let header = format!("--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n", jpeg.len());
+        let header = format!(
+            "--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {}\r\n\r\n",
+            jpeg.len()
+        );
         client.write_all(header.as_bytes()).await?;
         client.write_all(&jpeg).await?;
         client.write_all(b"\r\n").await?;

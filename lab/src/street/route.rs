@@ -33,23 +33,38 @@ impl Route {
         const TURN: u32 = 16;
         let turn = |x_m: f64, from_rad: f64| {
             (0..=TURN).map(move |step| {
-                let (sin, cos) = (from_rad + std::f64::consts::PI * f64::from(step) / f64::from(TURN)).sin_cos();
+                let (sin, cos) =
+                    (from_rad + std::f64::consts::PI * f64::from(step) / f64::from(TURN)).sin_cos();
                 Point2::new(x_m + radius_m * cos, radius_m * sin)
             })
         };
         let east = turn(half_m, -std::f64::consts::FRAC_PI_2);
-        let corners = east.chain(turn(-half_m, std::f64::consts::FRAC_PI_2)).collect();
-        Self::Loop { corners, speed_mps, start_m: start_m - 2.0 * half_m }
+        let corners = east
+            .chain(turn(-half_m, std::f64::consts::FRAC_PI_2))
+            .collect();
+        Self::Loop {
+            corners,
+            speed_mps,
+            start_m: start_m - 2.0 * half_m,
+        }
     }
 
     /// Position and heading at a time in seconds.
     pub(super) fn at(&self, at_s: f64) -> Pose {
         match self {
             Self::Stands(pose) => *pose,
-            Self::Loop { corners, speed_mps, start_m } => {
+            Self::Loop {
+                corners,
+                speed_mps,
+                start_m,
+            } => {
                 let along_m = start_m + speed_mps * at_s;
-                let chord = point(corners, along_m + HALF_CHORD_M) - point(corners, along_m - HALF_CHORD_M);
-                Pose { position: point(corners, along_m), heading_rad: chord.y.atan2(chord.x) }
+                let chord =
+                    point(corners, along_m + HALF_CHORD_M) - point(corners, along_m - HALF_CHORD_M);
+                Pose {
+                    position: point(corners, along_m),
+                    heading_rad: chord.y.atan2(chord.x),
+                }
             }
         }
     }
@@ -77,7 +92,11 @@ mod tests {
     #[test]
     fn a_way_is_walked_at_its_speed_and_begins_again() {
         let corners = vec![Point2::new(0.0, 0.0), Point2::new(8.0, 0.0)];
-        let route = Route::Loop { corners, speed_mps: 2.0, start_m: 1.0 };
+        let route = Route::Loop {
+            corners,
+            speed_mps: 2.0,
+            start_m: 1.0,
+        };
         let places = [0.0, 3.0, 5.0, 8.0].map(|at_s| route.at(at_s));
         assert_eq!(places.map(|pose| pose.position.x), [1.0, 7.0, 5.0, 1.0]);
         assert!(places[2].heading_rad.cos() < -0.99, "on the way back");
@@ -86,15 +105,28 @@ mod tests {
     #[test]
     fn cars_keep_to_the_right_and_turn_at_the_ends() {
         let route = Route::road(10.0, 2.5, 4.0, 0.0);
-        let [start, end, turned] = [0.0, 4.9, 5.0 + 2.5 * std::f64::consts::PI / 4.0 + 1.0].map(|at_s| route.at(at_s));
-        assert!((start.position - Point2::new(-10.0, -2.5)).norm() < 0.1, "{start:?}");
-        assert!((end.position - Point2::new(9.6, -2.5)).norm() < 0.1 && end.heading_rad.abs() < 1e-6, "{end:?}");
-        assert!((turned.position - Point2::new(6.0, 2.5)).norm() < 0.2, "{turned:?}");
+        let [start, end, turned] =
+            [0.0, 4.9, 5.0 + 2.5 * std::f64::consts::PI / 4.0 + 1.0].map(|at_s| route.at(at_s));
+        assert!(
+            (start.position - Point2::new(-10.0, -2.5)).norm() < 0.1,
+            "{start:?}"
+        );
+        assert!(
+            (end.position - Point2::new(9.6, -2.5)).norm() < 0.1 && end.heading_rad.abs() < 1e-6,
+            "{end:?}"
+        );
+        assert!(
+            (turned.position - Point2::new(6.0, 2.5)).norm() < 0.2,
+            "{turned:?}"
+        );
         let mut headings = (0..200).map(|step| route.at(f64::from(step) * 0.1).heading_rad);
         let mut last = headings.next().unwrap();
         for heading in headings {
             let turn = ecod::model::geometry::wrap_angle(heading - last);
-            assert!(turn > -1e-9 && turn < 0.25, "turned by {turn} rad in a tenth of a second");
+            assert!(
+                turn > -1e-9 && turn < 0.25,
+                "turned by {turn} rad in a tenth of a second"
+            );
             last = heading;
         }
     }

@@ -30,10 +30,14 @@ const PERSON_PLACARD_M: f64 = 0.85;
 
 impl Default for Street {
     fn default() -> Self {
-        let driving = |start_m, color| car(Route::road(LANE_M[0], LANE_M[1], CAR_MPS, start_m), color);
+        let driving =
+            |start_m, color| car(Route::road(LANE_M[0], LANE_M[1], CAR_MPS, start_m), color);
         let parked = |x_m, color| van(Route::stands(x_m, 4.9, 0.0), color);
         let walk = |corners: &[[f64; 2]], start_m| Route::Loop {
-            corners: corners.iter().map(|[x_m, y_m]| Point2::new(*x_m, *y_m)).collect(),
+            corners: corners
+                .iter()
+                .map(|[x_m, y_m]| Point2::new(*x_m, *y_m))
+                .collect(),
             speed_mps: WALK_MPS,
             start_m,
         };
@@ -46,19 +50,51 @@ impl Default for Street {
             parked(-1.0, [120.0, 110.0, 70.0]),
             parked(5.0, [60.0, 60.0, 65.0]),
             // Behind the vans.
-            person(walk(&[[-5.0, 6.7], [5.5, 6.7], [5.5, 7.6], [-5.0, 7.6]], 4.0), [160.0, 90.0, 140.0]),
-            person(walk(&[[3.0, 7.6], [-8.0, 7.6], [-8.0, 6.7], [3.0, 6.7]], 2.0), [60.0, 150.0, 190.0]),
+            person(
+                walk(&[[-5.0, 6.7], [5.5, 6.7], [5.5, 7.6], [-5.0, 7.6]], 4.0),
+                [160.0, 90.0, 140.0],
+            ),
+            person(
+                walk(&[[3.0, 7.6], [-8.0, 7.6], [-8.0, 6.7], [3.0, 6.7]], 2.0),
+                [60.0, 150.0, 190.0],
+            ),
             // Out from between two vans to the edge of the road, and back.
-            person(walk(&[[2.0, 4.2], [2.0, 7.1], [-1.0, 7.1], [2.0, 7.1]], 1.0), [80.0, 80.0, 190.0]),
+            person(
+                walk(&[[2.0, 4.2], [2.0, 7.1], [-1.0, 7.1], [2.0, 7.1]], 1.0),
+                [80.0, 80.0, 190.0],
+            ),
             // On the other side, where a kiosk hides them from some.
-            person(walk(&[[-2.0, -5.0], [10.0, -5.0], [10.0, -5.8], [-2.0, -5.8]], 9.0), [150.0, 130.0, 60.0]),
-            person(walk(&[[9.0, -7.6], [-2.0, -7.6], [-2.0, -6.9], [9.0, -6.9]], 1.0), [70.0, 120.0, 90.0]),
+            person(
+                walk(
+                    &[[-2.0, -5.0], [10.0, -5.0], [10.0, -5.8], [-2.0, -5.8]],
+                    9.0,
+                ),
+                [150.0, 130.0, 60.0],
+            ),
+            person(
+                walk(&[[9.0, -7.6], [-2.0, -7.6], [-2.0, -6.9], [9.0, -6.9]], 1.0),
+                [70.0, 120.0, 90.0],
+            ),
             // Around the ends of the road.
-            person(walk(&[[16.4, -4.5], [16.4, 4.5], [17.2, 4.5], [17.2, -4.5]], 3.0), [120.0, 70.0, 70.0]),
-            person(walk(&[[-16.4, 4.5], [-16.4, -4.5], [-17.2, -4.5], [-17.2, 4.5]], 5.0), [60.0, 70.0, 160.0]),
+            person(
+                walk(&[[16.4, -4.5], [16.4, 4.5], [17.2, 4.5], [17.2, -4.5]], 3.0),
+                [120.0, 70.0, 70.0],
+            ),
+            person(
+                walk(
+                    &[[-16.4, 4.5], [-16.4, -4.5], [-17.2, -4.5], [-17.2, 4.5]],
+                    5.0,
+                ),
+                [60.0, 70.0, 160.0],
+            ),
         ];
         bodies.push(plain(1.5, -6.3, [2.4, 1.0, 2.6], [70.0, 110.0, 60.0]));
-        let houses = [[90.0, 130.0, 170.0], [150.0, 160.0, 175.0], [100.0, 105.0, 150.0], [140.0, 170.0, 185.0]];
+        let houses = [
+            [90.0, 130.0, 170.0],
+            [150.0, 160.0, 175.0],
+            [100.0, 105.0, 150.0],
+            [140.0, 170.0, 185.0],
+        ];
         for (number, color) in (0..).zip(houses) {
             let x_m = -13.5 + 9.0 * f64::from(number);
             let height_m = [7.0, 9.0, 6.5, 8.0][number as usize];
@@ -70,14 +106,29 @@ impl Default for Street {
         let on_car = |name, body| StreetCamera {
             name: NodeName::from_static(name),
             carrier: Carrier::Body(body),
-            mount: Mount { height_m: Some(CAR_CAMERA_M), ..Mount::default() },
+            mount: Mount {
+                height_m: Some(CAR_CAMERA_M),
+                ..Mount::default()
+            },
         };
         let mast = StreetCamera {
             name: NodeName::from_static("kepler"),
             carrier: Carrier::Mast(Pose::new(-7.0, -8.2, 0.6)),
-            mount: Mount { height_m: Some(4.5), pitch_rad: 14f64.to_radians(), ..Mount::default() },
+            mount: Mount {
+                height_m: Some(4.5),
+                pitch_rad: 14f64.to_radians(),
+                ..Mount::default()
+            },
         };
-        Self { bodies, cameras: vec![on_car("euclid", 0), on_car("gauss", 1), on_car("galileo", 2), mast] }
+        Self {
+            bodies,
+            cameras: vec![
+                on_car("euclid", 0),
+                on_car("gauss", 1),
+                on_car("galileo", 2),
+                mast,
+            ],
+        }
     }
 }
 
@@ -88,12 +139,23 @@ fn car(route: Route, color: [f64; 3]) -> StreetBody {
         solid([-0.2, 2.4, 1.6], [0.85, 1.45], glass),
         placard(CAR_PLACARD_M, 1.45),
     ];
-    StreetBody { label: Some(Label::new_static("car")), route, solids }
+    StreetBody {
+        label: Some(Label::new_static("car")),
+        route,
+        solids,
+    }
 }
 
 fn van(route: Route, color: [f64; 3]) -> StreetBody {
-    let solids = vec![solid([0.0, 5.0, 2.0], [0.25, 2.3], color), placard(CAR_PLACARD_M, 2.3)];
-    StreetBody { label: Some(Label::new_static("car")), route, solids }
+    let solids = vec![
+        solid([0.0, 5.0, 2.0], [0.25, 2.3], color),
+        placard(CAR_PLACARD_M, 2.3),
+    ];
+    StreetBody {
+        label: Some(Label::new_static("car")),
+        route,
+        solids,
+    }
 }
 
 fn person(route: Route, color: [f64; 3]) -> StreetBody {
@@ -105,21 +167,45 @@ fn person(route: Route, color: [f64; 3]) -> StreetBody {
         placard(PERSON_PLACARD_M, 0.75),
         solid([0.0, 0.24, 0.24], [shoulders_m, shoulders_m + 0.28], skin),
     ];
-    StreetBody { label: Some(Label::new_static("person")), route, solids }
+    StreetBody {
+        label: Some(Label::new_static("person")),
+        route,
+        solids,
+    }
 }
 
 /// A house or the like: its middle; length, width and height.
-fn plain(x_m: f64, y_m: f64, [length_m, width_m, height_m]: [f64; 3], color: [f64; 3]) -> StreetBody {
+fn plain(
+    x_m: f64,
+    y_m: f64,
+    [length_m, width_m, height_m]: [f64; 3],
+    color: [f64; 3],
+) -> StreetBody {
     let solids = vec![solid([0.0, length_m, width_m], [0.0, height_m], color)];
-    StreetBody { label: None, route: Route::stands(x_m, y_m, 0.0), solids }
+    StreetBody {
+        label: None,
+        route: Route::stands(x_m, y_m, 0.0),
+        solids,
+    }
 }
 
 fn solid([forward_m, length_m, width_m]: [f64; 3], heights_m: [f64; 2], color: [f64; 3]) -> Solid {
-    Solid { forward_m, left_m: 0.0, length_m, width_m, heights_m, color, is_placard: false }
+    Solid {
+        forward_m,
+        left_m: 0.0,
+        length_m,
+        width_m,
+        heights_m,
+        color,
+        is_placard: false,
+    }
 }
 
 /// A cube of placards.
 fn placard(side_m: f64, bottom_m: f64) -> Solid {
     let white = [235.0, 238.0, 240.0];
-    Solid { is_placard: true, ..solid([0.0, side_m, side_m], [bottom_m, bottom_m + side_m], white) }
+    Solid {
+        is_placard: true,
+        ..solid([0.0, side_m, side_m], [bottom_m, bottom_m + side_m], white)
+    }
 }

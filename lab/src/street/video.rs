@@ -22,7 +22,13 @@ pub(crate) fn write(street: &Street, camera: &StreetCamera, file: &Path) -> anyh
     let (view, optics) = (StreetView::new(street)?, Street::optics());
     let size = Size::new(optics.width.cast_signed(), optics.height.cast_signed());
     let name = file.to_str().context("the path is no UTF-8")?;
-    let mut writer = VideoWriter::new(name, VideoWriter::fourcc('a', 'v', 'c', '1')?, FRAMES_PER_S, size, true)?;
+    let mut writer = VideoWriter::new(
+        name,
+        VideoWriter::fourcc('a', 'v', 'c', '1')?,
+        FRAMES_PER_S,
+        size,
+        true,
+    )?;
     ensure!(writer.is_opened()?, "OpenCV cannot write {name} as H.264");
     for frame in 0..FRAMES {
         writer.write(&view.render(street, camera, f64::from(frame) / FRAMES_PER_S)?)?;

@@ -8,8 +8,8 @@ use ecod::perception::camera::{Intrinsics, Mount};
 use nalgebra::{Matrix3, Point2, Point3, Vector2, Vector3};
 use opencv::core::{BORDER_TRANSPARENT, CV_8UC3, Mat, Point, Point2f, Rect, Scalar, Size, Vector};
 use opencv::imgproc::{
-    INTER_LINEAR, INTER_NEAREST, LINE_8, fill_convex_poly, get_perspective_transform_slice_def, resize,
-    warp_perspective,
+    INTER_LINEAR, INTER_NEAREST, LINE_8, fill_convex_poly, get_perspective_transform_slice_def,
+    resize, warp_perspective,
 };
 use opencv::prelude::*;
 use qrcode::{Color, EcLevel, QrCode};
@@ -56,40 +56,76 @@ impl StreetView {
                 for module in 1..=MAX_MODULE {
                     let mut enlarged = Mat::default();
                     let side = print.cols() * module;
-                    resize(&print, &mut enlarged, Size::new(side, side), 0.0, 0.0, INTER_NEAREST)?;
+                    resize(
+                        &print,
+                        &mut enlarged,
+                        Size::new(side, side),
+                        0.0,
+                        0.0,
+                        INTER_NEAREST,
+                    )?;
                     placards.insert((label.clone(), module), enlarged);
                 }
             }
         }
-        Ok(Self { optics: Street::optics(), placards })
+        Ok(Self {
+            optics: Street::optics(),
+            placards,
+        })
     }
 
     /// The picture of a camera at a time in seconds, without noise: 8-bit BGR.
     ///
     /// # Errors
     /// When OpenCV fails.
-    pub(crate) fn render(&self, street: &Street, camera: &StreetCamera, at_s: f64) -> opencv::Result<Mat> {
-        let (rows, columns) = (self.optics.height.cast_signed(), self.optics.width.cast_signed());
+    pub(crate) fn render(
+        &self,
+        street: &Street,
+        camera: &StreetCamera,
+        at_s: f64,
+    ) -> opencv::Result<Mat> {
+        let (rows, columns) = (
+            self.optics.height.cast_signed(),
+            self.optics.width.cast_signed(),
+        );
         let image = Mat::new_rows_cols_with_default(rows, columns, CV_8UC3, scalar(SKY, 1.0))?;
         let sight = StreetSight::new(street.pose(camera, at_s), &camera.mount);
-        let mut canvas = Canvas { view: self, sight, image };
+        let mut canvas = Canvas {
+            view: self,
+            sight,
+            image,
+        };
         canvas.paint_ground()?;
         let own = match camera.carrier {
             Carrier::Body(body) => Some(body),
             Carrier::Mast(_) => None,
         };
-        let others = street.bodies.iter().enumerate().filter(|(place, _)| Some(*place) != own);
-        let bodies: Vec<_> = others.map(|(_, body)| (body, body.route.at(at_s))).collect();
-        let footprints: Vec<_> = bodies.iter().map(|(body, pose)| body.footprint(pose)).collect();
+        let others = street
+            .bodies
+            .iter()
+            .enumerate()
+            .filter(|(place, _)| Some(*place) != own);
+        let bodies: Vec<_> = others
+            .map(|(_, body)| (body, body.route.at(at_s)))
+            .collect();
+        let footprints: Vec<_> = bodies
+            .iter()
+            .map(|(body, pose)| body.footprint(pose))
+            .collect();
         let eye_m = canvas.sight.height_m;
         for place in depth_order(&canvas.sight.pose.position, &footprints) {
             let (body, pose) = &bodies[place];
             // Parts lie on each other: the farther from the height of the eye, the sooner.
             let mut solids = body.solids.clone();
-            let from_eye = |solid: &Solid| ((solid.heights_m[0] + solid.heights_m[1]) / 2.0 - eye_m).abs();
+            let from_eye =
+                |solid: &Solid| ((solid.heights_m[0] + solid.heights_m[1]) / 2.0 - eye_m).abs();
             solids.sort_by(|a, b| from_eye(b).total_cmp(&from_eye(a)));
             for solid in &solids {
-                canvas.paint_solid(solid, pose, body.label.as_ref().filter(|_| solid.is_placard))?;
+                canvas.paint_solid(
+                    solid,
+                    pose,
+                    body.label.as_ref().filter(|_| solid.is_placard),
+                )?;
             }
         }
         Ok(canvas.image)
@@ -99,13 +135,23 @@ impl StreetView {
 /// A label as it is printed: one pixel for each module, with the quiet zone.
 fn print(label: &Label) -> anyhow::Result<Mat> {
     let code = QrCode::with_error_correction_level(label.as_bytes(), EcLevel::M)?;
-    anyhow::ensure!(code.width() == CODE_MODULES, "label {label} does not fit into the smallest code");
+    anyhow::ensure!(
+        code.width() == CODE_MODULES,
+        "label {label} does not fit into the smallest code"
+    );
     let side = CODE_MODULES + 2 * QUIET_MODULES;
-    let mut print =
-        Mat::new_rows_cols_with_default(side as i32, side as i32, CV_8UC3, scalar([235.0, 238.0, 240.0], 1.0))?;
+    let mut print = Mat::new_rows_cols_with_default(
+        side as i32,
+        side as i32,
+        CV_8UC3,
+        scalar([235.0, 238.0, 240.0], 1.0),
+    )?;
     for (place, color) in code.to_colors().into_iter().enumerate() {
         if color == Color::Dark {
-            let (row, column) = (place / CODE_MODULES + QUIET_MODULES, place % CODE_MODULES + QUIET_MODULES);
+            let (row, column) = (
+                place / CODE_MODULES + QUIET_MODULES,
+                place % CODE_MODULES + QUIET_MODULES,
+            );
             *print.at_2d_mut(row as i32, column as i32)? = opencv::core::Vec3b::from([32, 30, 31]);
         }
     }
@@ -122,15 +168,22 @@ pub(super) struct StreetSight {
 impl StreetSight {
     pub(super) fn new(pose: Pose, mount: &Mount) -> Self {
         let (pose, height_m) = (mount.camera_pose(&pose), mount.height_m.unwrap_or_default());
-        Self { pose, height_m, from_level: mount.to_level().transpose() }
+        Self {
+            pose,
+            height_m,
+            from_level: mount.to_level().transpose(),
+        }
     }
 
     /// A point of the world in the camera frame, in metres.
     pub(super) fn point(&self, place: &Point2<f64>, height_m: f64) -> Point3<f64> {
         let offset = place - self.pose.position;
         let (sin, cos) = self.pose.heading_rad.sin_cos();
-        let level =
-            Vector3::new(offset.x * cos + offset.y * sin, offset.y * cos - offset.x * sin, height_m - self.height_m);
+        let level = Vector3::new(
+            offset.x * cos + offset.y * sin,
+            offset.y * cos - offset.x * sin,
+            height_m - self.height_m,
+        );
         Point3::from(self.from_level * level)
     }
 }
@@ -144,9 +197,15 @@ struct Canvas<'a> {
 
 impl Canvas<'_> {
     fn paint_ground(&mut self) -> opencv::Result<()> {
-        let dashes = (-6..=6).map(|number| ([2.0 * f64::from(number), 0.0], [1.0, 0.12], DASH_COLOR));
+        let dashes =
+            (-6..=6).map(|number| ([2.0 * f64::from(number), 0.0], [1.0, 0.12], DASH_COLOR));
         for ([x_m, y_m], [length_m, width_m], color) in GROUND.into_iter().chain(dashes) {
-            let corners = super::corners(&Pose::new(x_m, y_m, 0.0), Point2::origin(), length_m, width_m);
+            let corners = super::corners(
+                &Pose::new(x_m, y_m, 0.0),
+                Point2::origin(),
+                length_m,
+                width_m,
+            );
             let face = corners.map(|corner| self.sight.point(&corner, 0.0));
             self.fill(&face, scalar(color, 1.0))?;
         }
@@ -154,7 +213,12 @@ impl Canvas<'_> {
     }
 
     /// Paints the sides of a box that face the camera, and its top if that is seen.
-    fn paint_solid(&mut self, solid: &Solid, pose: &Pose, label: Option<&Label>) -> opencv::Result<()> {
+    fn paint_solid(
+        &mut self,
+        solid: &Solid,
+        pose: &Pose,
+        label: Option<&Label>,
+    ) -> opencv::Result<()> {
         let middle = Point2::new(solid.forward_m, solid.left_m);
         let corners = super::corners(pose, middle, solid.length_m, solid.width_m);
         let [bottom_m, top_m] = solid.heights_m;
@@ -170,8 +234,13 @@ impl Canvas<'_> {
                 continue;
             }
             // The viewer has the later corner on the right.
-            let face = [(right, top_m), (left, top_m), (left, bottom_m), (right, bottom_m)]
-                .map(|(corner, height_m)| self.sight.point(&corner, height_m));
+            let face = [
+                (right, top_m),
+                (left, top_m),
+                (left, bottom_m),
+                (right, bottom_m),
+            ]
+            .map(|(corner, height_m)| self.sight.point(&corner, height_m));
             let lit = 0.86 + 0.14 * (out.y.atan2(out.x) + 1.1).cos();
             match label {
                 Some(label) => self.paste(&face, label, scalar(solid.color, lit))?,
@@ -182,41 +251,84 @@ impl Canvas<'_> {
     }
 
     /// Pastes a placard into a face that is wholly before the camera; others stay blank.
-    fn paste(&mut self, face: &[Point3<f64>; 4], label: &Label, blank: Scalar) -> opencv::Result<()> {
-        let pixels = face.map(|corner| self.view.optics.project(&corner).filter(|_| corner.z >= NEAR_M));
-        let [Some(a), Some(b), Some(c), Some(d)] = pixels else { return self.fill(face, blank) };
+    fn paste(
+        &mut self,
+        face: &[Point3<f64>; 4],
+        label: &Label,
+        blank: Scalar,
+    ) -> opencv::Result<()> {
+        let pixels = face.map(|corner| {
+            self.view
+                .optics
+                .project(&corner)
+                .filter(|_| corner.z >= NEAR_M)
+        });
+        let [Some(a), Some(b), Some(c), Some(d)] = pixels else {
+            return self.fill(face, blank);
+        };
         let pixels = [a, b, c, d];
-        let longest = (0..4).map(|side| nalgebra::distance(&pixels[side], &pixels[(side + 1) % 4])).fold(0.0, f64::max);
+        let longest = (0..4)
+            .map(|side| nalgebra::distance(&pixels[side], &pixels[(side + 1) % 4]))
+            .fold(0.0, f64::max);
         let modules = (CODE_MODULES + 2 * QUIET_MODULES) as f64;
         let module = ((longest / modules).round() as i32).clamp(1, MAX_MODULE);
-        let Some(print) = self.view.placards.get(&(label.clone(), module)) else { return self.fill(face, blank) };
+        let Some(print) = self.view.placards.get(&(label.clone(), module)) else {
+            return self.fill(face, blank);
+        };
         let bounds = |of: fn(&Point2<f64>) -> f64, end: i32| {
-            let low = pixels.iter().map(of).fold(f64::INFINITY, f64::min).floor().clamp(0.0, f64::from(end));
-            let high = pixels.iter().map(of).fold(f64::NEG_INFINITY, f64::max).ceil().clamp(0.0, f64::from(end));
+            let low = pixels
+                .iter()
+                .map(of)
+                .fold(f64::INFINITY, f64::min)
+                .floor()
+                .clamp(0.0, f64::from(end));
+            let high = pixels
+                .iter()
+                .map(of)
+                .fold(f64::NEG_INFINITY, f64::max)
+                .ceil()
+                .clamp(0.0, f64::from(end));
             (low as i32, (high - low) as i32)
         };
-        let ((x, width), (y, height)) = (bounds(|p| p.x, self.image.cols()), bounds(|p| p.y, self.image.rows()));
+        let ((x, width), (y, height)) = (
+            bounds(|p| p.x, self.image.cols()),
+            bounds(|p| p.y, self.image.rows()),
+        );
         if width == 0 || height == 0 {
             return Ok(());
         }
         // OpenCV counts pixels from their middles.
         let side = print.cols() as f32 - 0.5;
-        let from = [(-0.5, -0.5), (side, -0.5), (side, side), (-0.5, side)].map(|(x, y)| Point2f::new(x, y));
-        let to = pixels.map(|p| Point2f::new((p.x - 0.5) as f32 - x as f32, (p.y - 0.5) as f32 - y as f32));
+        let from = [(-0.5, -0.5), (side, -0.5), (side, side), (-0.5, side)]
+            .map(|(x, y)| Point2f::new(x, y));
+        let to = pixels
+            .map(|p| Point2f::new((p.x - 0.5) as f32 - x as f32, (p.y - 0.5) as f32 - y as f32));
         let transform = get_perspective_transform_slice_def(from, to)?;
         let mut part = self.image.roi_mut(Rect::new(x, y, width, height))?;
         let size = Size::new(width, height);
-        warp_perspective(print, &mut part, &transform, size, INTER_LINEAR, BORDER_TRANSPARENT, Scalar::default())
+        warp_perspective(
+            print,
+            &mut part,
+            &transform,
+            size,
+            INTER_LINEAR,
+            BORDER_TRANSPARENT,
+            Scalar::default(),
+        )
     }
 
     /// Fills the part of a plane polygon that is before the camera.
     fn fill(&mut self, corners: &[Point3<f64>], color: Scalar) -> opencv::Result<()> {
         let scale = f64::from(1 << FRACTION_BITS);
         let before = clip(corners);
-        let pixels = before.iter().filter_map(|corner| self.view.optics.project(corner));
+        let pixels = before
+            .iter()
+            .filter_map(|corner| self.view.optics.project(corner));
         // Far outside of the picture OpenCV's integers end.
         let fixed = |value: f64| ((value - 0.5) * scale).clamp(-1e8, 1e8) as i32;
-        let points: Vector<Point> = pixels.map(|pixel| Point::new(fixed(pixel.x), fixed(pixel.y))).collect();
+        let points: Vector<Point> = pixels
+            .map(|pixel| Point::new(fixed(pixel.x), fixed(pixel.y)))
+            .collect();
         if points.len() < 3 {
             return Ok(());
         }

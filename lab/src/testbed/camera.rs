@@ -31,7 +31,12 @@ impl TestbedCamera {
     ///
     /// # Errors
     /// [`RenderError`] when a placard's text does not fit into a code or OpenCV fails.
-    pub fn new(testbed: &Testbed, scene: &Scene, cav: &Cav, seed: u64) -> Result<Self, RenderError> {
+    pub fn new(
+        testbed: &Testbed,
+        scene: &Scene,
+        cav: &Cav,
+        seed: u64,
+    ) -> Result<Self, RenderError> {
         Self::mounted(testbed, scene, cav, &Mount::default(), seed)
     }
 
@@ -39,7 +44,13 @@ impl TestbedCamera {
     ///
     /// # Errors
     /// As [`Self::new`].
-    pub fn mounted(testbed: &Testbed, scene: &Scene, cav: &Cav, mount: &Mount, seed: u64) -> Result<Self, RenderError> {
+    pub fn mounted(
+        testbed: &Testbed,
+        scene: &Scene,
+        cav: &Cav,
+        mount: &Mount,
+        seed: u64,
+    ) -> Result<Self, RenderError> {
         let still = render::still(testbed, &testbed.cards(scene), &cav.pose, mount)?;
         let sensor = Sensor::new(&still, stream_seed(seed, &[&scene.name, cav.name.as_str()]));
         Ok(Self { still, sensor })
@@ -94,5 +105,7 @@ fn stream_seed(seed: u64, names: &[&str]) -> u64 {
     seed.to_le_bytes()
         .into_iter()
         .chain(separated)
-        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+            (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3)
+        })
 }

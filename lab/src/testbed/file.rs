@@ -54,14 +54,19 @@ pub(super) fn read(text: &str) -> Result<Testbed, TestbedError> {
     let mut scenes: Vec<Scene> = Vec::with_capacity(head.scenes.len());
     for (index, value) in head.scenes.into_iter().enumerate() {
         let name = value.get("name").and_then(Value::as_str);
-        let place = KeyPath(name.map_or_else(|| format!("scene {index}"), |name| format!("scene {name}")));
+        let place =
+            KeyPath(name.map_or_else(|| format!("scene {index}"), |name| format!("scene {name}")));
         let scene = place.parse::<SceneFields>(value)?.check(&place)?;
         if scenes.iter().any(|other| other.name == scene.name) {
             return Err(place.error("name", "is used by an earlier scene"));
         }
         scenes.push(scene);
     }
-    Ok(Testbed { camera, placard, scenes })
+    Ok(Testbed {
+        camera,
+        placard,
+        scenes,
+    })
 }
 
 /// The part of the file that an error is about.
@@ -69,20 +74,37 @@ pub(super) struct KeyPath(pub(super) String);
 
 impl KeyPath {
     pub(super) fn error(&self, key: impl Into<String>, reason: impl Display) -> TestbedError {
-        TestbedError::Value { place: self.0.clone(), key: key.into(), reason: reason.to_string() }
+        TestbedError::Value {
+            place: self.0.clone(),
+            key: key.into(),
+            reason: reason.to_string(),
+        }
     }
 
     pub(super) fn parse<T: DeserializeOwned>(&self, value: Value) -> Result<T, TestbedError> {
-        serde_path_to_error::deserialize(value)
-            .map_err(|error| self.error(error.path().to_string(), format_args!("cannot be read: {}", error.inner())))
+        serde_path_to_error::deserialize(value).map_err(|error| {
+            self.error(
+                error.path().to_string(),
+                format_args!("cannot be read: {}", error.inner()),
+            )
+        })
     }
 
     /// A number above `low` and up to `high`.
-    pub(super) fn number(&self, key: &str, value: f64, low: f64, high: f64) -> Result<f64, TestbedError> {
+    pub(super) fn number(
+        &self,
+        key: &str,
+        value: f64,
+        low: f64,
+        high: f64,
+    ) -> Result<f64, TestbedError> {
         if value > low && value <= high {
             Ok(value)
         } else {
-            Err(self.error(key, format_args!("is {value}, must be above {low} and at most {high}")))
+            Err(self.error(
+                key,
+                format_args!("is {value}, must be above {low} and at most {high}"),
+            ))
         }
     }
 
@@ -90,7 +112,10 @@ impl KeyPath {
         if inches.iter().all(|value| value.abs() <= MAX_COORDINATE_IN) {
             Ok(Point2::from(inches) * METRES_PER_INCH)
         } else {
-            Err(self.error(key, format_args!("is {inches:?}, must be within ±{MAX_COORDINATE_IN} inches")))
+            Err(self.error(
+                key,
+                format_args!("is {inches:?}, must be within ±{MAX_COORDINATE_IN} inches"),
+            ))
         }
     }
 
@@ -100,7 +125,9 @@ impl KeyPath {
         } else {
             Err(self.error(
                 key,
-                format_args!("is {text:?}, must have 1 to {MAX_NAME_BYTES} bytes and no control characters"),
+                format_args!(
+                    "is {text:?}, must have 1 to {MAX_NAME_BYTES} bytes and no control characters"
+                ),
             ))
         }
     }
@@ -159,13 +186,27 @@ impl CameraFields {
     pub(super) fn check(&self, place: &KeyPath) -> Result<Camera, TestbedError> {
         place.number("camera.image_width", self.image_width.into(), 0.0, 8192.0)?;
         place.number("camera.image_height", self.image_height.into(), 0.0, 8192.0)?;
-        let horizontal = place.number("camera.horizontal_fov_deg", self.horizontal_fov_deg, 0.0, 170.0)?;
-        let vertical = place.number("camera.vertical_fov_deg", self.vertical_fov_deg, 0.0, 170.0)?;
-        let capture_s =
-            place.number("camera.capture_interval_s", self.capture_interval_s, MIN_INTERVAL_S, MAX_INTERVAL_S)?;
+        let horizontal = place.number(
+            "camera.horizontal_fov_deg",
+            self.horizontal_fov_deg,
+            0.0,
+            170.0,
+        )?;
+        let vertical =
+            place.number("camera.vertical_fov_deg", self.vertical_fov_deg, 0.0, 170.0)?;
+        let capture_s = place.number(
+            "camera.capture_interval_s",
+            self.capture_interval_s,
+            MIN_INTERVAL_S,
+            MAX_INTERVAL_S,
+        )?;
         let most_s = (MAX_FRAMES_PER_SUBMISSION * capture_s).min(MAX_INTERVAL_S);
-        let submission_s =
-            place.number("camera.submission_interval_s", self.submission_interval_s, MIN_INTERVAL_S, most_s)?;
+        let submission_s = place.number(
+            "camera.submission_interval_s",
+            self.submission_interval_s,
+            MIN_INTERVAL_S,
+            most_s,
+        )?;
         Ok(Camera {
             intrinsics: Intrinsics::from_field_of_view(
                 self.image_width,
@@ -192,7 +233,12 @@ impl PlacardFields {
     fn check(self, place: &KeyPath) -> Result<Placard, TestbedError> {
         let width = place.number("placard.card_width", self.card_width, 0.0, 1e4)?;
         let height = place.number("placard.card_height", self.card_height, 0.0, 1e4)?;
-        let quiet = place.number("placard.qr_with_quiet_zone", self.qr_with_quiet_zone, 0.0, width.min(height))?;
+        let quiet = place.number(
+            "placard.qr_with_quiet_zone",
+            self.qr_with_quiet_zone,
+            0.0,
+            width.min(height),
+        )?;
         let qr = place.number("placard.qr_width", self.qr_width, 0.0, quiet)?;
         Ok(Placard {
             qr_width_m: qr * METRES_PER_INCH,
@@ -220,12 +266,25 @@ impl SceneFields {
         for (index, fields) in self.cavs.into_iter().enumerate() {
             let cav = fields.check(index, place)?;
             if cavs.iter().any(|other| other.name == cav.name) {
-                return Err(place.error(format!("cavs[{index}].id"), format_args!("is {}, used before", cav.name)));
+                return Err(place.error(
+                    format!("cavs[{index}].id"),
+                    format_args!("is {}, used before", cav.name),
+                ));
             }
             cavs.push(cav);
         }
-        let recorded = self.recorded.into_iter().flatten().map(|run| run.order_by(&cavs)).collect();
-        Ok(Scene { name: self.name, spots, cavs, recorded })
+        let recorded = self
+            .recorded
+            .into_iter()
+            .flatten()
+            .map(|run| run.order_by(&cavs))
+            .collect();
+        Ok(Scene {
+            name: self.name,
+            spots,
+            cavs,
+            recorded,
+        })
     }
 }
 
@@ -262,18 +321,32 @@ fn check_spots(fields: Vec<SpotFields>, place: &KeyPath) -> Result<Vec<Spot>, Te
             return Err(place.error(key("id"), format_args!("gives {id:?}, used before")));
         }
         let occupied = place.point(&key("occupied_placard"), spot.occupied_placard)?;
-        let empty = spot.empty_placard.map(|point| place.point(&key("empty_placard"), point)).transpose()?;
-        let truth = spot.truth.map(|text| place.label(&key("truth"), text)).transpose()?;
+        let empty = spot
+            .empty_placard
+            .map(|point| place.point(&key("empty_placard"), point))
+            .transpose()?;
+        let truth = spot
+            .truth
+            .map(|text| place.label(&key("truth"), text))
+            .transpose()?;
         let direction = empty.and_then(|empty| (occupied - empty).try_normalize(1e-9));
         match direction {
             Some(direction) => mean += direction,
             None => undirected.push(index),
         }
         let facing_rad = direction.map_or(0.0, |direction| direction.y.atan2(direction.x));
-        spots.push(Spot { id, occupied, empty, facing_rad, truth });
+        spots.push(Spot {
+            id,
+            occupied,
+            empty,
+            facing_rad,
+            truth,
+        });
     }
     // Spots without a direction of their own face as the others do on average, or +x.
-    let facing_rad = mean.try_normalize(1e-9).map_or(0.0, |mean| mean.y.atan2(mean.x));
+    let facing_rad = mean
+        .try_normalize(1e-9)
+        .map_or(0.0, |mean| mean.y.atan2(mean.x));
     for index in undirected {
         spots[index].facing_rad = facing_rad;
     }
@@ -290,10 +363,22 @@ pub(super) struct CavFields {
 impl CavFields {
     pub(super) fn check(self, index: usize, place: &KeyPath) -> Result<Cav, TestbedError> {
         let key = |name: &str| format!("cavs[{index}].{name}");
-        let name = NodeName::new(&self.id).map_err(|error| place.error(key("id"), format_args!("is a {error}")))?;
+        let name = NodeName::new(&self.id)
+            .map_err(|error| place.error(key("id"), format_args!("is a {error}")))?;
         let position = place.point(&key("position"), self.position)?;
-        let heading_deg = place.number(&key("camera_heading_deg"), self.camera_heading_deg, -1e6, 1e6)?;
-        Ok(Cav { name, pose: Pose { position, heading_rad: wrap_angle(heading_deg.to_radians()) } })
+        let heading_deg = place.number(
+            &key("camera_heading_deg"),
+            self.camera_heading_deg,
+            -1e6,
+            1e6,
+        )?;
+        Ok(Cav {
+            name,
+            pose: Pose {
+                position,
+                heading_rad: wrap_angle(heading_deg.to_radians()),
+            },
+        })
     }
 }
 
@@ -307,7 +392,12 @@ struct RunFields {
 
 impl RunFields {
     fn order_by(self, cavs: &[Cav]) -> RecordedRun {
-        let accuracy = |cav: &Cav| Some((cav.name.clone(), *self.single_cav_accuracy_pct.get(cav.name.as_str())?));
+        let accuracy = |cav: &Cav| {
+            Some((
+                cav.name.clone(),
+                *self.single_cav_accuracy_pct.get(cav.name.as_str())?,
+            ))
+        };
         RecordedRun {
             pace_accuracy_pct: self.pace_accuracy_pct,
             single_cav_accuracy_pct: cavs.iter().filter_map(accuracy).collect(),

@@ -27,7 +27,8 @@ pub fn render(
     directory: &Path,
 ) -> anyhow::Result<SourceConfig> {
     let camera = TestbedCamera::new(testbed, scene, cav, seed)?;
-    fs::create_dir_all(directory).with_context(|| format!("cannot make {}", directory.display()))?;
+    fs::create_dir_all(directory)
+        .with_context(|| format!("cannot make {}", directory.display()))?;
     for number in 0..FRAMES {
         // Uncompressed: noise does not compress, and a camera's frames need no decoding either.
         let file = directory.join(format!("{number:04}.ppm"));
@@ -38,6 +39,11 @@ pub fn render(
             file.display()
         );
     }
-    let path = fs::canonicalize(directory).with_context(|| format!("cannot find {}", directory.display()))?;
-    Ok(SourceConfig::Images { path, fps: 1.0 / testbed.camera.capture_interval.as_secs_f64(), looping: true })
+    let path = fs::canonicalize(directory)
+        .with_context(|| format!("cannot find {}", directory.display()))?;
+    Ok(SourceConfig::Images {
+        path,
+        fps: 1.0 / testbed.camera.capture_interval.as_secs_f64(),
+        looping: true,
+    })
 }

@@ -58,7 +58,11 @@ const SIZES: [(&str, f64, f64); 16] = [
 /// Height in metres of what has any other label, to find its bearing with.
 const ANY_HEIGHT_M: f64 = 0.11;
 /// Which location an object of known size is taken for.
-const GATE: LandmarkGate = LandmarkGate { radius_m: 0.5, sigmas: 3.0, floor_m: 0.02 };
+const GATE: LandmarkGate = LandmarkGate {
+    radius_m: 0.5,
+    sigmas: 3.0,
+    floor_m: 0.02,
+};
 /// Greatest angle in radians between an object of unknown size and the location that it is taken for.
 const MAX_BESIDE_RAD: f64 = 0.15;
 /// By what factor such an object may be higher or lower than [`ANY_HEIGHT_M`] if it stands at the location.
@@ -113,8 +117,16 @@ pub fn run(name: &str, recording: &IntersectionRecording) -> anyhow::Result<Inte
     let (_, paper) = fuse(recording, &reports, Algorithms::Vote, VoteMode::Paper)?;
     let (_, pace) = fuse(recording, &reports, Algorithms::Pace, VoteMode::Weighted)?;
     let (_, answer) = fuse(recording, &reports, Algorithms::Both, VoteMode::Weighted)?;
-    let alone =
-        |cav: &Cav| (cav.name.clone(), scores.vehicles.get(&cav.name).and_then(|v| v.accuracy_pct).unwrap_or(0.0));
+    let alone = |cav: &Cav| {
+        (
+            cav.name.clone(),
+            scores
+                .vehicles
+                .get(&cav.name)
+                .and_then(|v| v.accuracy_pct)
+                .unwrap_or(0.0),
+        )
+    };
     Ok(IntersectionResult {
         name: name.to_owned(),
         scenes: 1,
@@ -133,8 +145,18 @@ impl IntersectionResult {
     /// The mean of scenes with equally many verdicts; `None` of none.
     pub fn mean(name: &str, scenes: &[Self]) -> Option<Self> {
         let first = scenes.first()?;
-        let mean = |figure: &dyn Fn(&Self) -> f64| scenes.iter().map(figure).sum::<f64>() / scenes.len() as f64;
-        let alone = |cav: &NodeName| mean(&|scene| scene.single_cav_accuracy_pct.get(cav).copied().unwrap_or(0.0));
+        let mean = |figure: &dyn Fn(&Self) -> f64| {
+            scenes.iter().map(figure).sum::<f64>() / scenes.len() as f64
+        };
+        let alone = |cav: &NodeName| {
+            mean(&|scene| {
+                scene
+                    .single_cav_accuracy_pct
+                    .get(cav)
+                    .copied()
+                    .unwrap_or(0.0)
+            })
+        };
         Some(Self {
             name: name.to_owned(),
             scenes: scenes.len() as u64,
@@ -157,8 +179,11 @@ impl IntersectionResult {
 /// Reports that the vehicles would have published, in order of arrival.
 pub fn reports(recording: &IntersectionRecording) -> Vec<ObjectReport> {
     let landmarks = Arc::new(LandmarkIndex::new(recording.landmarks(), GATE.radius_m));
-    let mut vehicles: Vec<Perception> =
-        recording.cavs.iter().map(|cav| perception(recording, cav, landmarks.clone())).collect();
+    let mut vehicles: Vec<Perception> = recording
+        .cavs
+        .iter()
+        .map(|cav| perception(recording, cav, landmarks.clone()))
+        .collect();
     let mut reports = Vec::new();
     for frame in 0..recording.frame_count() {
         for (vehicle, frames) in vehicles.iter_mut().zip(&recording.frames) {
@@ -174,17 +199,29 @@ pub fn reports(recording: &IntersectionRecording) -> Vec<ObjectReport> {
 
 /// Takes every object of unknown size for the location that is least beside it.
 fn name_by_bearing(report: &mut ObjectReport, landmarks: &[Landmark]) {
-    let Some(camera) = report.pose.map(Pose::from) else { return };
+    let Some(camera) = report.pose.map(Pose::from) else {
+        return;
+    };
     let is_known = |label: &Label| SIZES.iter().any(|(known, ..)| label == known);
-    for object in report.objects.iter_mut().filter(|object| !is_known(&object.label)) {
+    for object in report
+        .objects
+        .iter_mut()
+        .filter(|object| !is_known(&object.label))
+    {
         let (range_m, bearing_rad) = camera.range_bearing(&Point2::new(object.x_m, object.y_m));
         let beside_rad = |landmark: &Landmark| {
             let (to_landmark_m, towards_rad) = camera.range_bearing(&landmark.position);
-            let is_of_a_size = (1.0 / MAX_HEIGHT_FACTOR..=MAX_HEIGHT_FACTOR).contains(&(to_landmark_m / range_m));
-            Some(wrap_angle(towards_rad - bearing_rad).abs()).filter(|rad| is_of_a_size && *rad <= MAX_BESIDE_RAD)
+            let is_of_a_size =
+                (1.0 / MAX_HEIGHT_FACTOR..=MAX_HEIGHT_FACTOR).contains(&(to_landmark_m / range_m));
+            Some(wrap_angle(towards_rad - bearing_rad).abs())
+                .filter(|rad| is_of_a_size && *rad <= MAX_BESIDE_RAD)
         };
-        let near = landmarks.iter().filter_map(|landmark| Some((beside_rad(landmark)?, &landmark.id)));
-        object.landmark = near.min_by(|(a, _), (b, _)| a.total_cmp(b)).map(|(_, id)| id.clone());
+        let near = landmarks
+            .iter()
+            .filter_map(|landmark| Some((beside_rad(landmark)?, &landmark.id)));
+        object.landmark = near
+            .min_by(|(a, _), (b, _)| a.total_cmp(b))
+            .map(|(_, id)| id.clone());
     }
 }
 
@@ -210,7 +247,11 @@ fn fuse(
 ) -> anyhow::Result<(Vec<FusedLine>, Scores)> {
     let landmarks = recording.landmarks();
     let fusion = fusion(algorithms, mode);
-    let mut replay = Replay::new(ReplayConfig { fusion, landmarks: landmarks.clone(), ..ReplayConfig::default() });
+    let mut replay = Replay::new(ReplayConfig {
+        fusion,
+        landmarks: landmarks.clone(),
+        ..ReplayConfig::default()
+    });
     let mut fused = Vec::new();
     for report in reports {
         // As vehicles send them: votes first.
@@ -229,7 +270,9 @@ fn fuse(
     let index = LandmarkIndex::new(landmarks, GATE.radius_m);
     let mut evaluation = Evaluation::new(truth(recording)?).with_landmarks(index, GATE);
     fused.iter().for_each(|line| evaluation.fused(line));
-    reports.iter().for_each(|report| evaluation.report(ReportKind::VoteDetections, report));
+    reports
+        .iter()
+        .for_each(|report| evaluation.report(ReportKind::VoteDetections, report));
     let EvalResult { pace, vote } = evaluation.result();
     let scores = if algorithms.pace() { pace } else { vote };
     let scores = scores.ok_or_else(|| anyhow::anyhow!("no report, and nothing fused"))?;
@@ -239,26 +282,48 @@ fn fuse(
 /// Every frame counts by itself.
 fn truth(recording: &IntersectionRecording) -> anyhow::Result<Truth> {
     let spans = |accepted: &[Label]| -> Vec<_> {
-        (0..recording.frame_count()).map(|f| json!({"from_us": captured_at(f), "label": accepted})).collect()
+        (0..recording.frame_count())
+            .map(|f| json!({"from_us": captured_at(f), "label": accepted}))
+            .collect()
     };
-    let objects: serde_json::Map<_, _> =
-        recording.objects.iter().map(|object| (object.id.to_string(), spans(&object.accepted).into())).collect();
+    let objects: serde_json::Map<_, _> = recording
+        .objects
+        .iter()
+        .map(|object| (object.id.to_string(), spans(&object.accepted).into()))
+        .collect();
     Ok(Truth::parse(&json!({ "landmarks": objects }).to_string())?)
 }
 
 /// The last verdict on every object in every frame.
 fn labels(recording: &IntersectionRecording, fused: &[FusedLine]) -> Vec<FrameLabel> {
-    let verdicts = |line: &FusedLine| if let FusedLine::Verdicts(v) = line { Some(v.clone()) } else { None };
+    let verdicts = |line: &FusedLine| {
+        if let FusedLine::Verdicts(v) = line {
+            Some(v.clone())
+        } else {
+            None
+        }
+    };
     let rounds: Vec<_> = fused.iter().filter_map(verdicts).collect();
     let mut labels = Vec::new();
     for frame in 0..recording.frame_count() {
         let in_frame = captured_at(frame)..captured_at(frame + 1);
-        let round = rounds.iter().rev().find(|round| in_frame.contains(&round.fused_at_us));
+        let round = rounds
+            .iter()
+            .rev()
+            .find(|round| in_frame.contains(&round.fused_at_us));
         for object in &recording.objects {
-            let verdict = round.and_then(|round| round.verdicts.iter().find(|v| v.landmark == object.id));
+            let verdict =
+                round.and_then(|round| round.verdicts.iter().find(|v| v.landmark == object.id));
             let label = verdict.and_then(|verdict| verdict.label.clone());
-            let right = label.as_ref().is_some_and(|label| object.accepted.contains(label));
-            labels.push(FrameLabel { frame: frame as u64 + 1, landmark: object.id.clone(), label, right });
+            let right = label
+                .as_ref()
+                .is_some_and(|label| object.accepted.contains(label));
+            labels.push(FrameLabel {
+                frame: frame as u64 + 1,
+                landmark: object.id.clone(),
+                label,
+                right,
+            });
         }
     }
     labels
@@ -270,20 +335,39 @@ fn captured_at(frame: usize) -> Timestamp {
 
 /// A round closes with the last vehicle's report of a frame, at the latest within the time of the next.
 fn fusion(algorithms: Algorithms, mode: VoteMode) -> FusionConfig {
-    let mut vote = VoteConfig { mode, ..VoteConfig::default() };
+    let mut vote = VoteConfig {
+        mode,
+        ..VoteConfig::default()
+    };
     vote.paper.frames_per_verdict = 1;
     vote.weighted.max_range_m = vote.paper.max_range_m;
-    let LandmarkGate { radius_m: gate_m, sigmas: gate_sigmas, floor_m: position_floor_m } = GATE;
+    let LandmarkGate {
+        radius_m: gate_m,
+        sigmas: gate_sigmas,
+        floor_m: position_floor_m,
+    } = GATE;
     FusionConfig {
         algorithms,
-        pace: PaceConfig { gate_m, gate_sigmas, position_floor_m, ..PaceConfig::default() },
-        round: RoundConfig { period_s: FRAME_INTERVAL.as_secs_f64(), ..RoundConfig::default() },
+        pace: PaceConfig {
+            gate_m,
+            gate_sigmas,
+            position_floor_m,
+            ..PaceConfig::default()
+        },
+        round: RoundConfig {
+            period_s: FRAME_INTERVAL.as_secs_f64(),
+            ..RoundConfig::default()
+        },
         vote,
         ..FusionConfig::default()
     }
 }
 
-fn perception(recording: &IntersectionRecording, cav: &Cav, landmarks: Arc<LandmarkIndex>) -> Perception {
+fn perception(
+    recording: &IntersectionRecording,
+    cav: &Cav,
+    landmarks: Arc<LandmarkIndex>,
+) -> Perception {
     let vehicle_camera = VehicleCamera {
         node: cav.name.clone(),
         pose: cav.pose,
@@ -291,11 +375,18 @@ fn perception(recording: &IntersectionRecording, cav: &Cav, landmarks: Arc<Landm
         lens: Lens::ideal(recording.intrinsics),
         landmarks,
     };
-    let size = |height_m, relative_sigma| ObjectSize { relative_sigma, ..ObjectSize::square(height_m) };
-    let labels = SIZES.map(|(label, height_m, relative_sigma)| (label.into(), size(height_m, relative_sigma)));
+    let size = |height_m, relative_sigma| ObjectSize {
+        relative_sigma,
+        ..ObjectSize::square(height_m)
+    };
+    let labels = SIZES
+        .map(|(label, height_m, relative_sigma)| (label.into(), size(height_m, relative_sigma)));
     let projection = ProjectionConfig {
         ranging: Ranging::BoxHeight,
-        sizes: ObjectSizes { default: Some(size(ANY_HEIGHT_M, 1.0)), labels: labels.into() },
+        sizes: ObjectSizes {
+            default: Some(size(ANY_HEIGHT_M, 1.0)),
+            labels: labels.into(),
+        },
         pixel_sigma_px: 4.0,
         heading_sigma_rad: 0.05,
         position_sigma_m: 0.02,

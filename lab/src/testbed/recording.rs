@@ -80,7 +80,12 @@ impl KnownObject {
 
     fn landmark(&self) -> Landmark {
         let others = &self.accepted[..self.accepted.len().saturating_sub(1)];
-        let synonym = |from: &Label| self.label().map(|label| Synonym { from: from.clone(), label: label.clone() });
+        let synonym = |from: &Label| {
+            self.label().map(|label| Synonym {
+                from: from.clone(),
+                label: label.clone(),
+            })
+        };
         Landmark {
             id: self.id.clone(),
             position: self.position,
@@ -120,8 +125,14 @@ struct DetectionFields {
 impl RecordingFields {
     fn check(mut self, place: &KeyPath) -> Result<IntersectionRecording, TestbedError> {
         self.units.check(place)?;
-        if let Some(order) = self.bounding_box_order.filter(|order| !order.starts_with(BOX_ORDER)) {
-            return Err(place.error("bounding_box_order", format_args!("is {order:?}, must be {BOX_ORDER:?}")));
+        if let Some(order) = self
+            .bounding_box_order
+            .filter(|order| !order.starts_with(BOX_ORDER))
+        {
+            return Err(place.error(
+                "bounding_box_order",
+                format_args!("is {order:?}, must be {BOX_ORDER:?}"),
+            ));
         }
         let intrinsics = self.camera.check(place)?.intrinsics;
         let mut ids = HashSet::new();
@@ -129,30 +140,49 @@ impl RecordingFields {
         for (index, fields) in self.objects.into_iter().enumerate() {
             let object = fields.check(index, place)?;
             if !ids.insert(object.id.clone()) {
-                return Err(
-                    place.error(format!("objects[{index}].id"), format_args!("is {:?}, used before", object.id))
-                );
+                return Err(place.error(
+                    format!("objects[{index}].id"),
+                    format_args!("is {:?}, used before", object.id),
+                ));
             }
             objects.push(object);
         }
-        let boxes: usize = self.frames.values().flatten().map(|frame| 1 + frame.len()).sum();
+        let boxes: usize = self
+            .frames
+            .values()
+            .flatten()
+            .map(|frame| 1 + frame.len())
+            .sum();
         if boxes > MAX_BOXES {
-            return Err(place.error("frames", format_args!("holds more than {MAX_BOXES} frames and boxes")));
+            return Err(place.error(
+                "frames",
+                format_args!("holds more than {MAX_BOXES} frames and boxes"),
+            ));
         }
         let mut cavs: Vec<Cav> = Vec::with_capacity(self.cavs.len());
         let mut frames = Vec::with_capacity(self.cavs.len());
         for (index, fields) in self.cavs.into_iter().enumerate() {
             let cav = fields.check(index, place)?;
             if cavs.iter().any(|other| other.name == cav.name) {
-                return Err(place.error(format!("cavs[{index}].id"), format_args!("is {}, used before", cav.name)));
+                return Err(place.error(
+                    format!("cavs[{index}].id"),
+                    format_args!("is {}, used before", cav.name),
+                ));
             }
             let recorded = self.frames.remove(cav.name.as_str()).unwrap_or_default();
             frames.push(detections(recorded, &cav, &intrinsics, place)?);
             cavs.push(cav);
         }
         match self.frames.keys().next() {
-            Some(stranger) => Err(place.error(format!("frames.{stranger}"), "is of no vehicle in `cavs`")),
-            None => Ok(IntersectionRecording { intrinsics, objects, cavs, frames }),
+            Some(stranger) => {
+                Err(place.error(format!("frames.{stranger}"), "is of no vehicle in `cavs`"))
+            }
+            None => Ok(IntersectionRecording {
+                intrinsics,
+                objects,
+                cavs,
+                frames,
+            }),
         }
     }
 }
@@ -163,7 +193,10 @@ impl RecordedFields {
         if self.accepted_labels.is_empty() {
             return Err(place.error(key("accepted_labels"), "is empty"));
         }
-        let labels = self.accepted_labels.into_iter().map(|label| place.label(&key("accepted_labels"), label));
+        let labels = self
+            .accepted_labels
+            .into_iter()
+            .map(|label| place.label(&key("accepted_labels"), label));
         Ok(KnownObject {
             id: place.label(&key("id"), self.id)?,
             position: place.point(&key("position"), self.position)?,
@@ -191,18 +224,35 @@ fn detections(
 }
 
 impl DetectionFields {
-    fn check(self, key: &str, camera: &Intrinsics, place: &KeyPath) -> Result<Detection, TestbedError> {
+    fn check(
+        self,
+        key: &str,
+        camera: &Intrinsics,
+        place: &KeyPath,
+    ) -> Result<Detection, TestbedError> {
         let [y_min, x_min, y_max, x_max] = self.bounding_box;
         let (width, height) = (f64::from(camera.width), f64::from(camera.height));
-        let bounding_box =
-            BoundingBox { x_min: x_min * width, y_min: y_min * height, x_max: x_max * width, y_max: y_max * height };
+        let bounding_box = BoundingBox {
+            x_min: x_min * width,
+            y_min: y_min * height,
+            x_max: x_max * width,
+            y_max: y_max * height,
+        };
         if !bounding_box.is_valid() {
             let found = self.bounding_box;
-            return Err(place.error(format!("{key}.bounding_box"), format_args!("is {found:?} and has no area")));
+            return Err(place.error(
+                format!("{key}.bounding_box"),
+                format_args!("is {found:?} and has no area"),
+            ));
         }
         Ok(Detection {
             label: place.label(&format!("{key}.label"), self.label)?,
-            confidence: place.number(&format!("{key}.confidence"), self.confidence, -f64::MIN_POSITIVE, 1.0)?,
+            confidence: place.number(
+                &format!("{key}.confidence"),
+                self.confidence,
+                -f64::MIN_POSITIVE,
+                1.0,
+            )?,
             bounding_box,
             corners: None,
         })
@@ -218,11 +268,21 @@ mod tests {
     #[test]
     fn the_recording_is_read_in_metres_and_pixels() {
         let recording = IntersectionRecording::from_json(TEXT).unwrap();
-        assert_eq!((recording.objects.len(), recording.cavs.len(), recording.frame_count()), (3, 4, 3));
+        assert_eq!(
+            (
+                recording.objects.len(),
+                recording.cavs.len(),
+                recording.frame_count()
+            ),
+            (3, 4, 3)
+        );
         let landmarks = recording.landmarks();
         assert!((landmarks[0].position - Point2::new(0.5334, 0.889)).norm() < 1e-12);
         assert_eq!(
-            (landmarks[0].synonyms[0].from.as_str(), landmarks[0].synonyms[0].label.as_str()),
+            (
+                landmarks[0].synonyms[0].from.as_str(),
+                landmarks[0].synonyms[0].label.as_str()
+            ),
             ("vase", "sports ball")
         );
         let first = &recording.frames[0][0][0];
@@ -235,11 +295,27 @@ mod tests {
     fn what_cannot_be_used_is_named() {
         for (from, to, parts) in [
             ("\"ball\"", "\"cup\"", ["objects[1].id", "used before"]),
-            ("0.3548", "0.9", ["frames.euclid[0][0].bounding_box", "no area"]),
-            ("0.5625", "1.5", ["frames.euclid[0][0].confidence", "at most 1"]),
+            (
+                "0.3548",
+                "0.9",
+                ["frames.euclid[0][0].bounding_box", "no area"],
+            ),
+            (
+                "0.5625",
+                "1.5",
+                ["frames.euclid[0][0].confidence", "at most 1"],
+            ),
             ("\"watson\"", "\"hal\"", ["frames.watson", "no vehicle"]),
-            ("y_min, x_min", "x_min, y_min", ["bounding_box_order", "y_min, x_min"]),
-            ("\"length\": \"inch\"", "\"length\": \"mile\"", ["units.length", "inch"]),
+            (
+                "y_min, x_min",
+                "x_min, y_min",
+                ["bounding_box_order", "y_min, x_min"],
+            ),
+            (
+                "\"length\": \"inch\"",
+                "\"length\": \"mile\"",
+                ["units.length", "inch"],
+            ),
             (
                 "\"accepted_labels\": [",
                 "\"accepted_labels\": [], \"other\": [",
@@ -247,7 +323,9 @@ mod tests {
             ),
         ] {
             assert!(TEXT.contains(from), "{from}");
-            let error = IntersectionRecording::from_json(&TEXT.replacen(from, to, 1)).unwrap_err().to_string();
+            let error = IntersectionRecording::from_json(&TEXT.replacen(from, to, 1))
+                .unwrap_err()
+                .to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
         }
     }

@@ -22,16 +22,25 @@ impl SpotScore {
     pub fn judge(&mut self, testbed: &Testbed, scene: &Scene, map: &GlobalMap) {
         for spot in &scene.spots {
             let state = map.landmarks.iter().find(|state| state.id == spot.id);
-            self.count(spot, state.and_then(|state| is_right(testbed, spot, state)) == Some(true));
+            self.count(
+                spot,
+                state.and_then(|state| is_right(testbed, spot, state)) == Some(true),
+            );
         }
     }
 
     /// Judges every spot by its verdict; without a label that is wrong, as nobody voted for the placard of a free spot.
     pub fn judge_verdicts(&mut self, testbed: &Testbed, scene: &Scene, verdicts: &Verdicts) {
         for spot in &scene.spots {
-            let verdict = verdicts.verdicts.iter().find(|verdict| verdict.landmark == spot.id);
+            let verdict = verdicts
+                .verdicts
+                .iter()
+                .find(|verdict| verdict.landmark == spot.id);
             let right = spot.truth.as_ref().unwrap_or(&testbed.placard.empty_text);
-            self.count(spot, verdict.is_some_and(|verdict| verdict.label.as_ref() == Some(right)));
+            self.count(
+                spot,
+                verdict.is_some_and(|verdict| verdict.label.as_ref() == Some(right)),
+            );
         }
     }
 
@@ -105,11 +114,29 @@ impl SceneResult {
         fused: &SpotScore,
         single: &BTreeMap<NodeName, SpotScore>,
     ) -> Self {
-        let empty = scene.spots.iter().filter(|spot| spot.truth.is_none()).count() as u64;
-        let unseen = |spot: &&Spot| !scene.cavs.iter().any(|cav| testbed.sighting(scene, cav, spot).is_some());
+        let empty = scene
+            .spots
+            .iter()
+            .filter(|spot| spot.truth.is_none())
+            .count() as u64;
+        let unseen = |spot: &&Spot| {
+            !scene
+                .cavs
+                .iter()
+                .any(|cav| testbed.sighting(scene, cav, spot).is_some())
+        };
         let recorded_single = scene.cavs.iter().filter_map(|cav| {
-            let runs = scene.recorded.iter().flat_map(|run| &run.single_cav_accuracy_pct);
-            Some((cav.name.clone(), mean(runs.filter(|(name, _)| *name == cav.name).map(|(_, pct)| *pct))?))
+            let runs = scene
+                .recorded
+                .iter()
+                .flat_map(|run| &run.single_cav_accuracy_pct);
+            Some((
+                cav.name.clone(),
+                mean(
+                    runs.filter(|(name, _)| *name == cav.name)
+                        .map(|(_, pct)| *pct),
+                )?,
+            ))
         });
         Self {
             name: scene.name.clone(),
@@ -118,11 +145,24 @@ impl SceneResult {
             vote_accuracy_pct: None,
             answer_accuracy_pct: None,
             occupied_accuracy_pct: fused.occupied_accuracy_pct(),
-            single_cav_accuracy_pct: single.iter().map(|(name, s)| (name.clone(), s.accuracy_pct())).collect(),
+            single_cav_accuracy_pct: single
+                .iter()
+                .map(|(name, s)| (name.clone(), s.accuracy_pct()))
+                .collect(),
             always_empty_pct: percent(empty, scene.spots.len() as u64),
-            recorded_pace_accuracy_pct: mean(scene.recorded.iter().filter_map(|run| run.pace_accuracy_pct)),
+            recorded_pace_accuracy_pct: mean(
+                scene
+                    .recorded
+                    .iter()
+                    .filter_map(|run| run.pace_accuracy_pct),
+            ),
             recorded_single_cav_accuracy_pct: recorded_single.collect(),
-            unseen_spots: scene.spots.iter().filter(unseen).map(|spot| spot.id.clone()).collect(),
+            unseen_spots: scene
+                .spots
+                .iter()
+                .filter(unseen)
+                .map(|spot| spot.id.clone())
+                .collect(),
         }
     }
 }
@@ -132,7 +172,11 @@ fn hundred_if_none<S: Serializer>(pct: &Option<f64>, serializer: S) -> Result<S:
 }
 
 fn percent(part: u64, whole: u64) -> f64 {
-    if whole == 0 { 0.0 } else { 100.0 * part as f64 / whole as f64 }
+    if whole == 0 {
+        0.0
+    } else {
+        100.0 * part as f64 / whole as f64
+    }
 }
 
 fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {

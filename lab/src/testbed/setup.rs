@@ -38,13 +38,19 @@ const MAX_AGE_S: f64 = 3600.0;
 
 /// The edge's configuration: role, known locations and fusion.
 pub fn edge(testbed: &Testbed, scene: &Scene) -> NodeConfig {
-    NodeConfig { name: Some(unused_name(scene, "edge")), role: Role::Edge, ..cell(testbed, scene) }
+    NodeConfig {
+        name: Some(unused_name(scene, "edge")),
+        role: Role::Edge,
+        ..cell(testbed, scene)
+    }
 }
 
 /// The wanted name, or the first of `name-2`, `name-3` … that no vehicle of the scene has.
 pub fn unused_name(scene: &Scene, wanted: &'static str) -> NodeName {
     let numbered = (2..).map(|n| NodeName::new(format!("{wanted}-{n}")));
-    let mut names = std::iter::once(Ok(NodeName::from_static(wanted))).chain(numbered).filter_map(Result::ok);
+    let mut names = std::iter::once(Ok(NodeName::from_static(wanted)))
+        .chain(numbered)
+        .filter_map(Result::ok);
     let unused = names.find(|name| scene.cavs.iter().all(|cav| cav.name != *name));
     unused.unwrap_or(NodeName::from_static(wanted))
 }
@@ -92,9 +98,17 @@ pub fn perception(testbed: &Testbed, scene: &Scene, cav: &Cav) -> Perception {
         pose: cav.pose,
         mount: Mount::default(),
         lens: Lens::ideal(testbed.camera.intrinsics),
-        landmarks: Arc::new(LandmarkIndex::new(scene.landmarks(&testbed.placard), gate.radius_m)),
+        landmarks: Arc::new(LandmarkIndex::new(
+            scene.landmarks(&testbed.placard),
+            gate.radius_m,
+        )),
     };
-    Perception::new(vehicle_camera, projection(&testbed.placard), view(&testbed.placard), gate)
+    Perception::new(
+        vehicle_camera,
+        projection(&testbed.placard),
+        view(&testbed.placard),
+        gate,
+    )
 }
 
 /// Fusion of reports: a round for every frame, which counts until some more have come.
@@ -102,13 +116,22 @@ pub fn fusion(testbed: &Testbed) -> FusionConfig {
     let period_s = testbed.camera.capture_interval.as_secs_f64();
     let (mut window, mut pace) = (WindowConfig::default(), PaceConfig::default());
     (pace.gate_m, pace.position_floor_m) = (GATE_M, 0.01);
-    pace.max_age_s = pace.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MAX_AGE_S);
-    window.max_age_s = window.max_age_s.max(FRAMES_REMEMBERED * period_s).min(MAX_AGE_S);
+    pace.max_age_s = pace
+        .max_age_s
+        .max(FRAMES_REMEMBERED * period_s)
+        .min(MAX_AGE_S);
+    window.max_age_s = window
+        .max_age_s
+        .max(FRAMES_REMEMBERED * period_s)
+        .min(MAX_AGE_S);
     let mut vote = VoteConfig::default();
     vote.weighted.freshness_s = vote.weighted.freshness_s.max(FRAMES_REMEMBERED * period_s);
     FusionConfig {
         algorithms: Algorithms::Pace,
-        round: RoundConfig { period_s, ..RoundConfig::default() },
+        round: RoundConfig {
+            period_s,
+            ..RoundConfig::default()
+        },
         pace,
         vote,
         window,
@@ -119,7 +142,10 @@ pub fn fusion(testbed: &Testbed) -> FusionConfig {
 /// Poses are known to two millimetres, corners to half a pixel.
 fn projection(placard: &Placard) -> ProjectionConfig {
     ProjectionConfig {
-        sizes: ObjectSizes { default: Some(ObjectSize::square(placard.qr_width_m)), ..ObjectSizes::default() },
+        sizes: ObjectSizes {
+            default: Some(ObjectSize::square(placard.qr_width_m)),
+            ..ObjectSizes::default()
+        },
         pixel_sigma_px: 0.5,
         heading_sigma_rad: 0.002,
         position_sigma_m: 0.002,
@@ -144,14 +170,24 @@ fn view(placard: &Placard) -> ViewConfig {
 fn cell(testbed: &Testbed, scene: &Scene) -> NodeConfig {
     let membership = MembershipConfig {
         bind: Some(SocketAddr::from(([127, 0, 0, 1], 0))),
-        multicast: MulticastConfig { enabled: false, ..MulticastConfig::default() },
+        multicast: MulticastConfig {
+            enabled: false,
+            ..MulticastConfig::default()
+        },
         ..MembershipConfig::default()
     };
     NodeConfig {
         membership,
-        dashboard: DashboardConfig { enabled: false, ..DashboardConfig::default() },
+        dashboard: DashboardConfig {
+            enabled: false,
+            ..DashboardConfig::default()
+        },
         cell: NodeName::from_static("testbed"),
-        landmarks: scene.landmarks(&testbed.placard).iter().map(LandmarkConfig::from).collect(),
+        landmarks: scene
+            .landmarks(&testbed.placard)
+            .iter()
+            .map(LandmarkConfig::from)
+            .collect(),
         fusion: fusion(testbed),
         ..NodeConfig::default()
     }

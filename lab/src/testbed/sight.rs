@@ -39,7 +39,11 @@ impl Card {
         let depth_m = (self.position - camera.position).dot(&facing) / approach;
         let at = camera.position + sight * depth_m - self.position;
         let right_m = facing.x * at.y - facing.y * at.x;
-        (depth_m >= NEAR_M && right_m.is_finite()).then_some(Hit { depth_m, right_m, front: approach < 0.0 })
+        (depth_m >= NEAR_M && right_m.is_finite()).then_some(Hit {
+            depth_m,
+            right_m,
+            front: approach < 0.0,
+        })
     }
 
     /// The slope of the line of sight to a point of the card, `right_m` from its middle; `None` behind the camera.
@@ -71,20 +75,29 @@ impl Sighting {
         let (intrinsics, placard) = (&testbed.camera.intrinsics, &testbed.placard);
         let half_m = placard.qr_width_m / 2.0;
         let (left, right) = (card.slope(camera, -half_m)?, card.slope(camera, half_m)?);
-        let (left_px, right_px) = (intrinsics.cx - intrinsics.fx * left, intrinsics.cx - intrinsics.fx * right);
+        let (left_px, right_px) = (
+            intrinsics.cx - intrinsics.fx * left,
+            intrinsics.cx - intrinsics.fx * right,
+        );
         if right_px <= left_px || left_px < 0.0 || right_px > f64::from(intrinsics.width) {
             return None;
         }
-        let nearest_m = card.hit(camera, left)?.depth_m.min(card.hit(camera, right)?.depth_m);
+        let nearest_m = card
+            .hit(camera, left)?
+            .depth_m
+            .min(card.hit(camera, right)?.depth_m);
         if half_m * intrinsics.fy > intrinsics.cy * nearest_m {
             return None;
         }
         let is_shown = |probe: &u32| {
             let slope = left + (right - left) * (f64::from(*probe) + 0.5) / f64::from(PROBES);
-            let Some(own) = card.hit(camera, slope) else { return false };
+            let Some(own) = card.hit(camera, slope) else {
+                return false;
+            };
             let hides = |other: &Card| {
                 other.hit(camera, slope).is_some_and(|hit| {
-                    hit.right_m.abs() <= placard.card_width_m / 2.0 && hit.depth_m < own.depth_m - NEAR_M
+                    hit.right_m.abs() <= placard.card_width_m / 2.0
+                        && hit.depth_m < own.depth_m - NEAR_M
                 })
             };
             !cards.iter().any(hides)
@@ -92,7 +105,12 @@ impl Sighting {
         let shown = (0..PROBES).filter(is_shown).count() as f64 / f64::from(PROBES);
         let to_camera = camera.position - card.position;
         let yaw_rad = wrap_angle(to_camera.y.atan2(to_camera.x) - card.facing_rad).abs();
-        Some(Self { range_m: to_camera.norm(), yaw_rad, width_px: right_px - left_px, shown })
+        Some(Self {
+            range_m: to_camera.norm(),
+            yaw_rad,
+            width_px: right_px - left_px,
+            shown,
+        })
     }
 
     /// True if the code is large enough, and little enough of it hidden, to be read.

@@ -27,7 +27,11 @@ pub fn table(results: &[SceneResult]) -> String {
     let mut line = |cells: [&str; COLUMNS]| {
         for (index, (cell, width)) in cells.iter().zip(widths).enumerate() {
             let padding = width - cell.chars().count();
-            let (before, after) = if index == 0 || index == COLUMNS - 1 { (0, padding) } else { (padding, 0) };
+            let (before, after) = if index == 0 || index == COLUMNS - 1 {
+                (0, padding)
+            } else {
+                (padding, 0)
+            };
             let _ = write!(text, "{:before$}{cell}{:after$}  ", "", "");
         }
         text.truncate(text.trim_end().len());
@@ -41,12 +45,25 @@ pub fn table(results: &[SceneResult]) -> String {
     for result in results {
         let alone = result.single_cav_accuracy_pct.iter().map(|(name, pct)| {
             let recorded = result.recorded_single_cav_accuracy_pct.get(name);
-            format!("{name} {pct:.1}{}", recorded.map_or_else(String::new, |pct| format!(" (recorded {pct:.1})")))
+            format!(
+                "{name} {pct:.1}{}",
+                recorded.map_or_else(String::new, |pct| format!(" (recorded {pct:.1})"))
+            )
         });
-        let kinds = [("VOTE alone", result.vote_accuracy_pct), ("PACE and VOTE together", result.answer_accuracy_pct)];
-        let kinds = kinds.into_iter().filter_map(|(kind, pct)| Some(format!("{kind} {:.2}", pct?)));
+        let kinds = [
+            ("VOTE alone", result.vote_accuracy_pct),
+            ("PACE and VOTE together", result.answer_accuracy_pct),
+        ];
+        let kinds = kinds
+            .into_iter()
+            .filter_map(|(kind, pct)| Some(format!("{kind} {:.2}", pct?)));
         let all: Vec<_> = alone.chain(kinds).collect();
-        let _ = writeln!(text, "{}, right % by each alone: {}", result.name, all.join(", "));
+        let _ = writeln!(
+            text,
+            "{}, right % by each alone: {}",
+            result.name,
+            all.join(", ")
+        );
     }
     text
 }
@@ -55,7 +72,11 @@ const COLUMNS: usize = 8;
 
 fn row(result: &SceneResult) -> [String; COLUMNS] {
     let percent = |pct: Option<f64>| pct.map_or_else(|| "-".into(), |pct| format!("{pct:.2}"));
-    let best_alone = result.single_cav_accuracy_pct.values().copied().max_by(f64::total_cmp);
+    let best_alone = result
+        .single_cav_accuracy_pct
+        .values()
+        .copied()
+        .max_by(f64::total_cmp);
     let unseen: Vec<&str> = result.unseen_spots.iter().map(|id| id.as_str()).collect();
     [
         result.name.clone(),
@@ -65,6 +86,10 @@ fn row(result: &SceneResult) -> [String; COLUMNS] {
         percent(best_alone),
         percent(Some(result.always_empty_pct)),
         percent(result.recorded_pace_accuracy_pct),
-        if unseen.is_empty() { "-".into() } else { unseen.join(" ") },
+        if unseen.is_empty() {
+            "-".into()
+        } else {
+            unseen.join(" ")
+        },
     ]
 }

@@ -32,7 +32,11 @@ fn spot(id: u32, x: f64, y: f64, truth: Option<&str>) -> Value {
 fn seen(spots: &Value) -> Vec<bool> {
     let testbed = read(&lot(spots)).unwrap();
     let scene = &testbed.scenes[0];
-    scene.spots.iter().map(|spot| testbed.sighting(scene, &scene.cavs[0], spot).is_some()).collect()
+    scene
+        .spots
+        .iter()
+        .map(|spot| testbed.sighting(scene, &scene.cavs[0], spot).is_some())
+        .collect()
 }
 
 #[test]
@@ -41,7 +45,16 @@ fn the_recorded_setups_are_read_in_metres_and_radians() {
     assert_eq!((first.scenes.len(), second.scenes.len()), (5, 6));
     assert_eq!(first.camera.capture_interval, Duration::from_millis(100));
     assert_eq!(first.camera.submission_interval, Duration::from_millis(500));
-    assert!((first.camera.intrinsics.horizontal_field_of_view().to_degrees() - 62.2).abs() < 1e-9);
+    assert!(
+        (first
+            .camera
+            .intrinsics
+            .horizontal_field_of_view()
+            .to_degrees()
+            - 62.2)
+            .abs()
+            < 1e-9
+    );
     let scene = first.scene("setup1-lot1").unwrap();
     let landmarks = scene.landmarks(&first.placard);
     assert_eq!(landmarks[5].id, "slot-5");
@@ -50,7 +63,11 @@ fn the_recorded_setups_are_read_in_metres_and_radians() {
     assert_eq!(landmarks[5].vacancy.as_ref().unwrap().label, "EMPTY");
     assert_eq!(scene.spots[0].truth.as_deref(), Some("EFGH456"));
     assert_eq!(scene.spots[2].truth, None);
-    assert_eq!(first.cards(scene).len(), 8 + 6, "every spot has its sign, six have a vehicle");
+    assert_eq!(
+        first.cards(scene).len(),
+        8 + 6,
+        "every spot has its sign, six have a vehicle"
+    );
     assert_eq!(scene.cavs[3].name.as_str(), "watson");
     assert!((scene.cavs[3].pose.heading_rad - (-127f64).to_radians()).abs() < 1e-12);
     assert_eq!(scene.recorded[0].single_cav_accuracy_pct[0].1, 27.62);
@@ -68,7 +85,13 @@ fn what_was_recorded_may_be_told_in_part() {
     let mut file = lot(&json!([spot(1, 10.0, 0.0, None)]));
     file["scenes"][0]["recorded"] = json!([{"run": "14a"}, {"pace_accuracy_pct": 87.5}]);
     let recorded = read(&file).unwrap().scenes[0].recorded.clone();
-    assert_eq!(recorded.iter().filter_map(|run| run.pace_accuracy_pct).collect::<Vec<_>>(), [87.5]);
+    assert_eq!(
+        recorded
+            .iter()
+            .filter_map(|run| run.pace_accuracy_pct)
+            .collect::<Vec<_>>(),
+        [87.5]
+    );
 }
 
 #[test]
@@ -84,9 +107,21 @@ fn other_files_of_the_kind_may_leave_much_out() {
     let testbed = read(&file).unwrap();
     let spots = &testbed.scenes[0].spots;
     assert_eq!(spots[0].id, "slot-north");
-    assert!(spots.iter().all(|spot| (spot.facing_rad + FRAC_PI_2).abs() < 1e-12), "all face as the only one that can");
+    assert!(
+        spots
+            .iter()
+            .all(|spot| (spot.facing_rad + FRAC_PI_2).abs() < 1e-12),
+        "all face as the only one that can"
+    );
     assert_eq!(testbed.cards(&testbed.scenes[0]).len(), 3);
-    assert_eq!(read(&lot(&json!([{"id": 0, "occupied_placard": [1, 1]}]))).unwrap().scenes[0].spots[0].facing_rad, 0.0);
+    assert_eq!(
+        read(&lot(&json!([{"id": 0, "occupied_placard": [1, 1]}])))
+            .unwrap()
+            .scenes[0]
+            .spots[0]
+            .facing_rad,
+        0.0
+    );
     let mut none = lot(&json!([]));
     none["scenes"][0]["cavs"] = json!([]);
     assert!(read(&none).unwrap().scenes[0].cavs.is_empty());
@@ -116,7 +151,9 @@ fn errors_name_the_scene_the_key_and_the_value() {
         scene(&|scene| scene["spots"][0]["occupied_placard"] = json!([1e9, 0])),
         "scene lot: `spots[0].occupied_placard` is [1000000000.0, 0.0], must be within ±1000000 inches"
     );
-    assert!(scene(&|scene| scene["cavs"][0] = json!({"id": "a"})).contains("missing field `position`"));
+    assert!(
+        scene(&|scene| scene["cavs"][0] = json!({"id": "a"})).contains("missing field `position`")
+    );
     assert!(scene(&|scene| *scene = json!({"spots": []})).starts_with("scene 0: "));
     assert_eq!(
         broken(&|file| file["camera"]["vertical_fov_deg"] = json!(180)),
@@ -129,7 +166,8 @@ fn errors_name_the_scene_the_key_and_the_value() {
     for interval_s in [1e-9, 0.0, -1.0, 7200.0] {
         let error = broken(&|file| file["camera"]["capture_interval_s"] = json!(interval_s));
         assert!(
-            error.starts_with("scene file: `camera.capture_interval_s` is ") && error.contains("0.0001"),
+            error.starts_with("scene file: `camera.capture_interval_s` is ")
+                && error.contains("0.0001"),
             "{error}"
         );
     }
@@ -137,30 +175,61 @@ fn errors_name_the_scene_the_key_and_the_value() {
         file["camera"]["capture_interval_s"] = json!(0.001);
         file["camera"]["submission_interval_s"] = json!(60);
     });
-    assert_eq!(hours, "scene file: `camera.submission_interval_s` is 60, must be above 0.0001 and at most 1");
+    assert_eq!(
+        hours,
+        "scene file: `camera.submission_interval_s` is 60, must be above 0.0001 and at most 1"
+    );
     assert_eq!(
         broken(&|file| file["scenes"] = json!([])),
         "scene file: `scenes` is empty, must have at least one scene"
     );
-    assert!(matches!(Testbed::from_json("{"), Err(TestbedError::NotJson(_))));
+    assert!(matches!(
+        Testbed::from_json("{"),
+        Err(TestbedError::NotJson(_))
+    ));
 }
 
 #[test]
 fn a_spot_is_seen_from_the_front_and_whole() {
     assert_eq!(seen(&json!([spot(0, 15.0, 0.0, Some("A"))])), [true]);
     let edge = 15.0 * 31.1f64.to_radians().tan() - 1.9375 / 2.0;
-    assert_eq!(seen(&json!([spot(0, 15.0, edge - 0.01, Some("A"))])), [true]);
-    assert_eq!(seen(&json!([spot(0, 15.0, edge + 0.01, Some("A"))])), [false], "cut by the left edge of the image");
-    assert_eq!(seen(&json!([spot(0, -15.0, 0.0, Some("A"))])), [false], "behind the camera");
-    let from_behind = json!({"id": 0, "occupied_placard": [15, 0], "empty_placard": [11, 0], "truth": "A"});
+    assert_eq!(
+        seen(&json!([spot(0, 15.0, edge - 0.01, Some("A"))])),
+        [true]
+    );
+    assert_eq!(
+        seen(&json!([spot(0, 15.0, edge + 0.01, Some("A"))])),
+        [false],
+        "cut by the left edge of the image"
+    );
+    assert_eq!(
+        seen(&json!([spot(0, -15.0, 0.0, Some("A"))])),
+        [false],
+        "behind the camera"
+    );
+    let from_behind =
+        json!({"id": 0, "occupied_placard": [15, 0], "empty_placard": [11, 0], "truth": "A"});
     assert_eq!(seen(&json!([from_behind])), [false]);
-    assert_eq!(seen(&json!([spot(0, 2.0, 0.0, Some("A"))])), [false], "taller than the image");
-    assert_eq!(seen(&json!([spot(0, 0.0, 0.0, Some("A"))])), [false], "on the camera itself");
+    assert_eq!(
+        seen(&json!([spot(0, 2.0, 0.0, Some("A"))])),
+        [false],
+        "taller than the image"
+    );
+    assert_eq!(
+        seen(&json!([spot(0, 0.0, 0.0, Some("A"))])),
+        [false],
+        "on the camera itself"
+    );
 }
 
 #[test]
 fn a_parked_vehicle_hides_what_is_behind_it() {
-    let cover = |y: f64| seen(&json!([spot(0, 16.0, 0.0, None), spot(1, 8.0, y, Some("A"))]))[0];
+    let cover = |y: f64| {
+        seen(&json!([
+            spot(0, 16.0, 0.0, None),
+            spot(1, 8.0, y, Some("A"))
+        ]))[0]
+    };
     assert!(!cover(0.0));
     // Seen from the origin, the code of the sign ends at a slope of 0.0497, the plate before it begins at (y - 1.375) /
     // 8.
@@ -170,13 +239,25 @@ fn a_parked_vehicle_hides_what_is_behind_it() {
     let testbed = read(&lot(&json!([spot(0, 15.0, 0.0, Some("A"))]))).unwrap();
     let [sign, plate] = testbed.cards(&testbed.scenes[0]).try_into().unwrap();
     let cards = [sign.clone(), plate.clone()];
-    assert_eq!(Sighting::of(&sign, &cards, &camera, &testbed).unwrap().shown, 0.0);
+    assert_eq!(
+        Sighting::of(&sign, &cards, &camera, &testbed)
+            .unwrap()
+            .shown,
+        0.0
+    );
     let sighting = Sighting::of(&plate, &cards, &camera, &testbed).unwrap();
     assert_eq!((sighting.shown, sighting.yaw_rad), (1.0, 0.0));
     assert!((sighting.range_m - 0.381).abs() < 1e-12);
     let fx = testbed.camera.intrinsics.fx;
     assert!((sighting.width_px - fx * 1.9375 / 15.0).abs() < 1e-9);
-    assert_eq!(plate.hit(&camera, 0.0).unwrap(), Hit { depth_m: 0.381, right_m: 0.0, front: true });
+    assert_eq!(
+        plate.hit(&camera, 0.0).unwrap(),
+        Hit {
+            depth_m: 0.381,
+            right_m: 0.0,
+            front: true
+        }
+    );
     assert!(wrap(plate.facing_rad - PI) < 1e-12);
 }
 

@@ -45,18 +45,29 @@ impl Trial<'_> {
     pub fn run(&self, progress: impl Fn() + Sync) -> anyhow::Result<SceneResult> {
         let reports = self.reports(&progress)?;
         let mut fused = self.aggregator(Algorithms::Pace);
-        let (mut voting, mut agreeing) = (self.aggregator(Algorithms::Vote), self.aggregator(Algorithms::Both));
+        let (mut voting, mut agreeing) = (
+            self.aggregator(Algorithms::Vote),
+            self.aggregator(Algorithms::Both),
+        );
         let alone = || (self.aggregator(Algorithms::Pace), SpotScore::default());
-        let mut alone: BTreeMap<NodeName, (Aggregator, SpotScore)> =
-            self.scene.cavs.iter().map(|cav| (cav.name.clone(), alone())).collect();
+        let mut alone: BTreeMap<NodeName, (Aggregator, SpotScore)> = self
+            .scene
+            .cavs
+            .iter()
+            .map(|cav| (cav.name.clone(), alone()))
+            .collect();
         let [mut score, mut votes, mut answers] = [SpotScore::default(); 3];
         for verdict in 0..self.verdicts {
-            let steps = verdict * self.frames_per_verdict()..(verdict + 1) * self.frames_per_verdict();
-            let of_verdict = |cav: &[ObjectReport]| cav[steps.start as usize..steps.end as usize].to_vec();
+            let steps =
+                verdict * self.frames_per_verdict()..(verdict + 1) * self.frames_per_verdict();
+            let of_verdict =
+                |cav: &[ObjectReport]| cav[steps.start as usize..steps.end as usize].to_vec();
             let all: Vec<_> = reports.values().flat_map(|cav| of_verdict(cav)).collect();
-            for (aggregator, score) in
-                [(&mut fused, &mut score), (&mut voting, &mut votes), (&mut agreeing, &mut answers)]
-            {
+            for (aggregator, score) in [
+                (&mut fused, &mut score),
+                (&mut voting, &mut votes),
+                (&mut agreeing, &mut answers),
+            ] {
                 self.judge(aggregator, all.clone(), score);
             }
             for (name, cav) in &reports {
@@ -65,15 +76,30 @@ impl Trial<'_> {
                 }
             }
         }
-        let alone = alone.into_iter().map(|(name, (_, score))| (name, score)).collect();
+        let alone = alone
+            .into_iter()
+            .map(|(name, (_, score))| (name, score))
+            .collect();
         let result = SceneResult::new(self.testbed, self.scene, self.verdicts, &score, &alone);
-        let [vote_accuracy_pct, answer_accuracy_pct] = [votes, answers].map(|score| Some(score.accuracy_pct()));
-        Ok(SceneResult { vote_accuracy_pct, answer_accuracy_pct, ..result })
+        let [vote_accuracy_pct, answer_accuracy_pct] =
+            [votes, answers].map(|score| Some(score.accuracy_pct()));
+        Ok(SceneResult {
+            vote_accuracy_pct,
+            answer_accuracy_pct,
+            ..result
+        })
     }
 
     /// Fuses one verdict's reports and judges what comes of them.
-    fn judge(&self, aggregator: &mut Aggregator, reports: Vec<ObjectReport>, score: &mut SpotScore) {
-        let Some(Fused { map, verdicts, .. }) = fuse(aggregator, reports) else { return };
+    fn judge(
+        &self,
+        aggregator: &mut Aggregator,
+        reports: Vec<ObjectReport>,
+        score: &mut SpotScore,
+    ) {
+        let Some(Fused { map, verdicts, .. }) = fuse(aggregator, reports) else {
+            return;
+        };
         match (map, verdicts) {
             (Some(map), _) => score.judge(self.testbed, self.scene, &map),
             (None, Some(verdicts)) => score.judge_verdicts(self.testbed, self.scene, &verdicts),
@@ -84,27 +110,45 @@ impl Trial<'_> {
     /// Frames that every vehicle captures for one verdict.
     pub fn frames_per_verdict(&self) -> u64 {
         let camera = &self.testbed.camera;
-        let frames = camera.submission_interval.as_secs_f64() / camera.capture_interval.as_secs_f64();
+        let frames =
+            camera.submission_interval.as_secs_f64() / camera.capture_interval.as_secs_f64();
         (frames.round() as u64).max(1)
     }
 
     /// Every vehicle's reports, one for each frame.
-    fn reports(&self, progress: &(impl Fn() + Sync)) -> anyhow::Result<BTreeMap<NodeName, Vec<ObjectReport>>> {
+    fn reports(
+        &self,
+        progress: &(impl Fn() + Sync),
+    ) -> anyhow::Result<BTreeMap<NodeName, Vec<ObjectReport>>> {
         let next = AtomicU64::new(0);
         let done = Mutex::new(BTreeMap::new());
-        let workers = thread::available_parallelism().map_or(1, usize::from).min(self.scene.cavs.len().max(1));
+        let workers = thread::available_parallelism()
+            .map_or(1, usize::from)
+            .min(self.scene.cavs.len().max(1));
         thread::scope(|scope| {
             let work = || {
-                while let Some(cav) = self.scene.cavs.get(next.fetch_add(1, Ordering::Relaxed) as usize) {
-                    let reports = self.watch(cav, progress).with_context(|| format!("vehicle {}", cav.name));
-                    done.lock().unwrap_or_else(std::sync::PoisonError::into_inner).insert(cav.name.clone(), reports);
+                while let Some(cav) = self
+                    .scene
+                    .cavs
+                    .get(next.fetch_add(1, Ordering::Relaxed) as usize)
+                {
+                    let reports = self
+                        .watch(cav, progress)
+                        .with_context(|| format!("vehicle {}", cav.name));
+                    done.lock()
+                        .unwrap_or_else(std::sync::PoisonError::into_inner)
+                        .insert(cav.name.clone(), reports);
                 }
             };
             (1..workers).for_each(|_| drop(scope.spawn(work)));
             work();
         });
-        let done = done.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
-        done.into_iter().map(|(name, reports)| Ok((name, reports?))).collect()
+        let done = done
+            .into_inner()
+            .unwrap_or_else(std::sync::PoisonError::into_inner);
+        done.into_iter()
+            .map(|(name, reports)| Ok((name, reports?)))
+            .collect()
     }
 
     /// One vehicle's reports.
@@ -116,7 +160,11 @@ impl Trial<'_> {
         (0..self.verdicts * self.frames_per_verdict())
             .map(|seq| {
                 let captured_at = START + interval * u32::try_from(seq)?;
-                let frame = CameraFrame { image: camera.frame(seq)?, captured_at, seq };
+                let frame = CameraFrame {
+                    image: camera.frame(seq)?,
+                    captured_at,
+                    seq,
+                };
                 let report = perception.report(detector.detect(&frame)?, captured_at);
                 progress();
                 Ok(report)
@@ -126,19 +174,29 @@ impl Trial<'_> {
 
     fn aggregator(&self, algorithms: Algorithms) -> Aggregator {
         let landmarks = self.scene.landmarks(&self.testbed.placard);
-        let fusion = FusionConfig { algorithms, ..setup::fusion(self.testbed) };
+        let fusion = FusionConfig {
+            algorithms,
+            ..setup::fusion(self.testbed)
+        };
         Aggregator::new(NodeName::from_static("edge"), 1, fusion, landmarks, START)
     }
 }
 
 /// Fuses one verdict's reports in the order of capture, each for the algorithms that run, and returns the last round.
 fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<Fused> {
-    reports.sort_by(|a, b| a.captured_at_us.cmp(&b.captured_at_us).then_with(|| a.node.cmp(&b.node)));
+    reports.sort_by(|a, b| {
+        a.captured_at_us
+            .cmp(&b.captured_at_us)
+            .then_with(|| a.node.cmp(&b.node))
+    });
     let last = reports.last()?.captured_at_us;
     let mut round = None;
     for report in &reports {
         let (node, captured_at) = (&report.node, report.captured_at_us);
-        for (kind, report) in [(ReportKind::VoteDetections, votes(report)), (ReportKind::Detections, report.clone())] {
+        for (kind, report) in [
+            (ReportKind::VoteDetections, votes(report)),
+            (ReportKind::Detections, report.clone()),
+        ] {
             match aggregator.report(kind, &Arc::new(report), captured_at) {
                 Ok(closed) => round = closed.or(round),
                 Err(RejectReason::NotFused) => {}

@@ -11,7 +11,8 @@ use ecod::model::time::Timestamp;
 use ecod::neighbours::Neighbours;
 use ecod::tracking::HandOvers;
 use ecod::wire::{
-    CellMap, FusedObject, GlobalMap, ObjectReport, RegionTopic, RegionTopicKind, ReportKind, SCHEMA_VERSION,
+    CellMap, FusedObject, GlobalMap, ObjectReport, RegionTopic, RegionTopicKind, ReportKind,
+    SCHEMA_VERSION,
 };
 use uuid::Uuid;
 
@@ -33,12 +34,21 @@ pub(super) struct TownCell {
 }
 
 impl TownCell {
-    pub(super) fn new(name: NodeName, frame: CellFrame, config: FusionConfig, start: Timestamp) -> Self {
+    pub(super) fn new(
+        name: NodeName,
+        frame: CellFrame,
+        config: FusionConfig,
+        start: Timestamp,
+    ) -> Self {
         let tile = Quadkey::of_cell(&frame.origin);
         Self {
             aggregator: Aggregator::new(name.clone(), 1, config, Vec::new(), frame.time(start)),
             neighbours: Neighbours::new(name.clone(), frame.origin),
-            topic: RegionTopic { tile, cell: name, kind: RegionTopicKind::Map },
+            topic: RegionTopic {
+                tile,
+                cell: name,
+                kind: RegionTopicKind::Map,
+            },
             frame,
             maps: Vec::new(),
             sent_at: Timestamp(0),
@@ -64,18 +74,27 @@ impl TownCell {
     pub(super) fn report(&mut self, report: &ObjectReport, now: Timestamp) {
         let at = self.frame.time(now);
         let report = Arc::new(self.frame.report(report));
-        let fused = self.aggregator.report(ReportKind::Detections, &report, at).unwrap_or_default();
+        let fused = self
+            .aggregator
+            .report(ReportKind::Detections, &report, at)
+            .unwrap_or_default();
         self.keep(fused, at);
     }
 
     fn keep(&mut self, fused: Option<Fused>, at: Timestamp) {
-        let Some(map) = fused.and_then(|fused| fused.map) else { return };
+        let Some(map) = fused.and_then(|fused| fused.map) else {
+            return;
+        };
         self.neighbours.observe_own(&map, at);
         self.maps.push((self.frame.town_time(at), map));
     }
 
     /// The newest map, if it is due at `now` to be sent and was not considered before.
-    pub(super) fn due_map(&mut self, now: Timestamp, period: Duration) -> Option<(RegionTopic, CellMap)> {
+    pub(super) fn due_map(
+        &mut self,
+        now: Timestamp,
+        period: Duration,
+    ) -> Option<(RegionTopic, CellMap)> {
         // Rounds come a little early or late.
         if self.maps.len() == self.considered || now.since(self.sent_at) < period - period / 10 {
             return None;
@@ -83,10 +102,22 @@ impl TownCell {
         self.considered = self.maps.len();
         self.sent_at = now;
         let map = self.maps.last()?.1.clone();
-        let map = GlobalMap { neighbour_objects: Vec::new(), ..map };
+        let map = GlobalMap {
+            neighbour_objects: Vec::new(),
+            ..map
+        };
         let (cell, origin) = (self.topic.cell.clone(), self.frame.origin);
         let sent_at_us = self.frame.time(now);
-        Some((self.topic.clone(), CellMap { schema: SCHEMA_VERSION, cell, sent_at_us, origin, map }))
+        Some((
+            self.topic.clone(),
+            CellMap {
+                schema: SCHEMA_VERSION,
+                cell,
+                sent_at_us,
+                origin,
+                map,
+            },
+        ))
     }
 
     pub(super) fn receive(&mut self, topic: &RegionTopic, message: CellMap, now: Timestamp) {
@@ -95,7 +126,13 @@ impl TownCell {
         match self.neighbours.accept(topic, message, at) {
             Ok(()) => {
                 let objects: Arc<[_]> = self.neighbours.near(at).into();
-                self.aggregator.command(&Command::TakeNeighbours { objects, stated_at: at }, at);
+                self.aggregator.command(
+                    &Command::TakeNeighbours {
+                        objects,
+                        stated_at: at,
+                    },
+                    at,
+                );
             }
             Err(_) => self.refused += 1,
         }
@@ -105,10 +142,17 @@ impl TownCell {
     pub(super) fn objects_at(&self, at: Timestamp, within: Duration) -> Vec<FusedObject> {
         let distance = |time: Timestamp| at.micros_from(time).unsigned_abs();
         let from = self.maps.partition_point(|(time, _)| *time + within < at);
-        let near = self.maps[from..].iter().take_while(|(time, _)| *time <= at + within);
-        let Some((time, map)) = near.min_by_key(|(time, _)| distance(*time)) else { return Vec::new() };
+        let near = self.maps[from..]
+            .iter()
+            .take_while(|(time, _)| *time <= at + within);
+        let Some((time, map)) = near.min_by_key(|(time, _)| distance(*time)) else {
+            return Vec::new();
+        };
         let ahead_s = at.micros_from(*time) as f64 * 1e-6;
-        map.objects.iter().map(|object| self.frame.town_object(object, ahead_s)).collect()
+        map.objects
+            .iter()
+            .map(|object| self.frame.town_object(object, ahead_s))
+            .collect()
     }
 
     pub(super) fn hand_overs(&self) -> HandOvers {
@@ -116,6 +160,9 @@ impl TownCell {
     }
 
     pub(super) fn identities(&self) -> BTreeSet<Uuid> {
-        self.maps.iter().flat_map(|(_, map)| map.objects.iter().map(|object| object.id)).collect()
+        self.maps
+            .iter()
+            .flat_map(|(_, map)| map.objects.iter().map(|object| object.id))
+            .collect()
     }
 }

@@ -21,7 +21,11 @@ impl CellFrame {
         let place = |x_m| origin.to_map(&town.to_wgs84(x_m, 0.0, 0.0)).xy();
         let (zero, east) = (place(0.0), place(100.0));
         let angle = (east.y - zero.y).atan2(east.x - zero.x);
-        Self { origin, into: Isometry2::new(zero.coords, angle), clock_us }
+        Self {
+            origin,
+            into: Isometry2::new(zero.coords, angle),
+            clock_us,
+        }
     }
 
     pub(super) fn time(&self, town: Timestamp) -> Timestamp {
@@ -44,9 +48,15 @@ impl CellFrame {
         for object in &mut report.objects {
             let place = self.into * Point2::new(object.x_m, object.y_m);
             (object.x_m, object.y_m) = (place.x, place.y);
-            object.velocity_mps = object.velocity_mps.map(|velocity| (self.into * Vector2::from(velocity)).into());
-            object.heading_rad = object.heading_rad.map(|heading| wrap_angle(heading + self.into.rotation.angle()));
-            object.covariance_m2 = object.covariance_m2.map(|covariance| turned(covariance, &self.into));
+            object.velocity_mps = object
+                .velocity_mps
+                .map(|velocity| (self.into * Vector2::from(velocity)).into());
+            object.heading_rad = object
+                .heading_rad
+                .map(|heading| wrap_angle(heading + self.into.rotation.angle()));
+            object.covariance_m2 = object
+                .covariance_m2
+                .map(|covariance| turned(covariance, &self.into));
         }
         report
     }
@@ -57,7 +67,12 @@ impl CellFrame {
         let velocity: Vector2<f64> = back * Vector2::from(object.velocity_mps.unwrap_or_default());
         let place = back * Point2::new(object.x_m, object.y_m) + velocity * ahead_s;
         let covariance_m2 = turned(object.covariance_m2, &back);
-        FusedObject { x_m: place.x, y_m: place.y, covariance_m2, ..object.clone() }
+        FusedObject {
+            x_m: place.x,
+            y_m: place.y,
+            covariance_m2,
+            ..object.clone()
+        }
     }
 }
 

@@ -142,7 +142,14 @@ impl Default for SensorConfig {
 
 impl Default for SaidConfig {
     fn default() -> Self {
-        Self { poses: true, covariances: true, views: true, velocities_mps: None, headings_rad: None, sizes_m: None }
+        Self {
+            poses: true,
+            covariances: true,
+            views: true,
+            velocities_mps: None,
+            headings_rad: None,
+            sizes_m: None,
+        }
     }
 }
 
@@ -164,7 +171,12 @@ impl TrafficConfig {
                 lures: 0.4,
                 ..SensorConfig::default()
             },
-            said: SaidConfig { poses: false, covariances: false, views: false, ..SaidConfig::default() },
+            said: SaidConfig {
+                poses: false,
+                covariances: false,
+                views: false,
+                ..SaidConfig::default()
+            },
             ..Self::default()
         }
     }
@@ -197,7 +209,12 @@ impl TrafficConfig {
         check_range("vehicles", self.vehicles as f64, 1.0, lanes_m / 15.0)?;
         let posts = 4 * self.roads * self.roads;
         let max_observers = if self.fixed { posts } else { self.vehicles };
-        check_range("observers", self.observers as f64, 1.0, max_observers as f64)?;
+        check_range(
+            "observers",
+            self.observers as f64,
+            1.0,
+            max_observers as f64,
+        )?;
         check_range("parked", self.parked as f64, 0.0, lanes_m / 15.0)?;
         let max_standing = if self.fixed { 0 } else { self.parked };
         check_range("standing", self.standing as f64, 0.0, max_standing as f64)?;
@@ -206,11 +223,23 @@ impl TrafficConfig {
         check_range("duration_s", self.duration_s, 0.1, 3600.0)?;
         check_range("warm_up_s", self.warm_up_s, 0.0, 3600.0)?;
         check_range("memory_s", self.memory_s, 0.0, 3600.0)?;
-        let SaidConfig { velocities_mps, headings_rad, sizes_m, .. } = self.said;
-        for (key, value) in [("velocities_mps", velocities_mps), ("headings_rad", headings_rad), ("sizes_m", sizes_m)] {
-            check_range(key, value.unwrap_or_default(), 0.0, 100.0).map_err(|error| error.within("said"))?;
+        let SaidConfig {
+            velocities_mps,
+            headings_rad,
+            sizes_m,
+            ..
+        } = self.said;
+        for (key, value) in [
+            ("velocities_mps", velocities_mps),
+            ("headings_rad", headings_rad),
+            ("sizes_m", sizes_m),
+        ] {
+            check_range(key, value.unwrap_or_default(), 0.0, 100.0)
+                .map_err(|error| error.within("said"))?;
         }
-        self.sensor.validate().map_err(|error| error.within("sensor"))
+        self.sensor
+            .validate()
+            .map_err(|error| error.within("sensor"))
     }
 }
 

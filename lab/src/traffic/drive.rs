@@ -33,7 +33,12 @@ pub(super) struct MovingVehicle {
 }
 
 /// Vehicles at random places on random routes; in a convoy, the first `convoy` are one behind the other.
-pub(super) fn vehicles(roads: &Roads, count: usize, convoy: usize, dice: &mut Dice<'_>) -> Vec<MovingVehicle> {
+pub(super) fn vehicles(
+    roads: &Roads,
+    count: usize,
+    convoy: usize,
+    dice: &mut Dice<'_>,
+) -> Vec<MovingVehicle> {
     let lanes = roads.lanes();
     let mut vehicles: Vec<MovingVehicle> = Vec::with_capacity(count);
     while vehicles.len() < count {
@@ -42,7 +47,11 @@ pub(super) fn vehicles(roads: &Roads, count: usize, convoy: usize, dice: &mut Di
             path: lanes[dice.below(lanes.len())],
             along_m: dice.between(0.0, roads.length_m(lanes[0])),
             speed_mps: 0.0,
-            length_m: if is_van { dice.between(5.5, 7.0) } else { dice.between(3.8, 4.9) },
+            length_m: if is_van {
+                dice.between(5.5, 7.0)
+            } else {
+                dice.between(3.8, 4.9)
+            },
             width_m: if is_van { 2.1 } else { 1.8 },
             desired_mps: dice.between(8.0, 14.0),
             route: (0..ROUTE).map(|_| dice.below(4) as u8).collect(),
@@ -96,7 +105,11 @@ fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) ->
     let me = &vehicles[number];
     let remaining_m = roads.length_m(me.path) - me.along_m;
     let next = me.next(roads);
-    let mut ahead = Ahead { gap_m: f64::INFINITY, speed_mps: 0.0, limit_mps: f64::INFINITY };
+    let mut ahead = Ahead {
+        gap_m: f64::INFINITY,
+        speed_mps: 0.0,
+        limit_mps: f64::INFINITY,
+    };
     let mut mind = |distance_m: f64, other: &MovingVehicle| {
         let gap_m = distance_m - (me.length_m + other.length_m) / 2.0;
         if gap_m < ahead.gap_m {
@@ -104,10 +117,17 @@ fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) ->
         }
     };
     let after = match next {
-        Path::Turn { at, to, .. } => Path::Lane { from: at, heading: to },
+        Path::Turn { at, to, .. } => Path::Lane {
+            from: at,
+            heading: to,
+        },
         lane @ Path::Lane { .. } => lane,
     };
-    for (place, other) in vehicles.iter().enumerate().filter(|(place, _)| *place != number) {
+    for (place, other) in vehicles
+        .iter()
+        .enumerate()
+        .filter(|(place, _)| *place != number)
+    {
         if other.path == me.path && (other.along_m, place) > (me.along_m, number) {
             mind(other.along_m - me.along_m, other);
         } else if other.path != me.path && me.shares_beginning(other, next) {
@@ -123,7 +143,8 @@ fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) ->
                 ahead.limit_mps = (BEND_MPS * BEND_MPS + 2.0 * BRAKING * remaining_m).sqrt();
             }
             let can_stop = remaining_m > me.speed_mps * me.speed_mps / (2.0 * HARDEST_BRAKING);
-            let may_go = (roads.is_green(at, heading, at_s) || !can_stop) && is_free(vehicles, number, at, heading, to);
+            let may_go = (roads.is_green(at, heading, at_s) || !can_stop)
+                && is_free(vehicles, number, at, heading, to);
             let to_line_m = remaining_m - me.length_m / 2.0;
             if !may_go && to_line_m < ahead.gap_m {
                 (ahead.gap_m, ahead.speed_mps) = (to_line_m, 0.0);
@@ -136,18 +157,33 @@ fn ahead(roads: &Roads, vehicles: &[MovingVehicle], number: usize, at_s: f64) ->
 }
 
 /// True if nobody on the crossing is in the way, and there is room behind it.
-fn is_free(vehicles: &[MovingVehicle], number: usize, crossing: Crossing, heading: Direction, to: Direction) -> bool {
+fn is_free(
+    vehicles: &[MovingVehicle],
+    number: usize,
+    crossing: Crossing,
+    heading: Direction,
+    to: Direction,
+) -> bool {
     let is_left = |from: Direction, to: Direction| (from + 1) % 4 == to % 4;
-    vehicles.iter().enumerate().filter(|(place, _)| *place != number).all(|(_, other)| match other.path {
-        Path::Turn { at, from, to: other_to } if at == crossing => {
-            let faces = (from + 2) % 4 == heading % 4;
-            from == heading || (faces && !is_left(heading, to) && !is_left(from, other_to))
-        }
-        Path::Lane { from, heading: other_heading } if from == crossing && other_heading == to => {
-            other.along_m > ROOM_M
-        }
-        _ => true,
-    })
+    vehicles
+        .iter()
+        .enumerate()
+        .filter(|(place, _)| *place != number)
+        .all(|(_, other)| match other.path {
+            Path::Turn {
+                at,
+                from,
+                to: other_to,
+            } if at == crossing => {
+                let faces = (from + 2) % 4 == heading % 4;
+                from == heading || (faces && !is_left(heading, to) && !is_left(from, other_to))
+            }
+            Path::Lane {
+                from,
+                heading: other_heading,
+            } if from == crossing && other_heading == to => other.along_m > ROOM_M,
+            _ => true,
+        })
 }
 
 impl MovingVehicle {
@@ -155,9 +191,14 @@ impl MovingVehicle {
     #[expect(clippy::expect_used, reason = "the grid of roads has no dead ends")]
     fn next(&self, roads: &Roads) -> Path {
         match self.path {
-            Path::Turn { at, to, .. } => Path::Lane { from: at, heading: to },
+            Path::Turn { at, to, .. } => Path::Lane {
+                from: at,
+                heading: to,
+            },
             Path::Lane { from, heading } => {
-                let at = roads.next(from, heading).expect("every lane leads to a crossing");
+                let at = roads
+                    .next(from, heading)
+                    .expect("every lane leads to a crossing");
                 let [straight, left, right] = [heading, (heading + 1) % 4, (heading + 3) % 4];
                 let wishes = match self.route[self.crossed % self.route.len()] {
                     0 | 1 => [straight, right, left],
@@ -165,7 +206,11 @@ impl MovingVehicle {
                     _ => [left, straight, right],
                 };
                 let to = wishes.into_iter().find(|to| roads.next(at, *to).is_some());
-                Path::Turn { at, from: heading, to: to.expect("a crossing has two other roads at least") }
+                Path::Turn {
+                    at,
+                    from: heading,
+                    to: to.expect("a crossing has two other roads at least"),
+                }
             }
         }
     }
@@ -173,9 +218,14 @@ impl MovingVehicle {
     /// True if another is on this one's way: behind the same stop line, wherever it turns to.
     fn shares_beginning(&self, other: &Self, next: Path) -> bool {
         match (next, other.path) {
-            (Path::Turn { at, from, .. }, Path::Turn { at: other_at, from: other_from, .. }) => {
-                (at, from) == (other_at, other_from)
-            }
+            (
+                Path::Turn { at, from, .. },
+                Path::Turn {
+                    at: other_at,
+                    from: other_from,
+                    ..
+                },
+            ) => (at, from) == (other_at, other_from),
             (next, path) => next == path,
         }
     }
@@ -184,9 +234,12 @@ impl MovingVehicle {
         let desired = self.desired_mps.min(ahead.limit_mps);
         let closing = self.speed_mps - ahead.speed_mps;
         let wanted_m = GAP_M
-            + (self.speed_mps * GAP_S + self.speed_mps * closing / (2.0 * (ACCELERATION * BRAKING).sqrt())).max(0.0);
+            + (self.speed_mps * GAP_S
+                + self.speed_mps * closing / (2.0 * (ACCELERATION * BRAKING).sqrt()))
+            .max(0.0);
         let gap_m = ahead.gap_m.max(0.1);
-        let change = ACCELERATION * (1.0 - (self.speed_mps / desired).powi(4) - (wanted_m / gap_m).powi(2));
+        let change =
+            ACCELERATION * (1.0 - (self.speed_mps / desired).powi(4) - (wanted_m / gap_m).powi(2));
         self.speed_mps = (self.speed_mps + change.max(-HARDEST_BRAKING) * step_s).max(0.0);
     }
 }

@@ -28,7 +28,11 @@ pub(super) enum Path {
     /// From a crossing to the next.
     Lane { from: Crossing, heading: Direction },
     /// Over a crossing.
-    Turn { at: Crossing, from: Direction, to: Direction },
+    Turn {
+        at: Crossing,
+        from: Direction,
+        to: Direction,
+    },
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -56,7 +60,11 @@ impl Roads {
     /// The crossing that a lane leads to, `None` off the grid.
     pub(super) fn next(&self, (column, row): Crossing, heading: Direction) -> Option<Crossing> {
         let step = |at: usize, forward: bool| {
-            if forward { Some(at + 1).filter(|at| *at < self.count) } else { at.checked_sub(1) }
+            if forward {
+                Some(at + 1).filter(|at| *at < self.count)
+            } else {
+                at.checked_sub(1)
+            }
         };
         match heading % 4 {
             0 => Some((step(column, true)?, row)),
@@ -68,7 +76,8 @@ impl Roads {
 
     /// All lanes.
     pub(super) fn lanes(&self) -> Vec<Path> {
-        let crossings = (0..self.count).flat_map(|column| (0..self.count).map(move |row| (column, row)));
+        let crossings =
+            (0..self.count).flat_map(|column| (0..self.count).map(move |row| (column, row)));
         let lanes = crossings.flat_map(|from| (0..4).map(move |heading| (from, heading)));
         lanes
             .filter(|(from, heading)| self.next(*from, *heading).is_some())
@@ -88,7 +97,9 @@ impl Roads {
                 const PARTS: usize = 8;
                 let curve = self.curve(at, from, to);
                 let point = |part: usize| bezier(&curve, part as f64 / PARTS as f64).0;
-                (0..PARTS).map(|part| (point(part + 1) - point(part)).norm()).sum()
+                (0..PARTS)
+                    .map(|part| (point(part + 1) - point(part)).norm())
+                    .sum()
             }
         }
     }
@@ -121,7 +132,15 @@ impl Roads {
         let begin = center - unit(from) * CROSSING_M + right_of(from) * LANE_M;
         let end = center + unit(to) * CROSSING_M + right_of(to) * LANE_M;
         let corner = begin + unit(from) * (end - begin).dot(&unit(from));
-        [begin, if from % 4 == to % 4 { nalgebra::center(&begin, &end) } else { corner }, end]
+        [
+            begin,
+            if from % 4 == to % 4 {
+                nalgebra::center(&begin, &end)
+            } else {
+                corner
+            },
+            end,
+        ]
     }
 
     /// Position and heading in radians of a camera on a post: four look at each crossing, the middle one first.
@@ -130,7 +149,10 @@ impl Roads {
         let crossing = (number / 4 + crossings / 2 + self.count / 2) % crossings;
         let corner = number % 4;
         let out = (unit(corner) + unit(corner + 1)) * POST_M;
-        (self.center((crossing % self.count, crossing / self.count)) + out, (-out.y).atan2(-out.x))
+        (
+            self.center((crossing % self.count, crossing / self.count)) + out,
+            (-out.y).atan2(-out.x),
+        )
     }
 
     /// True if the signal lets this direction go.
@@ -144,19 +166,27 @@ impl Roads {
     /// The buildings, one a block.
     pub(super) fn buildings(&self) -> Vec<Building> {
         let half_m = self.block_m / 2.0 - BUILDING_M;
-        self.blocks().into_iter().map(|center| Building { center, half_m }).collect()
+        self.blocks()
+            .into_iter()
+            .map(|center| Building { center, half_m })
+            .collect()
     }
 
     /// The middles of all blocks.
     pub(super) fn blocks(&self) -> Vec<Point2<f64>> {
         let of = |number: usize| (number as f64 + 0.5) * self.block_m;
         let blocks = self.count - 1;
-        (0..blocks).flat_map(|column| (0..blocks).map(move |row| Point2::new(of(column), of(row)))).collect()
+        (0..blocks)
+            .flat_map(|column| (0..blocks).map(move |row| Point2::new(of(column), of(row))))
+            .collect()
     }
 }
 
 fn bezier([begin, control, end]: &[Point2<f64>; 3], share: f64) -> (Point2<f64>, Vector2<f64>) {
-    let (first, second) = (begin + (control - begin) * share, control + (end - control) * share);
+    let (first, second) = (
+        begin + (control - begin) * share,
+        control + (end - control) * share,
+    );
     (first + (second - first) * share, second - first)
 }
 

@@ -33,9 +33,15 @@ pub(super) struct Sight {
 }
 
 /// Bodies within `range_m` of a place, and how much of each is seen from there; the one at the place itself is not.
-pub(super) fn sights(from: Point2<f64>, bodies: &[TrafficBody], buildings: &[Building], range_m: f64) -> Vec<Sight> {
-    let mut sights: Vec<Sight> =
-        (0..bodies.len()).filter_map(|body| Sight::towards(from, body, &bodies[body], range_m)).collect();
+pub(super) fn sights(
+    from: Point2<f64>,
+    bodies: &[TrafficBody],
+    buildings: &[Building],
+    range_m: f64,
+) -> Vec<Sight> {
+    let mut sights: Vec<Sight> = (0..bodies.len())
+        .filter_map(|body| Sight::towards(from, body, &bodies[body], range_m))
+        .collect();
     sights.sort_by(|a, b| a.range_m.total_cmp(&b.range_m));
     for place in 0..sights.len() {
         let (nearer, rest) = sights.split_at_mut(place);
@@ -56,7 +62,13 @@ impl Sight {
         let bearing_rad = offset.y.atan2(offset.x);
         let (sin, cos) = (of.heading_rad - bearing_rad).sin_cos();
         let half_m = (of.length_m * sin.abs() + of.width_m * cos.abs()) / 2.0;
-        Some(Self { body, range_m, bearing_rad, share: 1.0, half_rad: half_m.atan2(range_m) })
+        Some(Self {
+            body,
+            range_m,
+            bearing_rad,
+            share: 1.0,
+            half_rad: half_m.atan2(range_m),
+        })
     }
 
     /// Share of the angle that none of the others covers.
@@ -85,7 +97,11 @@ fn past_buildings(from: Point2<f64>, sight: &Sight, buildings: &[Building]) -> f
         let (sin, cos) = (sight.bearing_rad + share * sight.half_rad).sin_cos();
         from + Vector2::new(cos, sin) * sight.range_m
     });
-    points.iter().filter(|to| !buildings.iter().any(|building| building.hides(&from, to))).count() as f64 / 3.0
+    points
+        .iter()
+        .filter(|to| !buildings.iter().any(|building| building.hides(&from, to)))
+        .count() as f64
+        / 3.0
 }
 
 #[cfg(test)]
@@ -107,13 +123,26 @@ mod tests {
     }
 
     fn share(bodies: &[TrafficBody], body: usize) -> f64 {
-        let buildings = Roads { count: 2, block_m: 80.0 }.buildings();
-        sights(bodies[0].center, bodies, &buildings, 100.0).into_iter().find(|sight| sight.body == body).unwrap().share
+        let buildings = Roads {
+            count: 2,
+            block_m: 80.0,
+        }
+        .buildings();
+        sights(bodies[0].center, bodies, &buildings, 100.0)
+            .into_iter()
+            .find(|sight| sight.body == body)
+            .unwrap()
+            .share
     }
 
     #[test]
     fn a_vehicle_hides_what_is_behind_it_and_nothing_else() {
-        let queue = [car(0.0, -2.0), car(10.0, -2.0), car(20.0, -2.0), car(20.0, 2.0)];
+        let queue = [
+            car(0.0, -2.0),
+            car(10.0, -2.0),
+            car(20.0, -2.0),
+            car(20.0, 2.0),
+        ];
         assert_eq!([1, 2].map(|body| share(&queue, body)), [1.0, 0.0]);
         assert!(share(&queue, 3) > 0.9, "the next lane is seen past it");
         let mut seen_over = queue.clone();
@@ -128,6 +157,9 @@ mod tests {
         // The building stands between 10 and 70 m on both axes.
         let corner = [car(0.0, 40.0), car(40.0, 0.0), car(5.0, 80.0)];
         assert_eq!([1, 2].map(|body| share(&corner, body)), [0.0, 1.0]);
-        assert!(sights(corner[0].center, &corner, &[], 30.0).is_empty(), "too far");
+        assert!(
+            sights(corner[0].center, &corner, &[], 30.0).is_empty(),
+            "too far"
+        );
     }
 }

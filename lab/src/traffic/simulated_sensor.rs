@@ -93,7 +93,13 @@ impl SimulatedSensor {
         Self {
             offset: [drift(), drift()],
             turn: drift(),
-            glances: (0..bodies).map(|_| Glance { quality: drift(), bias: [drift(), drift()], at_s: 0.0 }).collect(),
+            glances: (0..bodies)
+                .map(|_| Glance {
+                    quality: drift(),
+                    bias: [drift(), drift()],
+                    at_s: 0.0,
+                })
+                .collect(),
             ghosts: Vec::new(),
             last_s: 0.0,
         }
@@ -117,50 +123,104 @@ impl SimulatedSensor {
         let passed_s = around.at_s - self.last_s;
         self.last_s = around.at_s;
         let mut found: Vec<Found> = Vec::new();
-        for sight in around.sights.iter().filter(|sight| Self::sees(config, &around.pose, sight)) {
+        for sight in around
+            .sights
+            .iter()
+            .filter(|sight| Self::sees(config, &around.pose, sight))
+        {
             found.extend(self.glance(config, around, sight, dice));
         }
         self.haunt(config, around, passed_s, dice);
         for ghost in &self.ghosts {
             if dice.chance(GHOST_CHANCE) {
                 let confidence = share_of(0.6 * dice.normal() - 0.3);
-                found.push(Found { position: ghost.position, label: ghost.label, confidence, body: None });
+                found.push(Found {
+                    position: ghost.position,
+                    label: ghost.label,
+                    confidence,
+                    body: None,
+                });
             }
         }
         for lure in around.lures {
             let range_m = (lure - around.pose.position).norm();
             if range_m < LURE_RANGE * sensor.range_m && dice.chance(LURE_CHANCE) {
                 let confidence = share_of(0.6 * dice.normal() - 0.2);
-                found.push(Found { position: *lure, label: "car", confidence, body: None });
+                found.push(Found {
+                    position: *lure,
+                    label: "car",
+                    confidence,
+                    body: None,
+                });
             }
         }
         for _ in 0..dice.poisson(sensor.clutter) {
             let (position, label) = (somewhere(config, &around.pose, dice), around.label(dice));
-            found.push(Found { position, label, confidence: share_of(0.8 * dice.normal() - 0.9), body: None });
+            found.push(Found {
+                position,
+                label,
+                confidence: share_of(0.8 * dice.normal() - 0.9),
+                body: None,
+            });
         }
         let drift_s = if config.fixed { 0.0 } else { passed_s };
-        let error =
-            Vector2::from(self.offset.each_mut().map(|drift| drift.step(drift_s, POSE_S, dice))) * sensor.pose_m;
+        let error = Vector2::from(
+            self.offset
+                .each_mut()
+                .map(|drift| drift.step(drift_s, POSE_S, dice)),
+        ) * sensor.pose_m;
         let turned_rad = self.turn.step(drift_s, POSE_S, dice) * sensor.pose_rad;
-        let said = Pose { position: around.pose.position + error, heading_rad: around.pose.heading_rad + turned_rad };
+        let said = Pose {
+            position: around.pose.position + error,
+            heading_rad: around.pose.heading_rad + turned_rad,
+        };
         let is_posed = config.said.poses;
-        report.pose = is_posed.then(|| Pose { heading_rad: rounded(wrap_angle(said.heading_rad)), ..said }.into());
-        report.view = (is_posed && config.said.views)
-            .then_some(FieldOfView { range_m: sensor.range_m, angle_rad: sensor.angle_rad });
-        for Found { position, label, confidence, body } in found {
+        report.pose = is_posed.then(|| {
+            Pose {
+                heading_rad: rounded(wrap_angle(said.heading_rad)),
+                ..said
+            }
+            .into()
+        });
+        report.view = (is_posed && config.said.views).then_some(FieldOfView {
+            range_m: sensor.range_m,
+            angle_rad: sensor.angle_rad,
+        });
+        for Found {
+            position,
+            label,
+            confidence,
+            body,
+        } in found
+        {
             let (range_m, bearing_rad) = around.pose.range_bearing(&position);
             let along_m = sensor.noise_m + sensor.noise_per_m * range_m;
             let ahead_m = range_m + along_m * dice.normal();
             let aside_m = ACROSS * along_m * dice.normal();
             let (sin, cos) = bearing_rad.sin_cos();
-            let place = said.transform(ahead_m * cos - aside_m * sin, ahead_m * sin + aside_m * cos);
-            let covariance = Covariance::along_bearing(said.heading_rad + bearing_rad, along_m, ACROSS * along_m);
-            let mut object = PerceivedObject::new(label, rounded(confidence), rounded(place.x), rounded(place.y));
-            object.covariance_m2 = config
-                .said
-                .covariances
-                .then_some([covariance.xx, covariance.xy, covariance.yy].map(|v| (v * 1e6).round() / 1e6));
-            describe(&config.said, &mut object, body.map(|body| &around.bodies[body]), turned_rad, dice);
+            let place =
+                said.transform(ahead_m * cos - aside_m * sin, ahead_m * sin + aside_m * cos);
+            let covariance = Covariance::along_bearing(
+                said.heading_rad + bearing_rad,
+                along_m,
+                ACROSS * along_m,
+            );
+            let mut object = PerceivedObject::new(
+                label,
+                rounded(confidence),
+                rounded(place.x),
+                rounded(place.y),
+            );
+            object.covariance_m2 = config.said.covariances.then_some(
+                [covariance.xx, covariance.xy, covariance.yy].map(|v| (v * 1e6).round() / 1e6),
+            );
+            describe(
+                &config.said,
+                &mut object,
+                body.map(|body| &around.bodies[body]),
+                turned_rad,
+                dice,
+            );
             report.objects.push(object);
         }
     }
@@ -178,7 +238,12 @@ impl SimulatedSensor {
         let passed_s = around.at_s - glance.at_s;
         glance.at_s = around.at_s;
         let quality = glance.quality.step(passed_s, GLANCE_S, dice);
-        let bias = Vector2::from(glance.bias.each_mut().map(|drift| drift.step(passed_s, GLANCE_S, dice)));
+        let bias = Vector2::from(
+            glance
+                .bias
+                .each_mut()
+                .map(|drift| drift.step(passed_s, GLANCE_S, dice)),
+        );
         let far = sight.range_m / config.sensor.range_m;
         let small = if body.label == "car" { 0.0 } else { 0.8 };
         let log_odds = 4.0 - 4.5 * far * far - 5.0 * (1.0 - sight.share) - small + quality;
@@ -187,21 +252,34 @@ impl SimulatedSensor {
         }
         let hidden_m = 0.25 * (1.0 - sight.share) * body.length_m;
         let (sin, cos) = sight.bearing_rad.sin_cos();
-        let position = body.center + bias * config.sensor.bias_m - Vector2::new(cos, sin) * hidden_m;
+        let position =
+            body.center + bias * config.sensor.bias_m - Vector2::new(cos, sin) * hidden_m;
         let label = match body.label {
             "person" if dice.chance(CONFUSED) => "bicycle",
             "bicycle" if dice.chance(CONFUSED) => "person",
             label => label,
         };
         let confidence = share_of(0.6 * log_odds - 0.6 + 0.5 * dice.normal());
-        Some(Found { position, label, confidence, body: Some(sight.body) })
+        Some(Found {
+            position,
+            label,
+            confidence,
+            body: Some(sight.body),
+        })
     }
 
     /// Ends and begins what is not there.
-    fn haunt(&mut self, config: &TrafficConfig, around: &Surroundings<'_>, passed_s: f64, dice: &mut Dice<'_>) {
+    fn haunt(
+        &mut self,
+        config: &TrafficConfig,
+        around: &Surroundings<'_>,
+        passed_s: f64,
+        dice: &mut Dice<'_>,
+    ) {
         let range_m = config.sensor.range_m;
-        self.ghosts
-            .retain(|ghost| ghost.until_s > around.at_s && (ghost.position - around.pose.position).norm() < range_m);
+        self.ghosts.retain(|ghost| {
+            ghost.until_s > around.at_s && (ghost.position - around.pose.position).norm() < range_m
+        });
         for _ in 0..dice.poisson(config.sensor.ghosts_per_s * passed_s.min(1.0)) {
             self.ghosts.push(Ghost {
                 position: somewhere(config, &around.pose, dice),
@@ -224,10 +302,15 @@ fn describe(
     let speed_mps = body.map_or(0.0, |body| body.speed_mps);
     let size_m = body.map_or([4.5, 1.8], |body| [body.length_m, body.width_m]);
     let (sin, cos) = heading_rad.sin_cos();
-    object.velocity_mps =
-        said.velocities_mps.map(|sigma| [cos, sin].map(|part| rounded(speed_mps * part + sigma * dice.normal())));
-    object.heading_rad = said.headings_rad.map(|sigma| rounded(wrap_angle(heading_rad + sigma * dice.normal())));
-    object.size_m = said.sizes_m.map(|sigma| size_m.map(|side| rounded((side + sigma * dice.normal()).max(0.1))));
+    object.velocity_mps = said
+        .velocities_mps
+        .map(|sigma| [cos, sin].map(|part| rounded(speed_mps * part + sigma * dice.normal())));
+    object.heading_rad = said
+        .headings_rad
+        .map(|sigma| rounded(wrap_angle(heading_rad + sigma * dice.normal())));
+    object.size_m = said
+        .sizes_m
+        .map(|sigma| size_m.map(|side| rounded((side + sigma * dice.normal()).max(0.1))));
 }
 
 /// A place in view, all places alike.

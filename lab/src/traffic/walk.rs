@@ -26,12 +26,21 @@ pub(super) struct Walker {
     pauses_for_s: f64,
 }
 
-pub(super) fn walkers(roads: &Roads, count: usize, is_bicycle: bool, dice: &mut Dice<'_>) -> Vec<Walker> {
+pub(super) fn walkers(
+    roads: &Roads,
+    count: usize,
+    is_bicycle: bool,
+    dice: &mut Dice<'_>,
+) -> Vec<Walker> {
     let blocks = roads.blocks();
     let side_m = roads.block_m - 2.0 * if is_bicycle { KERB_M } else { PAVEMENT_M };
     let mut walker = || Walker {
         is_bicycle,
-        speed_mps: if is_bicycle { dice.between(3.0, 6.0) } else { dice.between(0.8, 1.8) },
+        speed_mps: if is_bicycle {
+            dice.between(3.0, 6.0)
+        } else {
+            dice.between(0.8, 1.8)
+        },
         block: blocks[dice.below(blocks.len())],
         side_m,
         along_m: dice.between(0.0, 4.0 * side_m),
@@ -54,16 +63,26 @@ impl Walker {
 
     /// The present speed.
     pub(super) fn speed_mps(&self) -> f64 {
-        if self.pauses_for_s > 0.0 { 0.0 } else { self.speed_mps }
+        if self.pauses_for_s > 0.0 {
+            0.0
+        } else {
+            self.speed_mps
+        }
     }
 
     /// Position and heading in radians.
     pub(super) fn place(&self) -> (Point2<f64>, f64) {
         let around_m = 4.0 * self.side_m;
-        let along_m = if self.is_clockwise { (around_m - self.along_m) % around_m } else { self.along_m };
+        let along_m = if self.is_clockwise {
+            (around_m - self.along_m) % around_m
+        } else {
+            self.along_m
+        };
         let side = (along_m / self.side_m) as usize % 4;
         let (along, out) = (unit(side), unit(side + 3));
-        let at = self.block + out * (self.side_m / 2.0) + along * (along_m - (side as f64 + 0.5) * self.side_m);
+        let at = self.block
+            + out * (self.side_m / 2.0)
+            + along * (along_m - (side as f64 + 0.5) * self.side_m);
         let turned = if self.is_clockwise { 2.0 } else { 0.0 };
         (at, (side as f64 + turned) * FRAC_PI_2)
     }

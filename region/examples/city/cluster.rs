@@ -42,25 +42,49 @@ impl Cluster {
         fs::create_dir_all(directory.join("cells.d"))?;
         for Place { cell, origin } in places {
             let account = CellAccount::new(cell.clone(), origin);
-            fs::write(directory.join("cells.d").join(format!("{cell}.conf")), account.nats(PASSWORD))?;
+            fs::write(
+                directory.join("cells.d").join(format!("{cell}.conf")),
+                account.nats(PASSWORD),
+            )?;
         }
-        let added = Command::new(Path::new(DEPLOY).join("add-cell")).env("REGION_CONFIG", &directory).status()?;
+        let added = Command::new(Path::new(DEPLOY).join("add-cell"))
+            .env("REGION_CONFIG", &directory)
+            .status()?;
         ensure!(added.success(), "add-cell failed");
         for file in ["common.conf", "nats-cluster.conf"] {
             fs::copy(Path::new(DEPLOY).join(file), directory.join(file))?;
         }
         // Without certificates: what is measured is the engine, not this machine's cryptography.
-        fs::write(directory.join("mqtt.conf"), "mqtt { listen: $REGION_MQTT }\n")?;
+        fs::write(
+            directory.join("mqtt.conf"),
+            "mqtt { listen: $REGION_MQTT }\n",
+        )?;
         fs::write(directory.join("cluster-tls.conf"), "")?;
         let addresses: Vec<[SocketAddr; 4]> = (0..SERVERS)
-            .map(|_| Ok([free_address()?, free_address()?, free_address()?, free_address()?]))
+            .map(|_| {
+                Ok([
+                    free_address()?,
+                    free_address()?,
+                    free_address()?,
+                    free_address()?,
+                ])
+            })
             .collect::<anyhow::Result<_>>()?;
-        let routes: Vec<_> = addresses.iter().map(|[_, route, ..]| format!("\"nats://{route}\"")).collect();
-        fs::write(directory.join("routes.conf"), format!("routes: [{}]\n", routes.join(", ")))?;
+        let routes: Vec<_> = addresses
+            .iter()
+            .map(|[_, route, ..]| format!("\"nats://{route}\""))
+            .collect();
+        fs::write(
+            directory.join("routes.conf"),
+            format!("routes: [{}]\n", routes.join(", ")),
+        )?;
         let spawned = addresses.iter().enumerate();
         let servers = spawned
             .map(|(number, addresses)| {
-                Ok(Server { child: spawn(&directory, number, addresses)?, addresses: *addresses })
+                Ok(Server {
+                    child: spawn(&directory, number, addresses)?,
+                    addresses: *addresses,
+                })
             })
             .collect::<anyhow::Result<_>>()?;
         Ok(Self { directory, servers })
@@ -68,18 +92,28 @@ impl Cluster {
 
     /// Where cells connect.
     pub(crate) fn addresses(&self) -> Vec<SocketAddr> {
-        self.servers.iter().map(|server| server.addresses[0]).collect()
+        self.servers
+            .iter()
+            .map(|server| server.addresses[0])
+            .collect()
     }
 
     /// The login of one of the region's own users.
     pub(crate) fn login(&self, server: usize, user: &str) -> BrokerLogin {
         let secret = read_secret(&self.directory.join("passwords").join(user));
         let address = BrokerAddress::from(self.servers[server].addresses[0]);
-        BrokerLogin::plain(address, user, secret.as_ref().map_or("", |secret| secret.reveal()))
+        BrokerLogin::plain(
+            address,
+            user,
+            secret.as_ref().map_or("", |secret| secret.reveal()),
+        )
     }
 
     pub(crate) fn pids(&self) -> Vec<u32> {
-        self.servers.iter().map(|server| server.child.id()).collect()
+        self.servers
+            .iter()
+            .map(|server| server.child.id())
+            .collect()
     }
 
     /// Sends a signal to a server; waits for the end of one that is killed.
@@ -111,11 +145,20 @@ impl Drop for Cluster {
 }
 
 fn spawn(directory: &Path, number: usize, addresses: &[SocketAddr; 4]) -> anyhow::Result<Child> {
-    let log = fs::File::options().create(true).append(true).open(directory.join(format!("server-{number}.log")))?;
+    let log = fs::File::options()
+        .create(true)
+        .append(true)
+        .open(directory.join(format!("server-{number}.log")))?;
     let [mqtt, route, clients, monitor] = addresses.map(|address| address.to_string());
     // The servers end with this program, however that ends.
     Command::new("setpriv")
-        .args(["--pdeathsig", "KILL", "nats-server", "-c", "nats-cluster.conf"])
+        .args([
+            "--pdeathsig",
+            "KILL",
+            "nats-server",
+            "-c",
+            "nats-cluster.conf",
+        ])
         .current_dir(directory)
         .env("REGION_SERVER", format!("region-{}", number + 1))
         .env("REGION_MQTT", mqtt)
@@ -134,7 +177,8 @@ fn spawn(directory: &Path, number: usize, addresses: &[SocketAddr; 4]) -> anyhow
 pub(crate) fn free_address() -> anyhow::Result<SocketAddr> {
     static GIVEN: AtomicUsize = AtomicUsize::new(0);
     let start = std::process::id() as usize * 97;
-    let mut ports = (0..14_000).map(|_| 18_000 + (start + GIVEN.fetch_add(1, Ordering::Relaxed)) % 14_000);
+    let mut ports =
+        (0..14_000).map(|_| 18_000 + (start + GIVEN.fetch_add(1, Ordering::Relaxed)) % 14_000);
     let address = ports.find_map(|port| {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port as u16));
         TcpListener::bind(address).is_ok().then_some(address)

@@ -12,8 +12,8 @@ use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellMap, Encoding, FusedObject, GlobalMap, NodeState, NodeStatus, RegionTopic, RegionTopicKind, Role,
-    SCHEMA_VERSION, encode,
+    CellMap, Encoding, FusedObject, GlobalMap, NodeState, NodeStatus, RegionTopic, RegionTopicKind,
+    Role, SCHEMA_VERSION, encode,
 };
 use ecod_actors::platform::clock;
 use ecod_region::broker::BrokerLogin;
@@ -32,8 +32,16 @@ pub(crate) struct Fleet {
 }
 
 impl Fleet {
-    pub(crate) fn start(places: &[Place], cluster: &Cluster, hz: f64, objects: usize) -> anyhow::Result<Self> {
-        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    pub(crate) fn start(
+        places: &[Place],
+        cluster: &Cluster,
+        hz: f64,
+        objects: usize,
+    ) -> anyhow::Result<Self> {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .enable_all()
+            .build()?;
         let sent = Arc::new(AtomicU64::new(0));
         for (number, place) in places.iter().enumerate() {
             let cell = SimulatedCell {
@@ -46,7 +54,10 @@ impl Fleet {
             };
             runtime.spawn(cell.run());
         }
-        Ok(Self { sent, _runtime: runtime })
+        Ok(Self {
+            sent,
+            _runtime: runtime,
+        })
     }
 
     /// Maps that were sent so far.
@@ -97,11 +108,24 @@ impl SimulatedCell {
     async fn connection(&self, address: SocketAddr, share: f64, round: &mut u64) -> bool {
         let Place { cell, origin } = &self.place;
         let tile = Quadkey::of_cell(origin);
-        let topic = |kind| RegionTopic { tile, cell: cell.clone(), kind }.path();
-        let mut options = BrokerLogin::plain(BrokerAddress::from(address), cell.as_str(), PASSWORD).options();
+        let topic = |kind| {
+            RegionTopic {
+                tile,
+                cell: cell.clone(),
+                kind,
+            }
+            .path()
+        };
+        let mut options =
+            BrokerLogin::plain(BrokerAddress::from(address), cell.as_str(), PASSWORD).options();
         options.set_keep_alive(KEEP_ALIVE);
         let gone = encode(&status(NodeState::Offline), Encoding::Json);
-        options.set_last_will(LastWill::new(topic(RegionTopicKind::Status), gone, QoS::AtMostOnce, true));
+        options.set_last_will(LastWill::new(
+            topic(RegionTopicKind::Status),
+            gone,
+            QoS::AtMostOnce,
+            true,
+        ));
         let (client, mut events) = AsyncClient::new(options, 8);
         let mut network = NetworkOptions::new();
         network.set_connection_timeout(LOGIN_TIMEOUT_S);
@@ -116,7 +140,12 @@ impl SimulatedCell {
         }
         let template = MapTemplate::new(&self.map(TEMPLATE_ROUND, TEMPLATE_TIME));
         let present = encode(&status(NodeState::Aggregating), Encoding::Json);
-        let _ = client.try_publish(topic(RegionTopicKind::Status), QoS::AtMostOnce, true, present);
+        let _ = client.try_publish(
+            topic(RegionTopicKind::Status),
+            QoS::AtMostOnce,
+            true,
+            present,
+        );
         let publishing = async {
             let mut ticks = interval_at(Instant::now() + self.period.mul_f64(share), self.period);
             ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
@@ -124,7 +153,10 @@ impl SimulatedCell {
                 ticks.tick().await;
                 let payload = template.map(*round + 1, clock::now());
                 // A full queue is that of a hanging server: this map is dropped.
-                if client.try_publish(topic(RegionTopicKind::Map), QoS::AtMostOnce, false, payload).is_ok() {
+                if client
+                    .try_publish(topic(RegionTopicKind::Map), QoS::AtMostOnce, false, payload)
+                    .is_ok()
+                {
                     *round += 1;
                     self.sent.fetch_add(1, Ordering::Relaxed);
                 }
@@ -143,7 +175,10 @@ impl SimulatedCell {
             let id = Uuid::from_u128((self.number * 1000 + number) as u128);
             let angle = 0.2 * number as f64;
             let (x_m, y_m) = (80.0 * angle.cos(), 80.0 * angle.sin());
-            let contributors = vec![NodeName::from_static("euclid"), NodeName::from_static("gauss")];
+            let contributors = vec![
+                NodeName::from_static("euclid"),
+                NodeName::from_static("gauss"),
+            ];
             FusedObject {
                 contributors,
                 existence: Some(0.97),
@@ -161,7 +196,13 @@ impl SimulatedCell {
             ..GlobalMap::new(&epoch, round, now)
         };
         let origin = self.place.origin;
-        CellMap { schema: SCHEMA_VERSION, cell: self.place.cell.clone(), sent_at_us: now, origin, map }
+        CellMap {
+            schema: SCHEMA_VERSION,
+            cell: self.place.cell.clone(),
+            sent_at_us: now,
+            origin,
+            map,
+        }
     }
 }
 
@@ -181,12 +222,19 @@ impl MapTemplate {
     fn new(map: &CellMap) -> Self {
         let payload = encode(map, Encoding::Compact);
         let places = |wanted: &[u8]| {
-            let found = payload.windows(wanted.len()).enumerate().filter(|(_, window)| *window == wanted);
+            let found = payload
+                .windows(wanted.len())
+                .enumerate()
+                .filter(|(_, window)| *window == wanted);
             found.map(|(at, _)| at).collect()
         };
         let round_at = places(&(TEMPLATE_ROUND as u32).to_be_bytes());
         let times_at = places(&TEMPLATE_TIME.micros().to_be_bytes());
-        Self { payload, round_at, times_at }
+        Self {
+            payload,
+            round_at,
+            times_at,
+        }
     }
 
     fn map(&self, round: u64, now: Timestamp) -> Vec<u8> {
@@ -206,7 +254,17 @@ const FIRST_ROUND: u32 = 0xffff;
 
 fn status(state: NodeState) -> NodeStatus {
     let edge = NodeName::from_static("edge");
-    let starting = NodeStatus::starting(edge.clone(), Uuid::nil(), Role::Edge, env!("CARGO_PKG_VERSION"));
+    let starting = NodeStatus::starting(
+        edge.clone(),
+        Uuid::nil(),
+        Role::Edge,
+        env!("CARGO_PKG_VERSION"),
+    );
     let aggregator = (state == NodeState::Aggregating).then_some(edge);
-    NodeStatus { state, epoch: 1, aggregator, ..starting }
+    NodeStatus {
+        state,
+        epoch: 1,
+        aggregator,
+        ..starting
+    }
 }

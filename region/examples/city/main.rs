@@ -78,7 +78,8 @@ fn main() -> anyhow::Result<()> {
     let halves = places::halves(&places);
     let mut city = City {
         of_halves: halves.each_ref().map(|half| half.cells),
-        watches: [0, 1].map(|half| Watch::start(cluster.login(half, "region.reader"), &halves[half])),
+        watches: [0, 1]
+            .map(|half| Watch::start(cluster.login(half, "region.reader"), &halves[half])),
         fleet: Fleet::start(simulated, &cluster, arguments.hz, arguments.objects)?,
         real: RealCells::start(arguments.node.as_deref(), real, &cluster, directory.path())?,
         cluster,
@@ -99,7 +100,8 @@ fn main() -> anyhow::Result<()> {
         "  maps that counted though they were too old, while all logged in for the first time: {}",
         at_start.len()
     );
-    let vehicles = PassingVehicles::start(&simulated[..simulated.len().min(TELLERS)], &city.cluster)?;
+    let vehicles =
+        PassingVehicles::start(&simulated[..simulated.len().min(TELLERS)], &city.cluster)?;
 
     println!("\nserver 3 killed");
     let at = clock::now();
@@ -114,7 +116,11 @@ fn main() -> anyhow::Result<()> {
         println!("\nserver 2 stopped for {PAUSE:?}, with a subscriber on it");
         let at = clock::now();
         city.cluster.signal(1, Signal::SIGSTOP)?;
-        city.until_whole_at(&[0], "for the half of the cells that is read on another server", at)?;
+        city.until_whole_at(
+            &[0],
+            "for the half of the cells that is read on another server",
+            at,
+        )?;
         std::thread::sleep(PAUSE.saturating_sub(clock::now().since(at)));
         let at = clock::now();
         city.cluster.signal(1, Signal::SIGCONT)?;
@@ -140,12 +146,27 @@ fn main() -> anyhow::Result<()> {
     city.note_too_old("all servers were killed");
 
     let (passed, lost) = vehicles.end(&city.cluster.login(0, "region.reader"))?;
-    println!("\nvehicles that passed through cells meanwhile: {passed}, reputations lost: {}", lost.len());
+    println!(
+        "\nvehicles that passed through cells meanwhile: {passed}, reputations lost: {}",
+        lost.len()
+    );
 
     let too_old = city.too_old;
-    println!("\nmaps that counted though they were too old, since then: {}", too_old.len());
-    ensure!(too_old.is_empty(), "{} maps were too old: {:?}", too_old.len(), too_old.iter().take(10));
-    ensure!(lost.is_empty(), "reputations were lost: {:?}", lost.iter().take(20));
+    println!(
+        "\nmaps that counted though they were too old, since then: {}",
+        too_old.len()
+    );
+    ensure!(
+        too_old.is_empty(),
+        "{} maps were too old: {:?}",
+        too_old.len(),
+        too_old.iter().take(10)
+    );
+    ensure!(
+        lost.is_empty(),
+        "reputations were lost: {:?}",
+        lost.iter().take(20)
+    );
     Ok(())
 }
 
@@ -168,14 +189,22 @@ impl City {
     }
 
     /// Waits until the subscribers have a map of 99 of 100 cells that was sent later than `since`.
-    fn until_whole_at(&self, watches: &[usize], what: &str, since: Timestamp) -> anyhow::Result<()> {
+    fn until_whole_at(
+        &self,
+        watches: &[usize],
+        what: &str,
+        since: Timestamp,
+    ) -> anyhow::Result<()> {
         let cells: usize = watches.iter().map(|watch| self.of_halves[*watch]).sum();
         let wanted = cells - cells / 100;
         let begun = Instant::now();
         let mut first = None;
         loop {
             let now = clock::now();
-            let fresh: usize = watches.iter().map(|watch| self.watches[*watch].sent_after(since)).sum();
+            let fresh: usize = watches
+                .iter()
+                .map(|watch| self.watches[*watch].sent_after(since))
+                .sum();
             if fresh >= cells / 2 {
                 first.get_or_insert(now.since(since));
             }
@@ -186,7 +215,11 @@ impl City {
                 return Ok(());
             }
             let troubles = || self.watches.each_ref().map(Watch::trouble);
-            ensure!(begun.elapsed() < PATIENCE, "only {fresh} of {cells} cells {what}; {:?}", troubles());
+            ensure!(
+                begun.elapsed() < PATIENCE,
+                "only {fresh} of {cells} cells {what}; {:?}",
+                troubles()
+            );
             std::thread::sleep(Duration::from_millis(100));
         }
     }
@@ -197,7 +230,10 @@ impl City {
 
     /// Notes maps that counted since the last call though they were too old.
     fn note_too_old(&mut self, after: &str) {
-        let too_old = self.take_too_old().into_iter().map(|(cell, age)| (after.to_owned(), cell, age));
+        let too_old = self
+            .take_too_old()
+            .into_iter()
+            .map(|(cell, age)| (after.to_owned(), cell, age));
         self.too_old.extend(too_old);
     }
 
@@ -205,9 +241,19 @@ impl City {
     fn steady(&self, seconds: u64) {
         std::thread::sleep(SETTLE);
         self.watches.iter().for_each(Watch::reset);
-        let meters = self.cluster.pids().into_iter().map(Meter::start).collect::<Vec<_>>();
+        let meters = self
+            .cluster
+            .pids()
+            .into_iter()
+            .map(Meter::start)
+            .collect::<Vec<_>>();
         let own = Meter::start(std::process::id());
-        let nodes = self.real.pids().into_iter().map(Meter::start).collect::<Vec<_>>();
+        let nodes = self
+            .real
+            .pids()
+            .into_iter()
+            .map(Meter::start)
+            .collect::<Vec<_>>();
         let sent = self.fleet.sent();
         let begun = Instant::now();
         std::thread::sleep(Duration::from_secs(seconds));
@@ -218,14 +264,23 @@ impl City {
         for (number, meter) in meters.iter().enumerate() {
             let (percent, megabytes) = meter.read();
             engine = (engine.0 + percent, engine.1 + megabytes);
-            println!("  server {}: {percent:.0} % of a core, {megabytes:.0} MB", number + 1);
+            println!(
+                "  server {}: {percent:.0} % of a core, {megabytes:.0} MB",
+                number + 1
+            );
         }
         for (number, watch) in self.watches.iter().enumerate() {
             println!("  subscriber {}: {}", number + 1, watch.figures(span));
         }
-        println!("  engine: {:.0} % of a core, {:.0} MB; this program: {:.0} %", engine.0, engine.1, own.read().0);
+        println!(
+            "  engine: {:.0} % of a core, {:.0} MB; this program: {:.0} %",
+            engine.0,
+            engine.1,
+            own.read().0
+        );
         if !nodes.is_empty() {
-            let percent: f64 = nodes.iter().map(|node| node.read().0).sum::<f64>() / nodes.len() as f64;
+            let percent: f64 =
+                nodes.iter().map(|node| node.read().0).sum::<f64>() / nodes.len() as f64;
             println!("  a real node: {percent:.1} % of a core");
         }
     }
@@ -236,17 +291,27 @@ impl City {
         let mean = || {
             let meters: Vec<_> = pids.iter().map(|pid| Meter::start(*pid)).collect();
             std::thread::sleep(PAUSE);
-            let read = meters.iter().map(Meter::read).fold((0.0, 0.0), |sum, each| (sum.0 + each.0, sum.1 + each.1));
+            let read = meters
+                .iter()
+                .map(Meter::read)
+                .fold((0.0, 0.0), |sum, each| (sum.0 + each.0, sum.1 + each.1));
             (read.0 / meters.len() as f64, read.1 / meters.len() as f64)
         };
         let connected = mean();
         self.real.cut(5);
         let since = clock::now() + Duration::from_secs(1);
         let apart = mean();
-        let others: usize = self.watches.iter().map(|watch| watch.sent_after(since)).sum();
+        let others: usize = self
+            .watches
+            .iter()
+            .map(|watch| watch.sent_after(since))
+            .sum();
         self.real.mend();
         println!("  meanwhile {others} of {} cells are heard", self.cells);
-        for (state, (percent, megabytes)) in [("with its uplink", connected), ("while it is cut off", apart)] {
+        for (state, (percent, megabytes)) in [
+            ("with its uplink", connected),
+            ("while it is cut off", apart),
+        ] {
             println!("  a real node {state}: {percent:.1} % of a core, {megabytes:.1} MB");
         }
     }
@@ -256,7 +321,12 @@ impl City {
         let begun = Instant::now();
         let watch = Watch::start_overview(self.cluster.login(0, "region.reader"));
         while watch.cells() < self.cells {
-            ensure!(begun.elapsed() < PATIENCE, "a new reader gets {} of {} statuses", watch.cells(), self.cells);
+            ensure!(
+                begun.elapsed() < PATIENCE,
+                "a new reader gets {} of {} statuses",
+                watch.cells(),
+                self.cells
+            );
             std::thread::sleep(Duration::from_millis(10));
         }
         println!(
@@ -269,9 +339,16 @@ impl City {
 }
 
 /// Runs a future on a thread of its own, until the process ends.
-fn spawn_thread<F: Future<Output = ()> + Send + 'static>(name: &str, future: F) -> anyhow::Result<()> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+fn spawn_thread<F: Future<Output = ()> + Send + 'static>(
+    name: &str,
+    future: F,
+) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
     let thread = std::thread::Builder::new().name(name.into());
-    thread.spawn(move || runtime.block_on(future)).context("no thread")?;
+    thread
+        .spawn(move || runtime.block_on(future))
+        .context("no thread")?;
     Ok(())
 }

@@ -38,8 +38,15 @@ pub(crate) fn places(simulated: usize, real: usize) -> Vec<Place> {
             height_m: 0.0,
             rotation_deg: 0.0,
         };
-        let name = if number < simulated { format!("cell-{number}") } else { format!("real-{number}") };
-        Some(Place { cell: NodeName::new(name).ok()?, origin })
+        let name = if number < simulated {
+            format!("cell-{number}")
+        } else {
+            format!("real-{number}")
+        };
+        Some(Place {
+            cell: NodeName::new(name).ok()?,
+            origin,
+        })
     };
     (0..count).filter_map(place).collect()
 }
@@ -48,7 +55,9 @@ pub(crate) fn places(simulated: usize, real: usize) -> Vec<Place> {
 pub(crate) fn halves(places: &[Place]) -> [Half; 2] {
     let mut tiles = BTreeMap::<Quadkey, usize>::new();
     for Place { origin, .. } in places {
-        *tiles.entry(Quadkey::of_cell(origin).outer(HALF_DIGITS)).or_default() += 1;
+        *tiles
+            .entry(Quadkey::of_cell(origin).outer(HALF_DIGITS))
+            .or_default() += 1;
     }
     let mut halves = [Half::default(), Half::default()];
     for (tile, cells) in tiles {

@@ -11,7 +11,9 @@ use std::time::Duration;
 use anyhow::Context;
 use ecod::leadership::BrokerAddress;
 use ecod::model::names::NodeName;
-use ecod::wire::{Encoding, ObjectReport, PerceivedObject, SCHEMA_VERSION, Topic, Topics, WirePose, encode};
+use ecod::wire::{
+    Encoding, ObjectReport, PerceivedObject, SCHEMA_VERSION, Topic, Topics, WirePose, encode,
+};
 use ecod_actors::platform::clock;
 use ecod_region::broker::BrokerLogin;
 use rumqttc::{AsyncClient, QoS};
@@ -43,8 +45,15 @@ impl RealCells {
         cluster: &Cluster,
         directory: &Path,
     ) -> anyhow::Result<Self> {
-        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
-        let mut cells = Self { nodes: Vec::new(), lines: Vec::new(), _runtime: runtime };
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()?;
+        let mut cells = Self {
+            nodes: Vec::new(),
+            lines: Vec::new(),
+            _runtime: runtime,
+        };
         let Some(node) = node else { return Ok(cells) };
         for Place { cell, origin } in places {
             let [line, listen, gossip] = [free_address()?, free_address()?, free_address()?];
@@ -60,7 +69,9 @@ impl RealCells {
             let log = fs::File::create(directory.join(format!("{cell}.log")))?;
             let mut command = Command::new(node);
             // The node is what its file says, whatever the environment says to others.
-            for (key, _) in std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_")) {
+            for (key, _) in
+                std::env::vars_os().filter(|(key, _)| key.to_string_lossy().starts_with("ECOD_"))
+            {
                 command.env_remove(key);
             }
             let child = command
@@ -118,14 +129,18 @@ impl Drop for RealCells {
 /// Passes connections on to the next server that takes them, as an address in front of the servers does.
 async fn forward(line: SocketAddr, servers: Arc<Vec<SocketAddr>>, opened: watch::Receiver<bool>) {
     static NEXT: AtomicUsize = AtomicUsize::new(0);
-    let Ok(listener) = TcpListener::bind(line).await else { return };
+    let Ok(listener) = TcpListener::bind(line).await else {
+        return;
+    };
     while let Ok((near, _)) = listener.accept().await {
         let (servers, opened) = (Arc::clone(&servers), opened.clone());
         tokio::spawn(async move {
             let first = NEXT.fetch_add(1, Ordering::Relaxed);
             for number in 0..servers.len() {
-                if let Ok(far) = TcpStream::connect(servers[(first + number) % servers.len()]).await {
-                    let ((near_in, near_out), (far_in, far_out)) = (near.into_split(), far.into_split());
+                if let Ok(far) = TcpStream::connect(servers[(first + number) % servers.len()]).await
+                {
+                    let ((near_in, near_out), (far_in, far_out)) =
+                        (near.into_split(), far.into_split());
                     tokio::select! {
                         () = copy(near_in, far_out, opened.clone()) => {}
                         () = copy(far_in, near_out, opened) => {}
@@ -145,7 +160,9 @@ async fn copy(
 ) {
     let mut buffer = vec![0; 16 * 1024];
     while let Ok(count @ 1..) = from.read(&mut buffer).await {
-        if opened.wait_for(|is_open| *is_open).await.is_err() || to.write_all(&buffer[..count]).await.is_err() {
+        if opened.wait_for(|is_open| *is_open).await.is_err()
+            || to.write_all(&buffer[..count]).await.is_err()
+        {
             return;
         }
     }
@@ -184,6 +201,11 @@ async fn drive(broker: SocketAddr, cell: NodeName) {
             frame_yaw_rate_radps: None,
             moving: None,
         };
-        let _ = client.try_publish(&topic, QoS::AtMostOnce, false, encode(&report, Encoding::Json));
+        let _ = client.try_publish(
+            &topic,
+            QoS::AtMostOnce,
+            false,
+            encode(&report, Encoding::Json),
+        );
     }
 }

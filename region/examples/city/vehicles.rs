@@ -37,7 +37,10 @@ const PATIENCE: Duration = Duration::from_secs(90);
 
 impl PassingVehicles {
     pub(crate) fn start(places: &[Place], cluster: &Cluster) -> anyhow::Result<Self> {
-        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()?;
         let (left, is_over) = (Arc::<Mutex<_>>::default(), Arc::<AtomicBool>::default());
         for (number, place) in places.iter().enumerate() {
             let teller = Teller {
@@ -52,7 +55,11 @@ impl PassingVehicles {
             };
             runtime.spawn(teller.run());
         }
-        Ok(Self { left, is_over, runtime })
+        Ok(Self {
+            left,
+            is_over,
+            runtime,
+        })
     }
 
     /// Lets the last vehicles leave, and waits until a new reader has what was said of all; the number of vehicles, and the topics
@@ -61,7 +68,11 @@ impl PassingVehicles {
         self.is_over.store(true, Ordering::Relaxed);
         self.runtime.block_on(async {
             sleep(2 * STAY).await;
-            let left = self.left.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            let left = self
+                .left
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .clone();
             ensure!(!left.is_empty(), "no vehicle has left");
             let (client, mut events) = AsyncClient::new(login.options(), 64);
             let mut missing = left.clone();
@@ -69,12 +80,19 @@ impl PassingVehicles {
                 while !missing.is_empty() {
                     match events.poll().await {
                         Ok(Event::Incoming(Packet::ConnAck(_))) => {
-                            let _ = client.try_subscribe(ReputationTopic::filter_everywhere(), QoS::AtMostOnce);
+                            let _ = client.try_subscribe(
+                                ReputationTopic::filter_everywhere(),
+                                QoS::AtMostOnce,
+                            );
                         }
                         Ok(Event::Incoming(Packet::Publish(message))) => {
-                            let said = decode::<CellReputation>(&message.payload, &Limits::default());
+                            let said =
+                                decode::<CellReputation>(&message.payload, &Limits::default());
                             let votes = said.map_or(0, |said| said.correct);
-                            if missing.get(&message.topic).is_some_and(|wanted| votes >= *wanted) {
+                            if missing
+                                .get(&message.topic)
+                                .is_some_and(|wanted| votes >= *wanted)
+                            {
                                 missing.remove(&message.topic);
                             }
                         }
@@ -115,7 +133,9 @@ impl Teller {
     }
 
     async fn connection(&mut self, address: SocketAddr) {
-        let mut options = BrokerLogin::plain(BrokerAddress::from(address), self.cell.as_str(), PASSWORD).options();
+        let mut options =
+            BrokerLogin::plain(BrokerAddress::from(address), self.cell.as_str(), PASSWORD)
+                .options();
         options.set_keep_alive(Duration::from_secs(5));
         let (client, mut events) = AsyncClient::new(options, 32);
         let mut network = NetworkOptions::new();
@@ -149,39 +169,79 @@ impl Teller {
 
     /// Lets a vehicle leave and the next one come when it is time.
     fn pass(&mut self) {
-        if self.vehicle.as_ref().is_some_and(|(_, since)| since.elapsed() < STAY) {
+        if self
+            .vehicle
+            .as_ref()
+            .is_some_and(|(_, since)| since.elapsed() < STAY)
+        {
             return;
         }
         if let Some((vehicle, _)) = self.vehicle.take() {
             let votes = 10 + self.passed;
-            let all = Counts { correct: votes, incorrect: 1 };
-            self.exchange.count(&vehicle, CellCounts { all, ..CellCounts::default() }, clock::now());
-            let topic = ReputationTopic { vehicle, cell: self.cell.clone() }.path();
-            self.left.lock().unwrap_or_else(PoisonError::into_inner).insert(topic, votes);
+            let all = Counts {
+                correct: votes,
+                incorrect: 1,
+            };
+            self.exchange.count(
+                &vehicle,
+                CellCounts {
+                    all,
+                    ..CellCounts::default()
+                },
+                clock::now(),
+            );
+            let topic = ReputationTopic {
+                vehicle,
+                cell: self.cell.clone(),
+            }
+            .path();
+            self.left
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .insert(topic, votes);
             self.passed += 1;
         }
         if !self.is_over.load(Ordering::Relaxed) {
-            self.vehicle = NodeName::new(format!("v{}", self.passed)).ok().map(|vehicle| (vehicle, Instant::now()));
+            self.vehicle = NodeName::new(format!("v{}", self.passed))
+                .ok()
+                .map(|vehicle| (vehicle, Instant::now()));
         }
-        self.exchange.set_present(&self.vehicle.iter().map(|(vehicle, _)| vehicle.clone()).collect());
+        self.exchange.set_present(
+            &self
+                .vehicle
+                .iter()
+                .map(|(vehicle, _)| vehicle.clone())
+                .collect(),
+        );
     }
 
     fn tell(&mut self, client: &AsyncClient) {
         for step in self.exchange.next(clock::now(), 6) {
             match step {
                 ExchangeStep::Subscribe(filters) => {
-                    let filters = filters.into_iter().map(|filter| SubscribeFilter::new(filter, QoS::AtMostOnce));
+                    let filters = filters
+                        .into_iter()
+                        .map(|filter| SubscribeFilter::new(filter, QoS::AtMostOnce));
                     if client.try_subscribe_many(filters).is_err() {
                         self.exchange.connect();
                     }
                 }
                 ExchangeStep::Unsubscribe(filters) => {
-                    filters.into_iter().for_each(|filter| _ = client.try_unsubscribe(filter));
+                    filters
+                        .into_iter()
+                        .for_each(|filter| _ = client.try_unsubscribe(filter));
                 }
                 ExchangeStep::Publish(said) => {
-                    let topic = ReputationTopic { vehicle: said.vehicle.clone(), cell: said.cell.clone() }.path();
+                    let topic = ReputationTopic {
+                        vehicle: said.vehicle.clone(),
+                        cell: said.cell.clone(),
+                    }
+                    .path();
                     let payload = encode(&said, Encoding::Compact);
-                    if client.try_publish(topic, QoS::AtLeastOnce, true, payload).is_err() {
+                    if client
+                        .try_publish(topic, QoS::AtLeastOnce, true, payload)
+                        .is_err()
+                    {
                         self.exchange.not_sent(&said.vehicle);
                     }
                 }

@@ -84,13 +84,24 @@ impl Watch {
     /// Begins a new measurement.
     pub(crate) fn reset(&self) {
         let mut figures = lock(&self.figures);
-        let (newest, too_old) = (std::mem::take(&mut figures.newest), std::mem::take(&mut figures.too_old));
-        *figures = Figures { newest, too_old, ..Figures::default() };
+        let (newest, too_old) = (
+            std::mem::take(&mut figures.newest),
+            std::mem::take(&mut figures.too_old),
+        );
+        *figures = Figures {
+            newest,
+            too_old,
+            ..Figures::default()
+        };
     }
 
     /// Number of cells of which a map counts that was sent later.
     pub(crate) fn sent_after(&self, since: Timestamp) -> usize {
-        lock(&self.figures).newest.values().filter(|(_, sent_at)| *sent_at > since).count()
+        lock(&self.figures)
+            .newest
+            .values()
+            .filter(|(_, sent_at)| *sent_at > since)
+            .count()
     }
 
     /// Number of cells of which anything is known.
@@ -110,7 +121,15 @@ impl Watch {
 
     /// The figures of a time in seconds, in a line.
     pub(crate) fn figures(&self, span: f64) -> String {
-        let Figures { ages, bytes, maps, missing, stale, other, .. } = &*lock(&self.figures);
+        let Figures {
+            ages,
+            bytes,
+            maps,
+            missing,
+            stale,
+            other,
+            ..
+        } = &*lock(&self.figures);
         let milliseconds = |quantile| ages.value_at_quantile(quantile) as f64 / 1000.0;
         // Those that came too late are not among the maps that count either.
         let lost = missing.saturating_sub(*stale);
@@ -131,7 +150,16 @@ impl Default for Figures {
     fn default() -> Self {
         // Ages up to ten minutes, to three digits.
         let ages = Histogram::new_with_bounds(1, 600_000_000, 3).expect("these bounds are valid");
-        Self { ages, bytes: 0, maps: 0, missing: 0, stale: 0, other: 0, newest: HashMap::new(), too_old: Vec::new() }
+        Self {
+            ages,
+            bytes: 0,
+            maps: 0,
+            missing: 0,
+            stale: 0,
+            other: 0,
+            newest: HashMap::new(),
+            too_old: Vec::new(),
+        }
     }
 }
 
@@ -139,11 +167,15 @@ impl Figures {
     fn take(&mut self, cell: &NodeName, round: u64, sent_at: Timestamp, at: Timestamp) {
         let age = at.since(sent_at);
         self.maps += 1;
-        self.ages.saturating_record(u64::try_from(age.as_micros()).unwrap_or(u64::MAX));
+        self.ages
+            .saturating_record(u64::try_from(age.as_micros()).unwrap_or(u64::MAX));
         if age > MAX_AGE + TOLERANCE {
             self.too_old.push((cell.clone(), age));
         }
-        let newest = self.newest.entry(cell.clone()).or_insert((round - 1, sent_at));
+        let newest = self
+            .newest
+            .entry(cell.clone())
+            .or_insert((round - 1, sent_at));
         // Real cells leave rounds out.
         if cell.as_str().starts_with("cell-") {
             self.missing += round.saturating_sub(newest.0 + 1);

@@ -41,21 +41,42 @@ enum Engine {
 }
 
 pub(super) fn run(arguments: &AccountArguments) -> Result<(), Failure> {
-    let AccountArguments { latitude: latitude_deg, longitude: longitude_deg, .. } = *arguments;
-    let origin = GeographicOrigin { latitude_deg, longitude_deg, height_m: 0.0, rotation_deg: 0.0 };
+    let AccountArguments {
+        latitude: latitude_deg,
+        longitude: longitude_deg,
+        ..
+    } = *arguments;
+    let origin = GeographicOrigin {
+        latitude_deg,
+        longitude_deg,
+        height_m: 0.0,
+        rotation_deg: 0.0,
+    };
     origin.validate().map_err(Failure::usage)?;
     let account = CellAccount::new(arguments.cell.clone(), &origin);
     let text = match (arguments.engine, &arguments.password_file) {
         (Engine::Mosquitto, _) => account.mosquitto(),
         (Engine::Nats, Some(file)) => {
             let password = read_secret(file).map_err(Failure::usage)?;
-            if !password.reveal().bytes().all(|byte| byte.is_ascii_alphanumeric() || b"-_".contains(&byte)) {
-                let allowed = "letters, digits, - and _, so that it stands in the configuration as it is";
-                return Err(Failure::usage(anyhow!("the password in {} is to have {allowed}", file.display())));
+            if !password
+                .reveal()
+                .bytes()
+                .all(|byte| byte.is_ascii_alphanumeric() || b"-_".contains(&byte))
+            {
+                let allowed =
+                    "letters, digits, - and _, so that it stands in the configuration as it is";
+                return Err(Failure::usage(anyhow!(
+                    "the password in {} is to have {allowed}",
+                    file.display()
+                )));
             }
             account.nats(password.reveal())
         }
-        (Engine::Nats, None) => return Err(Failure::usage(anyhow!("--password-file is needed for NATS"))),
+        (Engine::Nats, None) => {
+            return Err(Failure::usage(anyhow!(
+                "--password-file is needed for NATS"
+            )));
+        }
     };
     print(&text)?;
     Ok(())

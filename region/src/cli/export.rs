@@ -44,10 +44,19 @@ enum ExportFormat {
 }
 
 pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
-    let format = match arguments.out.extension().and_then(|extension| extension.to_str()) {
+    let format = match arguments
+        .out
+        .extension()
+        .and_then(|extension| extension.to_str())
+    {
         Some("geojson" | "json") => ExportFormat::GeoJson,
         Some("mcap") => ExportFormat::Mcap,
-        _ => return Err(Failure::usage(anyhow!("{}: name a .geojson or .mcap file", arguments.out.display()))),
+        _ => {
+            return Err(Failure::usage(anyhow!(
+                "{}: name a .geojson or .mcap file",
+                arguments.out.display()
+            )));
+        }
     };
     let login = arguments.broker.load().map_err(Failure::usage)?;
     let state = Arc::new(RegionState::default());
@@ -74,7 +83,9 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
         Ok(())
     })?;
     if let Some(error) = failed.into_inner() {
-        return Err(error.context(format!("cannot write {}", arguments.out.display())).into());
+        return Err(error
+            .context(format!("cannot write {}", arguments.out.display()))
+            .into());
     }
     let summary = match log.into_inner() {
         Some(log) => {
@@ -84,9 +95,9 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
         None => write_geojson((arguments.tile, &unfinished), &state, clock::now())?,
     };
     let link = state.link();
-    let trouble = link
-        .trouble
-        .or_else(|| (link.logins == 0).then(|| "the broker has not answered; give it more --seconds".into()));
+    let trouble = link.trouble.or_else(|| {
+        (link.logins == 0).then(|| "the broker has not answered; give it more --seconds".into())
+    });
     if let (Some(trouble), 0) = (trouble, state.town().counts().maps) {
         let _ = std::fs::remove_file(&unfinished);
         return Err(anyhow!("{trouble}").into());
@@ -97,12 +108,20 @@ pub(super) fn run(arguments: &ExportArguments) -> Result<(), Failure> {
     Ok(())
 }
 
-fn write_geojson((tile, path): (Quadkey, &Path), state: &RegionState, now: Timestamp) -> anyhow::Result<String> {
+fn write_geojson(
+    (tile, path): (Quadkey, &Path),
+    state: &RegionState,
+    now: Timestamp,
+) -> anyhow::Result<String> {
     let town = state.town();
     let collection = geojson(&town, &GeographicBounds::of(tile), now);
     let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
     if let Err(error) = serde_json::to_writer(BufWriter::new(file), &collection) {
         bail!("cannot write {}: {error}", path.display());
     }
-    Ok(format!("{} cells, {} features", town.count_within(&[tile]), collection.features.len()))
+    Ok(format!(
+        "{} cells, {} features",
+        town.count_within(&[tile]),
+        collection.features.len()
+    ))
 }

@@ -32,13 +32,28 @@ pub(super) struct ServeArguments {
 
 pub(super) fn run(arguments: &ServeArguments) -> Result<(), Failure> {
     let login = arguments.broker.load().map_err(Failure::usage)?;
-    let token = arguments.token_file.as_deref().map(read_secret).transpose().map_err(Failure::usage)?;
-    let config = DashboardConfig { listen: Some(arguments.listen), token, ..DashboardConfig::default() };
-    config.validate().map_err(|error| Failure::usage(error.within("region")))?;
+    let token = arguments
+        .token_file
+        .as_deref()
+        .map(read_secret)
+        .transpose()
+        .map_err(Failure::usage)?;
+    let config = DashboardConfig {
+        listen: Some(arguments.listen),
+        token,
+        ..DashboardConfig::default()
+    };
+    config
+        .validate()
+        .map_err(|error| Failure::usage(error.within("region")))?;
     let state = Arc::new(RegionState::default());
     run_until_stopped(async {
-        let page =
-            RegionPage::listen(arguments.listen, config.token.as_ref(), arguments.watch.clone(), Arc::clone(&state));
+        let page = RegionPage::listen(
+            arguments.listen,
+            config.token.as_ref(),
+            arguments.watch.clone(),
+            Arc::clone(&state),
+        );
         let page = page.await?;
         tracing::info!(url = %format_args!("http://{}/", page.address()), "page serves");
         tokio::join!(reader::read(&login, &state, |_| ()), page.serve());

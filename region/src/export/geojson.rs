@@ -16,12 +16,29 @@ pub struct FeatureCollection {
 
 /// The cells within bounds and all their objects. Each feature has `kind`: `cell`, `tile` or `object`.
 pub fn geojson(town: &RegionTown, bounds: &GeographicBounds, now: Timestamp) -> FeatureCollection {
-    let TownView { cells, tiles, objects, .. } = town.view_whole(bounds, now);
+    let TownView {
+        cells,
+        tiles,
+        objects,
+        ..
+    } = town.view_whole(bounds, now);
     let mut features = Vec::new();
     for tile in tiles {
-        let GeographicBounds { west, south, east, north } = tile.bounds;
-        let ring = json!([[[west, south], [east, south], [east, north], [west, north], [west, south]]]);
-        let properties = json!({ "key": tile.key, "cells": tile.totals.cells, "objects": tile.totals.objects });
+        let GeographicBounds {
+            west,
+            south,
+            east,
+            north,
+        } = tile.bounds;
+        let ring = json!([[
+            [west, south],
+            [east, south],
+            [east, north],
+            [west, north],
+            [west, south]
+        ]]);
+        let properties =
+            json!({ "key": tile.key, "cells": tile.totals.cells, "objects": tile.totals.objects });
         features.push(feature("tile", "Polygon", &ring, properties));
     }
     for cell in cells {
@@ -32,14 +49,21 @@ pub fn geojson(town: &RegionTown, bounds: &GeographicBounds, now: Timestamp) -> 
         let at = json!([object.longitude_deg, object.latitude_deg]);
         features.push(feature("object", "Point", &at, json!(object)));
     }
-    FeatureCollection { r#type: "FeatureCollection", features }
+    FeatureCollection {
+        r#type: "FeatureCollection",
+        features,
+    }
 }
 
 fn feature(kind: &str, geometry: &str, coordinates: &Value, properties: Value) -> Value {
     let mut told = Map::from_iter([("kind".to_owned(), json!(kind))]);
     if let Value::Object(properties) = properties {
         // The geometry has them.
-        told.extend(properties.into_iter().filter(|(name, _)| !["latitude_deg", "longitude_deg"].contains(&&**name)));
+        told.extend(
+            properties
+                .into_iter()
+                .filter(|(name, _)| !["latitude_deg", "longitude_deg"].contains(&&**name)),
+        );
     }
     json!({
         "type": "Feature",

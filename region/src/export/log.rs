@@ -26,11 +26,19 @@ impl CellMapLog {
     /// # Errors
     /// When it cannot be written.
     pub fn create(path: &Path) -> anyhow::Result<Self> {
-        let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+        let file =
+            File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
         let mut writer = Writer::new(BufWriter::new(file))?;
-        let schema = schemas().remove("CellMap").map(|schema| schema.to_value().to_string()).unwrap_or_default();
+        let schema = schemas()
+            .remove("CellMap")
+            .map(|schema| schema.to_value().to_string())
+            .unwrap_or_default();
         let schema = writer.add_schema("CellMap", "jsonschema", schema.as_bytes())?;
-        Ok(Self { writer, schema, channels: BTreeMap::new() })
+        Ok(Self {
+            writer,
+            schema,
+            channels: BTreeMap::new(),
+        })
     }
 
     /// Writes a map that was received at `at`, whatever its encoding was.
@@ -38,12 +46,18 @@ impl CellMapLog {
     /// # Errors
     /// When it cannot be written.
     pub fn write(&mut self, topic: &str, payload: &[u8], at: Timestamp) -> anyhow::Result<()> {
-        let Ok(map) = decode::<CellMap>(payload, &Limits::default()) else { return Ok(()) };
+        let Ok(map) = decode::<CellMap>(payload, &Limits::default()) else {
+            return Ok(());
+        };
         if !self.channels.contains_key(topic) {
-            let channel = self.writer.add_channel(self.schema, topic, "json", &BTreeMap::new())?;
+            let channel = self
+                .writer
+                .add_channel(self.schema, topic, "json", &BTreeMap::new())?;
             self.channels.insert(topic.to_owned(), (channel, 0));
         }
-        let Some((channel, sequence)) = self.channels.get_mut(topic) else { return Ok(()) };
+        let Some((channel, sequence)) = self.channels.get_mut(topic) else {
+            return Ok(());
+        };
         let header = MessageHeader {
             channel_id: *channel,
             sequence: *sequence,
@@ -51,7 +65,11 @@ impl CellMapLog {
             publish_time: map.sent_at_us.micros().saturating_mul(1000),
         };
         *sequence += 1;
-        let payload = if payload.starts_with(b"{") { Cow::from(payload) } else { encode(&map, Encoding::Json).into() };
+        let payload = if payload.starts_with(b"{") {
+            Cow::from(payload)
+        } else {
+            encode(&map, Encoding::Json).into()
+        };
         Ok(self.writer.write_to_known_channel(&header, &payload)?)
     }
 
@@ -61,6 +79,12 @@ impl CellMapLog {
     /// When it cannot be written.
     pub fn finish(mut self) -> anyhow::Result<(usize, u64)> {
         self.writer.finish()?;
-        Ok((self.channels.len(), self.channels.values().map(|(_, maps)| u64::from(*maps)).sum()))
+        Ok((
+            self.channels.len(),
+            self.channels
+                .values()
+                .map(|(_, maps)| u64::from(*maps))
+                .sum(),
+        ))
     }
 }

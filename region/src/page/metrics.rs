@@ -36,43 +36,92 @@ type RegionLabels = Vec<(&'static str, String)>;
 ///
 /// # Errors
 /// Never for text; the encoder's writer may fail.
-pub(super) fn metrics(state: &RegionState, page: &PageCounts, started_at: Timestamp) -> Result<String, fmt::Error> {
+pub(super) fn metrics(
+    state: &RegionState,
+    page: &PageCounts,
+    started_at: Timestamp,
+) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("ecod_region");
     let (link, tiles) = (state.link(), state.tiles());
     let (cells, counts) = {
         let town = state.town();
         (town.states(&tiles, clock::now()), town.counts().clone())
     };
-    gauge(&mut registry, "broker_up", "Whether the region's broker lets the reader in", i64::from(link.is_up));
-    counter(&mut registry, "broker_logins", "Logins at the region's broker", link.logins);
+    gauge(
+        &mut registry,
+        "broker_up",
+        "Whether the region's broker lets the reader in",
+        i64::from(link.is_up),
+    );
+    counter(
+        &mut registry,
+        "broker_logins",
+        "Logins at the region's broker",
+        link.logins,
+    );
     let states = Family::<RegionLabels, Gauge>::default();
     for (state, number) in cells {
-        states.get_or_create(&vec![("state", state.as_str().to_owned())]).set(count(number));
+        states
+            .get_or_create(&vec![("state", state.as_str().to_owned())])
+            .set(count(number));
     }
     let help = "Cells by state; live and silent are told apart where maps are read, the others lead or are offline by their own word";
     registry.register("cells", help, states);
-    gauge(&mut registry, "tiles_read", "Tiles whose maps are read", count(tiles.count()));
-    counter(&mut registry, "messages", "Messages received", counts.messages);
+    gauge(
+        &mut registry,
+        "tiles_read",
+        "Tiles whose maps are read",
+        count(tiles.count()),
+    );
+    counter(
+        &mut registry,
+        "messages",
+        "Messages received",
+        counts.messages,
+    );
     let bytes = Counter::<u64>::default();
     bytes.inc_by(counts.bytes);
     registry.register_with_unit("received", "Payloads received", Unit::Bytes, bytes);
     counter(&mut registry, "maps", "Maps that count", counts.maps);
     let rejected = Family::<RegionLabels, Counter>::default();
     for (reason, number) in counts.rejected {
-        rejected.get_or_create(&vec![("reason", reason.as_str().to_owned())]).inc_by(number);
+        rejected
+            .get_or_create(&vec![("reason", reason.as_str().to_owned())])
+            .inc_by(number);
     }
-    rejected.get_or_create(&vec![("reason", "cell_throttled".to_owned())]).inc_by(counts.losses.throttled);
-    let help =
-        "Messages that do not count; stale are maps that came too late, cell_throttled those beyond 20/s of a cell";
+    rejected
+        .get_or_create(&vec![("reason", "cell_throttled".to_owned())])
+        .inc_by(counts.losses.throttled);
+    let help = "Messages that do not count; stale are maps that came too late, cell_throttled those beyond 20/s of a cell";
     registry.register("rejected", help, rejected);
     let objects = Family::<RegionLabels, Counter>::default();
-    for (reason, number) in [("outside", counts.losses.outside), ("too_many", counts.losses.too_many)] {
-        objects.get_or_create(&vec![("reason", reason.to_owned())]).inc_by(number);
+    for (reason, number) in [
+        ("outside", counts.losses.outside),
+        ("too_many", counts.losses.too_many),
+    ] {
+        objects
+            .get_or_create(&vec![("reason", reason.to_owned())])
+            .inc_by(number);
     }
-    registry.register("objects_refused", "Objects outside of their cell's area, or beyond 2048 of a cell", objects);
-    let [refused, throttled] = [&page.refused, &page.throttled].map(|counter| counter.load(Ordering::Relaxed));
-    counter(&mut registry, "browsers_refused", "Requests without access, and connections beyond the limit", refused);
-    counter(&mut registry, "browsers_throttled", "Requests beyond the rate", throttled);
+    registry.register(
+        "objects_refused",
+        "Objects outside of their cell's area, or beyond 2048 of a cell",
+        objects,
+    );
+    let [refused, throttled] =
+        [&page.refused, &page.throttled].map(|counter| counter.load(Ordering::Relaxed));
+    counter(
+        &mut registry,
+        "browsers_refused",
+        "Requests without access, and connections beyond the limit",
+        refused,
+    );
+    counter(
+        &mut registry,
+        "browsers_throttled",
+        "Requests beyond the rate",
+        throttled,
+    );
     let mut process = Registry::default();
     process_metrics::register(&mut process, started_at);
     let mut text = String::new();

@@ -49,11 +49,21 @@ const MAX_TILES_OF_VIEW: usize = 16;
 const MAX_NAME_BYTES: usize = 64;
 
 /// The whole map.
-const EARTH: GeographicBounds = GeographicBounds { west: -180.0, south: -85.06, east: 180.0, north: 85.06 };
+const EARTH: GeographicBounds = GeographicBounds {
+    west: -180.0,
+    south: -85.06,
+    east: 180.0,
+    north: 85.06,
+};
 
 impl RegionApi {
     pub(super) fn new(state: Arc<RegionState>, viewers: Viewers) -> Self {
-        Self { state, counts: PageCounts::default(), viewers: Mutex::new(viewers), started_at: clock::now() }
+        Self {
+            state,
+            counts: PageCounts::default(),
+            viewers: Mutex::new(viewers),
+            started_at: clock::now(),
+        }
     }
 
     /// Asks for the tiles of all viewers, of whom one looks at `bounds` now.
@@ -66,7 +76,8 @@ impl RegionApi {
         bounds: &GeographicBounds,
         now: Timestamp,
     ) -> Result<(), MapsWithheld> {
-        self.viewers().look(viewer.clone(), bounds.tiles(MAX_TILES_OF_VIEW), now)?;
+        self.viewers()
+            .look(viewer.clone(), bounds.tiles(MAX_TILES_OF_VIEW), now)?;
         self.ask(now).remove(viewer).map_or(Ok(()), Err)
     }
 
@@ -95,9 +106,13 @@ pub(super) fn router(api: &Arc<RegionApi>, access: PageAccess) -> Router {
             HttpRefusal::Throttled => &counted.counts.throttled,
         });
     });
-    let guarded =
-        Router::new().route("/metrics", get(show_metrics)).route("/api/view", get(show_view)).fallback(show_asset);
-    let routes = Router::new().route("/healthz", get(show_health)).merge(guard.protect(guarded));
+    let guarded = Router::new()
+        .route("/metrics", get(show_metrics))
+        .route("/api/view", get(show_view))
+        .fallback(show_asset);
+    let routes = Router::new()
+        .route("/healthz", get(show_health))
+        .merge(guard.protect(guarded));
     with_headers(routes).with_state(Arc::clone(api))
 }
 
@@ -125,9 +140,17 @@ async fn show_metrics(State(api): RegionRequest) -> Response {
 
 /// The town within `?bounds=WEST,SOUTH,EAST,NORTH`, whose maps are read from now on; without bounds, all of it.
 /// `viewer=NAME` tells viewers of one host apart: each looks at one place.
-async fn show_view(State(api): RegionRequest, Extension(host): Extension<BrowserHost>, uri: Uri) -> Response {
+async fn show_view(
+    State(api): RegionRequest,
+    Extension(host): Extension<BrowserHost>,
+    uri: Uri,
+) -> Response {
     let query = uri.query().unwrap_or_default();
-    let parameter = |name: &str| query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='));
+    let parameter = |name: &str| {
+        query
+            .split('&')
+            .find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))
+    };
     let bounds = match parameter("bounds") {
         None => EARTH,
         Some(text) => match text.replace("%2C", ",").parse() {
@@ -135,13 +158,28 @@ async fn show_view(State(api): RegionRequest, Extension(host): Extension<Browser
             Err(error) => return (StatusCode::BAD_REQUEST, format!("{error}\n")).into_response(),
         },
     };
-    let name = parameter("viewer").filter(|name| name.len() <= MAX_NAME_BYTES).unwrap_or_default();
+    let name = parameter("viewer")
+        .filter(|name| name.len() <= MAX_NAME_BYTES)
+        .unwrap_or_default();
     let now = clock::now();
-    let looked = api.look(&ViewerId { host: host.0, name: name.to_owned() }, &bounds, now);
+    let looked = api.look(
+        &ViewerId {
+            host: host.0,
+            name: name.to_owned(),
+        },
+        &bounds,
+        now,
+    );
     let (link, read) = (api.state.link(), api.state.tiles());
     let town = api.state.town().view(&bounds, &read, now);
     let maps_withheld = looked.err().map(MapsWithheld::in_words);
-    Json(ViewAnswer { broker_up: link.is_up, trouble: link.trouble, maps_withheld, town }).into_response()
+    Json(ViewAnswer {
+        broker_up: link.is_up,
+        trouble: link.trouble,
+        maps_withheld,
+        town,
+    })
+    .into_response()
 }
 
 async fn show_asset(uri: Uri) -> Response {

@@ -74,19 +74,36 @@ impl MapsWithheld {
 
 impl Viewers {
     pub(super) fn new(watched: Vec<Quadkey>) -> Self {
-        Self { watched, views: BTreeMap::new() }
+        Self {
+            watched,
+            views: BTreeMap::new(),
+        }
     }
 
     /// Notes that a viewer looks at tiles and no others.
     ///
     /// # Errors
     /// [`MapsWithheld::ManyViews`]; nothing has changed then.
-    pub(super) fn look(&mut self, viewer: ViewerId, tiles: Vec<Quadkey>, now: Timestamp) -> Result<(), MapsWithheld> {
+    pub(super) fn look(
+        &mut self,
+        viewer: ViewerId,
+        tiles: Vec<Quadkey>,
+        now: Timestamp,
+    ) -> Result<(), MapsWithheld> {
         if !self.views.contains_key(&viewer) && self.views.len() >= MAX_VIEWS {
-            let replaced = self.replaced_by(&viewer, now).ok_or(MapsWithheld::ManyViews)?;
+            let replaced = self
+                .replaced_by(&viewer, now)
+                .ok_or(MapsWithheld::ManyViews)?;
             self.views.remove(&replaced);
         }
-        self.views.insert(viewer, TownWindow { tiles, cells: None, looked_at: now });
+        self.views.insert(
+            viewer,
+            TownWindow {
+                tiles,
+                cells: None,
+                looked_at: now,
+            },
+        );
         Ok(())
     }
 
@@ -97,11 +114,18 @@ impl Viewers {
             return Some(oldest.0.clone());
         }
         let mut by_host = BTreeMap::<IpAddr, usize>::new();
-        self.views.keys().for_each(|id| *by_host.entry(id.host).or_default() += 1);
+        self.views
+            .keys()
+            .for_each(|id| *by_host.entry(id.host).or_default() += 1);
         let own = by_host.get(&viewer.host).copied().unwrap_or(0);
         let (host, most) = by_host.into_iter().max_by_key(|(_, views)| *views)?;
-        let of_host = self.views.iter().filter(|(id, _)| id.host == host && most > own + 1);
-        of_host.min_by_key(|(_, view)| view.looked_at).map(|(id, _)| id.clone())
+        let of_host = self
+            .views
+            .iter()
+            .filter(|(id, _)| id.host == host && most > own + 1);
+        of_host
+            .min_by_key(|(_, view)| view.looked_at)
+            .map(|(id, _)| id.clone())
     }
 
     /// All tiles whose maps are to be read, without those that are in another, and the viewers whose maps are not;
@@ -111,23 +135,37 @@ impl Viewers {
         count: impl Fn(&[Quadkey]) -> usize,
         now: Timestamp,
     ) -> (BTreeSet<Quadkey>, BTreeMap<ViewerId, MapsWithheld>) {
-        self.views.retain(|_, view| now.since(view.looked_at) < VIEW_LASTS);
+        self.views
+            .retain(|_, view| now.since(view.looked_at) < VIEW_LASTS);
         for view in self.views.values_mut() {
             view.cells.get_or_insert_with(|| count(&view.tiles));
         }
         let mut by_host = BTreeMap::<IpAddr, Vec<_>>::new();
-        self.views.iter().for_each(|(id, view)| by_host.entry(id.host).or_default().push((id, view)));
+        self.views
+            .iter()
+            .for_each(|(id, view)| by_host.entry(id.host).or_default().push((id, view)));
         let mut in_turn = Vec::new();
         for views in by_host.values_mut() {
             views.sort_by_key(|(_, view)| view.cells);
             let of_host = views.iter().enumerate();
-            in_turn.extend(of_host.map(|(turn, (id, view))| (turn, view.cells.unwrap_or_default(), *id, *view)));
+            in_turn.extend(
+                of_host
+                    .map(|(turn, (id, view))| (turn, view.cells.unwrap_or_default(), *id, *view)),
+            );
         }
         in_turn.sort_by_key(|(turn, cells, id, _)| (*turn, *cells, *id));
-        let (mut read, mut withheld) = (self.watched.iter().copied().collect::<BTreeSet<_>>(), BTreeMap::new());
+        let (mut read, mut withheld) = (
+            self.watched.iter().copied().collect::<BTreeSet<_>>(),
+            BTreeMap::new(),
+        );
         let mut cells = 0;
         for (_, cells_of_view, id, view) in in_turn {
-            let more: Vec<_> = view.tiles.iter().copied().filter(|tile| !is_within(*tile, &read)).collect();
+            let more: Vec<_> = view
+                .tiles
+                .iter()
+                .copied()
+                .filter(|tile| !is_within(*tile, &read))
+                .collect();
             let more_cells = match more.len() {
                 0 => 0,
                 all if all == view.tiles.len() => cells_of_view,
@@ -142,7 +180,9 @@ impl Viewers {
                 read.extend(more);
             }
         }
-        let outer = read.iter().filter(|tile| tile.digits() == 0 || !is_within(tile.outer(tile.digits() - 1), &read));
+        let outer = read
+            .iter()
+            .filter(|tile| tile.digits() == 0 || !is_within(tile.outer(tile.digits() - 1), &read));
         (outer.copied().collect(), withheld)
     }
 }
@@ -161,12 +201,20 @@ mod tests {
     }
 
     fn viewer(host: u8, name: usize) -> ViewerId {
-        ViewerId { host: [10, 0, 0, host].into(), name: name.to_string() }
+        ViewerId {
+            host: [10, 0, 0, host].into(),
+            name: name.to_string(),
+        }
     }
 
     /// The tile of four digits with this number.
     fn numbered(number: usize) -> Quadkey {
-        tile(&[6, 4, 2, 0].map(|bit| char::from(b'0' + (number >> bit & 3) as u8)).iter().collect::<String>())
+        tile(
+            &[6, 4, 2, 0]
+                .map(|bit| char::from(b'0' + (number >> bit & 3) as u8))
+                .iter()
+                .collect::<String>(),
+        )
     }
 
     fn at(ms: u64) -> Timestamp {
@@ -177,13 +225,30 @@ mod tests {
     fn a_tile_is_read_while_somebody_looks_and_once_only() {
         let mut viewers = Viewers::new(vec![tile("0")]);
         let read = |viewers: &mut Viewers, ms| viewers.tiles(|_| 1, at(ms)).0;
-        viewers.look(viewer(1, 1), vec![tile("12"), tile("123"), tile("013")], at(0)).unwrap();
+        viewers
+            .look(
+                viewer(1, 1),
+                vec![tile("12"), tile("123"), tile("013")],
+                at(0),
+            )
+            .unwrap();
         assert_eq!(read(&mut viewers, 1), [tile("0"), tile("12")].into());
-        viewers.look(viewer(1, 2), vec![tile("2")], at(5000)).unwrap();
-        assert_eq!(read(&mut viewers, 5000), [tile("0"), tile("12"), tile("2")].into());
+        viewers
+            .look(viewer(1, 2), vec![tile("2")], at(5000))
+            .unwrap();
+        assert_eq!(
+            read(&mut viewers, 5000),
+            [tile("0"), tile("12"), tile("2")].into()
+        );
         assert_eq!(read(&mut viewers, 11_000), [tile("0"), tile("2")].into());
-        viewers.look(viewer(1, 2), vec![tile("33")], at(12_000)).unwrap();
-        assert_eq!(read(&mut viewers, 12_000), [tile("0"), tile("33")].into(), "one that moves leaves what it saw");
+        viewers
+            .look(viewer(1, 2), vec![tile("33")], at(12_000))
+            .unwrap();
+        assert_eq!(
+            read(&mut viewers, 12_000),
+            [tile("0"), tile("33")].into(),
+            "one that moves leaves what it saw"
+        );
         assert_eq!(read(&mut viewers, 30_000), [tile("0")].into());
     }
 
@@ -195,11 +260,23 @@ mod tests {
             assert_eq!(looked.is_ok(), number < MAX_VIEWS, "{number}");
         }
         for number in 0..40 {
-            let _ = viewers.look(viewer(2, number), vec![numbered(200 + number % 50)], at(1001));
+            let _ = viewers.look(
+                viewer(2, number),
+                vec![numbered(200 + number % 50)],
+                at(1001),
+            );
         }
-        let of = |viewers: &Viewers, host| viewers.views.keys().filter(|id| id.host == viewer(host, 0).host).count();
+        let of = |viewers: &Viewers, host| {
+            viewers
+                .views
+                .keys()
+                .filter(|id| id.host == viewer(host, 0).host)
+                .count()
+        };
         assert_eq!([of(&viewers, 1), of(&viewers, 2)], [32, 32]);
-        viewers.look(viewer(3, 0), vec![tile("3333")], at(1002)).unwrap();
+        viewers
+            .look(viewer(3, 0), vec![tile("3333")], at(1002))
+            .unwrap();
         assert!(viewers.tiles(|_| 1, at(1002)).0.contains(&tile("3333")));
         assert_eq!(viewers.views.len(), MAX_VIEWS);
     }
@@ -209,10 +286,16 @@ mod tests {
         let mut viewers = Viewers::new(Vec::new());
         viewers.look(viewer(2, 0), vec![tile("3")], at(0)).unwrap();
         for number in 1..MAX_VIEWS {
-            viewers.look(viewer(1, number), vec![numbered(number)], at(3000)).unwrap();
+            viewers
+                .look(viewer(1, number), vec![numbered(number)], at(3000))
+                .unwrap();
         }
-        viewers.look(viewer(1, 100), vec![tile("2")], at(3000)).unwrap();
-        assert!(!viewers.views.contains_key(&viewer(2, 0)) && viewers.views.contains_key(&viewer(1, 1)));
+        viewers
+            .look(viewer(1, 100), vec![tile("2")], at(3000))
+            .unwrap();
+        assert!(
+            !viewers.views.contains_key(&viewer(2, 0)) && viewers.views.contains_key(&viewer(1, 1))
+        );
     }
 
     #[test]
@@ -224,12 +307,26 @@ mod tests {
             let tiles = (0..20).map(|tile| numbered(20 * number + tile)).collect();
             viewers.look(viewer(1, number), tiles, at(0)).unwrap();
         }
-        viewers.look(viewer(2, 0), (240..256).map(numbered).collect(), at(0)).unwrap();
-        viewers.look(viewer(3, 0), (0..21).map(numbered).collect(), at(0)).unwrap();
+        viewers
+            .look(viewer(2, 0), (240..256).map(numbered).collect(), at(0))
+            .unwrap();
+        viewers
+            .look(viewer(3, 0), (0..21).map(numbered).collect(), at(0))
+            .unwrap();
         let (read, withheld) = viewers.tiles(count, at(0));
-        assert!((240..256).all(|number| read.contains(&numbered(number))), "the other host's");
+        assert!(
+            (240..256).all(|number| read.contains(&numbered(number))),
+            "the other host's"
+        );
         assert_eq!(withheld.get(&viewer(3, 0)), Some(&MapsWithheld::LargeView));
-        let of_many = withheld.values().filter(|reason| **reason == MapsWithheld::ManyCells).count();
-        assert_eq!((read.len(), of_many), (16 + 4 * 20, 8), "10,000 cells at most");
+        let of_many = withheld
+            .values()
+            .filter(|reason| **reason == MapsWithheld::ManyCells)
+            .count();
+        assert_eq!(
+            (read.len(), of_many),
+            (16 + 4 * 20, 8),
+            "10,000 cells at most"
+        );
     }
 }

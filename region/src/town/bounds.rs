@@ -20,7 +20,9 @@ pub struct GeographicBounds {
 
 /// A text that is no [`GeographicBounds`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("bounds are four numbers WEST,SOUTH,EAST,NORTH in degrees, west below east and south below north")]
+#[error(
+    "bounds are four numbers WEST,SOUTH,EAST,NORTH in degrees, west below east and south below north"
+)]
 pub struct InvalidBounds;
 
 impl FromStr for GeographicBounds {
@@ -31,8 +33,18 @@ impl FromStr for GeographicBounds {
         let &[west, south, east, north] = numbers.map_err(|_| InvalidBounds)?.as_slice() else {
             return Err(InvalidBounds);
         };
-        let bounds = Self { west, south, east, north };
-        if west < east && south < north && [west, south, east, north].iter().all(|number| number.is_finite()) {
+        let bounds = Self {
+            west,
+            south,
+            east,
+            north,
+        };
+        if west < east
+            && south < north
+            && [west, south, east, north]
+                .iter()
+                .all(|number| number.is_finite())
+        {
             Ok(bounds)
         } else {
             Err(InvalidBounds)
@@ -44,7 +56,12 @@ impl GeographicBounds {
     /// The bounds of a tile.
     pub fn of(tile: Quadkey) -> Self {
         let [[north, west], [south, east]] = tile.corners_deg();
-        Self { west, south, east, north }
+        Self {
+            west,
+            south,
+            east,
+            north,
+        }
     }
 
     /// The least bounds around both.
@@ -60,7 +77,10 @@ impl GeographicBounds {
 
     /// True if both have a place in common.
     pub fn meets(&self, other: &Self) -> bool {
-        self.west < other.east && other.west < self.east && self.south < other.north && other.south < self.north
+        self.west < other.east
+            && other.west < self.east
+            && self.south < other.north
+            && other.south < self.north
     }
 
     /// The smallest tiles that cover the bounds, at most so many, none smaller than a cell's.
@@ -85,17 +105,40 @@ mod tests {
 
     #[test]
     fn a_view_is_covered_by_few_tiles_whatever_its_size() {
-        for (text, max_digits) in [("2.29,48.85,2.30,48.86", 15), ("2.0,48.5,2.6,49.1", 11), ("-180,-85,180,85", 2)] {
+        for (text, max_digits) in [
+            ("2.29,48.85,2.30,48.86", 15),
+            ("2.0,48.5,2.6,49.1", 11),
+            ("-180,-85,180,85", 2),
+        ] {
             let view: GeographicBounds = text.parse().unwrap();
             let tiles = view.tiles(16);
             assert!((1..=16).contains(&tiles.len()), "{text}: {}", tiles.len());
-            assert!(tiles.iter().all(|tile| tile.digits() <= max_digits), "{text}: {}", tiles[0]);
-            let all = tiles.iter().map(|tile| GeographicBounds::of(*tile)).reduce(GeographicBounds::with).unwrap();
-            assert!(all.west <= view.west && all.east >= view.east && all.north >= view.north, "{all:?}");
+            assert!(
+                tiles.iter().all(|tile| tile.digits() <= max_digits),
+                "{text}: {}",
+                tiles[0]
+            );
+            let all = tiles
+                .iter()
+                .map(|tile| GeographicBounds::of(*tile))
+                .reduce(GeographicBounds::with)
+                .unwrap();
+            assert!(
+                all.west <= view.west && all.east >= view.east && all.north >= view.north,
+                "{all:?}"
+            );
         }
-        assert_eq!("0,86,1,87".parse::<GeographicBounds>().unwrap().tiles(16), [], "beyond the map");
+        assert_eq!(
+            "0,86,1,87".parse::<GeographicBounds>().unwrap().tiles(16),
+            [],
+            "beyond the map"
+        );
         for stranger in ["", "1,2,3", "2,1,1,2", "a,b,c,d", "NaN,0,1,1"] {
-            assert_eq!(stranger.parse::<GeographicBounds>(), Err(InvalidBounds), "{stranger}");
+            assert_eq!(
+                stranger.parse::<GeographicBounds>(),
+                Err(InvalidBounds),
+                "{stranger}"
+            );
         }
     }
 }

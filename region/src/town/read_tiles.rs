@@ -23,7 +23,9 @@ impl ReadTiles {
 
     /// Reads these tiles and no others from `now` on. The time of those that are read already stays.
     pub fn replace(&mut self, tiles: impl Iterator<Item = Quadkey>, now: Timestamp) {
-        self.0 = tiles.map(|tile| (tile, self.since(tile).unwrap_or(now))).collect();
+        self.0 = tiles
+            .map(|tile| (tile, self.since(tile).unwrap_or(now)))
+            .collect();
     }
 
     /// Reads none.
@@ -47,7 +49,8 @@ mod tests {
         let mut read = ReadTiles::default();
         read.replace([tile("12"), tile("3")].into_iter(), Timestamp(5));
         read.replace([tile("120"), tile("2")].into_iter(), Timestamp(9));
-        let since = ["120", "1203", "121", "2", "3"].map(|key| read.since(tile(key)).map(|since| since.0));
+        let since =
+            ["120", "1203", "121", "2", "3"].map(|key| read.since(tile(key)).map(|since| since.0));
         assert_eq!(since, [Some(5), Some(5), None, Some(9), None]);
     }
 }

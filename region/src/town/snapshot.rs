@@ -137,16 +137,22 @@ pub(super) const MAX_OBJECTS_SHOWN: usize = 4096;
 impl RegionTown {
     /// Number of cells in each state.
     pub fn states(&self, tiles: &ReadTiles, now: Timestamp) -> BTreeMap<CellState, usize> {
-        let mut states: BTreeMap<_, _> = CellState::ALL.into_iter().map(|state| (state, 0)).collect();
+        let mut states: BTreeMap<_, _> =
+            CellState::ALL.into_iter().map(|state| (state, 0)).collect();
         for ((tile, _), cell) in self.cells() {
-            *states.entry(cell.state(now, tiles.since(*tile))).or_default() += 1;
+            *states
+                .entry(cell.state(now, tiles.since(*tile)))
+                .or_default() += 1;
         }
         states
     }
 
     /// Number of cells within tiles.
     pub fn count_within(&self, tiles: &[Quadkey]) -> usize {
-        self.cells().keys().filter(|(tile, _)| tiles.iter().any(|outer| outer.contains(*tile))).count()
+        self.cells()
+            .keys()
+            .filter(|(tile, _)| tiles.iter().any(|outer| outer.contains(*tile)))
+            .count()
     }
 
     /// The town within bounds.
@@ -181,9 +187,19 @@ impl RegionTown {
             }
         }
         let mut view = TownTotals::default();
-        shown.iter().for_each(|(_, _, cell, state)| view.add(cell, *state));
-        let cells = if shown.len() > max_cells { &[] } else { &*shown };
-        let objects = if view.objects > max_objects { &[] } else { &*shown };
+        shown
+            .iter()
+            .for_each(|(_, _, cell, state)| view.add(cell, *state));
+        let cells = if shown.len() > max_cells {
+            &[]
+        } else {
+            &*shown
+        };
+        let objects = if view.objects > max_objects {
+            &[]
+        } else {
+            &*shown
+        };
         TownView {
             known,
             region,
@@ -207,13 +223,20 @@ type Shown<'a> = (Quadkey, &'a NodeName, &'a RegionCell, CellState);
 
 /// Tiles of one size with the cells in them.
 fn tiles(bounds: &GeographicBounds, shown: &[Shown<'_>], now: Timestamp) -> Vec<TileView> {
-    let digits = bounds.tiles(MAX_TILES_SHOWN).first().map_or(0, |tile| tile.digits());
+    let digits = bounds
+        .tiles(MAX_TILES_SHOWN)
+        .first()
+        .map_or(0, |tile| tile.digits());
     let mut tiles = BTreeMap::<Quadkey, (TownTotals, Option<f64>)>::new();
     for (tile, _, cell, state) in shown {
         let (totals, oldest_s) = tiles.entry(tile.outer(digits)).or_default();
         totals.add(cell, *state);
         let is_read = [CellState::Live, CellState::Silent].contains(state);
-        let age_s = cell.map.as_ref().filter(|_| is_read).map(|map| map.age_s(now));
+        let age_s = cell
+            .map
+            .as_ref()
+            .filter(|_| is_read)
+            .map(|map| map.age_s(now));
         *oldest_s = [*oldest_s, age_s].into_iter().flatten().reduce(f64::max);
     }
     let view = |(tile, (totals, oldest_s)): (Quadkey, (TownTotals, Option<f64>))| TileView {
@@ -235,7 +258,11 @@ impl TownTotals {
             CellState::Offline => &mut self.offline,
         };
         *number += 1;
-        self.troubled += usize::from(cell.status.as_ref().is_some_and(|status| !status.troubles.is_empty()));
+        self.troubled += usize::from(
+            cell.status
+                .as_ref()
+                .is_some_and(|status| !status.troubles.is_empty()),
+        );
         // Objects of an old map may be gone.
         if let (CellState::Live, Some(TownMap { objects, .. })) = (state, &cell.map) {
             self.objects += objects.len();
@@ -245,7 +272,10 @@ impl TownTotals {
 }
 
 fn vehicles(objects: &[FusedObject]) -> usize {
-    objects.iter().filter(|object| object.vehicle.is_some()).count()
+    objects
+        .iter()
+        .filter(|object| object.vehicle.is_some())
+        .count()
 }
 
 impl TownMap {
@@ -258,7 +288,10 @@ impl TownMap {
 impl RegionCell {
     /// The objects of its newest map, on Earth.
     pub fn objects<'a>(&'a self, name: &'a NodeName) -> impl Iterator<Item = ObjectView> + 'a {
-        let placed = self.map.iter().flat_map(|map| map.objects.iter().map(|object| (&map.origin, object)));
+        let placed = self
+            .map
+            .iter()
+            .flat_map(|map| map.objects.iter().map(|object| (&map.origin, object)));
         placed.map(move |(origin, object)| ObjectView::new(name, origin, object))
     }
 }
@@ -274,19 +307,28 @@ impl ObjectView {
             confidence: object.confidence,
             latitude_deg: at.latitude_deg,
             longitude_deg: at.longitude_deg,
-            velocity_mps: object.velocity_mps.map(|[x, y]| [x * cos - y * sin, x * sin + y * cos]),
+            velocity_mps: object
+                .velocity_mps
+                .map(|[x, y]| [x * cos - y * sin, x * sin + y * cos]),
             vehicle: object.vehicle.clone(),
         }
     }
 }
 
 impl TownCellView {
-    fn new(tile: Quadkey, name: &NodeName, cell: &RegionCell, state: CellState, now: Timestamp) -> Self {
+    fn new(
+        tile: Quadkey,
+        name: &NodeName,
+        cell: &RegionCell,
+        state: CellState,
+        now: Timestamp,
+    ) -> Self {
         let (map, status) = (cell.map.as_ref(), cell.status.as_ref());
         let [[north, west], [south, east]] = tile.corners_deg();
         let middle = [(north + south) / 2.0, (west + east) / 2.0];
-        let [latitude_deg, longitude_deg] =
-            map.map_or(middle, |map| [map.origin.latitude_deg, map.origin.longitude_deg]);
+        let [latitude_deg, longitude_deg] = map.map_or(middle, |map| {
+            [map.origin.latitude_deg, map.origin.longitude_deg]
+        });
         let led = status.and_then(|status| status.aggregator.clone());
         Self {
             cell: name.clone(),
@@ -295,15 +337,21 @@ impl TownCellView {
             longitude_deg,
             state: state.as_str(),
             leader: map.map(|map| map.aggregator.clone()).or(led),
-            epoch: map.map(|map| map.epoch).or(status.map(|status| status.epoch)),
+            epoch: map
+                .map(|map| map.epoch)
+                .or(status.map(|status| status.epoch)),
             round: map.map(|map| map.round),
             age_s: map.map(|map| map.age_s(now)),
             objects: map.map_or(0, |map| map.objects.len()),
             vehicles: map.map_or(0, |map| vehicles(&map.objects)),
-            troubles: status.map(|status| status.troubles.clone()).unwrap_or_default(),
+            troubles: status
+                .map(|status| status.troubles.clone())
+                .unwrap_or_default(),
             version: status.map(|status| status.version.clone()),
             description: cell.description,
-            page: status.and_then(|status| status.page.clone()).filter(|page| is_reachable(page)),
+            page: status
+                .and_then(|status| status.page.clone())
+                .filter(|page| is_reachable(page)),
             messages_refused: cell.losses.throttled,
             objects_refused: cell.losses.outside + cell.losses.too_many,
         }
@@ -312,6 +360,8 @@ impl TownCellView {
 
 /// True if an announced address is one that browsers elsewhere can open.
 fn is_reachable(page: &str) -> bool {
-    let ip = page.parse::<std::net::SocketAddr>().map(|address| address.ip());
+    let ip = page
+        .parse::<std::net::SocketAddr>()
+        .map(|address| address.ip());
     ip.is_ok_and(|ip| !ip.is_unspecified() && !ip.is_loopback())
 }

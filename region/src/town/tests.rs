@@ -5,15 +5,23 @@ use uuid::Uuid;
 
 use super::*;
 
-const PLACE: GeographicOrigin =
-    GeographicOrigin { latitude_deg: 48.8584, longitude_deg: 2.2945, height_m: 0.0, rotation_deg: 0.0 };
+const PLACE: GeographicOrigin = GeographicOrigin {
+    latitude_deg: 48.8584,
+    longitude_deg: 2.2945,
+    height_m: 0.0,
+    rotation_deg: 0.0,
+};
 
 fn at(ms: u64) -> Timestamp {
     Timestamp(1_800_000_000_000_000 + 1000 * ms)
 }
 
 fn topic(cell: &'static str, kind: RegionTopicKind) -> RegionTopic {
-    RegionTopic { tile: Quadkey::of_cell(&PLACE), cell: NodeName::from_static(cell), kind }
+    RegionTopic {
+        tile: Quadkey::of_cell(&PLACE),
+        cell: NodeName::from_static(cell),
+        kind,
+    }
 }
 
 fn tile() -> Quadkey {
@@ -31,20 +39,61 @@ fn map(
     let object = |x_m: &f64| {
         let contributors = vec![NodeName::from_static("euclid")];
         let scores = [("car".into(), 0.9)].into();
-        let of = FusedObject::new(Uuid::new_v4(), "car", 0.9, *x_m, 0.0, Covariance::isotropic(0.1));
-        FusedObject { contributors, scores, ..of }
+        let of = FusedObject::new(
+            Uuid::new_v4(),
+            "car",
+            0.9,
+            *x_m,
+            0.0,
+            Covariance::isotropic(0.1),
+        );
+        FusedObject {
+            contributors,
+            scores,
+            ..of
+        }
     };
-    let (epoch, objects) = (Epoch::new(1, NodeName::from_static("edge")), east_m.iter().map(object).collect());
-    let map = GlobalMap { objects, ..GlobalMap::new(&epoch, round, at(ms)) };
+    let (epoch, objects) = (
+        Epoch::new(1, NodeName::from_static("edge")),
+        east_m.iter().map(object).collect(),
+    );
+    let map = GlobalMap {
+        objects,
+        ..GlobalMap::new(&epoch, round, at(ms))
+    };
     let cell_name = NodeName::from_static(cell);
-    let message = CellMap { schema: SCHEMA_VERSION, cell: cell_name, sent_at_us: at(ms), origin: PLACE, map };
-    town.accept(&topic(cell, RegionTopicKind::Map).path(), &encode(&message, Encoding::Compact), at(ms))
+    let message = CellMap {
+        schema: SCHEMA_VERSION,
+        cell: cell_name,
+        sent_at_us: at(ms),
+        origin: PLACE,
+        map,
+    };
+    town.accept(
+        &topic(cell, RegionTopicKind::Map).path(),
+        &encode(&message, Encoding::Compact),
+        at(ms),
+    )
 }
 
-fn status(town: &mut RegionTown, cell: &'static str, ms: u64, state: NodeState) -> Result<Accepted, CellRefusal> {
-    let status = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, "0.1.0");
+fn status(
+    town: &mut RegionTown,
+    cell: &'static str,
+    ms: u64,
+    state: NodeState,
+) -> Result<Accepted, CellRefusal> {
+    let status = NodeStatus::starting(
+        NodeName::from_static("edge"),
+        Uuid::nil(),
+        Role::Edge,
+        "0.1.0",
+    );
     let payload = encode(&NodeStatus { state, ..status }, Encoding::Json);
-    town.accept(&topic(cell, RegionTopicKind::Status).path(), &payload, at(ms))
+    town.accept(
+        &topic(cell, RegionTopicKind::Status).path(),
+        &payload,
+        at(ms),
+    )
 }
 
 #[test]
@@ -56,42 +105,86 @@ fn a_cell_that_floods_is_held_to_its_rate_and_others_are_heard() {
     }
     let throttled = 2 * (1000 - 40);
     let losses = town.cells()[&(tile(), NodeName::from_static("flood"))].losses;
-    assert!((throttled - 4..=throttled + 4).contains(&losses.throttled), "{losses:?}");
+    assert!(
+        (throttled - 4..=throttled + 4).contains(&losses.throttled),
+        "{losses:?}"
+    );
     assert_eq!(town.counts().losses.throttled, losses.throttled);
     status(&mut town, "quiet", 1000, NodeState::Aggregating).unwrap();
     let _ = map(&mut town, "flood", 2000, 1001, &[]);
-    assert_eq!(map(&mut town, "flood", 2001, 1001, &[]), Err(CellRefusal::CellThrottled));
+    assert_eq!(
+        map(&mut town, "flood", 2001, 1001, &[]),
+        Err(CellRefusal::CellThrottled)
+    );
 }
 
 #[test]
 fn objects_beyond_a_cells_area_are_counted_and_not_shown() {
     let mut town = RegionTown::default();
     for round in 1..=20 {
-        let _ = map(&mut town, "lot", round, 100 * round, &[0.0, 250.0, 5000.0, -800_000.0]);
+        let _ = map(
+            &mut town,
+            "lot",
+            round,
+            100 * round,
+            &[0.0, 250.0, 5000.0, -800_000.0],
+        );
     }
     let cell = &town.cells()[&(tile(), NodeName::from_static("lot"))];
-    let shown: Vec<_> = cell.map.as_ref().unwrap().objects.iter().map(|object| object.x_m).collect();
+    let shown: Vec<_> = cell
+        .map
+        .as_ref()
+        .unwrap()
+        .objects
+        .iter()
+        .map(|object| object.x_m)
+        .collect();
     assert_eq!(shown, [0.0, 250.0]);
     let maps = town.counts().maps;
     assert_eq!((cell.losses.outside, cell.losses.too_many), (2 * maps, 0));
-    let view = town.view(&GeographicBounds::of(Quadkey::default()), &ReadTiles::default(), at(2000));
-    assert_eq!((view.objects.len(), view.cells[0].objects_refused), (2, 2 * maps));
+    let view = town.view(
+        &GeographicBounds::of(Quadkey::default()),
+        &ReadTiles::default(),
+        at(2000),
+    );
+    assert_eq!(
+        (view.objects.len(), view.cells[0].objects_refused),
+        (2, 2 * maps)
+    );
 }
 
 #[test]
 fn what_is_kept_of_a_cell_is_bounded() {
     let mut town = RegionTown::default();
     for round in 1..=20 {
-        let _ = map(&mut town, "lot", round, 100 * round, &vec![1.0; MAX_OBJECTS + 10]);
+        let _ = map(
+            &mut town,
+            "lot",
+            round,
+            100 * round,
+            &vec![1.0; MAX_OBJECTS + 10],
+        );
     }
-    let long = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, &"9".repeat(20_000));
+    let long = NodeStatus::starting(
+        NodeName::from_static("edge"),
+        Uuid::nil(),
+        Role::Edge,
+        &"9".repeat(20_000),
+    );
     let path = topic("lot", RegionTopicKind::Status).path();
     let refused = town.accept(&path, &encode(&long, Encoding::Json), at(2000));
     assert_eq!(refused, Err(CellRefusal::Rejected(RejectReason::TooLarge)));
     let cell = &town.cells()[&(tile(), NodeName::from_static("lot"))];
     let objects = &cell.map.as_ref().unwrap().objects;
-    assert_eq!((objects.len(), cell.losses.too_many), (MAX_OBJECTS, 10 * town.counts().maps));
-    assert!(objects.iter().all(|object| object.contributors.is_empty() && object.scores.is_empty()));
+    assert_eq!(
+        (objects.len(), cell.losses.too_many),
+        (MAX_OBJECTS, 10 * town.counts().maps)
+    );
+    assert!(
+        objects
+            .iter()
+            .all(|object| object.contributors.is_empty() && object.scores.is_empty())
+    );
 }
 
 #[test]
@@ -103,7 +196,11 @@ fn a_cell_is_silent_only_when_a_map_was_due() {
         cell.state(at(ms), read_ms.map(at))
     };
     assert_eq!(state(&town, None, 60_000), CellState::Told);
-    for (ms, expected) in [(60_000, CellState::Told), (62_900, CellState::Told), (63_000, CellState::Silent)] {
+    for (ms, expected) in [
+        (60_000, CellState::Told),
+        (62_900, CellState::Told),
+        (63_000, CellState::Silent),
+    ] {
         assert_eq!(state(&town, Some(60_000), ms), expected, "{ms} ms");
     }
     // One that comes back is given the same time.
@@ -117,6 +214,14 @@ fn a_cell_is_silent_only_when_a_map_was_due() {
     for round in 1..=6 {
         let _ = map(&mut town, "lot", round, 80_000 + 500 * round, &[]);
         let state = state(&town, Some(80_000), 80_000 + 500 * round + 499);
-        assert_eq!(state, if round < 3 { CellState::Told } else { CellState::Live }, "{round}");
+        assert_eq!(
+            state,
+            if round < 3 {
+                CellState::Told
+            } else {
+                CellState::Live
+            },
+            "{round}"
+        );
     }
 }

@@ -59,14 +59,28 @@ impl Broker {
         add_cell(first, &[], LOT);
         let names = routes.map(|route| format!("\"nats://{route}\""));
         for directory in &directories {
-            for file in ["common.conf", "nats-cluster.conf", "cluster-tls.conf", "mqtt.conf"] {
+            for file in [
+                "common.conf",
+                "nats-cluster.conf",
+                "cluster-tls.conf",
+                "mqtt.conf",
+            ] {
                 fs::copy(Path::new(DEPLOY).join(file), directory.path().join(file)).unwrap();
             }
-            fs::write(directory.path().join("routes.conf"), format!("routes: [{}]\n", names.join(", "))).unwrap();
+            fs::write(
+                directory.path().join("routes.conf"),
+                format!("routes: [{}]\n", names.join(", ")),
+            )
+            .unwrap();
         }
         for directory in &directories[1..] {
             let copied = ["tls", "passwords", "accounts.conf"].map(|path| first.join(path));
-            let status = Command::new("cp").arg("-r").args(copied).arg(directory.path()).status().unwrap();
+            let status = Command::new("cp")
+                .arg("-r")
+                .args(copied)
+                .arg(directory.path())
+                .status()
+                .unwrap();
             assert!(status.success());
         }
         let mut number = 0;
@@ -92,7 +106,9 @@ impl Broker {
         let (directory, address) = (TempDir::new().unwrap(), free_address());
         let at = |file: &str| directory.path().join(file).display().to_string();
         make_certificates(&directory.path().join("tls"));
-        let mut acl = "user region.reader\ntopic read ecod/v1/#\nuser town\ntopic write ecod/v1/#\n".to_owned();
+        let mut acl =
+            "user region.reader\ntopic read ecod/v1/#\nuser town\ntopic write ecod/v1/#\n"
+                .to_owned();
         for (name, latitude, longitude) in [LOT, FAR] {
             acl += &account(&["--engine", "mosquitto"], name, latitude, longitude);
         }
@@ -102,12 +118,18 @@ impl Broker {
             fs::write(at(&format!("passwords/{user}")), "secret\n").unwrap();
             let (file, made) = (at("passwd"), directory.path().join("passwd").exists());
             let create: &[&str] = if made { &[] } else { &["-c"] };
-            let status = Command::new("mosquitto_passwd").args(create).args(["-b", &file, user, "secret"]).status();
+            let status = Command::new("mosquitto_passwd")
+                .args(create)
+                .args(["-b", &file, user, "secret"])
+                .status();
             assert!(status.unwrap().success());
         }
         let conf = fs::read_to_string(Path::new(DEPLOY).join("mosquitto.conf")).unwrap();
         let conf = conf
-            .replace("listener 8883", &format!("listener {} 127.0.0.1", address.port()))
+            .replace(
+                "listener 8883",
+                &format!("listener {} 127.0.0.1", address.port()),
+            )
             .replace("/etc/ecod-region", directory.path().to_str().unwrap())
             .replace("persistence true", "persistence false");
         fs::write(at("mosquitto.conf"), conf).unwrap();
@@ -118,9 +140,20 @@ impl Broker {
 
     fn start(mut command: Command, directory: TempDir, address: SocketAddr) -> Self {
         let log = fs::File::create(directory.path().join("log")).unwrap();
-        command.current_dir(directory.path()).stdout(Stdio::null()).stderr(log).process_group(0);
-        let child = command.spawn().expect("nats-server and mosquitto are installed by `make test`");
-        let broker = Self { child, directory, address, route: None };
+        command
+            .current_dir(directory.path())
+            .stdout(Stdio::null())
+            .stderr(log)
+            .process_group(0);
+        let child = command
+            .spawn()
+            .expect("nats-server and mosquitto are installed by `make test`");
+        let broker = Self {
+            child,
+            directory,
+            address,
+            route: None,
+        };
         wait_for("the broker listens", || TcpStream::connect(address).is_ok());
         broker
     }
@@ -132,7 +165,9 @@ impl Broker {
 
     /// Sends a signal, such as `HUP`.
     pub(crate) fn signal(&self, name: &str) {
-        let status = Command::new("kill").args([&format!("-{name}"), &self.child.id().to_string()]).status();
+        let status = Command::new("kill")
+            .args([&format!("-{name}"), &self.child.id().to_string()])
+            .status();
         assert!(status.unwrap().success());
     }
 
@@ -159,25 +194,48 @@ impl Broker {
 
     /// Another password for a cell, which the server takes while it runs.
     pub(crate) fn renew_password(&self, name: &str, latitude: f64, longitude: f64) {
-        add_cell(self.directory(), &["--new-password"], (name, latitude, longitude));
+        add_cell(
+            self.directory(),
+            &["--new-password"],
+            (name, latitude, longitude),
+        );
         self.signal("HUP");
     }
 
     /// The lines that `make-streams` prints.
     pub(crate) fn make_streams(&self) -> Vec<String> {
         let output = Command::new(Path::new(DEPLOY).join("make-streams"))
-            .args(["1", "-h", "127.0.0.1", "-p", &self.address.port().to_string(), "--cafile", "tls/ca.pem"])
+            .args([
+                "1",
+                "-h",
+                "127.0.0.1",
+                "-p",
+                &self.address.port().to_string(),
+                "--cafile",
+                "tls/ca.pem",
+            ])
             .current_dir(self.directory())
             .env("REGION_CONFIG", self.directory())
             .output()
             .unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        String::from_utf8(output.stdout).unwrap().lines().map(str::to_owned).collect()
+        assert!(
+            output.status.success(),
+            "{}",
+            String::from_utf8_lossy(&output.stderr)
+        );
+        String::from_utf8(output.stdout)
+            .unwrap()
+            .lines()
+            .map(str::to_owned)
+            .collect()
     }
 
     /// A reader of the whole region that tells of each message.
     pub(crate) fn read(&self, seen: impl FnMut(&Reading<'_>) + Send + 'static) -> Arc<RegionState> {
-        let (login, state) = (self.login("region.reader"), Arc::new(RegionState::default()));
+        let (login, state) = (
+            self.login("region.reader"),
+            Arc::new(RegionState::default()),
+        );
         state.ask(["".parse().unwrap()].into());
         let read = Arc::clone(&state);
         tokio::spawn(async move { reader::read(&login, &read, seen).await });
@@ -187,11 +245,16 @@ impl Broker {
 
 impl Drop for Broker {
     fn drop(&mut self) {
-        let _ = Command::new("kill").args(["-CONT", &self.child.id().to_string()]).status();
+        let _ = Command::new("kill")
+            .args(["-CONT", &self.child.id().to_string()])
+            .status();
         let _ = self.child.kill();
         let _ = self.child.wait();
         if std::thread::panicking() {
-            eprintln!("{}", fs::read_to_string(self.directory().join("log")).unwrap_or_default());
+            eprintln!(
+                "{}",
+                fs::read_to_string(self.directory().join("log")).unwrap_or_default()
+            );
         }
     }
 }
@@ -205,14 +268,30 @@ fn add_cell(directory: &Path, flags: &[&str], (name, latitude, longitude): (&str
         .env("REGION_PROGRAM", env!("CARGO_BIN_EXE_ecod-region"))
         .output()
         .unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
 }
 
 fn account(flags: &[&str], name: &str, latitude: f64, longitude: f64) -> String {
-    let place = [format!("--cell={name}"), format!("--latitude={latitude}"), format!("--longitude={longitude}")];
-    let output = Command::new(env!("CARGO_BIN_EXE_ecod-region")).arg("cell-account").args(place).args(flags).output();
+    let place = [
+        format!("--cell={name}"),
+        format!("--latitude={latitude}"),
+        format!("--longitude={longitude}"),
+    ];
+    let output = Command::new(env!("CARGO_BIN_EXE_ecod-region"))
+        .arg("cell-account")
+        .args(place)
+        .args(flags)
+        .output();
     let output = output.unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     String::from_utf8(output.stdout).unwrap()
 }
 
@@ -223,19 +302,26 @@ fn make_certificates(directory: &PathBuf) {
     let mut ca = rcgen::CertificateParams::new(Vec::new()).unwrap();
     ca.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
     // OpenSSL takes a certificate for self-signed that has its issuer's name.
-    ca.distinguished_name.push(rcgen::DnType::CommonName, "region");
+    ca.distinguished_name
+        .push(rcgen::DnType::CommonName, "region");
     let ca_certificate = ca.self_signed(&ca_key).unwrap();
     let issuer = rcgen::Issuer::new(ca, ca_key);
     let key = rcgen::KeyPair::generate().unwrap();
     let names = vec!["127.0.0.1".to_owned(), "localhost".to_owned()];
-    let server = rcgen::CertificateParams::new(names).unwrap().signed_by(&key, &issuer).unwrap();
+    let server = rcgen::CertificateParams::new(names)
+        .unwrap()
+        .signed_by(&key, &issuer)
+        .unwrap();
     fs::write(directory.join("ca.pem"), ca_certificate.pem()).unwrap();
     fs::write(directory.join("server.pem"), server.pem()).unwrap();
     fs::write(directory.join("server-key.pem"), key.serialize_pem()).unwrap();
 }
 
 pub(crate) fn free_address() -> SocketAddr {
-    TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap().local_addr().unwrap()
+    TcpListener::bind((Ipv4Addr::LOCALHOST, 0))
+        .unwrap()
+        .local_addr()
+        .unwrap()
 }
 
 /// Waits until something is so.

@@ -8,8 +8,8 @@ use ecod::model::geometry::Covariance;
 use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::wire::{
-    CellMap, Encoding, FusedObject, GlobalMap, NodeState, NodeStatus, RegionTopic, RegionTopicKind, Role,
-    SCHEMA_VERSION, encode,
+    CellMap, Encoding, FusedObject, GlobalMap, NodeState, NodeStatus, RegionTopic, RegionTopicKind,
+    Role, SCHEMA_VERSION, encode,
 };
 use ecod_actors::platform::clock;
 use ecod_region::account::CellAccount;
@@ -39,8 +39,16 @@ pub(crate) struct Heard {
 
 impl Cell {
     /// Connects as this user.
-    pub(crate) fn connect(broker: &Broker, (name, latitude_deg, longitude_deg): (&'static str, f64, f64)) -> Self {
-        let origin = GeographicOrigin { latitude_deg, longitude_deg, height_m: 0.0, rotation_deg: 0.0 };
+    pub(crate) fn connect(
+        broker: &Broker,
+        (name, latitude_deg, longitude_deg): (&'static str, f64, f64),
+    ) -> Self {
+        let origin = GeographicOrigin {
+            latitude_deg,
+            longitude_deg,
+            height_m: 0.0,
+            rotation_deg: 0.0,
+        };
         let (client, mut events) = AsyncClient::new(broker.login(name).options(), 4096);
         let heard = Arc::new(Mutex::new(Heard::default()));
         let noted = Arc::clone(&heard);
@@ -51,10 +59,15 @@ impl Cell {
                 match event {
                     Ok(Event::Incoming(Packet::ConnAck(_))) => noted.logins += 1,
                     Ok(Event::Incoming(Packet::SubAck(answer))) => {
-                        let granted = |code: &SubscribeReasonCode| *code != SubscribeReasonCode::Failure;
-                        noted.granted.extend(answer.return_codes.iter().map(granted));
+                        let granted =
+                            |code: &SubscribeReasonCode| *code != SubscribeReasonCode::Failure;
+                        noted
+                            .granted
+                            .extend(answer.return_codes.iter().map(granted));
                     }
-                    Ok(Event::Incoming(Packet::Publish(message))) => noted.topics.push(message.topic),
+                    Ok(Event::Incoming(Packet::Publish(message))) => {
+                        noted.topics.push(message.topic)
+                    }
                     Err(rumqttc::ConnectionError::ConnectionRefused(_)) => {
                         noted.is_refused = true;
                         return;
@@ -67,7 +80,13 @@ impl Cell {
                 }
             }
         });
-        Self { account: CellAccount::new(NodeName::from_static(name), &origin), origin, client, heard, polling }
+        Self {
+            account: CellAccount::new(NodeName::from_static(name), &origin),
+            origin,
+            client,
+            heard,
+            polling,
+        }
     }
 
     /// Logs in as this user with a last will, if the broker lets it, and is gone without goodbye.
@@ -88,17 +107,28 @@ impl Cell {
 
     /// A topic of this cell.
     pub(crate) fn topic(&self, kind: RegionTopicKind) -> String {
-        RegionTopic { tile: self.account.tile, cell: self.account.cell.clone(), kind }.path()
+        RegionTopic {
+            tile: self.account.tile,
+            cell: self.account.cell.clone(),
+            kind,
+        }
+        .path()
     }
 
     /// Publishes without waiting.
     pub(crate) fn publish(&self, topic: &str, retain: bool, payload: Vec<u8>) {
-        self.client.try_publish(topic, QoS::AtMostOnce, retain, payload).unwrap();
+        self.client
+            .try_publish(topic, QoS::AtMostOnce, retain, payload)
+            .unwrap();
     }
 
     /// Publishes the map of a round, with so many objects, one of which is a vehicle.
     pub(crate) fn publish_map(&self, round: u64, objects: usize) {
-        self.publish(&self.topic(RegionTopicKind::Map), false, encode(&self.map(round, objects), Encoding::Compact));
+        self.publish(
+            &self.topic(RegionTopicKind::Map),
+            false,
+            encode(&self.map(round, objects), Encoding::Compact),
+        );
     }
 
     pub(crate) fn map(&self, round: u64, objects: usize) -> CellMap {
@@ -117,24 +147,52 @@ impl Cell {
             )
         };
         let objects = (0..objects).map(object).collect();
-        let map = GlobalMap { objects, ..GlobalMap::new(&epoch, round, now) };
-        CellMap { schema: SCHEMA_VERSION, cell: self.account.cell.clone(), sent_at_us: now, origin: self.origin, map }
+        let map = GlobalMap {
+            objects,
+            ..GlobalMap::new(&epoch, round, now)
+        };
+        CellMap {
+            schema: SCHEMA_VERSION,
+            cell: self.account.cell.clone(),
+            sent_at_us: now,
+            origin: self.origin,
+            map,
+        }
     }
 
     /// The status of its leader.
     pub(crate) fn status(&self, state: NodeState) -> Vec<u8> {
-        let starting = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, "0.1.0");
+        let starting = NodeStatus::starting(
+            NodeName::from_static("edge"),
+            Uuid::nil(),
+            Role::Edge,
+            "0.1.0",
+        );
         let page = Some("10.0.0.3:8080".to_owned());
         let aggregator = Some(NodeName::from_static("edge"));
-        encode(&NodeStatus { state, epoch: 1, aggregator, page, ..starting }, Encoding::Json)
+        encode(
+            &NodeStatus {
+                state,
+                epoch: 1,
+                aggregator,
+                page,
+                ..starting
+            },
+            Encoding::Json,
+        )
     }
 
     /// Subscribes, and returns what the broker granted.
     pub(crate) async fn subscribe(&self, filters: &[String]) -> Vec<bool> {
         let before = self.heard().granted.len();
-        let wanted = filters.iter().map(|filter| SubscribeFilter::new(filter.clone(), QoS::AtMostOnce));
+        let wanted = filters
+            .iter()
+            .map(|filter| SubscribeFilter::new(filter.clone(), QoS::AtMostOnce));
         self.client.subscribe_many(wanted).await.unwrap();
-        crate::broker::until("the broker answers", || self.heard().granted.len() == before + filters.len()).await;
+        crate::broker::until("the broker answers", || {
+            self.heard().granted.len() == before + filters.len()
+        })
+        .await;
         self.heard().granted.split_off(before)
     }
 }

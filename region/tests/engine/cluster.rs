@@ -18,11 +18,14 @@ async fn servers_of_a_cluster_know_each_other_by_certificates_and_pass_maps_on()
     until("the reader is let in", || state.link().is_up).await;
     let lot = Cell::connect(&servers[0], LOT);
     let mut round = 0;
-    until("a map of the first server's cell is read at the second", || {
-        round += 1;
-        lot.publish_map(round, 1);
-        state.town().counts().maps > 0
-    })
+    until(
+        "a map of the first server's cell is read at the second",
+        || {
+            round += 1;
+            lot.publish_map(round, 1);
+            state.town().counts().maps > 0
+        },
+    )
     .await;
     let before = state.town().counts().maps;
     servers[2].signal("KILL");
@@ -33,16 +36,22 @@ async fn servers_of_a_cluster_know_each_other_by_certificates_and_pass_maps_on()
         maps() > before + 10
     })
     .await;
-    let refused = connect_without_certificate(&servers[0]).unwrap_err().to_string();
+    let refused = connect_without_certificate(&servers[0])
+        .unwrap_err()
+        .to_string();
     assert!(refused.contains("Certificate"), "{refused}");
 }
 
 /// The answer to a stranger at a server's address for other servers.
 fn connect_without_certificate(server: &Broker) -> std::io::Result<usize> {
     let mut roots = RootCertStore::empty();
-    roots.add(CertificateDer::from_pem_file(server.directory().join("tls/ca.pem")).unwrap()).unwrap();
+    roots
+        .add(CertificateDer::from_pem_file(server.directory().join("tls/ca.pem")).unwrap())
+        .unwrap();
     let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let builder = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
+    let builder = ClientConfig::builder_with_provider(provider)
+        .with_safe_default_protocol_versions()
+        .unwrap();
     let config = builder.with_root_certificates(roots).with_no_client_auth();
     let name = ServerName::try_from("127.0.0.1").unwrap();
     let connection = ClientConnection::new(Arc::new(config), name).unwrap();

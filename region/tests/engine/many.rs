@@ -12,8 +12,8 @@ use ecod::model::names::NodeName;
 use ecod::model::origin::GeographicOrigin;
 use ecod::model::quadkey::Quadkey;
 use ecod::wire::{
-    CellMap, Encoding, FusedObject, GlobalMap, NodeState, NodeStatus, RegionTopic, RegionTopicKind, Role,
-    SCHEMA_VERSION, Trouble, encode,
+    CellMap, Encoding, FusedObject, GlobalMap, NodeState, NodeStatus, RegionTopic, RegionTopicKind,
+    Role, SCHEMA_VERSION, Trouble, encode,
 };
 use ecod_actors::platform::clock;
 use rumqttc::{AsyncClient, QoS};
@@ -42,7 +42,13 @@ impl Reader {
     fn start(broker: &Broker) -> Self {
         let (arguments, address) = (broker.arguments("region.reader"), free_address());
         let child = Command::new(env!("CARGO_BIN_EXE_ecod-region"))
-            .args(["serve", "--broker", &broker.address.to_string(), "--listen", &address.to_string()])
+            .args([
+                "serve",
+                "--broker",
+                &broker.address.to_string(),
+                "--listen",
+                &address.to_string(),
+            ])
             .args(["--user", "region.reader", "--ca"])
             .arg(arguments.ca.unwrap())
             .arg("--password-file")
@@ -51,7 +57,9 @@ impl Reader {
             .spawn()
             .unwrap();
         let reader = Self { child, address };
-        crate::broker::wait_for("the page listens", || std::net::TcpStream::connect(address).is_ok());
+        crate::broker::wait_for("the page listens", || {
+            std::net::TcpStream::connect(address).is_ok()
+        });
         reader
     }
 
@@ -71,7 +79,10 @@ impl Reader {
     /// Resident memory in MB.
     fn memory_mb(&self) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
-        let kb = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+        let kb = status
+            .lines()
+            .find_map(|line| line.strip_prefix("VmRSS:"))
+            .unwrap();
         kb.trim().trim_end_matches(" kB").parse::<u64>().unwrap() / 1024
     }
 }
@@ -88,26 +99,56 @@ fn cell(x: usize, y: usize) -> (NodeName, GeographicOrigin) {
     // Tiles are 0.011 degrees wide, and 0.0072 high at this latitude.
     let (latitude_deg, longitude_deg) = (48.5 + 0.0075 * y as f64, 2.0 + 0.011 * x as f64);
     let name = NodeName::new(format!("cell-{x}-{y}")).unwrap();
-    (name, GeographicOrigin { latitude_deg, longitude_deg, height_m: 0.0, rotation_deg: 0.0 })
+    (
+        name,
+        GeographicOrigin {
+            latitude_deg,
+            longitude_deg,
+            height_m: 0.0,
+            rotation_deg: 0.0,
+        },
+    )
 }
 
 fn topic(cell: &NodeName, origin: &GeographicOrigin, kind: RegionTopicKind) -> String {
-    RegionTopic { tile: Quadkey::of_cell(origin), cell: cell.clone(), kind }.path()
+    RegionTopic {
+        tile: Quadkey::of_cell(origin),
+        cell: cell.clone(),
+        kind,
+    }
+    .path()
 }
 
 /// The status of a cell's leader: one of a hundred is offline, and as many have a trouble.
 fn status(number: usize) -> Vec<u8> {
     let leader = NodeName::from_static("edge");
-    let state = if number % 100 == 7 { NodeState::Offline } else { NodeState::Aggregating };
+    let state = if number % 100 == 7 {
+        NodeState::Offline
+    } else {
+        NodeState::Aggregating
+    };
     let trouble = Trouble {
         kind: "camera_stalled".into(),
         about: None,
         cause: "the camera gives no pictures".into(),
         remedy: "look at its cable".into(),
     };
-    let troubles = if number % 100 == 50 { vec![trouble] } else { Vec::new() };
+    let troubles = if number % 100 == 50 {
+        vec![trouble]
+    } else {
+        Vec::new()
+    };
     let starting = NodeStatus::starting(leader.clone(), Uuid::nil(), Role::Edge, "0.1.0");
-    encode(&NodeStatus { state, epoch: 1, aggregator: Some(leader), troubles, ..starting }, Encoding::Json)
+    encode(
+        &NodeStatus {
+            state,
+            epoch: 1,
+            aggregator: Some(leader),
+            troubles,
+            ..starting
+        },
+        Encoding::Json,
+    )
 }
 
 fn map(cell: &NodeName, origin: GeographicOrigin, round: u64) -> Vec<u8> {
@@ -125,8 +166,17 @@ fn map(cell: &NodeName, origin: GeographicOrigin, round: u64) -> Vec<u8> {
         )
     };
     let epoch = Epoch::new(1, NodeName::from_static("edge"));
-    let map = GlobalMap { objects: (0..OBJECTS).map(object).collect(), ..GlobalMap::new(&epoch, round, now) };
-    let message = CellMap { schema: SCHEMA_VERSION, cell: cell.clone(), sent_at_us: now, origin, map };
+    let map = GlobalMap {
+        objects: (0..OBJECTS).map(object).collect(),
+        ..GlobalMap::new(&epoch, round, now)
+    };
+    let message = CellMap {
+        schema: SCHEMA_VERSION,
+        cell: cell.clone(),
+        sent_at_us: now,
+        origin,
+        map,
+    };
     encode(&message, Encoding::Compact)
 }
 
@@ -135,7 +185,10 @@ async fn publish(client: AsyncClient, stop: Arc<AtomicBool>) {
     for number in 0..SIDE * SIDE {
         let (cell, origin) = cell(number % SIDE, number / SIDE);
         let topic = topic(&cell, &origin, RegionTopicKind::Status);
-        client.publish(topic, QoS::AtMostOnce, true, status(number)).await.unwrap();
+        client
+            .publish(topic, QoS::AtMostOnce, true, status(number))
+            .await
+            .unwrap();
     }
     let mut due = tokio::time::interval(Duration::from_millis(500));
     for round in 1.. {
@@ -147,7 +200,10 @@ async fn publish(client: AsyncClient, stop: Arc<AtomicBool>) {
             let (cell, origin) = cell(number % READ_SIDE, number / READ_SIDE);
             let payload = map(&cell, origin, round);
             let topic = topic(&cell, &origin, RegionTopicKind::Map);
-            client.publish(topic, QoS::AtMostOnce, false, payload).await.unwrap();
+            client
+                .publish(topic, QoS::AtMostOnce, false, payload)
+                .await
+                .unwrap();
         }
     }
 }
@@ -164,7 +220,11 @@ async fn ten_thousand_cells_are_on_the_page() {
     let begun = Instant::now();
     let mut all = reader.view(String::new()).await.0;
     while all["region"]["cells"] != SIDE * SIDE {
-        assert!(begun.elapsed() < Duration::from_secs(60), "{}", all["region"]);
+        assert!(
+            begun.elapsed() < Duration::from_secs(60),
+            "{}",
+            all["region"]
+        );
         tokio::time::sleep(Duration::from_millis(200)).await;
         all = reader.view(String::new()).await.0;
     }
@@ -174,10 +234,16 @@ async fn ten_thousand_cells_are_on_the_page() {
         begun.elapsed().as_secs_f64(),
         reader.memory_mb()
     );
-    let known = ["west", "south", "east", "north"].map(|side| all["known"][side].to_string()).join(",");
+    let known = ["west", "south", "east", "north"]
+        .map(|side| all["known"][side].to_string())
+        .join(",");
     let (all, bytes, took) = reader.view(format!("bounds={known}")).await;
     let tiles = all["tiles"].as_array().unwrap().len();
-    println!("whole town: {tiles} tiles, {} kB in {} ms", bytes / 1000, took.as_millis());
+    println!(
+        "whole town: {tiles} tiles, {} kB in {} ms",
+        bytes / 1000,
+        took.as_millis()
+    );
     assert!(
         all["maps_withheld"].is_string() && all["cells"].as_array().unwrap().is_empty(),
         "{}",
@@ -209,11 +275,17 @@ async fn ten_thousand_cells_are_on_the_page() {
                     took.as_millis(),
                     reader.memory_mb()
                 );
-                assert!(view["has_maps"] == true && view["maps_withheld"].is_null(), "{name}");
+                assert!(
+                    view["has_maps"] == true && view["maps_withheld"].is_null(),
+                    "{name}"
+                );
                 assert!(took < Duration::from_secs(2), "{name}: {took:?}");
                 break;
             }
-            assert!(begun.elapsed() < Duration::from_secs(60), "{name}: {totals}");
+            assert!(
+                begun.elapsed() < Duration::from_secs(60),
+                "{name}: {totals}"
+            );
             tokio::time::sleep(Duration::from_millis(500)).await;
         }
     }

@@ -22,8 +22,22 @@ async fn listen(broker: &Broker) -> Arc<Mutex<Vec<String>>> {
 async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<String> {
     let (lot, far) = (Cell::connect(broker, LOT), Cell::connect(broker, FAR));
     // The last of its own messages shows that all before it had their chance.
-    let foreign_name = |kind| RegionTopic { tile: lot.account.tile, cell: far.account.cell.clone(), kind }.path();
-    let foreign_tile = |kind| RegionTopic { tile: far.account.tile, cell: lot.account.cell.clone(), kind }.path();
+    let foreign_name = |kind| {
+        RegionTopic {
+            tile: lot.account.tile,
+            cell: far.account.cell.clone(),
+            kind,
+        }
+        .path()
+    };
+    let foreign_tile = |kind| {
+        RegionTopic {
+            tile: far.account.tile,
+            cell: lot.account.cell.clone(),
+            kind,
+        }
+        .path()
+    };
     for kind in RegionTopicKind::ALL {
         for topic in [far.topic(kind), foreign_name(kind), foreign_tile(kind)] {
             for retain in [false, true] {
@@ -34,25 +48,53 @@ async fn attack(broker: &Broker, arrived: &Mutex<Vec<String>>) -> BTreeSet<Strin
     lot.publish("ecod/v1/geo", false, b"forged".to_vec());
     lot.publish_map(1, 1);
     far.publish_map(1, 1);
-    let both = [lot.topic(RegionTopicKind::Map), far.topic(RegionTopicKind::Map)];
-    until("both cells are heard", || both.iter().all(|topic| arrived.lock().unwrap().contains(topic))).await;
-    assert_eq!(lot.heard().logins, 1, "a refused message ends no connection");
-    let statuses = [far.topic(RegionTopicKind::Status), lot.topic(RegionTopicKind::Status)];
+    let both = [
+        lot.topic(RegionTopicKind::Map),
+        far.topic(RegionTopicKind::Map),
+    ];
+    until("both cells are heard", || {
+        both.iter()
+            .all(|topic| arrived.lock().unwrap().contains(topic))
+    })
+    .await;
+    assert_eq!(
+        lot.heard().logins,
+        1,
+        "a refused message ends no connection"
+    );
+    let statuses = [
+        far.topic(RegionTopicKind::Status),
+        lot.topic(RegionTopicKind::Status),
+    ];
     for (topic, retain) in statuses.iter().zip([true, false]) {
         Cell::vanish(broker, LOT.0, topic, retain).await;
     }
-    until("the own last will is heard", || arrived.lock().unwrap().contains(&statuses[1])).await;
+    until("the own last will is heard", || {
+        arrived.lock().unwrap().contains(&statuses[1])
+    })
+    .await;
     // A retained forgery would come to whoever subscribes later.
     let later = listen(broker).await;
     lot.publish_map(2, 1);
-    until("the second reader hears", || !later.lock().unwrap().is_empty()).await;
-    let (arrived, later) = (arrived.lock().unwrap().clone(), later.lock().unwrap().clone());
+    until("the second reader hears", || {
+        !later.lock().unwrap().is_empty()
+    })
+    .await;
+    let (arrived, later) = (
+        arrived.lock().unwrap().clone(),
+        later.lock().unwrap().clone(),
+    );
     arrived.into_iter().chain(later).collect()
 }
 
 /// All that [`attack`] sends and may.
 fn honest(lot: &Cell, far: &Cell) -> BTreeSet<String> {
-    [lot.topic(RegionTopicKind::Map), lot.topic(RegionTopicKind::Status), far.topic(RegionTopicKind::Map)].into()
+    [
+        lot.topic(RegionTopicKind::Map),
+        lot.topic(RegionTopicKind::Status),
+        far.topic(RegionTopicKind::Map),
+    ]
+    .into()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -64,7 +106,10 @@ async fn on_nats_a_cell_writes_below_its_own_tile_and_reads_the_tiles_around() {
     assert_eq!(heard, honest(&lot, &far), "nothing that is forged");
 
     let tiles = lot.account.tile.with_neighbours();
-    let around: Vec<_> = tiles.iter().map(|tile| RegionTopic::filter(*tile, RegionTopicKind::Map)).collect();
+    let around: Vec<_> = tiles
+        .iter()
+        .map(|tile| RegionTopic::filter(*tile, RegionTopicKind::Map))
+        .collect();
     assert_eq!(lot.subscribe(&around).await, [true; 9]);
     let own_status = lot.topic(RegionTopicKind::Status);
     assert_eq!(lot.subscribe(&[own_status]).await, [true]);
@@ -131,14 +176,21 @@ async fn a_cell_is_added_while_the_others_stay_connected() {
     until("the cell is in", || lot.heard().logins == 1).await;
     broker.add_cell(NEW.0, NEW.1, NEW.2);
     let added = admitted(&broker, NEW).await;
-    added.publish(&added.topic(RegionTopicKind::Status), true, added.status(NodeState::Aggregating));
+    added.publish(
+        &added.topic(RegionTopicKind::Status),
+        true,
+        added.status(NodeState::Aggregating),
+    );
     let state = broker.read(|_| ());
     until("its status is read", || state.town().cells().len() == 1).await;
     assert_eq!(lot.heard().logins, 1);
 
     // It goes on with the password that it has.
     broker.renew_password(NEW.0, NEW.1, NEW.2);
-    until("who has the former password is shut out", || added.heard().is_refused).await;
+    until("who has the former password is shut out", || {
+        added.heard().is_refused
+    })
+    .await;
     admitted(&broker, NEW).await;
     assert_eq!(lot.heard().logins, 1);
 }
@@ -157,13 +209,23 @@ fn junk_of_a_cell_is_counted_and_harms_nothing() {
     let mut town = RegionTown::default();
     let now = ecod_actors::platform::clock::now();
     for (path, payload) in [
-        ("ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/lot-1/map", &b"{"[..]),
+        (
+            "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/lot-1/map",
+            &b"{"[..],
+        ),
         ("ecod/v1/geo/1/2/lot-1/map", b"{}"),
-        ("ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/lot-1/status", b"junk"),
+        (
+            "ecod/v1/geo/1/2/0/2/2/0/0/1/1/0/1/2/0/0/0/lot-1/status",
+            b"junk",
+        ),
         ("elsewhere", b""),
     ] {
         town.accept(path, payload, now).unwrap_err();
     }
     assert_eq!(town.counts().rejected.values().sum::<u64>(), 4);
-    assert!(town.cells().values().all(|cell| cell.map.is_none() && cell.status.is_none()));
+    assert!(
+        town.cells()
+            .values()
+            .all(|cell| cell.map.is_none() && cell.status.is_none())
+    );
 }

@@ -30,7 +30,12 @@ async fn a_burst_of_old_maps_after_a_pause_reaches_nobody() {
     // Of a burst, 20 maps are looked at; the others are beyond the cell's rate.
     let stale = || {
         let counts = state.town().counts().clone();
-        counts.rejected.get(&RejectReason::Stale).copied().unwrap_or(0) + counts.losses.throttled
+        counts
+            .rejected
+            .get(&RejectReason::Stale)
+            .copied()
+            .unwrap_or(0)
+            + counts.losses.throttled
     };
     let mut round = 0;
     let mut publish_for = async |span: Duration| {
@@ -50,8 +55,15 @@ async fn a_burst_of_old_maps_after_a_pause_reaches_nobody() {
     broker.signal("CONT");
     publish_for(Duration::from_secs(3)).await;
     until("the burst has come", || stale() > stale_before + 20).await;
-    until("fresh maps count again", || taken.lock().unwrap().len() > before + 20).await;
+    until("fresh maps count again", || {
+        taken.lock().unwrap().len() > before + 20
+    })
+    .await;
     let oldest = taken.lock().unwrap().iter().max().copied().unwrap();
-    println!("{} maps taken, the oldest {oldest:?} old; {} were too old", taken.lock().unwrap().len(), stale());
+    println!(
+        "{} maps taken, the oldest {oldest:?} old; {} were too old",
+        taken.lock().unwrap().len(),
+        stale()
+    );
     assert!(oldest <= MAX_AGE + TOLERANCE, "a map of {oldest:?} counted");
 }

@@ -4,7 +4,10 @@ use super::*;
 const NOON: u64 = 1_732_154_400_000_000;
 
 fn report(node: &str, captured_us: u64) -> ObjectReport {
-    ObjectReport { objects: vec![], ..ObjectReport::new(NodeName::new(node).unwrap(), 0, Timestamp(captured_us)) }
+    ObjectReport {
+        objects: vec![],
+        ..ObjectReport::new(NodeName::new(node).unwrap(), 0, Timestamp(captured_us))
+    }
 }
 
 fn window() -> ReportWindow {
@@ -15,11 +18,26 @@ fn window() -> ReportWindow {
 fn takes_each_report_once_and_in_order() {
     let mut window = window();
     let now = Timestamp(NOON + 10_000);
-    assert_eq!(window.admit(&report("a", NOON), now), Ok(InOrder(Timestamp(NOON))));
-    assert_eq!(window.admit(&report("a", NOON), now), Err(RejectReason::OutOfOrder));
-    assert_eq!(window.admit(&report("a", NOON - 1), now), Ok(OutOfOrder(Timestamp(NOON - 1))));
-    assert_eq!(window.admit(&report("a", NOON - 1), now), Err(RejectReason::OutOfOrder));
-    assert_eq!(window.admit(&report("b", NOON - 1), now), Ok(InOrder(Timestamp(NOON - 1))));
+    assert_eq!(
+        window.admit(&report("a", NOON), now),
+        Ok(InOrder(Timestamp(NOON)))
+    );
+    assert_eq!(
+        window.admit(&report("a", NOON), now),
+        Err(RejectReason::OutOfOrder)
+    );
+    assert_eq!(
+        window.admit(&report("a", NOON - 1), now),
+        Ok(OutOfOrder(Timestamp(NOON - 1)))
+    );
+    assert_eq!(
+        window.admit(&report("a", NOON - 1), now),
+        Err(RejectReason::OutOfOrder)
+    );
+    assert_eq!(
+        window.admit(&report("b", NOON - 1), now),
+        Ok(InOrder(Timestamp(NOON - 1)))
+    );
 }
 
 #[test]
@@ -27,26 +45,55 @@ fn an_overtaken_report_is_told_from_a_duplicate_as_long_as_it_is_remembered() {
     let mut window = window();
     let now = Timestamp(NOON + 810_000);
     for n in 1..=40 {
-        assert!(matches!(window.admit(&report("a", NOON + n * 20_000), now), Ok(InOrder(_))));
+        assert!(matches!(
+            window.admit(&report("a", NOON + n * 20_000), now),
+            Ok(InOrder(_))
+        ));
     }
-    let admitted = |window: &mut ReportWindow, n: u64| window.admit(&report("a", NOON + n * 10_000), now);
-    assert_eq!(admitted(&mut window, 79), Ok(OutOfOrder(Timestamp(NOON + 790_000))));
+    let admitted =
+        |window: &mut ReportWindow, n: u64| window.admit(&report("a", NOON + n * 10_000), now);
+    assert_eq!(
+        admitted(&mut window, 79),
+        Ok(OutOfOrder(Timestamp(NOON + 790_000)))
+    );
     assert_eq!(admitted(&mut window, 79), Err(RejectReason::OutOfOrder));
-    assert_eq!(admitted(&mut window, 31), Ok(OutOfOrder(Timestamp(NOON + 310_000))));
+    assert_eq!(
+        admitted(&mut window, 31),
+        Ok(OutOfOrder(Timestamp(NOON + 310_000)))
+    );
     for n in [1, 2, 12] {
-        assert_eq!(admitted(&mut window, n), Err(RejectReason::OutOfOrder), "nobody knows whether {n} came before");
+        assert_eq!(
+            admitted(&mut window, n),
+            Err(RejectReason::OutOfOrder),
+            "nobody knows whether {n} came before"
+        );
     }
-    assert_eq!(window.admit(&report("a", NOON), Timestamp(NOON + 1_100_000)), Err(RejectReason::Stale));
+    assert_eq!(
+        window.admit(&report("a", NOON), Timestamp(NOON + 1_100_000)),
+        Err(RejectReason::Stale)
+    );
 }
 
 #[test]
 fn tomorrow_and_yesterday_are_rejected() {
     let mut window = window();
     let day = 86_400_000_000;
-    assert_eq!(window.admit(&report("a", NOON + day), Timestamp(NOON)), Err(RejectReason::FromTheFuture));
-    assert_eq!(window.admit(&report("a", NOON - day), Timestamp(NOON)), Err(RejectReason::Stale));
-    assert_eq!(window.admit(&report("a", u64::MAX), Timestamp(NOON)), Err(RejectReason::FromTheFuture));
-    assert_eq!(window.admit(&report("a", 0), Timestamp(NOON)), Err(RejectReason::Stale));
+    assert_eq!(
+        window.admit(&report("a", NOON + day), Timestamp(NOON)),
+        Err(RejectReason::FromTheFuture)
+    );
+    assert_eq!(
+        window.admit(&report("a", NOON - day), Timestamp(NOON)),
+        Err(RejectReason::Stale)
+    );
+    assert_eq!(
+        window.admit(&report("a", u64::MAX), Timestamp(NOON)),
+        Err(RejectReason::FromTheFuture)
+    );
+    assert_eq!(
+        window.admit(&report("a", 0), Timestamp(NOON)),
+        Err(RejectReason::Stale)
+    );
 }
 
 #[test]
@@ -54,25 +101,50 @@ fn a_clock_one_and_a_half_seconds_ahead_is_corrected() {
     let mut window = window();
     for step in 0..20 {
         let sent = NOON + step * 100_000;
-        let admitted = window.admit(&report("fast", sent + 1_500_000), Timestamp(sent + 2_000)).unwrap();
-        assert_eq!(admitted, InOrder(Timestamp(sent + 2_000)), "the fastest transit counts as none");
+        let admitted = window
+            .admit(&report("fast", sent + 1_500_000), Timestamp(sent + 2_000))
+            .unwrap();
+        assert_eq!(
+            admitted,
+            InOrder(Timestamp(sent + 2_000)),
+            "the fastest transit counts as none"
+        );
     }
     let late = NOON + 2_000_000;
-    let admitted = window.admit(&report("fast", late + 1_500_000), Timestamp(late + 302_000)).unwrap();
-    assert_eq!(admitted, InOrder(Timestamp(late + 2_000)), "queueing does not move the capture time");
+    let admitted = window
+        .admit(&report("fast", late + 1_500_000), Timestamp(late + 302_000))
+        .unwrap();
+    assert_eq!(
+        admitted,
+        InOrder(Timestamp(late + 2_000)),
+        "queueing does not move the capture time"
+    );
 }
 
 #[test]
 fn a_vehicle_that_invents_parts_takes_nobody_elses_room() {
     let mut window = window();
-    let admitted =
-        (0..100).filter(|n| window.admit(&report(&format!("a--{n}"), NOON), Timestamp(NOON)).is_ok()).count();
+    let admitted = (0..100)
+        .filter(|n| {
+            window
+                .admit(&report(&format!("a--{n}"), NOON), Timestamp(NOON))
+                .is_ok()
+        })
+        .count();
     assert_eq!(admitted, MAX_PARTS);
     for other in ["a", "a-", "b", "b--1"] {
-        assert!(window.admit(&report(other, NOON), Timestamp(NOON)).is_ok(), "{other}");
+        assert!(
+            window.admit(&report(other, NOON), Timestamp(NOON)).is_ok(),
+            "{other}"
+        );
     }
     let later = NOON + 11_000_000;
-    assert!(window.admit(&report("a--100", later), Timestamp(later)).is_ok(), "silent parts make room");
+    assert!(
+        window
+            .admit(&report("a--100", later), Timestamp(later))
+            .is_ok(),
+        "silent parts make room"
+    );
 }
 
 /// Reports every 100 ms with 2 ms of transit; the numbered one is stamped `ahead_us` ahead. Returns which of them
@@ -93,7 +165,10 @@ fn one_wrong_stamp_silences_its_vehicle_for_a_second_at_most() {
         for ahead_us in [100_000, 400_000, 600_000, 1_000_000, 1_900_000] {
             let admitted = admitted_around_a_wrong_stamp(wrong, ahead_us);
             let lost = admitted.iter().filter(|admitted| !**admitted).count();
-            assert!(lost <= 10, "report {wrong}, {ahead_us} µs ahead: {lost} reports lost");
+            assert!(
+                lost <= 10,
+                "report {wrong}, {ahead_us} µs ahead: {lost} reports lost"
+            );
         }
     }
 }
@@ -103,55 +178,97 @@ fn a_clock_that_was_set_forward_is_followed_and_a_duplicate_confirms_nothing() {
     let mut window = window();
     let sent = |n: u64| NOON + n * 100_000;
     for n in 0..10 {
-        assert!(window.admit(&report("a", sent(n)), Timestamp(sent(n) + 2_000)).is_ok());
+        assert!(
+            window
+                .admit(&report("a", sent(n)), Timestamp(sent(n) + 2_000))
+                .is_ok()
+        );
     }
     let first = report("a", sent(10) + 1_500_000);
     for transit_us in [2_000, 3_000] {
         let received = Timestamp(sent(10) + transit_us);
-        assert_eq!(window.admit(&first, received), Err(RejectReason::FromTheFuture), "over two links");
+        assert_eq!(
+            window.admit(&first, received),
+            Err(RejectReason::FromTheFuture),
+            "over two links"
+        );
     }
     for n in 11..20 {
         let received = Timestamp(sent(n) + 2_000);
-        assert_eq!(window.admit(&report("a", sent(n) + 1_500_000), received), Ok(InOrder(received)));
+        assert_eq!(
+            window.admit(&report("a", sent(n) + 1_500_000), received),
+            Ok(InOrder(received))
+        );
     }
 }
 
 #[test]
 fn a_delayed_report_from_a_synchronised_vehicle_is_stale() {
     let mut window = window();
-    assert!(window.admit(&report("a", NOON), Timestamp(NOON + 5_000)).is_ok());
+    assert!(
+        window
+            .admit(&report("a", NOON), Timestamp(NOON + 5_000))
+            .is_ok()
+    );
     let held_back = window.admit(&report("a", NOON + 100_000), Timestamp(NOON + 1_200_000));
     assert_eq!(held_back, Err(RejectReason::Stale));
 }
 
 #[test]
 fn a_vehicle_whose_clock_was_set_back_is_heard_again() {
-    let config = WindowConfig { max_clock_offset_s: 10.0, ..WindowConfig::default() };
+    let config = WindowConfig {
+        max_clock_offset_s: 10.0,
+        ..WindowConfig::default()
+    };
     let mut window = ReportWindow::new(config);
-    assert!(window.admit(&report("a", NOON + 9_000_000), Timestamp(NOON)).is_ok());
-    assert!(window.admit(&report("a", NOON - 9_000_000), Timestamp(NOON + 100_000)).is_ok());
+    assert!(
+        window
+            .admit(&report("a", NOON + 9_000_000), Timestamp(NOON))
+            .is_ok()
+    );
+    assert!(
+        window
+            .admit(&report("a", NOON - 9_000_000), Timestamp(NOON + 100_000))
+            .is_ok()
+    );
 }
 
 #[test]
 fn vehicles_are_bounded_and_silent_ones_make_room() {
-    let mut window = ReportWindow::new(WindowConfig { max_vehicles: 2, ..WindowConfig::default() });
+    let mut window = ReportWindow::new(WindowConfig {
+        max_vehicles: 2,
+        ..WindowConfig::default()
+    });
     for node in ["a", "b"] {
         assert!(window.admit(&report(node, NOON), Timestamp(NOON)).is_ok());
     }
-    assert_eq!(window.admit(&report("c", NOON), Timestamp(NOON)), Err(RejectReason::TooManyVehicles));
+    assert_eq!(
+        window.admit(&report("c", NOON), Timestamp(NOON)),
+        Err(RejectReason::TooManyVehicles)
+    );
     let later = NOON + 11_000_000;
     assert!(window.admit(&report("c", later), Timestamp(later)).is_ok());
 }
 
 /// Reports every 100 ms with 2 ms of transit, stamped `ahead_us(n)` ahead; returns how many were not admitted in order.
-fn lost(window: &mut ReportWindow, numbers: std::ops::Range<u64>, ahead_us: impl Fn(u64) -> i64) -> usize {
+fn lost(
+    window: &mut ReportWindow,
+    numbers: std::ops::Range<u64>,
+    ahead_us: impl Fn(u64) -> i64,
+) -> usize {
     let mut lost = 0;
     for n in numbers {
         let sent = Timestamp(NOON + n * 100_000);
-        let report = ObjectReport { seq: n, ..report("a", sent.shifted(ahead_us(n)).micros()) };
+        let report = ObjectReport {
+            seq: n,
+            ..report("a", sent.shifted(ahead_us(n)).micros())
+        };
         match window.admit(&report, sent.shifted(2_000)) {
             Ok(InOrder(captured_at)) => {
-                assert!(captured_at.micros().abs_diff(sent.micros()) <= 2_000, "report {n}");
+                assert!(
+                    captured_at.micros().abs_diff(sent.micros()) <= 2_000,
+                    "report {n}"
+                );
             }
             _ => lost += 1,
         }
@@ -163,18 +280,26 @@ const YEAR_US: i64 = 31_536_000_000_000;
 
 #[test]
 fn a_step_of_a_clock_silences_its_vehicle_for_a_second_or_so() {
-    for step_us in [-3_000_000, -1_200_000, 1_200_000, 5_000_000, -5_000_000, -YEAR_US, YEAR_US] {
+    for step_us in [
+        -3_000_000, -1_200_000, 1_200_000, 5_000_000, -5_000_000, -YEAR_US, YEAR_US,
+    ] {
         let mut window = window();
         let ahead_us = |n| if n >= 50 { step_us } else { 0 };
         assert!(lost(&mut window, 0..100, ahead_us) <= 12, "{step_us} µs");
-        assert!(lost(&mut window, 100..150, |_| 0) <= 12, "{step_us} µs and back");
+        assert!(
+            lost(&mut window, 100..150, |_| 0) <= 12,
+            "{step_us} µs and back"
+        );
     }
 }
 
 #[test]
 fn a_live_stream_is_heard_whatever_its_clock_says() {
     for ahead_us in [-YEAR_US, -9_000_000, 9_000_000, YEAR_US] {
-        assert!(lost(&mut window(), 0..100, |_| ahead_us) <= 11, "{ahead_us} µs");
+        assert!(
+            lost(&mut window(), 0..100, |_| ahead_us) <= 11,
+            "{ahead_us} µs"
+        );
     }
 }
 
@@ -191,7 +316,12 @@ fn a_queue_that_empties_is_no_live_stream() {
 
 fn in_cell_time(n: u64, cell_offset_us: i64) -> ObjectReport {
     let captured_at_us = Timestamp(NOON + n * 100_000).shifted(cell_offset_us);
-    ObjectReport { seq: n, captured_at_us, clock_error_us: Some(1_000), ..report("a", 0) }
+    ObjectReport {
+        seq: n,
+        captured_at_us,
+        clock_error_us: Some(1_000),
+        ..report("a", 0)
+    }
 }
 
 #[test]
@@ -204,9 +334,16 @@ fn a_jump_of_the_cells_time_costs_no_report_of_those_who_hear_of_it_late() {
             offset_us += if n == 150 { -5_000_000 } else { YEAR_US };
             window.set_cell_offset(offset_us);
         }
-        let told = if n % 100 < 75 { [-YEAR_US, 0, -5_000_000][n as usize / 100] } else { offset_us };
+        let told = if n % 100 < 75 {
+            [-YEAR_US, 0, -5_000_000][n as usize / 100]
+        } else {
+            offset_us
+        };
         let sent = Timestamp(NOON + n * 100_000);
-        for (transit_us, expected) in [(7_000, Ok(InOrder(sent))), (9_000, Err(RejectReason::OutOfOrder))] {
+        for (transit_us, expected) in [
+            (7_000, Ok(InOrder(sent))),
+            (9_000, Err(RejectReason::OutOfOrder)),
+        ] {
             let admitted = window.admit(&in_cell_time(n, told), sent.shifted(transit_us));
             assert_eq!(admitted, expected, "report {n}");
         }
@@ -217,7 +354,10 @@ fn a_jump_of_the_cells_time_costs_no_report_of_those_who_hear_of_it_late() {
 fn a_report_in_cell_time_that_was_under_way_for_long_is_stale_however_steadily_they_come() {
     let mut window = window();
     for n in 0..100 {
-        let admitted = window.admit(&in_cell_time(n, 0), Timestamp(NOON + n * 100_000 + 1_500_000));
+        let admitted = window.admit(
+            &in_cell_time(n, 0),
+            Timestamp(NOON + n * 100_000 + 1_500_000),
+        );
         assert_eq!(admitted, Err(RejectReason::Stale), "report {n}");
     }
 }
@@ -227,7 +367,9 @@ fn a_vehicle_that_mistakes_the_cells_time_is_heard_by_its_own() {
     let mut window = window();
     let silent = (0..100).filter(|n| {
         let received = Timestamp(NOON + n * 100_000 + 2_000);
-        window.admit(&in_cell_time(*n, 60_000_000), received).is_err()
+        window
+            .admit(&in_cell_time(*n, 60_000_000), received)
+            .is_err()
     });
     assert!(silent.count() <= 11);
 }
@@ -237,7 +379,9 @@ fn vehicles_that_are_rejected_for_their_time_on_and_on_are_untimely() {
     let mut window = window();
     let mut heard = |n: u64, node: &str, ahead_us: u64| {
         let sent = NOON + n * 100_000;
-        window.admit(&report(node, sent + ahead_us), Timestamp(sent + 2_000)).ok();
+        window
+            .admit(&report(node, sent + ahead_us), Timestamp(sent + 2_000))
+            .ok();
         window.timeliness(Timestamp(sent + 2_000))
     };
     let mut last = Timeliness::default();
@@ -247,6 +391,26 @@ fn vehicles_that_are_rejected_for_their_time_on_and_on_are_untimely() {
         heard(n, "bad", n * 10_000_000);
         last = heard(n, "worse", n * 20_000_000);
     }
-    assert_eq!((last, last.is_usable()), (Timeliness { timely: 1, untimely: 2 }, true));
-    assert!(!Timeliness { timely: 1, untimely: 5 }.is_usable() && Timeliness { timely: 0, untimely: 1 }.is_usable());
+    assert_eq!(
+        (last, last.is_usable()),
+        (
+            Timeliness {
+                timely: 1,
+                untimely: 2
+            },
+            true
+        )
+    );
+    assert!(
+        !Timeliness {
+            timely: 1,
+            untimely: 5
+        }
+        .is_usable()
+            && Timeliness {
+                timely: 0,
+                untimely: 1
+            }
+            .is_usable()
+    );
 }

@@ -76,8 +76,13 @@ impl Bounds {
     /// Microseconds from a sender's clock to the aggregator's, given its least delay. A sender within the tolerance of
     /// the cell's time keeps to that.
     fn to_aggregator(self, least: i64) -> i64 {
-        let is_in_cell_time = least.saturating_add(self.cell_offset).saturating_abs() <= self.tolerance;
-        if is_in_cell_time { self.cell_offset.saturating_neg() } else { least }
+        let is_in_cell_time =
+            least.saturating_add(self.cell_offset).saturating_abs() <= self.tolerance;
+        if is_in_cell_time {
+            self.cell_offset.saturating_neg()
+        } else {
+            least
+        }
     }
 }
 
@@ -126,28 +131,40 @@ impl VehicleClock {
     ) -> Result<Admitted, RejectReason> {
         let delay = received_at.micros_from(report.captured_at_us);
         if let Some(error) = report.clock_error_us {
-            let is_age = |offset: i64| (-bounds.tolerance..=bounds.max_age).contains(&delay.saturating_add(offset));
-            let scales = [(TimeBase::Cell, Some(bounds.cell_offset)), (TimeBase::CellBefore, offset_before)];
-            let mut scales = scales.into_iter().filter_map(|(base, offset)| Some((base, offset?)));
+            let is_age = |offset: i64| {
+                (-bounds.tolerance..=bounds.max_age).contains(&delay.saturating_add(offset))
+            };
+            let scales = [
+                (TimeBase::Cell, Some(bounds.cell_offset)),
+                (TimeBase::CellBefore, offset_before),
+            ];
+            let mut scales = scales
+                .into_iter()
+                .filter_map(|(base, offset)| Some((base, offset?)));
             let scale = scales.find(|(_, offset)| is_age(*offset));
             if let Some((base, offset)) = scale.filter(|_| i64::from(error) <= bounds.tolerance) {
                 return self.admit_in_cell_time(report, received_at, base, offset);
             }
-            if (bounds.max_age..=bounds.reach()).contains(&delay.saturating_add(bounds.cell_offset)) {
+            if (bounds.max_age..=bounds.reach()).contains(&delay.saturating_add(bounds.cell_offset))
+            {
                 return Err(RejectReason::Stale);
             }
         }
         match self.admit_by_own_clock(report, received_at, bounds) {
-            Err(reason @ (RejectReason::Stale | RejectReason::FromTheFuture)) => {
-                self.admit_if_live(report, received_at, bounds).ok_or(reason)
-            }
+            Err(reason @ (RejectReason::Stale | RejectReason::FromTheFuture)) => self
+                .admit_if_live(report, received_at, bounds)
+                .ok_or(reason),
             admitted => admitted,
         }
     }
 
     /// Forgets the clock, because the next stamps are by another one.
     fn start_over(&mut self, base: TimeBase, now: Timestamp) {
-        *self = Self { base, last_received: self.last_received, ..Self::new(now) };
+        *self = Self {
+            base,
+            last_received: self.last_received,
+            ..Self::new(now)
+        };
     }
 
     /// Admits a report whose stamp less `offset` is a time on the aggregator's clock.
@@ -169,7 +186,8 @@ impl VehicleClock {
             self.remember(report)?;
             return Ok(Admitted::OutOfOrder(captured_at));
         }
-        self.delay.observe(received_at.micros_from(report.captured_at_us), received_at);
+        self.delay
+            .observe(received_at.micros_from(report.captured_at_us), received_at);
         self.advance(report, received_at)?;
         Ok(Admitted::InOrder(captured_at))
     }
@@ -184,8 +202,14 @@ impl VehicleClock {
         let captured = report.captured_at_us;
         let delay = received_at.micros_from(captured);
         let in_cell = delay.saturating_add(bounds.cell_offset);
-        if !self.is_known(delay, bounds) && !(-bounds.max_offset..=bounds.reach()).contains(&in_cell) {
-            return Err(if in_cell < 0 { RejectReason::FromTheFuture } else { RejectReason::Stale });
+        if !self.is_known(delay, bounds)
+            && !(-bounds.max_offset..=bounds.reach()).contains(&in_cell)
+        {
+            return Err(if in_cell < 0 {
+                RejectReason::FromTheFuture
+            } else {
+                RejectReason::Stale
+            });
         }
         let stepped_back = self.last_captured.micros_from(captured) > bounds.reach();
         if stepped_back || self.is_contradicted(captured, delay, bounds) {
@@ -211,13 +235,21 @@ impl VehicleClock {
     }
 
     /// Admits a report that does not fit, if the stream that it belongs to is live: the sender's clock is another one.
-    fn admit_if_live(&mut self, report: &ObjectReport, received_at: Timestamp, bounds: Bounds) -> Option<Admitted> {
+    fn admit_if_live(
+        &mut self,
+        report: &ObjectReport,
+        received_at: Timestamp,
+        bounds: Bounds,
+    ) -> Option<Admitted> {
         let captured = report.captured_at_us;
-        let least = LiveStream::observe(&mut self.candidate, captured, received_at, bounds.slack())?;
+        let least =
+            LiveStream::observe(&mut self.candidate, captured, received_at, bounds.slack())?;
         self.start_over(TimeBase::Own, received_at);
         self.delay.observe(least, received_at);
         self.advance(report, received_at).ok()?;
-        Some(Admitted::InOrder(captured.shifted(bounds.to_aggregator(least))))
+        Some(Admitted::InOrder(
+            captured.shifted(bounds.to_aggregator(least)),
+        ))
     }
 
     /// True if a later report was admitted.
@@ -226,11 +258,18 @@ impl VehicleClock {
     }
 
     /// Notes the vehicle's latest report.
-    fn advance(&mut self, report: &ObjectReport, received_at: Timestamp) -> Result<(), RejectReason> {
+    fn advance(
+        &mut self,
+        report: &ObjectReport,
+        received_at: Timestamp,
+    ) -> Result<(), RejectReason> {
         self.remember(report)?;
         let goes_back = self.last_seq.is_some_and(|last| report.seq < last);
         self.back_and_forth = match goes_back {
-            true => self.back_and_forth.saturating_add(4).min(2 * MIN_BACK_AND_FORTH),
+            true => self
+                .back_and_forth
+                .saturating_add(4)
+                .min(2 * MIN_BACK_AND_FORTH),
             false => self.back_and_forth.saturating_sub(1),
         };
         self.last_captured = report.captured_at_us;
@@ -257,7 +296,8 @@ impl VehicleClock {
     /// True if a delay fits the clock that is known.
     fn is_known(&self, delay: i64, bounds: Bounds) -> bool {
         let least = self.delay.least();
-        least != i64::MAX && (-bounds.slack()..=bounds.max_age).contains(&delay.saturating_sub(least))
+        least != i64::MAX
+            && (-bounds.slack()..=bounds.max_age).contains(&delay.saturating_sub(least))
     }
 
     /// True if the clock estimate rests on a single report that was ahead, and this report is not.

@@ -29,7 +29,11 @@ fn positive(bound: f64) -> impl Strategy<Value = f64> {
 const VARIANCE: f64 = (1u128 << 66) as f64;
 
 fn covariance() -> impl Strategy<Value = [f64; 3]> {
-    (positive(VARIANCE), positive(VARIANCE), prop_oneof![-1.0..=1.0f64, Just(1.0), Just(-1.0)])
+    (
+        positive(VARIANCE),
+        positive(VARIANCE),
+        prop_oneof![-1.0..=1.0f64, Just(1.0), Just(-1.0)],
+    )
         .prop_map(|(xx, yy, correlation)| [xx, correlation * xx.sqrt() * yy.sqrt(), yy])
 }
 
@@ -82,7 +86,11 @@ fn honest_report(captured_ms: u64) -> Arc<ObjectReport> {
     Arc::new(ObjectReport {
         objects: vec![PerceivedObject::new("car", 0.9, 20.0, 5.0)],
         pose: Some(WirePose::new(0.0, 0.0, 0.0)),
-        ..ObjectReport::new(NodeName::from_static("euclid"), captured_ms, at(captured_ms))
+        ..ObjectReport::new(
+            NodeName::from_static("euclid"),
+            captured_ms,
+            at(captured_ms),
+        )
     })
 }
 

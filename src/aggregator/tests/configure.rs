@@ -35,12 +35,19 @@ fn seen_by(node: &str, ms: u64) -> Arc<ObjectReport> {
 
 fn running(fusion: &FusionConfig) -> (Aggregator, Fused) {
     let places = known(&[place("a", 0.0), place("b", 10.0)]);
-    let mut cell = Aggregator::new(NodeName::from_static("edge"), 7, fusion.clone(), places, at(0));
+    let mut cell = Aggregator::new(
+        NodeName::from_static("edge"),
+        7,
+        fusion.clone(),
+        places,
+        at(0),
+    );
     let mut last = None;
     for round in 1..=20 {
         for kind in [Detections, VoteDetections] {
             for node in ["euclid", "gauss"] {
-                cell.report(kind, &seen_by(node, round * 100 - 20), at(round * 100 - 10)).unwrap();
+                cell.report(kind, &seen_by(node, round * 100 - 20), at(round * 100 - 10))
+                    .unwrap();
             }
         }
         last = cell.tick(at(round * 100));
@@ -50,12 +57,19 @@ fn running(fusion: &FusionConfig) -> (Aggregator, Fused) {
 
 fn labels(fused: &Fused) -> Vec<(&str, Option<&str>)> {
     let map = fused.map.as_ref().unwrap();
-    map.landmarks.iter().map(|state| (&*state.id, state.label.as_deref())).collect()
+    map.landmarks
+        .iter()
+        .map(|state| (&*state.id, state.label.as_deref()))
+        .collect()
 }
 
 fn verdicts(fused: &Fused) -> Vec<(&str, Option<&str>)> {
     let verdicts = fused.verdicts.as_ref().unwrap();
-    verdicts.verdicts.iter().map(|verdict| (&*verdict.landmark, verdict.label.as_deref())).collect()
+    verdicts
+        .verdicts
+        .iter()
+        .map(|verdict| (&*verdict.landmark, verdict.label.as_deref()))
+        .collect()
 }
 
 #[test]
@@ -63,20 +77,43 @@ fn a_change_keeps_votes_tracks_and_trust_of_places_that_are_still_there() {
     for mode in [PaceMode::Bayes, PaceMode::Paper] {
         let (mut cell, before) = running(&settings(mode));
         assert_eq!(labels(&before), [("a", Some("cup")), ("b", Some("vase"))]);
-        let (reputations, car) = (cell.reputations(), before.map.as_ref().unwrap().objects[0].id);
+        let (reputations, car) = (
+            cell.reputations(),
+            before.map.as_ref().unwrap().objects[0].id,
+        );
         let mut fusion = settings(mode);
         fusion.round.period_s = 0.05;
         fusion.tracks.gate_m = 3.0;
         let landmarks = vec![place("new", 20.0), place("b", 10.2)];
-        let change = Command::Configure { fusion: Box::new(fusion), landmarks };
+        let change = Command::Configure {
+            fusion: Box::new(fusion),
+            landmarks,
+        };
         assert_eq!(cell.command(&change, at(2010)), None);
-        let after = cell.tick(at(2050)).expect("the shorter period holds at once");
-        assert_eq!((after.epoch.term, after.round), (7, before.round + 1), "the leadership goes on");
-        assert_eq!(labels(&after), [("new", None), ("b", Some("vase"))], "{mode:?}");
+        let after = cell
+            .tick(at(2050))
+            .expect("the shorter period holds at once");
+        assert_eq!(
+            (after.epoch.term, after.round),
+            (7, before.round + 1),
+            "the leadership goes on"
+        );
+        assert_eq!(
+            labels(&after),
+            [("new", None), ("b", Some("vase"))],
+            "{mode:?}"
+        );
         assert_eq!(verdicts(&after), [("b", Some("vase")), ("new", None)]);
         assert_eq!(after.map.as_ref().unwrap().objects[0].id, car);
-        assert_eq!(cell.reputations().keys().collect::<Vec<_>>(), reputations.keys().collect::<Vec<_>>());
-        assert!(cell.reputations().iter().all(|(node, now)| (now.score - reputations[node].score).abs() < 0.05));
+        assert_eq!(
+            cell.reputations().keys().collect::<Vec<_>>(),
+            reputations.keys().collect::<Vec<_>>()
+        );
+        assert!(
+            cell.reputations()
+                .iter()
+                .all(|(node, now)| (now.score - reputations[node].score).abs() < 0.05)
+        );
     }
 }
 
@@ -84,21 +121,32 @@ fn a_change_keeps_votes_tracks_and_trust_of_places_that_are_still_there() {
 fn an_algorithm_that_is_switched_on_starts_and_one_that_is_switched_off_ends() {
     let (mut cell, _) = running(&settings(PaceMode::Bayes));
     let places = [place("a", 0.0), place("b", 10.0)];
-    let only_votes = FusionConfig { algorithms: Algorithms::Vote, ..settings(PaceMode::Bayes) };
+    let only_votes = FusionConfig {
+        algorithms: Algorithms::Vote,
+        ..settings(PaceMode::Bayes)
+    };
     cell.configure(only_votes, known(&places));
     let fused = cell.tick(at(2100)).unwrap();
     assert!(fused.map.is_none() && verdicts(&fused)[0] == ("a", Some("cup")));
-    assert_eq!(cell.report(Detections, &seen_by("euclid", 2150), at(2150)), Err(RejectReason::NotFused));
+    assert_eq!(
+        cell.report(Detections, &seen_by("euclid", 2150), at(2150)),
+        Err(RejectReason::NotFused)
+    );
     cell.configure(settings(PaceMode::Bayes), known(&places));
-    cell.report(Detections, &seen_by("euclid", 2180), at(2180)).unwrap();
-    assert_eq!(labels(&cell.tick(at(2200)).unwrap()), [("a", Some("cup")), ("b", Some("vase"))]);
+    cell.report(Detections, &seen_by("euclid", 2180), at(2180))
+        .unwrap();
+    assert_eq!(
+        labels(&cell.tick(at(2200)).unwrap()),
+        [("a", Some("cup")), ("b", Some("vase"))]
+    );
 }
 
 #[test]
 fn a_cell_whose_last_place_is_taken_away_learns_places_from_votes_again() {
     let (mut cell, _) = running(&settings(PaceMode::Bayes));
     cell.configure(settings(PaceMode::Bayes), Vec::new());
-    cell.report(VoteDetections, &seen_by("euclid", 2050), at(2050)).unwrap();
+    cell.report(VoteDetections, &seen_by("euclid", 2050), at(2050))
+        .unwrap();
     let fused = cell.tick(at(2100)).unwrap();
     assert_eq!(verdicts(&fused), [("a", Some("cup")), ("b", Some("vase"))]);
     assert_eq!(labels(&fused), []);

@@ -11,12 +11,31 @@ struct Lot {
 
 impl Lot {
     fn new() -> Self {
-        let sign = VacancySign { label: "EMPTY".into(), position: Point2::new(0.9, 0.0) };
-        let synonyms = vec![Synonym { from: "VACANT".into(), label: "EMPTY".into() }];
-        let landmarks = vec![Landmark { vacancy: Some(sign), synonyms, ..landmarks()[0].clone() }];
-        let round = RoundConfig { close: RoundClose::Periodic, ..RoundConfig::default() };
-        let config = FusionConfig { round, ..FusionConfig::default() };
-        Self { cell: Aggregator::new(NodeName::from_static("edge"), 7, config, landmarks, at(0)), ms: 0 }
+        let sign = VacancySign {
+            label: "EMPTY".into(),
+            position: Point2::new(0.9, 0.0),
+        };
+        let synonyms = vec![Synonym {
+            from: "VACANT".into(),
+            label: "EMPTY".into(),
+        }];
+        let landmarks = vec![Landmark {
+            vacancy: Some(sign),
+            synonyms,
+            ..landmarks()[0].clone()
+        }];
+        let round = RoundConfig {
+            close: RoundClose::Periodic,
+            ..RoundConfig::default()
+        };
+        let config = FusionConfig {
+            round,
+            ..FusionConfig::default()
+        };
+        Self {
+            cell: Aggregator::new(NodeName::from_static("edge"), 7, config, landmarks, at(0)),
+            ms: 0,
+        }
     }
 
     /// Each vehicle reads its label for some seconds; returns the last round.
@@ -32,20 +51,33 @@ impl Lot {
             }
             last = self.cell.tick(at(self.ms));
             let verdicts = last.as_ref().and_then(|fused| fused.verdicts.as_ref());
-            assert!(verdicts.is_none_or(|verdicts| verdicts.verdicts.iter().all(|verdict| verdict.margin >= 0.0)));
+            assert!(verdicts.is_none_or(|verdicts| {
+                verdicts
+                    .verdicts
+                    .iter()
+                    .all(|verdict| verdict.margin >= 0.0)
+            }));
         }
         last.unwrap()
     }
 
     fn wrong(&self, node: &'static str) -> u64 {
-        self.cell.reputations().get(&NodeName::from_static(node)).map_or(0, |reputation| reputation.incorrect)
+        self.cell
+            .reputations()
+            .get(&NodeName::from_static(node))
+            .map_or(0, |reputation| reputation.incorrect)
     }
 }
 
 fn readings(fused: &Fused) -> Vec<(String, Vec<String>)> {
     let readings = &fused.map.as_ref().unwrap().landmarks[0].readings;
-    let names = |reading: &crate::wire::LabelReading| reading.nodes.iter().map(NodeName::to_string).collect();
-    readings.iter().map(|reading| (reading.label.to_string(), names(reading))).collect()
+    let names = |reading: &crate::wire::LabelReading| {
+        reading.nodes.iter().map(NodeName::to_string).collect()
+    };
+    readings
+        .iter()
+        .map(|reading| (reading.label.to_string(), names(reading)))
+        .collect()
 }
 
 /// A vehicle at the side reads the sign behind a plate: that is no vote against the plate, and the vehicle is not wrong.
@@ -56,7 +88,10 @@ fn a_sign_behind_a_plate_is_no_vote_against_it() {
     assert_eq!(shown(&fused), (Some("MNOP101"), Some("MNOP101")));
     assert_eq!(
         readings(&fused),
-        [("EMPTY".into(), vec!["galileo".into()]), ("MNOP101".to_owned(), vec!["euclid".to_owned()])]
+        [
+            ("EMPTY".into(), vec!["galileo".into()]),
+            ("MNOP101".to_owned(), vec!["euclid".to_owned()])
+        ]
     );
     assert!(lot.wrong("galileo") <= 1, "{:?}", lot.cell.reputations());
 }
@@ -66,26 +101,53 @@ fn a_sign_behind_a_plate_is_no_vote_against_it() {
 fn readings_are_told_where_they_differ_and_not_where_all_agree() {
     let names = ["euclid", "gauss", "galileo", "noether"];
     let agreeing = Lot::new().read(5, &names.map(|name| (name, "MNOP101")));
-    assert_eq!((shown(&agreeing), readings(&agreeing)), ((Some("MNOP101"), Some("MNOP101")), Vec::new()));
+    assert_eq!(
+        (shown(&agreeing), readings(&agreeing)),
+        ((Some("MNOP101"), Some("MNOP101")), Vec::new())
+    );
     assert_eq!(agreeing.map.unwrap().landmarks[0].contributors.len(), 4);
     let [first, second, third, fourth] = names;
-    let voters = [(first, "MNOP101"), (second, "MNOP101"), (third, "MNOP101"), (fourth, "XYZ")];
+    let voters = [
+        (first, "MNOP101"),
+        (second, "MNOP101"),
+        (third, "MNOP101"),
+        (fourth, "XYZ"),
+    ];
     assert_eq!(readings(&Lot::new().read(5, &voters)).len(), 2);
 }
 
 #[test]
 fn one_who_invents_a_plate_does_not_outvote_those_who_read_the_sign() {
     let mut lot = Lot::new();
-    let honest = [("euclid", "EMPTY"), ("gauss", "EMPTY"), ("galileo", "EMPTY")];
-    let fused = lot.read(20, &[honest[0], honest[1], honest[2], ("mallory", "MNOP101")]);
+    let honest = [
+        ("euclid", "EMPTY"),
+        ("gauss", "EMPTY"),
+        ("galileo", "EMPTY"),
+    ];
+    let fused = lot.read(
+        20,
+        &[honest[0], honest[1], honest[2], ("mallory", "MNOP101")],
+    );
     assert_eq!(shown(&fused), (Some("EMPTY"), Some("EMPTY")));
-    assert!(lot.wrong("mallory") > 5 && lot.wrong("gauss") == 0, "{:?}", lot.cell.reputations());
+    assert!(
+        lot.wrong("mallory") > 5 && lot.wrong("gauss") == 0,
+        "{:?}",
+        lot.cell.reputations()
+    );
 }
 
 #[test]
 fn a_known_liar_does_not_outvote_the_only_one_who_reads_the_sign() {
     let mut lot = Lot::new();
-    lot.read(20, &[("euclid", "EMPTY"), ("gauss", "EMPTY"), ("galileo", "EMPTY"), ("mallory", "MNOP101")]);
+    lot.read(
+        20,
+        &[
+            ("euclid", "EMPTY"),
+            ("gauss", "EMPTY"),
+            ("galileo", "EMPTY"),
+            ("mallory", "MNOP101"),
+        ],
+    );
     let fused = lot.read(10, &[("euclid", "EMPTY"), ("mallory", "MNOP101")]);
     assert_eq!(shown(&fused), (Some("EMPTY"), Some("EMPTY")));
 }
@@ -96,7 +158,10 @@ fn a_sign_by_its_synonym_is_no_vote_either() {
     let mut lot = Lot::new();
     let fused = lot.read(30, &[("euclid", "MNOP101"), ("galileo", "VACANT")]);
     assert_eq!(shown(&fused), (Some("MNOP101"), Some("MNOP101")));
-    assert_eq!(readings(&fused)[0], ("EMPTY".into(), vec!["galileo".into()]));
+    assert_eq!(
+        readings(&fused)[0],
+        ("EMPTY".into(), vec!["galileo".into()])
+    );
 }
 
 /// Map and verdict say the same, whoever was right before: when the car leaves, when another comes, and where two differ.
@@ -110,6 +175,13 @@ fn map_and_verdict_say_the_same() {
         let confidence = fused.map.unwrap().landmarks[0].confidence;
         assert!((0.8..=1.0).contains(&confidence), "{label} {confidence}");
     }
-    let fused = lot.read(20, &[("euclid", "MNOP101"), ("gauss", "MNOP101"), ("galileo", "MNOP1O1")]);
+    let fused = lot.read(
+        20,
+        &[
+            ("euclid", "MNOP101"),
+            ("gauss", "MNOP101"),
+            ("galileo", "MNOP1O1"),
+        ],
+    );
     assert_eq!(shown(&fused), (Some("MNOP101"), Some("MNOP101")));
 }

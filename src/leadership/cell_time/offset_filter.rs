@@ -38,21 +38,31 @@ impl OffsetFilter {
     /// Takes an exchange. Stamps that no exchange can have are ignored.
     pub(super) fn observe(&mut self, Exchange { t1, t2, t3, t4 }: Exchange) {
         let delay_us = t4.micros_from(t1).saturating_sub(t3.micros_from(t2));
-        let (Ok(delay_us), true) = (u64::try_from(delay_us), t3 >= t2) else { return };
+        let (Ok(delay_us), true) = (u64::try_from(delay_us), t3 >= t2) else {
+            return;
+        };
         let offset_us = t2.micros_from(t1).saturating_add(t3.micros_from(t4)) / 2;
         if self.0.len() >= SAMPLES {
             self.0.pop_front();
         }
-        self.0.push_back(OffsetSample { offset_us, delay_us, at: t4 });
+        self.0.push_back(OffsetSample {
+            offset_us,
+            delay_us,
+            at: t4,
+        });
     }
 
     /// The offset by the best exchange, counting drift since then.
     pub(super) fn best(&self, now: Timestamp) -> Option<Offset> {
-        let error =
-            |sample: &OffsetSample| sample.delay_us / 2 + now.since(sample.at).as_micros() as u64 * DRIFT / 1_000_000;
+        let error = |sample: &OffsetSample| {
+            sample.delay_us / 2 + now.since(sample.at).as_micros() as u64 * DRIFT / 1_000_000
+        };
         let best = self.0.iter().min_by_key(|sample| error(sample))?;
         let error_us = u32::try_from(error(best)).unwrap_or(u32::MAX);
-        (Duration::from_micros(error_us.into()) <= MAX_ERROR).then_some(Offset { offset_us: best.offset_us, error_us })
+        (Duration::from_micros(error_us.into()) <= MAX_ERROR).then_some(Offset {
+            offset_us: best.offset_us,
+            error_us,
+        })
     }
 }
 

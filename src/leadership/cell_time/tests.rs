@@ -39,7 +39,12 @@ impl Cell {
             wall_us: *wall_us,
             events: Vec::new(),
         };
-        Self { now: NOON, nodes: nodes.iter().enumerate().map(node).collect(), leader: 0, random: 1 }
+        Self {
+            now: NOON,
+            nodes: nodes.iter().enumerate().map(node).collect(),
+            leader: 0,
+            random: 1,
+        }
     }
 
     fn leadership(&self, index: usize) -> Leadership {
@@ -49,14 +54,28 @@ impl Cell {
             _ if index == (self.leader + 1) % self.nodes.len() => Position::StandingBy,
             _ => Position::Following,
         };
-        Leadership { position, epoch, standby: None, term: 7, is_deserted: false, is_yielding: false }
+        Leadership {
+            position,
+            epoch,
+            standby: None,
+            term: 7,
+            is_deserted: false,
+            is_yielding: false,
+        }
     }
 
     /// A transit of 1 to 4 ms, and seldom 300.
     fn transit(&mut self) -> Duration {
-        self.random = self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        self.random = self
+            .random
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1);
         let draw = self.random >> 33;
-        if draw.is_multiple_of(7) { Duration::from_millis(300) } else { Duration::from_micros(1000 + draw % 3000) }
+        if draw.is_multiple_of(7) {
+            Duration::from_millis(300)
+        } else {
+            Duration::from_micros(1000 + draw % 3000)
+        }
     }
 
     fn pass(&mut self, from: usize, to: usize) {
@@ -68,26 +87,44 @@ impl Cell {
             from: sender.name.clone(),
             run: 1,
             seq: 1,
-            candidacy: Candidacy { role: sender.role, priority: 0, load: 0, fit: true },
+            candidacy: Candidacy {
+                role: sender.role,
+                priority: 0,
+                load: 0,
+                fit: true,
+            },
             term: 7,
             epoch: None,
             hears_you: true,
-            body: Body::Status { over: None, no_login: Vec::new() },
-            clock: Some(Box::new(sender.time.stamps(&self.nodes[to].name, sender_now))),
+            body: Body::Status {
+                over: None,
+                no_login: Vec::new(),
+            },
+            clock: Some(Box::new(
+                sender.time.stamps(&self.nodes[to].name, sender_now),
+            )),
             description: None,
         };
         self.now = self.now + transit;
         let (leadership, now) = (self.leadership(to), self.now);
         let receiver = &mut self.nodes[to];
-        receiver.time.receive(&message, Rights::ALL, now.shifted(receiver.steady_us));
-        receiver.time.follow(&leadership, now.shifted(receiver.steady_us));
+        receiver
+            .time
+            .receive(&message, Rights::ALL, now.shifted(receiver.steady_us));
+        receiver
+            .time
+            .follow(&leadership, now.shifted(receiver.steady_us));
     }
 
     fn look(&mut self) {
         for index in 0..self.nodes.len() {
             let (leadership, now) = (self.leadership(index), self.now);
             let node = &mut self.nodes[index];
-            let events = node.time.look(node.wall_us - node.steady_us, &leadership, now.shifted(node.steady_us));
+            let events = node.time.look(
+                node.wall_us - node.steady_us,
+                &leadership,
+                now.shifted(node.steady_us),
+            );
             node.events.extend(events);
         }
     }
@@ -107,14 +144,28 @@ impl Cell {
 
     /// The cell's time less the true time, as each node knows it.
     fn errors(&self) -> Vec<i64> {
-        self.nodes.iter().map(|node| node.steady_us + node.time.reading().offset_us).collect()
+        self.nodes
+            .iter()
+            .map(|node| node.steady_us + node.time.reading().offset_us)
+            .collect()
     }
 
     #[track_caller]
     fn all_know(&self, expected_us: i64, tolerance_us: u64) {
         for (error, node) in self.errors().into_iter().zip(&self.nodes) {
-            assert!(error.abs_diff(expected_us) <= tolerance_us, "{}: {error} µs", node.name);
-            assert!(node.time.reading().error_us.is_some_and(|error| error < 20_000), "{}", node.name);
+            assert!(
+                error.abs_diff(expected_us) <= tolerance_us,
+                "{}: {error} µs",
+                node.name
+            );
+            assert!(
+                node.time
+                    .reading()
+                    .error_us
+                    .is_some_and(|error| error < 20_000),
+                "{}",
+                node.name
+            );
         }
     }
 }
@@ -143,7 +194,10 @@ fn a_step_of_any_vehicle_moves_nothing_and_is_told_once() {
         cell.nodes[index].wall_us = -3 * SECOND_US;
         cell.run(3);
         cell.all_know(0, 5_000);
-        assert_eq!(cell.nodes[index].events, [ClockEvent::WallStepped(-3 * SECOND_US)]);
+        assert_eq!(
+            cell.nodes[index].events,
+            [ClockEvent::WallStepped(-3 * SECOND_US)]
+        );
     }
     assert_eq!(cell.nodes[0].events, []);
 }
@@ -182,13 +236,21 @@ fn a_leader_from_1970_is_followed_and_set_right_when_its_clock_is() {
     cell.nodes[0].wall_us = 0;
     cell.run(2);
     cell.all_know(0, 5_000);
-    assert!(cell.nodes[0].events.contains(&ClockEvent::CellJumped(-TO_1970_US)));
+    assert!(
+        cell.nodes[0]
+            .events
+            .contains(&ClockEvent::CellJumped(-TO_1970_US))
+    );
 }
 
 #[test]
 fn a_new_leader_goes_on_from_the_old_ones_time_and_moves_slowly() {
     let ahead = 400_000;
-    let mut cell = Cell::new(&[(Role::Edge, 0, ahead), (Role::Auto, 9 * SECOND_US, 0), (Role::Cav, 0, 0)]);
+    let mut cell = Cell::new(&[
+        (Role::Edge, 0, ahead),
+        (Role::Auto, 9 * SECOND_US, 0),
+        (Role::Cav, 0, 0),
+    ]);
     cell.run(5);
     cell.all_know(ahead, 5_000);
     (cell.leader, cell.nodes[0].wall_us) = (1, 0);
@@ -210,21 +272,58 @@ fn clocks_that_are_off_are_known_by_name() {
     ]);
     cell.run(10);
     let errors = |index: usize| {
-        let Node { time, steady_us, .. } = &cell.nodes[index];
+        let Node {
+            time, steady_us, ..
+        } = &cell.nodes[index];
         let errors = time.wall_errors(cell.now.shifted(*steady_us));
-        errors.into_iter().map(|(name, us)| (name.map(NodeName::to_string), us)).collect::<Vec<_>>()
+        errors
+            .into_iter()
+            .map(|(name, us)| (name.map(NodeName::to_string), us))
+            .collect::<Vec<_>>()
     };
     let of_leader = errors(0);
-    let off = |of: Option<&str>| of_leader.iter().find(|(name, _)| name.as_deref() == of).map(|(_, us)| *us);
-    assert!(off(Some("n2")).is_some_and(|us| (us - 5 * SECOND_US).abs() < SECOND_US / 2), "{of_leader:?}");
-    assert!([None, Some("n1")].map(off).iter().all(|us| us.is_some_and(|us| us.abs() < SECOND_US)), "{of_leader:?}");
-    assert_eq!(off(Some("n3")), None, "a clock that was never set says nothing to others");
-    let blamed: Vec<_> = cell.nodes[0].time.wrong_clocks(cell.now.shifted(cell.nodes[0].steady_us));
-    let [WrongClock { node: Some(name), is_cell_wrong: false, is_certain: true, .. }] = &*blamed else {
+    let off = |of: Option<&str>| {
+        of_leader
+            .iter()
+            .find(|(name, _)| name.as_deref() == of)
+            .map(|(_, us)| *us)
+    };
+    assert!(
+        off(Some("n2")).is_some_and(|us| (us - 5 * SECOND_US).abs() < SECOND_US / 2),
+        "{of_leader:?}"
+    );
+    assert!(
+        [None, Some("n1")]
+            .map(off)
+            .iter()
+            .all(|us| us.is_some_and(|us| us.abs() < SECOND_US)),
+        "{of_leader:?}"
+    );
+    assert_eq!(
+        off(Some("n3")),
+        None,
+        "a clock that was never set says nothing to others"
+    );
+    let blamed: Vec<_> = cell.nodes[0]
+        .time
+        .wrong_clocks(cell.now.shifted(cell.nodes[0].steady_us));
+    let [
+        WrongClock {
+            node: Some(name),
+            is_cell_wrong: false,
+            is_certain: true,
+            ..
+        },
+    ] = &*blamed
+    else {
         panic!("{blamed:?}")
     };
     assert_eq!(name.as_str(), "n2", "two candidates agree");
-    assert!((errors(2)[0].1 - 5 * SECOND_US).abs() < SECOND_US / 2, "{:?}", errors(2));
+    assert!(
+        (errors(2)[0].1 - 5 * SECOND_US).abs() < SECOND_US / 2,
+        "{:?}",
+        errors(2)
+    );
     assert!(errors(3)[0].1 < -SECOND_US, "and its own node knows");
 }
 
@@ -235,17 +334,31 @@ fn of_clocks_that_differ_the_ones_that_agree_are_right() {
     let wrong = |nodes: &[(Role, i64, i64)]| {
         let mut cell = Cell::new(nodes);
         cell.run(10);
-        let Node { time, steady_us, .. } = &cell.nodes[0];
+        let Node {
+            time, steady_us, ..
+        } = &cell.nodes[0];
         let wrong = time.wrong_clocks(cell.now.shifted(*steady_us)).into_iter();
         let whole_s = |us: i64| (us as f64 / SECOND_US as f64).round();
         let shown = |it: WrongClock<'_>| {
-            (it.node.map(NodeName::to_string), whole_s(it.error_us), it.is_cell_wrong, it.is_certain)
+            (
+                it.node.map(NodeName::to_string),
+                whole_s(it.error_us),
+                it.is_cell_wrong,
+                it.is_certain,
+            )
         };
         wrong.map(shown).collect::<Vec<_>>()
     };
-    let (edge, cav, other) = ((Role::Edge, 0, 30 * SECOND_US), (Role::Cav, 9, 0), (Role::Cav, 7 * SECOND_US, 0));
+    let (edge, cav, other) = (
+        (Role::Edge, 0, 30 * SECOND_US),
+        (Role::Cav, 9, 0),
+        (Role::Cav, 7 * SECOND_US, 0),
+    );
     assert_eq!(wrong(&[edge, cav, other]), [(None, 30.0, true, true)]);
-    assert_eq!(wrong(&[edge, cav]), [(Some("n1".into()), -30.0, false, false)]);
+    assert_eq!(
+        wrong(&[edge, cav]),
+        [(Some("n1".into()), -30.0, false, false)]
+    );
 }
 
 #[test]
@@ -256,18 +369,34 @@ fn stamps_of_a_liar_are_survived() {
     for sent_us in extremes {
         for received_us in extremes {
             for other in extremes {
-                let answers = Some(AnsweredStamps { sent_us: other, received_us });
-                let clock = ClockStamps { sent_us, answers, wall_us: Some(other), cell_us: Some(received_us) };
+                let answers = Some(AnsweredStamps {
+                    sent_us: other,
+                    received_us,
+                });
+                let clock = ClockStamps {
+                    sent_us,
+                    answers,
+                    wall_us: Some(other),
+                    cell_us: Some(received_us),
+                };
                 let message = ElectionMessage {
                     schema: SCHEMA_VERSION,
                     from: cell.nodes[1].name.clone(),
                     run: 1,
                     seq: 1,
-                    candidacy: Candidacy { role: Role::Auto, priority: 0, load: 0, fit: true },
+                    candidacy: Candidacy {
+                        role: Role::Auto,
+                        priority: 0,
+                        load: 0,
+                        fit: true,
+                    },
                     term: 7,
                     epoch: None,
                     hears_you: true,
-                    body: Body::Status { over: None, no_login: Vec::new() },
+                    body: Body::Status {
+                        over: None,
+                        no_login: Vec::new(),
+                    },
                     clock: Some(Box::new(clock)),
                     description: None,
                 };

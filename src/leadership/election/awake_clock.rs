@@ -19,7 +19,11 @@ pub struct AwakeClock {
 impl AwakeClock {
     /// A clock that starts at `now` and takes a delay of up to `tolerance` for time.
     pub fn new(now: Timestamp, tolerance: Duration) -> Self {
-        Self { outside: now, inside: now, tolerance }
+        Self {
+            outside: now,
+            inside: now,
+            tolerance,
+        }
     }
 
     /// The time inside, after `now` outside, when the next thing was due at `due` inside.
@@ -52,10 +56,22 @@ mod tests {
         let at = |ms: u64| Timestamp(1_000_000 + ms * MS);
         let mut clock = AwakeClock::new(at(0), Duration::from_millis(40));
         assert_eq!(clock.advance(at(30), at(80)), at(30));
-        assert_eq!(clock.advance(at(90), at(80)), at(90), "a little late is time");
+        assert_eq!(
+            clock.advance(at(90), at(80)),
+            at(90),
+            "a little late is time"
+        );
         assert_eq!(clock.advance(at(5_000), at(100)), at(140), "a stall is not");
-        assert_eq!(clock.advance(at(10), at(200)), at(140), "nor is a clock set back");
+        assert_eq!(
+            clock.advance(at(10), at(200)),
+            at(140),
+            "nor is a clock set back"
+        );
         assert_eq!(clock.outside(at(200)), at(70));
-        assert_eq!(clock.advance(at(3_600_000), at(200)), at(240), "nor one set forward");
+        assert_eq!(
+            clock.advance(at(3_600_000), at(200)),
+            at(240),
+            "nor one set forward"
+        );
     }
 }

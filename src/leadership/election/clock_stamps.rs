@@ -8,7 +8,9 @@ use crate::model::time::Timestamp;
 use crate::wire::MAX_INTEGER;
 
 /// Stamps of one message, for the comparison of two clocks (RFC 5905, section 8).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
+)]
 pub struct ClockStamps {
     /// Time of sending, by the sender's steady clock.
     #[n(0)]
@@ -28,7 +30,9 @@ pub struct ClockStamps {
 }
 
 /// Stamps of an earlier message in the other direction.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
+)]
 pub struct AnsweredStamps {
     /// Time of its sending, by its sender's steady clock.
     #[n(0)]
@@ -41,8 +45,14 @@ pub struct AnsweredStamps {
 impl ClockStamps {
     /// True if all stamps are integers that a node sends.
     pub(super) fn is_plausible(&self) -> bool {
-        let answered = self.answers.map(|answered| [answered.sent_us, answered.received_us]);
-        let stamps = [Some(self.sent_us), self.wall_us, self.cell_us].into_iter().flatten();
-        stamps.chain(answered.into_iter().flatten()).all(|stamp| stamp.micros() <= MAX_INTEGER)
+        let answered = self
+            .answers
+            .map(|answered| [answered.sent_us, answered.received_us]);
+        let stamps = [Some(self.sent_us), self.wall_us, self.cell_us]
+            .into_iter()
+            .flatten();
+        stamps
+            .chain(answered.into_iter().flatten())
+            .all(|stamp| stamp.micros() <= MAX_INTEGER)
     }
 }

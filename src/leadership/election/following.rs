@@ -18,7 +18,9 @@ impl Election {
     }
 
     pub(super) fn follow_timers(&mut self, now: Timestamp) {
-        let State::Following(following) = &self.state else { return };
+        let State::Following(following) = &self.state else {
+            return;
+        };
         if now >= following.lost_at(&self.config) {
             let leader = following.epoch.leader.clone();
             self.peers.gone(&leader, now);
@@ -30,7 +32,9 @@ impl Election {
 
     /// Asks about the leader. While just a round is late, which all followers may miss, those who know best are asked first.
     fn doubt(&mut self, now: Timestamp) {
-        let State::Following(following) = &mut self.state else { return };
+        let State::Following(following) = &mut self.state else {
+            return;
+        };
         let first = following.asked_at.is_none();
         following.asked_at.get_or_insert(now);
         if first && following.claim.is_none() && now < following.silent_at(&self.config) {
@@ -49,7 +53,9 @@ impl Election {
         } else {
             self.config.beat() / 2
         };
-        following.suspect_at(&self.config).max(self.questions.last_at() + pause)
+        following
+            .suspect_at(&self.config)
+            .max(self.questions.last_at() + pause)
     }
 
     /// Takes a leader's sign of life, or its claim.
@@ -63,13 +69,15 @@ impl Election {
             State::Leading(_) => self.meet_leader(beat, now),
             State::Seeking(_) if Some(&beat.epoch) >= self.epoch.as_ref() => self.follow(beat, now),
             State::Following(following) if beat.epoch > following.epoch => {
-                let (leader, claimant) = (following.epoch.leader.clone(), beat.epoch.leader.clone());
+                let (leader, claimant) =
+                    (following.epoch.leader.clone(), beat.epoch.leader.clone());
                 let content = now < following.suspect_at(&self.config);
                 let rightful = beat.followers > 0 || beat.after.as_ref() >= Some(&following.epoch);
                 let gives_way = if self.outranks(&claimant, &leader) {
                     !content || beat.hears_us && rightful
                 } else {
-                    beat.hears_us && self.peers.followers(&claimant, now) > self.peers.followers(&leader, now)
+                    beat.hears_us
+                        && self.peers.followers(&claimant, now) > self.peers.followers(&leader, now)
                 };
                 if leader == claimant || gives_way {
                     self.follow(beat, now);
@@ -96,7 +104,9 @@ impl Election {
     /// fewer followers, and for one of a lower rank only if that one has more. Followers are counted by their own word.
     /// Otherwise it goes on in a term above both.
     fn meet_leader(&mut self, beat: Beat, now: Timestamp) {
-        let State::Leading(leading) = &self.state else { return };
+        let State::Leading(leading) = &self.state else {
+            return;
+        };
         let (own, other) = (leading.epoch.clone(), beat.epoch.leader.clone());
         if beat.epoch < own {
             self.send_beat(&other, now);
@@ -128,13 +138,18 @@ impl Election {
             let own = (*name == self.id).then(|| self.candidacy());
             Some(own.or_else(|| self.peers.get(name)?.candidacy)?.rank())
         };
-        rank(name).zip(rank(other)).is_some_and(|(name, other)| name < other)
+        rank(name)
+            .zip(rank(other))
+            .is_some_and(|(name, other)| name < other)
     }
 
     fn stop_leading(&mut self, next: &NodeName) {
         if let State::Leading(leading) = &self.state {
-            self.effects.push(ElectionEffect::StopPublishing { epoch: leading.epoch.clone() });
-            self.effects.push(ElectionEffect::SendSnapshot { to: next.clone() });
+            self.effects.push(ElectionEffect::StopPublishing {
+                epoch: leading.epoch.clone(),
+            });
+            self.effects
+                .push(ElectionEffect::SendSnapshot { to: next.clone() });
         }
     }
 
@@ -145,8 +160,13 @@ impl Election {
         self.waiting_questions.clear();
         let leader = beat.epoch.leader.clone();
         let beat_interval = Duration::from_millis(beat.every_ms);
-        self.state =
-            State::Following(Following::new(beat.epoch, beat.successors, beat_interval, now, Timestamp::default()));
+        self.state = State::Following(Following::new(
+            beat.epoch,
+            beat.successors,
+            beat_interval,
+            now,
+            Timestamp::default(),
+        ));
         self.send_status(&leader, now);
     }
 
@@ -155,7 +175,13 @@ impl Election {
         let leader = epoch.leader.clone();
         self.epoch = Some(epoch.clone());
         let unheard = Timestamp::default();
-        self.state = State::Following(Following::new(epoch, Vec::new(), self.config.beat(), unheard, heard_at));
+        self.state = State::Following(Following::new(
+            epoch,
+            Vec::new(),
+            self.config.beat(),
+            unheard,
+            heard_at,
+        ));
         self.peers.add(&leader);
         self.send_status(&leader, now);
     }
@@ -169,7 +195,9 @@ impl Election {
         if !self.waiting_questions.is_empty() {
             self.answer_waiting(now);
         }
-        let State::Following(following) = &mut self.state else { return };
+        let State::Following(following) = &mut self.state else {
+            return;
+        };
         following.beat_interval = Duration::from_millis(beat.every_ms);
         following.hear(now);
         following.has_beaten = true;
@@ -190,7 +218,10 @@ impl Election {
                 if !leads && !is_earlier && !matches!(message.body, Body::Beat { .. }) {
                     let ended = following.epoch.clone();
                     let follows = message.epoch.clone().filter(|next| {
-                        *next > ended && next.leader != message.from && next.leader != self.id && !self.is_over(next)
+                        *next > ended
+                            && next.leader != message.from
+                            && next.leader != self.id
+                            && !self.is_over(next)
                     });
                     self.close(ended);
                     // Followers of the old leader follow the one that it follows: none of them need claim.
@@ -203,13 +234,20 @@ impl Election {
             State::Leading(leading) if message.hears_you => {
                 let own = leading.epoch.clone();
                 match &message.epoch {
-                    Some(other) if *other > own && other.leader != message.from && other.leader != self.id => {
+                    Some(other)
+                        if *other > own
+                            && other.leader != message.from
+                            && other.leader != self.id =>
+                    {
                         // A leadership ends only on the word of more nodes than follow it, for a known candidate. Its own
                         // followers have time to answer; until then the other leader has to speak for itself.
                         let is_answered = now.since(leading.since) > self.config.response_timeout();
-                        let has_more_followers =
-                            self.peers.followers(&other.leader, now) > self.peers.followers(&self.id, now);
-                        if is_answered && has_more_followers && self.peers.may_lead(&other.leader, now) {
+                        let has_more_followers = self.peers.followers(&other.leader, now)
+                            > self.peers.followers(&self.id, now);
+                        if is_answered
+                            && has_more_followers
+                            && self.peers.may_lead(&other.leader, now)
+                        {
                             let other = other.clone();
                             self.stop_leading(&other.leader);
                             self.adopt(other, now, now);
@@ -293,18 +331,23 @@ impl Election {
                 self.close(following.epoch.clone());
                 self.lose_leader(now);
             }
-            State::Seeking(_) | State::Following(_) | State::Leading(_) => self.name_successors(now),
+            State::Seeking(_) | State::Following(_) | State::Leading(_) => {
+                self.name_successors(now)
+            }
         }
     }
 
     /// Follows the claimant to the lead if its claim is recent and this node does not outrank it, and seeks otherwise.
     fn lose_leader(&mut self, now: Timestamp) {
-        let State::Following(following) = &mut self.state else { return };
+        let State::Following(following) = &mut self.state else {
+            return;
+        };
         let order = std::mem::take(&mut following.successors);
         let claim = following.claim.take().map(|claim| *claim);
         let is_good = |(at, beat): &(Timestamp, Beat)| {
             let is_recent = now.since(*at) <= self.config.response_timeout();
-            let is_outranked = self.candidacy().may_lead() && self.outranks(&self.id, &beat.epoch.leader);
+            let is_outranked =
+                self.candidacy().may_lead() && self.outranks(&self.id, &beat.epoch.leader);
             is_recent && !is_outranked && !self.is_over(&beat.epoch)
         };
         match claim.filter(is_good) {

@@ -21,12 +21,25 @@ impl Election {
             return;
         }
         let out_of_reach = |name: &NodeName| self.is_out_of_reach(name, now);
-        let challenger = self.peers.challenger(ours, self.config.stable(), out_of_reach, now);
-        let challenger = challenger.filter(|(_, from)| now >= *from).map(|(to, _)| to);
-        let Some(to) = challenger.or_else(|| self.relief(now)) else { return };
-        let State::Leading(leading) = &mut self.state else { return };
-        leading.handover =
-            Some(Handover { to: to.clone(), retry_at: now, started_at: now, ready_at: None, yielded: false });
+        let challenger = self
+            .peers
+            .challenger(ours, self.config.stable(), out_of_reach, now);
+        let challenger = challenger
+            .filter(|(_, from)| now >= *from)
+            .map(|(to, _)| to);
+        let Some(to) = challenger.or_else(|| self.relief(now)) else {
+            return;
+        };
+        let State::Leading(leading) = &mut self.state else {
+            return;
+        };
+        leading.handover = Some(Handover {
+            to: to.clone(),
+            retry_at: now,
+            started_at: now,
+            ready_at: None,
+            yielded: false,
+        });
         self.name_successors(now);
         self.effects.push(ElectionEffect::SendSnapshot { to });
         self.drive_handover(now);
@@ -35,11 +48,23 @@ impl Election {
     /// Repeats offers and yields, or gives the handover up.
     pub(super) fn drive_handover(&mut self, now: Timestamp) {
         let limit = self.config.handover();
-        let State::Leading(Leading { handover: Some(handover), .. }) = &self.state else { return };
+        let State::Leading(Leading {
+            handover: Some(handover),
+            ..
+        }) = &self.state
+        else {
+            return;
+        };
         let to = handover.to.clone();
-        let fit = self.peers.hears(&to, now) && self.peers.may_lead(&to, now) && !self.is_out_of_reach(&to, now);
-        let State::Leading(leading) = &mut self.state else { return };
-        let Some(handover) = &mut leading.handover else { return };
+        let fit = self.peers.hears(&to, now)
+            && self.peers.may_lead(&to, now)
+            && !self.is_out_of_reach(&to, now);
+        let State::Leading(leading) = &mut self.state else {
+            return;
+        };
+        let Some(handover) = &mut leading.handover else {
+            return;
+        };
         if !fit || now.since(handover.started_at) > limit {
             leading.handover = None;
             self.peers.restart_trial(&to, now);
@@ -49,7 +74,9 @@ impl Election {
             return;
         }
         // A cell that publishes no rounds has none to miss.
-        handover.yielded |= handover.ready_at.is_some_and(|at| now.since(at) > self.config.roundless_yield());
+        handover.yielded |= handover
+            .ready_at
+            .is_some_and(|at| now.since(at) > self.config.roundless_yield());
         handover.retry_at = now + self.config.handover_retry(handover.yielded);
         let last_round = self.round;
         if handover.yielded {
@@ -62,7 +89,10 @@ impl Election {
 
     pub(super) fn take_ready(&mut self, from: &NodeName, now: Timestamp) {
         if let State::Leading(leading) = &mut self.state
-            && let Some(handover) = leading.handover.as_mut().filter(|handover| handover.to == *from)
+            && let Some(handover) = leading
+                .handover
+                .as_mut()
+                .filter(|handover| handover.to == *from)
         {
             handover.ready_at.get_or_insert(now);
         }
@@ -75,9 +105,15 @@ impl Election {
         self.learn_round(&epoch.leader, round);
         let least = self.config.beat();
         match &mut self.state {
-            State::Following(following) if following.epoch == *epoch => following.take_round(least, now),
+            State::Following(following) if following.epoch == *epoch => {
+                following.take_round(least, now)
+            }
             State::Leading(leading) => {
-                if let Some(handover) = leading.handover.as_mut().filter(|handover| handover.ready_at.is_some()) {
+                if let Some(handover) = leading
+                    .handover
+                    .as_mut()
+                    .filter(|handover| handover.ready_at.is_some())
+                {
                     handover.yielded = true;
                     handover.retry_at = now;
                     self.drive_handover(now);
@@ -89,15 +125,21 @@ impl Election {
 
     pub(super) fn take_offer(&mut self, from: &NodeName, epoch: Option<&Epoch>, now: Timestamp) {
         let may_lead = self.candidacy().may_lead();
-        let State::Following(following) = &mut self.state else { return };
+        let State::Following(following) = &mut self.state else {
+            return;
+        };
         if following.epoch.leader != *from || epoch != Some(&following.epoch) || !may_lead {
             return;
         }
-        let fresh = following.offered_at.is_some_and(|at| now.since(at) <= self.config.response_timeout());
+        let fresh = following
+            .offered_at
+            .is_some_and(|at| now.since(at) <= self.config.response_timeout());
         following.offered_at = Some(now);
         if !fresh {
             following.prepared = false;
-            self.effects.push(ElectionEffect::Prepare { leader: from.clone() });
+            self.effects.push(ElectionEffect::Prepare {
+                leader: from.clone(),
+            });
         } else if following.prepared {
             self.send(from, Body::Ready, now);
         }
@@ -113,9 +155,19 @@ impl Election {
         }
     }
 
-    pub(super) fn take_yield(&mut self, from: &NodeName, epoch: Option<&Epoch>, last_round: u64, now: Timestamp) {
-        let State::Following(following) = &self.state else { return };
-        let ours = following.epoch.leader == *from && epoch == Some(&following.epoch) && following.prepared;
+    pub(super) fn take_yield(
+        &mut self,
+        from: &NodeName,
+        epoch: Option<&Epoch>,
+        last_round: u64,
+        now: Timestamp,
+    ) {
+        let State::Following(following) = &self.state else {
+            return;
+        };
+        let ours = following.epoch.leader == *from
+            && epoch == Some(&following.epoch)
+            && following.prepared;
         if ours && self.candidacy().may_lead() {
             let after = following.epoch.clone();
             self.learn_round(from, last_round);

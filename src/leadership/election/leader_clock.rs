@@ -33,7 +33,13 @@ impl LeaderClock {
     /// Clock of a leader by a beat that it has just sent.
     pub(super) fn of_beat(epoch: Epoch, life: LifeSign, now: Timestamp) -> Self {
         let began_at = now - Duration::from_millis(life.led_ms);
-        Self { epoch, began_at, observed_at: now, latest: life, latest_received_at: now }
+        Self {
+            epoch,
+            began_at,
+            observed_at: now,
+            latest: life,
+            latest_received_at: now,
+        }
     }
 
     /// Takes a beat that the leader has just sent.
@@ -65,7 +71,11 @@ impl LeaderClock {
         let passed_there = Duration::from_millis(life.led_ms.saturating_sub(self.latest.led_ms));
         let is_live = passed_here >= LIVE_TIME && passed_there >= passed_here * 9 / 10;
         let drifted = self.began_at + now.since(self.observed_at) / MAX_DRIFT;
-        self.began_at = if is_live { now - led } else { drifted.min(now - led) };
+        self.began_at = if is_live {
+            now - led
+        } else {
+            drifted.min(now - led)
+        };
         self.observed_at = now;
         if life.led_ms > self.latest.led_ms {
             self.latest = life;
@@ -85,15 +95,26 @@ mod tests {
     }
 
     fn led(led_ms: u64) -> LifeSign {
-        LifeSign { led_ms, signature: None }
+        LifeSign {
+            led_ms,
+            signature: None,
+        }
     }
 
     #[test]
     fn a_sign_of_life_is_as_old_as_the_leader_says_whoever_passes_it_on() {
         let epoch = Epoch::new(3, NodeName::from_static("edge"));
         let mut clock = LeaderClock::of_beat(epoch, led(5000), ms(100));
-        assert_eq!(clock.observe(led(5100), ms(210)), ms(200).shifted(110), "ten milliseconds on its way, and drift");
-        assert_eq!(clock.observe(led(5400), ms(520)), ms(520), "signs of life go on");
+        assert_eq!(
+            clock.observe(led(5100), ms(210)),
+            ms(200).shifted(110),
+            "ten milliseconds on its way, and drift"
+        );
+        assert_eq!(
+            clock.observe(led(5400), ms(520)),
+            ms(520),
+            "signs of life go on"
+        );
         // The same one again and again, as new.
         for at in [600, 2000, 10_000] {
             assert!(clock.observe(led(5400), ms(at)) <= ms(530), "at {at} ms");
@@ -109,7 +130,10 @@ mod tests {
         let mut clock = LeaderClock::of_beat(epoch, led(5000), ms(100));
         // Its process was suspended for two seconds, which its clock does not count.
         assert!(clock.observe(led(5050), ms(2160)) < ms(160));
-        assert!(clock.observe(led(5100), ms(2210)) < ms(210), "they may have waited");
+        assert!(
+            clock.observe(led(5100), ms(2210)) < ms(210),
+            "they may have waited"
+        );
         assert_eq!(clock.observe(led(5300), ms(2410)), ms(2410));
     }
 }

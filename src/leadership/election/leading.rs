@@ -40,7 +40,12 @@ pub(super) struct Leading {
 }
 
 impl Leading {
-    pub(super) fn new(epoch: Epoch, after: Option<Epoch>, successors: Vec<NodeName>, now: Timestamp) -> Self {
+    pub(super) fn new(
+        epoch: Epoch,
+        after: Option<Epoch>,
+        successors: Vec<NodeName>,
+        now: Timestamp,
+    ) -> Self {
         Self {
             epoch,
             since: now,
@@ -57,27 +62,40 @@ impl Leading {
     /// Sets the pause of an epoch that renews another: each is twice as long as the one before, up to [`RENEWAL_PAUSE`].
     pub(super) fn renewed(&mut self, before: &Self, least: Duration) {
         let is_calm = self.since.since(before.since) > RENEWAL_PAUSE * 6;
-        self.pause = if is_calm { least } else { (before.pause * 2).clamp(least, RENEWAL_PAUSE) };
+        self.pause = if is_calm {
+            least
+        } else {
+            (before.pause * 2).clamp(least, RENEWAL_PAUSE)
+        };
     }
 
     /// The sign of life of this leader, unsigned. Beats that are sent at about the same time have the same.
     fn life_sign(&self, now: Timestamp) -> LifeSign {
         let led_ms = u64::try_from(now.since(self.since).as_millis()).unwrap_or(u64::MAX);
-        LifeSign { led_ms: led_ms / LIFE_SIGN_STEP_MS * LIFE_SIGN_STEP_MS, signature: None }
+        LifeSign {
+            led_ms: led_ms / LIFE_SIGN_STEP_MS * LIFE_SIGN_STEP_MS,
+            signature: None,
+        }
     }
 
     /// True if this leader has said that the next round is another node's.
     pub(super) fn is_yielding(&self) -> bool {
-        self.handover.as_ref().is_some_and(|handover| handover.yielded)
+        self.handover
+            .as_ref()
+            .is_some_and(|handover| handover.yielded)
     }
 
     /// True if this leader has said to a node that the next round is that node's.
     pub(super) fn has_yielded_to(&self, name: &NodeName) -> bool {
-        self.handover.as_ref().is_some_and(|handover| handover.yielded && handover.to == *name)
+        self.handover
+            .as_ref()
+            .is_some_and(|handover| handover.yielded && handover.to == *name)
     }
 
     pub(super) fn deadline(&self) -> Timestamp {
-        self.handover.as_ref().map_or(self.beat_at, |handover| handover.retry_at.min(self.beat_at))
+        self.handover
+            .as_ref()
+            .map_or(self.beat_at, |handover| handover.retry_at.min(self.beat_at))
     }
 }
 
@@ -85,7 +103,9 @@ impl Election {
     pub(super) fn lead_timers(&mut self, now: Timestamp) {
         self.drive_handover(now);
         let next = now + self.config.beat();
-        let State::Leading(leading) = &mut self.state else { return };
+        let State::Leading(leading) = &mut self.state else {
+            return;
+        };
         if now < leading.beat_at {
             return;
         }
@@ -102,10 +122,14 @@ impl Election {
         let beats = leading.beats;
         self.name_successors(now);
         self.start_handover(now);
-        let State::Leading(leading) = &self.state else { return };
+        let State::Leading(leading) = &self.state else {
+            return;
+        };
         let due: Vec<_> = (beats..)
             .zip(self.peers.names())
-            .filter(|(turn, name)| turn % (self.beat_for(leading, name).as_millis() as u64 / self.config.beat_ms) == 0)
+            .filter(|(turn, name)| {
+                turn % (self.beat_for(leading, name).as_millis() as u64 / self.config.beat_ms) == 0
+            })
             .map(|(_, name)| name.clone())
             .collect();
         for peer in due {
@@ -119,14 +143,21 @@ impl Election {
         self.peers.note_refusal(refused_by, true);
         let at = now + self.config.given_up_timeout();
         if let State::Leading(leading) = &mut self.state {
-            leading.renew_at.get_or_insert(at.max(leading.since + leading.pause));
+            leading
+                .renew_at
+                .get_or_insert(at.max(leading.since + leading.pause));
         }
     }
 
     /// Plans to outdo a rival, and asks all whom they follow: this node may have been held up, and they may have left it.
     pub(super) fn contest(&mut self, rival: &NodeName, now: Timestamp) {
-        let (soon, is_followed) = (now + self.config.given_up_timeout(), self.peers.followers(rival, now) > 0);
-        let State::Leading(leading) = &mut self.state else { return };
+        let (soon, is_followed) = (
+            now + self.config.given_up_timeout(),
+            self.peers.followers(rival, now) > 0,
+        );
+        let State::Leading(leading) = &mut self.state else {
+            return;
+        };
         // The pause is for single nodes that refuse. A rival that others follow is none of them.
         if leading.renew_at.is_none_or(|at| is_followed && at > soon) {
             leading.renew_at = is_followed.then_some(soon);
@@ -142,7 +173,9 @@ impl Election {
     }
 
     pub(super) fn send_beat(&mut self, to: &NodeName, now: Timestamp) {
-        let State::Leading(leading) = &self.state else { return };
+        let State::Leading(leading) = &self.state else {
+            return;
+        };
         let body = Body::Beat {
             every_ms: self.beat_for(leading, to).as_millis() as u64,
             round: self.round,
@@ -156,11 +189,17 @@ impl Election {
 
     /// Time between two beats to a peer. A better candidate that is not yet fit is to be heard soon when it is.
     fn beat_for(&self, leading: &Leading, to: &NodeName) -> Duration {
-        let outranks = |candidacy: Candidacy| candidacy.role != Role::Cav && candidacy.rank() < self.candidacy().rank();
+        let outranks = |candidacy: Candidacy| {
+            candidacy.role != Role::Cav && candidacy.rank() < self.candidacy().rank()
+        };
         match leading.successors.iter().position(|name| name == to) {
             Some(0) => self.config.beat(),
             Some(_) => self.config.near_beat(),
-            None if self.peers.get(to).and_then(|peer| peer.candidacy).is_some_and(outranks)
+            None if self
+                .peers
+                .get(to)
+                .and_then(|peer| peer.candidacy)
+                .is_some_and(outranks)
                 && self.peers.hears(to, self.clock.now()) =>
             {
                 self.config.near_beat()
@@ -175,7 +214,9 @@ impl Election {
             return;
         }
         let mut next = self.successors(now);
-        let State::Leading(leading) = &mut self.state else { return };
+        let State::Leading(leading) = &mut self.state else {
+            return;
+        };
         if let Some(handover) = &leading.handover {
             next.retain(|name| *name != handover.to);
             next.insert(0, handover.to.clone());

@@ -120,14 +120,22 @@ impl Following {
 
     /// Forgets the interval of rounds that no longer come.
     pub(super) fn forget_round_interval(&mut self, now: Timestamp) {
-        self.round_interval.take_if(|gap| self.round_at.is_none_or(|last| now.since(last) > *gap * REGULAR_GAPS));
+        self.round_interval.take_if(|gap| {
+            self.round_at
+                .is_none_or(|last| now.since(last) > *gap * REGULAR_GAPS)
+        });
     }
 
     /// First deadline: the leader is doubted.
     pub(super) fn suspect_at(&self, config: &ElectionConfig) -> Timestamp {
-        let late_at = self.telling_interval().map(|gap| self.direct_at + overdue(gap));
+        let late_at = self
+            .telling_interval()
+            .map(|gap| self.direct_at + overdue(gap));
         let claimed_at = self.claim.as_ref().map(|claim| claim.0);
-        [late_at, claimed_at].into_iter().flatten().fold(self.silent_at(config), Timestamp::min)
+        [late_at, claimed_at]
+            .into_iter()
+            .flatten()
+            .fold(self.silent_at(config), Timestamp::min)
     }
 
     /// Time from when on more than a round is missing.
@@ -143,11 +151,21 @@ impl Following {
     pub(super) fn direct_timeout_at(&self, config: &ElectionConfig) -> Timestamp {
         let silence = self.beat_interval * config.silence_beats;
         let unheard_at = self.bidirectional_at + silence.max(config.response_timeout());
-        let missing_at = self.telling_interval().map(|gap| self.direct_at + missing(gap));
-        let given_up_at = self.given_up.then(|| self.direct_at + config.given_up_timeout());
-        let claimed_at = self.claim.as_ref().map(|claim| claim.0 + config.given_up_timeout());
+        let missing_at = self
+            .telling_interval()
+            .map(|gap| self.direct_at + missing(gap));
+        let given_up_at = self
+            .given_up
+            .then(|| self.direct_at + config.given_up_timeout());
+        let claimed_at = self
+            .claim
+            .as_ref()
+            .map(|claim| claim.0 + config.given_up_timeout());
         let silent_at = (self.direct_at + silence).min(unheard_at);
-        [missing_at, given_up_at, claimed_at].into_iter().flatten().fold(silent_at, Timestamp::min)
+        [missing_at, given_up_at, claimed_at]
+            .into_iter()
+            .flatten()
+            .fold(silent_at, Timestamp::min)
     }
 
     /// Third deadline: the leader is lost.
@@ -158,7 +176,11 @@ impl Following {
     pub(super) fn lost_at(&self, config: &ElectionConfig) -> Timestamp {
         let direct_timeout_at = self.direct_timeout_at(config);
         let late = self.telling_interval().map(overdue);
-        let margin = late.unwrap_or(if self.given_up { config.beat() } else { self.beat_interval });
+        let margin = late.unwrap_or(if self.given_up {
+            config.beat()
+        } else {
+            self.beat_interval
+        });
         let hears_us_until = self.bidirectional_at + self.beat_interval + margin;
         if self.indirect_heard_at > (self.direct_at + margin).min(hears_us_until) {
             direct_timeout_at.max(self.indirect_heard_at + config.response_timeout())
@@ -188,18 +210,32 @@ mod tests {
     fn the_deadlines_of_a_silent_leader_pass_in_their_order() {
         let config = ElectionConfig::default();
         for beat_interval in [config.beat(), config.near_beat(), config.idle_beat()] {
-            for (has_rounds, given_up) in [(false, false), (true, false), (false, true), (true, true)] {
+            for (has_rounds, given_up) in
+                [(false, false), (true, false), (false, true), (true, true)]
+            {
                 let epoch = Epoch::new(1, NodeName::from_static("edge"));
-                let mut leader = Following::new(epoch, Vec::new(), beat_interval, ms(0), Timestamp::default());
+                let mut leader = Following::new(
+                    epoch,
+                    Vec::new(),
+                    beat_interval,
+                    ms(0),
+                    Timestamp::default(),
+                );
                 if has_rounds {
                     (1..=20).for_each(|round| leader.take_round(config.beat(), ms(100 * round)));
                 }
                 leader.bidirectional_at = leader.direct_at;
                 leader.given_up = given_up;
-                let deadlines =
-                    [leader.suspect_at(&config), leader.direct_timeout_at(&config), leader.lost_at(&config)];
+                let deadlines = [
+                    leader.suspect_at(&config),
+                    leader.direct_timeout_at(&config),
+                    leader.lost_at(&config),
+                ];
                 assert!(leader.suspect_at(&config) <= leader.silent_at(&config));
-                assert!(deadlines.is_sorted(), "{beat_interval:?} {has_rounds} {given_up}: {deadlines:?}");
+                assert!(
+                    deadlines.is_sorted(),
+                    "{beat_interval:?} {has_rounds} {given_up}: {deadlines:?}"
+                );
             }
         }
     }
@@ -208,7 +244,13 @@ mod tests {
     fn a_last_round_that_all_heard_keeps_a_standby_no_longer() {
         let config = ElectionConfig::default();
         let epoch = Epoch::new(1, NodeName::from_static("edge"));
-        let mut leader = Following::new(epoch, Vec::new(), config.beat(), ms(0), Timestamp::default());
+        let mut leader = Following::new(
+            epoch,
+            Vec::new(),
+            config.beat(),
+            ms(0),
+            Timestamp::default(),
+        );
         // A beat is due with the round: 50 ms after the last one, and a little late.
         leader.take_round(config.beat(), ms(53));
         leader.indirect_heard_at = ms(52);

@@ -12,7 +12,8 @@ use crate::model::time::Timestamp;
 impl Election {
     /// Followers that cannot log in at this leader's broker, and all followers, by their own word.
     pub fn followers_without_login(&self) -> (usize, usize) {
-        self.peers.without_login(&self.id, &self.id, self.clock.now())
+        self.peers
+            .without_login(&self.id, &self.id, self.clock.now())
     }
 
     /// Notes at which brokers this node cannot log in, and tells its leader.
@@ -40,14 +41,21 @@ impl Election {
 
     /// The best candidates to lead next. Those that most cannot reach come last.
     pub(super) fn successors(&self, now: Timestamp) -> Vec<NodeName> {
-        self.peers.successors(MAX_SUCCESSORS, |name| self.is_out_of_reach(name, now), now)
+        self.peers
+            .successors(MAX_SUCCESSORS, |name| self.is_out_of_reach(name, now), now)
     }
 
     /// The successor that this leader hands the lead to, as most of its followers cannot log in at its broker.
     pub(super) fn relief(&self, now: Timestamp) -> Option<NodeName> {
-        let State::Leading(leading) = &self.state else { return None };
-        let next = leading.successors.first().filter(|_| self.peers.lacks_logins())?;
-        let is_ready = self.peers.is_stable(next, self.config.stable(), now) && !self.is_out_of_reach(next, now);
+        let State::Leading(leading) = &self.state else {
+            return None;
+        };
+        let next = leading
+            .successors
+            .first()
+            .filter(|_| self.peers.lacks_logins())?;
+        let is_ready = self.peers.is_stable(next, self.config.stable(), now)
+            && !self.is_out_of_reach(next, now);
         (is_ready && self.is_deserted(next, now)).then(|| next.clone())
     }
 
@@ -59,6 +67,7 @@ impl Election {
             let candidacy = self.peers.get(next).and_then(|peer| peer.candidacy);
             candidacy.is_some_and(|other| other.rank() <= self.candidacy().rank())
         };
-        2 * without > followers && (without > 1 || self.peers.has_no_login(next, &self.id) && is_equal())
+        2 * without > followers
+            && (without > 1 || self.peers.has_no_login(next, &self.id) && is_equal())
     }
 }

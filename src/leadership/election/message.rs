@@ -80,7 +80,9 @@ pub struct ElectionMessage {
 }
 
 /// A node as a candidate: its rank among possible leaders.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
+)]
 pub struct Candidacy {
     /// The role it was started with.
     #[n(0)]
@@ -97,7 +99,9 @@ pub struct Candidacy {
 }
 
 /// A leader's sign of life, which others can pass on and cannot make: how long it has led, under its signature.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
+#[derive(
+    Debug, Clone, Default, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
+)]
 pub struct LifeSign {
     /// Time in ms for which the leader has led when it sent this, by its own clock.
     #[n(0)]
@@ -231,12 +235,22 @@ impl LifeSign {
         let header = b"ecod leader alive 1\0";
         let names = [cell.as_str(), epoch.leader.as_str()].map(str::as_bytes);
         let numbers = [epoch.term, self.led_ms].map(u64::to_be_bytes);
-        [&header[..], names[0], b"\0", names[1], b"\0", &numbers[0], &numbers[1]].concat()
+        [
+            &header[..],
+            names[0],
+            b"\0",
+            names[1],
+            b"\0",
+            &numbers[0],
+            &numbers[1],
+        ]
+        .concat()
     }
 
     fn is_plausible(&self) -> bool {
         let signature = self.signature.as_ref();
-        self.led_ms <= wire::MAX_INTEGER && signature.is_none_or(|text| text.len() <= Self::MAX_SIGNATURE)
+        self.led_ms <= wire::MAX_INTEGER
+            && signature.is_none_or(|text| text.len() <= Self::MAX_SIGNATURE)
     }
 }
 
@@ -258,9 +272,16 @@ impl ElectionMessage {
     /// [`RejectReason::TooLarge`], [`RejectReason::UnknownSchema`], or [`RejectReason::Malformed`] also for values that
     /// no node sends.
     pub fn decode(bytes: &[u8]) -> Result<Self, RejectReason> {
-        let limits = Limits { payload_bytes: MAX_MESSAGE_BYTES, ..Limits::default() };
+        let limits = Limits {
+            payload_bytes: MAX_MESSAGE_BYTES,
+            ..Limits::default()
+        };
         let message: Self = wire::decode(bytes, &limits)?;
-        if message.is_plausible() { Ok(message) } else { Err(RejectReason::Malformed) }
+        if message.is_plausible() {
+            Ok(message)
+        } else {
+            Err(RejectReason::Malformed)
+        }
     }
 
     /// The highest term of an epoch in the message.
@@ -269,17 +290,37 @@ impl ElectionMessage {
             Body::Status { over, .. } => over.as_ref(),
             Body::Beat { after, .. } => after.as_ref(),
             Body::Resign { epoch, .. } => Some(epoch),
-            Body::Ask { .. } | Body::LeaderEvidence { .. } | Body::Offer | Body::Ready | Body::Yield { .. } => None,
+            Body::Ask { .. }
+            | Body::LeaderEvidence { .. }
+            | Body::Offer
+            | Body::Ready
+            | Body::Yield { .. } => None,
         };
-        of_body.into_iter().chain(&self.epoch).map(|epoch| epoch.term).max().unwrap_or(0)
+        of_body
+            .into_iter()
+            .chain(&self.epoch)
+            .map(|epoch| epoch.term)
+            .max()
+            .unwrap_or(0)
     }
 
     fn is_plausible(&self) -> bool {
-        let known = |epoch: &Option<Epoch>| epoch.as_ref().is_none_or(|epoch| epoch.term <= self.term);
+        let known =
+            |epoch: &Option<Epoch>| epoch.as_ref().is_none_or(|epoch| epoch.term <= self.term);
         let body = match &self.body {
             Body::Status { over, no_login } => known(over) && no_login.len() <= MAX_NO_LOGIN,
-            Body::Beat { every_ms, after, successors, round, life, .. } => {
-                let leads = self.epoch.as_ref().is_some_and(|epoch| epoch.leader == self.from);
+            Body::Beat {
+                every_ms,
+                after,
+                successors,
+                round,
+                life,
+                ..
+            } => {
+                let leads = self
+                    .epoch
+                    .as_ref()
+                    .is_some_and(|epoch| epoch.leader == self.from);
                 leads
                     && known(after)
                     && successors.len() <= MAX_SUCCESSORS
@@ -312,7 +353,12 @@ mod tests {
             from: NodeName::new("edge").unwrap(),
             run: 1_732_154_400_000_000,
             seq: 9,
-            candidacy: Candidacy { role: Role::Edge, priority: 100, load: 1, fit: true },
+            candidacy: Candidacy {
+                role: Role::Edge,
+                priority: 100,
+                load: 1,
+                fit: true,
+            },
             term,
             epoch: Some(Epoch::new(4, NodeName::new(leader).unwrap())),
             hears_you: true,
@@ -333,17 +379,42 @@ mod tests {
     fn messages_survive_every_encoding_and_fit_a_packet() {
         let mut message = beat(4, "edge");
         let long = NodeName::new("x".repeat(64)).unwrap();
-        if let Body::Beat { successors, after, life, .. } = &mut message.body {
-            *life = LifeSign { led_ms: wire::MAX_INTEGER, signature: Some("x".repeat(96).into()) };
+        if let Body::Beat {
+            successors,
+            after,
+            life,
+            ..
+        } = &mut message.body
+        {
+            *life = LifeSign {
+                led_ms: wire::MAX_INTEGER,
+                signature: Some("x".repeat(96).into()),
+            };
             *successors = vec![long.clone(), long.clone(), long.clone()];
             *after = Some(Epoch::new(3, long));
         }
         let latest = Timestamp(wire::MAX_INTEGER);
-        let answers = Some(AnsweredStamps { sent_us: latest, received_us: latest });
-        message.clock =
-            Some(ClockStamps { sent_us: latest, answers, wall_us: Some(latest), cell_us: Some(latest) }.into());
+        let answers = Some(AnsweredStamps {
+            sent_us: latest,
+            received_us: latest,
+        });
+        message.clock = Some(
+            ClockStamps {
+                sent_us: latest,
+                answers,
+                wall_us: Some(latest),
+                cell_us: Some(latest),
+            }
+            .into(),
+        );
         let hash = ContentHash([u8::MAX; 32]);
-        message.description = Some(DescriptionStamp { version: wire::MAX_INTEGER, hash }.into());
+        message.description = Some(
+            DescriptionStamp {
+                version: wire::MAX_INTEGER,
+                hash,
+            }
+            .into(),
+        );
         for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
             let bytes = message.encode(encoding);
             assert!(bytes.len() <= MAX_MESSAGE_BYTES, "{}", bytes.len());
@@ -357,16 +428,29 @@ mod tests {
         let epoch = || Epoch::new(4, NodeName::from_static("edge"));
         for (body, expected) in [
             (
-                Body::Status { over: Some(epoch()), no_login: Vec::new() },
+                Body::Status {
+                    over: Some(epoch()),
+                    no_login: Vec::new(),
+                },
                 r#"{"status":{"over":{"term":4,"leader":"edge"}}}"#,
             ),
             (
-                Body::Status { over: None, no_login: vec![NodeName::from_static("edge")] },
+                Body::Status {
+                    over: None,
+                    no_login: vec![NodeName::from_static("edge")],
+                },
                 r#"{"status":{"no_login":["edge"]}}"#,
             ),
             (Body::Ask { ask: 7 }, r#"{"ask":{"ask":7}}"#),
             (
-                Body::LeaderEvidence { ask: 7, age_ms: 12, life: LifeSign { led_ms: 900, signature: None } },
+                Body::LeaderEvidence {
+                    ask: 7,
+                    age_ms: 12,
+                    life: LifeSign {
+                        led_ms: 900,
+                        signature: None,
+                    },
+                },
                 r#"{"vouch":{"ask":7,"age_ms":12,"life":{"led_ms":900}}}"#,
             ),
             (
@@ -376,7 +460,10 @@ mod tests {
                     followers: 3,
                     after: None,
                     successors: Vec::new(),
-                    life: LifeSign { led_ms: 900, signature: Some("MEU=".into()) },
+                    life: LifeSign {
+                        led_ms: 900,
+                        signature: Some("MEU=".into()),
+                    },
                 },
                 concat!(
                     r#"{"beat":{"every_ms":50,"round":88,"followers":3,"successors":[],"#,
@@ -385,13 +472,22 @@ mod tests {
             ),
             (Body::Offer, r#""offer""#),
             (Body::Ready, r#""ready""#),
-            (Body::Yield { last_round: 88 }, r#"{"yield":{"last_round":88}}"#),
             (
-                Body::Resign { epoch: epoch(), last_round: 88 },
+                Body::Yield { last_round: 88 },
+                r#"{"yield":{"last_round":88}}"#,
+            ),
+            (
+                Body::Resign {
+                    epoch: epoch(),
+                    last_round: 88,
+                },
                 r#"{"resign":{"epoch":{"term":4,"leader":"edge"},"last_round":88}}"#,
             ),
         ] {
-            let message = ElectionMessage { body, ..beat(4, "edge") };
+            let message = ElectionMessage {
+                body,
+                ..beat(4, "edge")
+            };
             let json = String::from_utf8(message.encode(Encoding::Json)).unwrap();
             let envelope = concat!(
                 r#"{"schema":1,"from":"edge","run":1732154400000000,"seq":9,"#,
@@ -400,21 +496,63 @@ mod tests {
             );
             assert_eq!(json, format!("{envelope}{expected}}}"));
         }
-        let life = LifeSign { led_ms: 900, signature: None };
-        let compact = ElectionMessage { body: Body::LeaderEvidence { ask: 7, age_ms: 12, life }, ..beat(4, "edge") };
-        let compact: String = compact.encode(Encoding::Compact).iter().map(|byte| format!("{byte:02x}")).collect();
-        assert_eq!(compact, "890164656467651b000627629fb54800098402186401f504f58402070c8119038482046465646765");
+        let life = LifeSign {
+            led_ms: 900,
+            signature: None,
+        };
+        let compact = ElectionMessage {
+            body: Body::LeaderEvidence {
+                ask: 7,
+                age_ms: 12,
+                life,
+            },
+            ..beat(4, "edge")
+        };
+        let compact: String = compact
+            .encode(Encoding::Compact)
+            .iter()
+            .map(|byte| format!("{byte:02x}"))
+            .collect();
+        assert_eq!(
+            compact,
+            "890164656467651b000627629fb54800098402186401f504f58402070c8119038482046465646765"
+        );
     }
 
     #[test]
     fn implausible_messages_are_refused() {
-        let refused = |message: ElectionMessage| ElectionMessage::decode(&message.encode(Encoding::Cbor)).unwrap_err();
-        assert_eq!(refused(beat(3, "edge")), RejectReason::Malformed, "an epoch beyond the sender's term");
-        assert_eq!(refused(beat(4, "euclid")), RejectReason::Malformed, "a beat in another's name");
-        assert_eq!(refused(beat(MAX_TERM + 1, "edge")), RejectReason::Malformed, "a term beyond all bounds");
-        let endless = Body::Yield { last_round: MAX_ROUND + 1 };
-        let reason = refused(ElectionMessage { body: endless, ..beat(4, "edge") });
+        let refused = |message: ElectionMessage| {
+            ElectionMessage::decode(&message.encode(Encoding::Cbor)).unwrap_err()
+        };
+        assert_eq!(
+            refused(beat(3, "edge")),
+            RejectReason::Malformed,
+            "an epoch beyond the sender's term"
+        );
+        assert_eq!(
+            refused(beat(4, "euclid")),
+            RejectReason::Malformed,
+            "a beat in another's name"
+        );
+        assert_eq!(
+            refused(beat(MAX_TERM + 1, "edge")),
+            RejectReason::Malformed,
+            "a term beyond all bounds"
+        );
+        let endless = Body::Yield {
+            last_round: MAX_ROUND + 1,
+        };
+        let reason = refused(ElectionMessage {
+            body: endless,
+            ..beat(4, "edge")
+        });
         assert_eq!(reason, RejectReason::Malformed, "a round beyond all bounds");
-        assert_eq!(refused(ElectionMessage { schema: 2, ..beat(4, "edge") }), RejectReason::UnknownSchema);
+        assert_eq!(
+            refused(ElectionMessage {
+                schema: 2,
+                ..beat(4, "edge")
+            }),
+            RejectReason::UnknownSchema
+        );
     }
 }

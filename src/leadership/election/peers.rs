@@ -89,12 +89,20 @@ impl Peers {
     /// Notes a term above 0 that a possible leader states.
     pub(super) fn note_term(&mut self, name: &NodeName, term: u64) {
         let lowest = &mut self.table.entry(name.clone()).or_default().term;
-        *lowest = if *lowest == 0 { term } else { term.min(*lowest) };
+        *lowest = if *lowest == 0 {
+            term
+        } else {
+            term.min(*lowest)
+        };
     }
 
     /// The lowest term that a possible leader states; none while no node knows of any.
     pub(super) fn lowest_term(&self) -> Option<u64> {
-        self.table.values().map(|peer| peer.term).filter(|term| *term > 0).min()
+        self.table
+            .values()
+            .map(|peer| peer.term)
+            .filter(|term| *term > 0)
+            .min()
     }
 
     pub(super) fn names(&self) -> impl Iterator<Item = &NodeName> {
@@ -107,16 +115,30 @@ impl Peers {
 
     /// Notes that a peer is sent a message, which says whether it is heard; gives that.
     pub(super) fn tell(&mut self, name: &NodeName, now: Timestamp) -> bool {
-        let Some(peer) = self.table.get_mut(name) else { return false };
-        peer.told = peer.heard_at.is_some_and(|at| now.since(at) <= self.contact_timeout);
+        let Some(peer) = self.table.get_mut(name) else {
+            return false;
+        };
+        peer.told = peer
+            .heard_at
+            .is_some_and(|at| now.since(at) <= self.contact_timeout);
         peer.told
     }
 
     /// True if a peer follows a leadership of `leader` that is over, and has not been told so: each is told of once, as its
     /// answer is answered too.
-    pub(super) fn correct(&mut self, name: &NodeName, leader: &NodeName, current: Option<&Epoch>) -> bool {
-        let Some(peer) = self.table.get_mut(name) else { return false };
-        let over = peer.epoch.clone().filter(|epoch| epoch.leader == *leader && Some(epoch) != current);
+    pub(super) fn correct(
+        &mut self,
+        name: &NodeName,
+        leader: &NodeName,
+        current: Option<&Epoch>,
+    ) -> bool {
+        let Some(peer) = self.table.get_mut(name) else {
+            return false;
+        };
+        let over = peer
+            .epoch
+            .clone()
+            .filter(|epoch| epoch.leader == *leader && Some(epoch) != current);
         let is_news = over.is_some() && over != peer.corrected;
         if is_news {
             peer.corrected = over;
@@ -133,7 +155,9 @@ impl Peers {
 
     /// True if a peer heard lately refuses this node's leadership.
     pub(super) fn any_refuses(&self, now: Timestamp) -> bool {
-        self.table.iter().any(|(name, peer)| peer.refuses && self.hears(name, now))
+        self.table
+            .iter()
+            .any(|(name, peer)| peer.refuses && self.hears(name, now))
     }
 
     /// Notes at whose brokers a peer cannot log in.
@@ -153,21 +177,41 @@ impl Peers {
     }
 
     /// Number of followers of `leader`, without `at`, that cannot log in at the broker of `at`, and number of all.
-    pub(super) fn without_login(&self, leader: &NodeName, at: &NodeName, now: Timestamp) -> (usize, usize) {
-        let concerned = || self.followers_of(leader, now).filter(|(name, _)| *name != at);
-        (concerned().filter(|(_, peer)| peer.no_login.contains(at)).count(), concerned().count())
+    pub(super) fn without_login(
+        &self,
+        leader: &NodeName,
+        at: &NodeName,
+        now: Timestamp,
+    ) -> (usize, usize) {
+        let concerned = || {
+            self.followers_of(leader, now)
+                .filter(|(name, _)| *name != at)
+        };
+        (
+            concerned()
+                .filter(|(_, peer)| peer.no_login.contains(at))
+                .count(),
+            concerned().count(),
+        )
     }
 
     /// True if a peer cannot log in at the broker of `at`.
     pub(super) fn has_no_login(&self, name: &NodeName, at: &NodeName) -> bool {
-        self.table.get(name).is_some_and(|peer| peer.no_login.contains(at))
+        self.table
+            .get(name)
+            .is_some_and(|peer| peer.no_login.contains(at))
     }
 
     /// True if a message's number can be that of its sender's next: messages are sent to each node, and some are lost.
     pub(super) fn is_in_sequence(&self, message: &ElectionMessage, now: Timestamp) -> bool {
-        let known = self.table.get(&message.from).filter(|peer| peer.run == message.run);
+        let known = self
+            .table
+            .get(&message.from)
+            .filter(|peer| peer.run == message.run);
         known.is_none_or(|peer| {
-            let is_silent = peer.heard_at.is_none_or(|at| now.since(at) > self.contact_timeout);
+            let is_silent = peer
+                .heard_at
+                .is_none_or(|at| now.since(at) > self.contact_timeout);
             is_silent || message.seq <= peer.seq.saturating_add(MAX_SEQ_STEP)
         })
     }
@@ -176,12 +220,16 @@ impl Peers {
     pub(super) fn note(&mut self, message: &ElectionMessage, now: Timestamp) -> bool {
         let contact_timeout = self.contact_timeout;
         let peer = self.table.entry(message.from.clone()).or_default();
-        let silent = peer.heard_at.is_none_or(|at| now.since(at) > contact_timeout);
+        let silent = peer
+            .heard_at
+            .is_none_or(|at| now.since(at) > contact_timeout);
         let newer = (message.run, message.seq) > (peer.run, peer.seq);
         if !newer && (message.run == peer.run || !silent) {
             return false;
         }
-        let same = peer.candidacy.is_some_and(|candidacy| candidacy.rank() == message.candidacy.rank());
+        let same = peer
+            .candidacy
+            .is_some_and(|candidacy| candidacy.rank() == message.candidacy.rank());
         if !message.candidacy.fit {
             peer.fit_since = None;
         } else if silent || !same || message.run != peer.run || peer.fit_since.is_none() {
@@ -209,8 +257,13 @@ impl Peers {
 
     /// Forgets a peer that the membership gave up: at once if it has been silent, else if it stays so.
     pub(super) fn down(&mut self, name: &NodeName, now: Timestamp) {
-        let Some(peer) = self.table.get_mut(name) else { return };
-        if peer.heard_at.is_none_or(|at| now.since(at) > self.given_up_timeout) {
+        let Some(peer) = self.table.get_mut(name) else {
+            return;
+        };
+        if peer
+            .heard_at
+            .is_none_or(|at| now.since(at) > self.given_up_timeout)
+        {
             self.table.remove(name);
         } else {
             peer.given_up_at = Some(now);
@@ -224,8 +277,14 @@ impl Peers {
             return;
         }
         let wait = self.given_up_timeout;
-        self.table.retain(|_, peer| peer.given_up_at.is_none_or(|at| now < at + wait));
-        self.forget_at = self.table.values().filter_map(|peer| peer.given_up_at).min().map(|at| at + wait);
+        self.table
+            .retain(|_, peer| peer.given_up_at.is_none_or(|at| now < at + wait));
+        self.forget_at = self
+            .table
+            .values()
+            .filter_map(|peer| peer.given_up_at)
+            .min()
+            .map(|at| at + wait);
     }
 
     /// True if a peer has been heard and fit for `stable`.
@@ -243,12 +302,18 @@ impl Peers {
 
     /// True if a peer was heard lately.
     pub(super) fn hears(&self, name: &NodeName, now: Timestamp) -> bool {
-        self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| now.since(at) <= self.contact_timeout)
+        self.table
+            .get(name)
+            .and_then(|peer| peer.heard_at)
+            .is_some_and(|at| now.since(at) <= self.contact_timeout)
     }
 
     /// True if a peer was heard at `since` or later.
     pub(super) fn heard_since(&self, name: &NodeName, since: Timestamp) -> bool {
-        self.table.get(name).and_then(|peer| peer.heard_at).is_some_and(|at| at >= since)
+        self.table
+            .get(name)
+            .and_then(|peer| peer.heard_at)
+            .is_some_and(|at| at >= since)
     }
 
     /// Number of nodes heard lately that follow a leader, by their own word. Parts share the certificate of their node, which
@@ -257,10 +322,20 @@ impl Peers {
         self.followers_of(leader, now).count()
     }
 
-    fn followers_of(&self, leader: &NodeName, now: Timestamp) -> impl Iterator<Item = (&NodeName, &Peer)> {
-        let follows = move |peer: &Peer| peer.epoch.as_ref().is_some_and(|epoch| epoch.leader == *leader);
+    fn followers_of(
+        &self,
+        leader: &NodeName,
+        now: Timestamp,
+    ) -> impl Iterator<Item = (&NodeName, &Peer)> {
+        let follows = move |peer: &Peer| {
+            peer.epoch
+                .as_ref()
+                .is_some_and(|epoch| epoch.leader == *leader)
+        };
         let is_node = move |name: &NodeName| name != leader && name.vehicle() == *name;
-        self.table.iter().filter(move |(name, peer)| follows(peer) && is_node(name) && self.hears(name, now))
+        self.table
+            .iter()
+            .filter(move |(name, peer)| follows(peer) && is_node(name) && self.hears(name, now))
     }
 
     /// True if a peer could lead, as far as is known without having heard it lately.
@@ -274,13 +349,21 @@ impl Peers {
     /// True if a peer that a leader named its successor could still lead: the leader's word outweighs what the peer
     /// said of itself long ago.
     pub(super) fn may_succeed(&self, name: &NodeName, now: Timestamp) -> bool {
-        let unfit =
-            |peer: &Peer| peer.candidacy.is_some_and(|candidacy| !candidacy.may_lead()) && self.hears(name, now);
-        self.table.get(name).is_some_and(|peer| peer.gone_until.is_none_or(|until| now >= until) && !unfit(peer))
+        let unfit = |peer: &Peer| {
+            peer.candidacy
+                .is_some_and(|candidacy| !candidacy.may_lead())
+                && self.hears(name, now)
+        };
+        self.table
+            .get(name)
+            .is_some_and(|peer| peer.gone_until.is_none_or(|until| now >= until) && !unfit(peer))
     }
 
     /// Everyone who could lead, in no order of preference.
-    pub(super) fn candidates(&self, now: Timestamp) -> impl Iterator<Item = (&NodeName, Candidacy)> {
+    pub(super) fn candidates(
+        &self,
+        now: Timestamp,
+    ) -> impl Iterator<Item = (&NodeName, Candidacy)> {
         self.table
             .iter()
             .filter(move |(name, _)| self.may_lead(name, now))
@@ -298,16 +381,23 @@ impl Peers {
     ) -> Vec<NodeName> {
         let silence = self.standby_silence;
         let given_up = |name: &NodeName| {
-            self.table.get(name).is_some_and(|peer| peer.given_up_at.is_some())
+            self.table
+                .get(name)
+                .is_some_and(|peer| peer.given_up_at.is_some())
                 && !self.heard_since(name, now - silence)
         };
-        let mut fit: Vec<_> =
-            self.candidates(now).filter(|(name, _)| self.hears(name, now) && !given_up(name)).collect();
+        let mut fit: Vec<_> = self
+            .candidates(now)
+            .filter(|(name, _)| self.hears(name, now) && !given_up(name))
+            .collect();
         fit.sort_by_key(|&(name, candidacy)| (candidacy.rank(), candidacy.load, name.clone()));
         if self.lacks_logins {
             fit.sort_by_cached_key(|(name, _)| out_of_reach(name));
         }
-        fit.into_iter().take(limit).map(|(name, _)| name.clone()).collect()
+        fit.into_iter()
+            .take(limit)
+            .map(|(name, _)| name.clone())
+            .collect()
     }
 
     /// The best peer of a higher rank than `ours`, and the time at which it has been fit for `stable`.
@@ -322,9 +412,15 @@ impl Peers {
         now: Timestamp,
     ) -> Option<(NodeName, Timestamp)> {
         self.candidates(now)
-            .filter(|(name, other)| self.hears(name, now) && other.rank() < ours && !out_of_reach(name))
-            .filter_map(|(name, other)| Some((name, other, self.table.get(name)?.fit_since? + stable)))
-            .min_by_key(|&(name, other, from)| (from > now + stable / 2, other.rank(), name.clone()))
+            .filter(|(name, other)| {
+                self.hears(name, now) && other.rank() < ours && !out_of_reach(name)
+            })
+            .filter_map(|(name, other)| {
+                Some((name, other, self.table.get(name)?.fit_since? + stable))
+            })
+            .min_by_key(|&(name, other, from)| {
+                (from > now + stable / 2, other.rank(), name.clone())
+            })
             .map(|(name, _, from)| (name.clone(), from))
     }
 }

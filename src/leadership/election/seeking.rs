@@ -30,7 +30,13 @@ pub(super) struct Seeking {
 
 impl Seeking {
     pub(super) fn new(since: Timestamp, order: Vec<NodeName>, ask_at: Timestamp) -> Self {
-        Self { since, order, asked_at: None, ask_at, known_until: Timestamp::default() }
+        Self {
+            since,
+            order,
+            asked_at: None,
+            ask_at,
+            known_until: Timestamp::default(),
+        }
     }
 }
 
@@ -54,21 +60,29 @@ impl Questions {
     }
 
     pub(super) fn asked_at(&self, ask: u64) -> Option<Timestamp> {
-        self.recent.iter().find(|(count, _)| *count == ask).map(|(_, at)| *at)
+        self.recent
+            .iter()
+            .find(|(count, _)| *count == ask)
+            .map(|(_, at)| *at)
     }
 
     pub(super) fn last_at(&self) -> Timestamp {
-        self.recent.back().map_or_else(Timestamp::default, |(_, at)| *at)
+        self.recent
+            .back()
+            .map_or_else(Timestamp::default, |(_, at)| *at)
     }
 }
 
 impl Election {
     pub(super) fn seeking_deadline(&self, seeking: &Seeking) -> Timestamp {
-        self.claim_at(seeking).map_or(seeking.ask_at, |claim_at| claim_at.min(seeking.ask_at))
+        self.claim_at(seeking)
+            .map_or(seeking.ask_at, |claim_at| claim_at.min(seeking.ask_at))
     }
 
     pub(super) fn seek_timers(&mut self, now: Timestamp) {
-        let State::Seeking(seeking) = &self.state else { return };
+        let State::Seeking(seeking) = &self.state else {
+            return;
+        };
         if self.claim_at(seeking).is_some_and(|at| now >= at) {
             self.lead(self.epoch.clone(), now);
         } else if now >= seeking.ask_at {
@@ -83,12 +97,19 @@ impl Election {
     /// Seeks a leader; the first of `order` that can leads at once, the next one step later.
     pub(super) fn seek(&mut self, order: Vec<NodeName>, since: Timestamp, now: Timestamp) {
         let (known_until, asked_at) = match &self.state {
-            State::Following(following) => (following.evidence_at() + self.config.beat(), following.asked_at),
+            State::Following(following) => (
+                following.evidence_at() + self.config.beat(),
+                following.asked_at,
+            ),
             State::Seeking(_) | State::Leading(_) => (now, None),
         };
         // The first in turn is heard before everyone has to ask.
         let ask_at = now + self.config.answer_time();
-        self.state = State::Seeking(Seeking { known_until, asked_at, ..Seeking::new(since, order, ask_at) });
+        self.state = State::Seeking(Seeking {
+            known_until,
+            asked_at,
+            ..Seeking::new(since, order, ask_at)
+        });
     }
 
     pub(super) fn ask_all(&mut self, now: Timestamp) {
@@ -98,7 +119,9 @@ impl Election {
 
     /// Asks the leader itself, and those who hear it often.
     pub(super) fn ask_near(&mut self, now: Timestamp) {
-        let State::Following(following) = &self.state else { return };
+        let State::Following(following) = &self.state else {
+            return;
+        };
         let near = following.successors.iter().filter(|name| **name != self.id);
         let near: Vec<_> = near.chain([&following.epoch.leader]).cloned().collect();
         let ask = self.questions.ask(now);
@@ -111,13 +134,17 @@ impl Election {
     /// that is old convinces nobody: then the leader is asked for another, which answers the question too.
     pub(super) fn answer(&mut self, from: &NodeName, ask: u64, now: Timestamp) {
         let patience = self.config.response_timeout();
-        let life =
-            self.leader_clock.as_ref().filter(|clock| self.current_epoch().is_some_and(|epoch| clock.is_of(epoch)));
+        let life = self
+            .leader_clock
+            .as_ref()
+            .filter(|clock| self.current_epoch().is_some_and(|epoch| clock.is_of(epoch)));
         match &self.state {
             State::Leading(_) => return self.send_beat(from, now),
             State::Following(following) if now.since(following.evidence_at()) <= patience => {
-                let (leader, evidence_at) = (following.epoch.leader.clone(), following.evidence_at());
-                let recent = life.filter(|clock| now.since(clock.latest_at()) <= self.config.beat() * 2);
+                let (leader, evidence_at) =
+                    (following.epoch.leader.clone(), following.evidence_at());
+                let recent =
+                    life.filter(|clock| now.since(clock.latest_at()) <= self.config.beat() * 2);
                 if let Some(life) = recent.map(|clock| clock.latest().clone()) {
                     let age = now.since(evidence_at).as_micros().div_ceil(1000);
                     let age_ms = u64::try_from(age).unwrap_or(u64::MAX);
@@ -151,14 +178,20 @@ impl Election {
         life: LifeSign,
         now: Timestamp,
     ) {
-        let (Some(epoch), Some(asked_at)) = (epoch, self.questions.asked_at(ask)) else { return };
+        let (Some(epoch), Some(asked_at)) = (epoch, self.questions.asked_at(ask)) else {
+            return;
+        };
         let is_superseded = Some(&epoch) < self.epoch.as_ref();
-        if epoch.leader == self.id || epoch.leader == *from || self.is_over(&epoch) || is_superseded {
+        if epoch.leader == self.id || epoch.leader == *from || self.is_over(&epoch) || is_superseded
+        {
             return;
         }
         let clock = match self.leader_clock.take().filter(|clock| clock.is_of(&epoch)) {
             Some(clock) => self.leader_clock.insert(clock),
-            None => self.leader_clock.insert(LeaderClock::of_beat(epoch.clone(), life.clone(), now)),
+            None => {
+                self.leader_clock
+                    .insert(LeaderClock::of_beat(epoch.clone(), life.clone(), now))
+            }
         };
         // Whatever its sender says, the leader was alive when it sent its sign of life, and not known to be later.
         let heard_at = (asked_at - Duration::from_millis(age_ms)).min(clock.observe(life, now));
@@ -169,7 +202,9 @@ impl Election {
                 return;
             }
             State::Following(following) => now >= following.direct_timeout_at(&self.config),
-            State::Seeking(seeking) => Some(&epoch) != self.epoch.as_ref() || heard_at > seeking.known_until,
+            State::Seeking(seeking) => {
+                Some(&epoch) != self.epoch.as_ref() || heard_at > seeking.known_until
+            }
             State::Leading(_) => false,
         };
         if believable && doubtful {
@@ -186,12 +221,18 @@ impl Election {
         self.epoch = Some(epoch.clone());
         let successors = self.successors(now);
         let first = match &self.state {
-            State::Seeking(seeking) if seeking.order.first() == Some(&self.id) => FirstRound::Overdue,
+            State::Seeking(seeking) if seeking.order.first() == Some(&self.id) => {
+                FirstRound::Overdue
+            }
             State::Seeking(_) => FirstRound::AfterConnects,
             State::Following(_) => FirstRound::OnTime,
             State::Leading(_) => FirstRound::InStep,
         };
-        self.effects.push(ElectionEffect::Lead { epoch: epoch.clone(), first_round: self.next_round(), first });
+        self.effects.push(ElectionEffect::Lead {
+            epoch: epoch.clone(),
+            first_round: self.next_round(),
+            first,
+        });
         let mut leading = Leading::new(epoch, after, successors, now);
         if let State::Leading(before) = &self.state {
             leading.renewed(before, self.config.given_up_timeout());
@@ -202,13 +243,23 @@ impl Election {
 
     /// Gives up the lead for want of broker, fuser or gateway, or because the node stops.
     pub(super) fn resign(&mut self, now: Timestamp) {
-        let State::Leading(leading) = &mut self.state else { return };
+        let State::Leading(leading) = &mut self.state else {
+            return;
+        };
         let epoch = leading.epoch.clone();
         let order = std::mem::take(&mut leading.successors);
         self.close(epoch.clone());
-        self.effects.push(ElectionEffect::StopPublishing { epoch: epoch.clone() });
+        self.effects.push(ElectionEffect::StopPublishing {
+            epoch: epoch.clone(),
+        });
         self.seek(order, now + self.config.response_timeout(), now);
-        self.send_all(&Body::Resign { epoch, last_round: self.round }, now);
+        self.send_all(
+            &Body::Resign {
+                epoch,
+                last_round: self.round,
+            },
+            now,
+        );
     }
 
     /// Time of this node's turn to claim; `None` when it may not lead.
@@ -216,10 +267,15 @@ impl Election {
     /// A node that did not answer when the leader was doubted is as much out of reach as the leader. It is waited for no
     /// longer than an answer takes.
     fn claim_at(&self, seeking: &Seeking) -> Option<Timestamp> {
-        let turn = |since| seeking.since + self.config.claim_step() * self.place(&seeking.order, since);
+        let turn =
+            |since| seeking.since + self.config.claim_step() * self.place(&seeking.order, since);
         let in_order = turn(None);
-        let among_present = seeking.asked_at.map(|at| turn(Some(at)).max(at + self.config.answer_time()));
-        self.candidacy().may_lead().then(|| among_present.map_or(in_order, |at| at.min(in_order)))
+        let among_present = seeking
+            .asked_at
+            .map(|at| turn(Some(at)).max(at + self.config.answer_time()));
+        self.candidacy()
+            .may_lead()
+            .then(|| among_present.map_or(in_order, |at| at.min(in_order)))
     }
 
     /// Number of nodes that would claim before this one, of those heard at `since` or later if it is given.
@@ -229,14 +285,27 @@ impl Election {
     fn place(&self, order: &[NodeName], since: Option<Timestamp>) -> u32 {
         let now = self.clock.now();
         let present = |name: &NodeName| since.is_none_or(|at| self.peers.heard_since(name, at));
-        let there = |name: &&NodeName| **name == self.id || self.peers.may_succeed(name, now) && present(name);
+        let there = |name: &&NodeName| {
+            **name == self.id || self.peers.may_succeed(name, now) && present(name)
+        };
         let named: Vec<&NodeName> = order.iter().filter(there).collect();
-        let before = named.iter().position(|name| **name == self.id).unwrap_or_else(|| {
-            let place = |name: &NodeName, candidacy: Candidacy| (candidacy.rank(), candidacy.load, name.clone());
-            let own = place(&self.id, self.candidacy());
-            let others = self.peers.candidates(now).filter(|(name, _)| !named.contains(name) && present(name));
-            named.len() + others.filter(|&(name, other)| place(name, other) < own).count()
-        });
+        let before = named
+            .iter()
+            .position(|name| **name == self.id)
+            .unwrap_or_else(|| {
+                let place = |name: &NodeName, candidacy: Candidacy| {
+                    (candidacy.rank(), candidacy.load, name.clone())
+                };
+                let own = place(&self.id, self.candidacy());
+                let others = self
+                    .peers
+                    .candidates(now)
+                    .filter(|(name, _)| !named.contains(name) && present(name));
+                named.len()
+                    + others
+                        .filter(|&(name, other)| place(name, other) < own)
+                        .count()
+            });
         u32::try_from(before).unwrap_or(u32::MAX)
     }
 }

@@ -13,8 +13,20 @@ fn euclid() -> Election {
 
 /// A fit node that finds this term on its disk.
 fn euclid_after(saved_term: u64) -> Election {
-    let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), saved_term, NOW);
-    let health = Health { broker: true, fuser: true, gateway: true, reports: true, settings: true, load_percent: 0 };
+    let mut election = Election::new(
+        ElectionConfig::default(),
+        NodeName::from_static("euclid"),
+        saved_term,
+        NOW,
+    );
+    let health = Health {
+        broker: true,
+        fuser: true,
+        gateway: true,
+        reports: true,
+        settings: true,
+        load_percent: 0,
+    };
     election.handle(ElectionInput::Health { health }, NOW);
     election
 }
@@ -26,7 +38,12 @@ fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> Elec
         from: from.clone(),
         run: 1,
         seq,
-        candidacy: Candidacy { role: Role::Auto, priority: 100, load: 0, fit: true },
+        candidacy: Candidacy {
+            role: Role::Auto,
+            priority: 100,
+            load: 0,
+            fit: true,
+        },
         term: epoch.map_or(0, |epoch| epoch.term),
         epoch: epoch.cloned(),
         hears_you: true,
@@ -37,7 +54,9 @@ fn message(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> Elec
 }
 
 fn received(from: &NodeName, seq: u64, epoch: Option<&Epoch>, body: Body) -> ElectionInput {
-    ElectionInput::Receive { message: message(from, seq, epoch, body) }
+    ElectionInput::Receive {
+        message: message(from, seq, epoch, body),
+    }
 }
 
 fn beat_after(after: Option<&Epoch>) -> Body {
@@ -53,8 +72,15 @@ fn beat_after(after: Option<&Epoch>) -> Body {
 
 /// A message of edge, the leader of term 8, that knows `term`.
 fn of_edge(seq: u64, term: u64, body: Body) -> ElectionInput {
-    let message = message(&NodeName::from_static("edge"), seq, Some(&epoch_of_edge()), body);
-    ElectionInput::Receive { message: ElectionMessage { term, ..message } }
+    let message = message(
+        &NodeName::from_static("edge"),
+        seq,
+        Some(&epoch_of_edge()),
+        body,
+    );
+    ElectionInput::Receive {
+        message: ElectionMessage { term, ..message },
+    }
 }
 
 fn epoch_of_edge() -> Epoch {
@@ -63,24 +89,53 @@ fn epoch_of_edge() -> Epoch {
 
 fn beat(round: u64) -> Body {
     let successors = vec![NodeName::from_static("euclid")];
-    Body::Beat { every_ms: 50, round, followers: 1, after: None, successors, life: LifeSign::default() }
+    Body::Beat {
+        every_ms: 50,
+        round,
+        followers: 1,
+        after: None,
+        successors,
+        life: LifeSign::default(),
+    }
 }
 
 fn is_counted(effects: &[ElectionEffect]) -> bool {
-    effects.contains(&ElectionEffect::CountImplausible { from: NodeName::from_static("edge") })
+    effects.contains(&ElectionEffect::CountImplausible {
+        from: NodeName::from_static("edge"),
+    })
 }
 
 #[test]
 fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
     let mut election = euclid();
     let mut hear = |seq, term| {
-        let effects = election.handle(of_edge(seq, term, Body::Status { over: None, no_login: Vec::new() }), NOW);
+        let effects = election.handle(
+            of_edge(
+                seq,
+                term,
+                Body::Status {
+                    over: None,
+                    no_login: Vec::new(),
+                },
+            ),
+            NOW,
+        );
         let forged = Epoch::new(term, NodeName::from_static("edge"));
-        election.handle(ElectionInput::Round { epoch: forged, round: 1 }, NOW);
+        election.handle(
+            ElectionInput::Round {
+                epoch: forged,
+                round: 1,
+            },
+            NOW,
+        );
         (election.term(), is_counted(&effects))
     };
     let cell = 5000;
-    assert_eq!(hear(1, cell), (cell, false), "a node that joins learns the cell's term");
+    assert_eq!(
+        hear(1, cell),
+        (cell, false),
+        "a node that joins learns the cell's term"
+    );
     assert_eq!(hear(2, MAX_TERM), (cell, true));
     assert_eq!(hear(3, cell + MAX_TERM_STEP + 1), (cell, true));
     assert_eq!(hear(4, cell + 1), (cell + 1, false));
@@ -90,7 +145,10 @@ fn a_forged_term_neither_ends_elections_nor_hides_those_of_the_cell() {
 fn a_forged_sequence_number_mutes_nobody_that_is_heard() {
     let mut election = euclid();
     let hear = |election: &mut Election, seq, term, now| {
-        let status = Body::Status { over: None, no_login: Vec::new() };
+        let status = Body::Status {
+            over: None,
+            no_login: Vec::new(),
+        };
         let effects = election.handle(of_edge(seq, term, status), now);
         (election.term(), is_counted(&effects))
     };
@@ -98,7 +156,11 @@ fn a_forged_sequence_number_mutes_nobody_that_is_heard() {
     for forged in [2 + MAX_SEQ_STEP, (1 << 53) - 1, u64::MAX] {
         assert_eq!(hear(&mut election, forged, 10, NOW), (9, true));
     }
-    assert_eq!(hear(&mut election, 2, 11, NOW), (11, false), "the node itself is heard");
+    assert_eq!(
+        hear(&mut election, 2, 11, NOW),
+        (11, false),
+        "the node itself is heard"
+    );
     let mut now = NOW;
     while now < NOW + Duration::from_secs(10) {
         now = now + Duration::from_millis(50);
@@ -112,26 +174,61 @@ fn a_forged_sequence_number_mutes_nobody_that_is_heard() {
 fn a_node_without_a_term_joins_a_cell_of_any_age() {
     let mut election = euclid_after(0);
     let old = 1_800_000_000;
-    assert!(!is_counted(&election.handle(of_edge(1, old, Body::Status { over: None, no_login: Vec::new() }), NOW)));
-    assert!(is_counted(
-        &election.handle(of_edge(2, MAX_FIRST_TERM, Body::Status { over: None, no_login: Vec::new() }), NOW)
-    ));
+    assert!(!is_counted(&election.handle(
+        of_edge(
+            1,
+            old,
+            Body::Status {
+                over: None,
+                no_login: Vec::new()
+            }
+        ),
+        NOW
+    )));
+    assert!(is_counted(&election.handle(
+        of_edge(
+            2,
+            MAX_FIRST_TERM,
+            Body::Status {
+                over: None,
+                no_login: Vec::new()
+            }
+        ),
+        NOW
+    )));
     assert_eq!(election.term(), old);
-    assert!(is_counted(
-        &euclid_after(0).handle(of_edge(1, MAX_FIRST_TERM + 1, Body::Status { over: None, no_login: Vec::new() }), NOW)
-    ));
+    assert!(is_counted(&euclid_after(0).handle(
+        of_edge(
+            1,
+            MAX_FIRST_TERM + 1,
+            Body::Status {
+                over: None,
+                no_login: Vec::new()
+            }
+        ),
+        NOW
+    )));
 }
 
 /// First round of euclid's own leadership after the leader's beats with these rounds, and the beats that were counted.
 fn succeeded_after(rounds: &[u64]) -> (u64, usize) {
     let mut election = euclid();
-    let beats = (1..).zip(rounds).map(|(seq, round)| of_edge(seq, 8, beat(*round)));
-    let counted = beats.filter(|beat| is_counted(&election.handle(beat.clone(), NOW))).count();
-    let gone = ElectionInput::PeerGone { peer: NodeName::from_static("edge") };
-    let first_round = election.handle(gone, NOW).into_iter().find_map(|effect| match effect {
-        ElectionEffect::Lead { first_round, .. } => Some(first_round),
-        _ => None,
-    });
+    let beats = (1..)
+        .zip(rounds)
+        .map(|(seq, round)| of_edge(seq, 8, beat(*round)));
+    let counted = beats
+        .filter(|beat| is_counted(&election.handle(beat.clone(), NOW)))
+        .count();
+    let gone = ElectionInput::PeerGone {
+        peer: NodeName::from_static("edge"),
+    };
+    let first_round = election
+        .handle(gone, NOW)
+        .into_iter()
+        .find_map(|effect| match effect {
+            ElectionEffect::Lead { first_round, .. } => Some(first_round),
+            _ => None,
+        });
     (first_round.unwrap(), counted)
 }
 
@@ -139,9 +236,17 @@ fn succeeded_after(rounds: &[u64]) -> (u64, usize) {
 fn a_forged_round_does_not_move_the_first_round_of_the_next_leader() {
     assert_eq!(succeeded_after(&[88]), (89, 0));
     assert_eq!(succeeded_after(&[88, 88 + MAX_ROUND_STEP + 1]), (89, 1));
-    assert_eq!(succeeded_after(&[3 * MAX_ROUND_STEP]), (3 * MAX_ROUND_STEP + 1, 0), "a node that joins an old cell");
+    assert_eq!(
+        succeeded_after(&[3 * MAX_ROUND_STEP]),
+        (3 * MAX_ROUND_STEP + 1, 0),
+        "a node that joins an old cell"
+    );
     for late in [MAX_ROUND - 1, MAX_ROUND] {
-        assert_eq!(succeeded_after(&[late]), (1, 0), "rounds begin anew before receivers take no more");
+        assert_eq!(
+            succeeded_after(&[late]),
+            (1, 0),
+            "rounds begin anew before receivers take no more"
+        );
     }
 }
 
@@ -150,9 +255,19 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
     let [euclid, gauss, hopper] = ["euclid", "gauss", "hopper"].map(NodeName::from_static);
     let mut now = Timestamp(1_000_000);
     let mut election = Election::new(ElectionConfig::default(), euclid, 0, now);
-    let health = Health { broker: true, fuser: true, gateway: true, reports: true, settings: true, load_percent: 0 };
+    let health = Health {
+        broker: true,
+        fuser: true,
+        gateway: true,
+        reports: true,
+        settings: true,
+        load_percent: 0,
+    };
     election.handle(ElectionInput::Health { health }, now);
-    let status = || Body::Status { over: None, no_login: Vec::new() };
+    let status = || Body::Status {
+        over: None,
+        no_login: Vec::new(),
+    };
     for seq in 1.. {
         election.handle(received(&hopper, seq, None, status()), now);
         now = election.next_deadline();
@@ -162,11 +277,24 @@ fn who_follows_a_leadership_that_is_over_is_told_so_at_once() {
         }
     }
     let (own, next) = (election.epoch().cloned(), Epoch::new(2, gauss.clone()));
-    let ElectionInput::Receive { message } = received(&gauss, 1, Some(&next), beat_after(own.as_ref())) else {
+    let ElectionInput::Receive { message } =
+        received(&gauss, 1, Some(&next), beat_after(own.as_ref()))
+    else {
         panic!("no message")
     };
-    let candidacy = Candidacy { role: Role::Edge, ..message.candidacy };
-    election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
+    let candidacy = Candidacy {
+        role: Role::Edge,
+        ..message.candidacy
+    };
+    election.handle(
+        ElectionInput::Receive {
+            message: ElectionMessage {
+                candidacy,
+                ..message
+            },
+        },
+        now,
+    );
     assert_eq!(election.leader(), Some(&gauss));
     let effects = election.handle(received(&hopper, 1000, own.as_ref(), status()), now);
     let is_answer = |effect: &ElectionEffect| matches!(effect, ElectionEffect::Send { to, message } if *to == hopper && message.epoch.as_ref() == Some(&next));
@@ -178,12 +306,45 @@ fn what_a_leader_sent_before_it_led_does_not_end_its_leadership() {
     let [edge, gauss] = ["edge", "gauss"].map(NodeName::from_static);
     let (before, next) = (Epoch::new(1, edge.clone()), Epoch::new(2, gauss.clone()));
     let now = Timestamp(1_000_000);
-    let mut election = Election::new(ElectionConfig::default(), NodeName::from_static("euclid"), 0, now);
+    let mut election = Election::new(
+        ElectionConfig::default(),
+        NodeName::from_static("euclid"),
+        0,
+        now,
+    );
     election.handle(received(&edge, 1, Some(&before), beat_after(None)), now);
-    election.handle(received(&edge, 2, Some(&next), Body::Status { over: None, no_login: Vec::new() }), now);
+    election.handle(
+        received(
+            &edge,
+            2,
+            Some(&next),
+            Body::Status {
+                over: None,
+                no_login: Vec::new(),
+            },
+        ),
+        now,
+    );
     assert_eq!(election.leader(), Some(&gauss));
-    election.handle(ElectionInput::Round { epoch: next, round: 2 }, now);
-    election.handle(received(&gauss, 1, Some(&before), Body::Status { over: None, no_login: Vec::new() }), now);
+    election.handle(
+        ElectionInput::Round {
+            epoch: next,
+            round: 2,
+        },
+        now,
+    );
+    election.handle(
+        received(
+            &gauss,
+            1,
+            Some(&before),
+            Body::Status {
+                over: None,
+                no_login: Vec::new(),
+            },
+        ),
+        now,
+    );
     assert_eq!(election.leader(), Some(&gauss));
 }
 
@@ -194,9 +355,25 @@ fn the_word_about_an_unknown_leader_ends_no_leadership() {
     let mut now = NOW;
     let hopper = NodeName::from_static("hopper");
     let of_hopper = |seq, epoch: Option<&Epoch>| {
-        let message = message(&hopper, seq, epoch, Body::Status { over: None, no_login: Vec::new() });
-        let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
-        ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }
+        let message = message(
+            &hopper,
+            seq,
+            epoch,
+            Body::Status {
+                over: None,
+                no_login: Vec::new(),
+            },
+        );
+        let candidacy = Candidacy {
+            role: Role::Cav,
+            ..message.candidacy
+        };
+        ElectionInput::Receive {
+            message: ElectionMessage {
+                candidacy,
+                ..message
+            },
+        }
     };
     for seq in 1.. {
         election.handle(of_hopper(seq, None), now);
@@ -222,7 +399,10 @@ fn a_leader_that_its_last_follower_has_left_waits_for_the_other_leader() {
         election.tick(now);
     }
     let own = election.epoch().cloned().unwrap();
-    let status = || Body::Status { over: None, no_login: Vec::new() };
+    let status = || Body::Status {
+        over: None,
+        no_login: Vec::new(),
+    };
     election.handle(received(&gauss, 1, Some(&own), status()), now);
     let later = Epoch::new(own.term + 1, edge);
     let end = now + Duration::from_secs(2);
@@ -242,7 +422,10 @@ fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
     let mut election = euclid();
     // A fit candidate that does not lead.
     election.handle(of_edge(1, 8, beat(1)), NOW);
-    let resigned = Body::Resign { epoch: epoch_of_edge(), last_round: 1 };
+    let resigned = Body::Resign {
+        epoch: epoch_of_edge(),
+        last_round: 1,
+    };
     election.handle(of_edge(2, 8, resigned), NOW);
     let mut now = NOW;
     while !election.is_leading() {
@@ -251,15 +434,42 @@ fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
     }
     let lie = Epoch::new(election.term() + 1, edge.clone());
     let tell = |election: &mut Election, seq, now| {
-        let message = message(&hopper, seq, Some(&lie), Body::Status { over: None, no_login: Vec::new() });
-        let candidacy = Candidacy { role: Role::Cav, ..message.candidacy };
-        election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, now);
+        let message = message(
+            &hopper,
+            seq,
+            Some(&lie),
+            Body::Status {
+                over: None,
+                no_login: Vec::new(),
+            },
+        );
+        let candidacy = Candidacy {
+            role: Role::Cav,
+            ..message.candidacy
+        };
+        election.handle(
+            ElectionInput::Receive {
+                message: ElectionMessage {
+                    candidacy,
+                    ..message
+                },
+            },
+            now,
+        );
     };
     tell(&mut election, 1, now);
     assert!(election.is_leading());
     // True news come from the other leader itself.
     let mut told = election.clone();
-    told.handle(received(&edge, 3, Some(&lie), beat_after(election.epoch().cloned().as_ref())), now);
+    told.handle(
+        received(
+            &edge,
+            3,
+            Some(&lie),
+            beat_after(election.epoch().cloned().as_ref()),
+        ),
+        now,
+    );
     assert_eq!(told.leader(), Some(&edge));
     let (began, mut seq) = (now, 1);
     while election.is_leading() {
@@ -268,7 +478,11 @@ fn a_vehicle_ends_no_leadership_before_its_first_follower_answers() {
         election.tick(now);
         tell(&mut election, seq, now);
     }
-    assert!(now.since(began) > Duration::from_millis(800), "{:?}", now.since(began));
+    assert!(
+        now.since(began) > Duration::from_millis(800),
+        "{:?}",
+        now.since(began)
+    );
 }
 
 /// Times at which euclid began another term after gauss had refused its first one.
@@ -277,7 +491,18 @@ fn renewals(gauss_follows: bool, time: Duration) -> Vec<Timestamp> {
     let (mut election, mut now, mut seq) = (euclid(), NOW, 0);
     let mut status = |election: &mut Election, epoch: Option<&Epoch>, over: Option<Epoch>, now| {
         seq += 1;
-        election.handle(received(&gauss, seq, epoch, Body::Status { over, no_login: Vec::new() }), now);
+        election.handle(
+            received(
+                &gauss,
+                seq,
+                epoch,
+                Body::Status {
+                    over,
+                    no_login: Vec::new(),
+                },
+            ),
+            now,
+        );
     };
     while !election.is_leading() {
         status(&mut election, None, None, now);
@@ -298,7 +523,11 @@ fn renewals(gauss_follows: bool, time: Duration) -> Vec<Timestamp> {
             }
         }
         let epoch = election.epoch().cloned();
-        let (epoch, over) = if gauss_follows && !led.is_empty() { (epoch, None) } else { (None, epoch) };
+        let (epoch, over) = if gauss_follows && !led.is_empty() {
+            (epoch, None)
+        } else {
+            (None, epoch)
+        };
         status(&mut election, epoch.as_ref(), over, now);
     }
     led
@@ -314,21 +543,33 @@ fn a_leader_whom_all_follow_again_does_not_lead_on_in_another_term() {
 #[test]
 fn one_that_refuses_every_term_has_a_leader_begin_another_every_ten_seconds_at_most() {
     let began = renewals(false, Duration::from_secs(120));
-    let pauses: Vec<_> = began.windows(2).map(|pair| pair[1].since(pair[0])).collect();
-    let frequent = pauses.iter().filter(|pause| **pause < Duration::from_secs(10)).count();
+    let pauses: Vec<_> = began
+        .windows(2)
+        .map(|pair| pair[1].since(pair[0]))
+        .collect();
+    let frequent = pauses
+        .iter()
+        .filter(|pause| **pause < Duration::from_secs(10))
+        .count();
     assert!(frequent <= 6 && pauses.len() - frequent >= 9, "{pauses:?}");
 }
 
 #[test]
 fn a_term_rises_by_a_bounded_step_in_an_hour_however_many_messages_state_more() {
     let mut election = euclid();
-    let status = || Body::Status { over: None, no_login: Vec::new() };
+    let status = || Body::Status {
+        over: None,
+        no_login: Vec::new(),
+    };
     for seq in 1..100 {
         election.handle(of_edge(seq, 8 + seq * (MAX_TERM_STEP / 2), status()), NOW);
     }
     assert!(election.term() <= 8 + MAX_TERM_STEP, "{}", election.term());
     let beat = election.handle(of_edge(100, MAX_TERM, beat(88)), NOW);
-    assert!(is_counted(&beat) && election.leader() == Some(&NodeName::from_static("edge")), "heard all the same");
+    assert!(
+        is_counted(&beat) && election.leader() == Some(&NodeName::from_static("edge")),
+        "heard all the same"
+    );
 }
 
 /// A message of gauss, which claims to have taken over from edge and to be followed by all.
@@ -336,8 +577,14 @@ fn claim_of_gauss(seq: u64) -> ElectionInput {
     let gauss = NodeName::from_static("gauss");
     let epoch = Epoch::new(9, gauss.clone());
     let after = Some(epoch_of_edge());
-    let body =
-        Body::Beat { every_ms: 50, round: 1, followers: 200, after, successors: Vec::new(), life: LifeSign::default() };
+    let body = Body::Beat {
+        every_ms: 50,
+        round: 1,
+        followers: 200,
+        after,
+        successors: Vec::new(),
+        life: LifeSign::default(),
+    };
     received(&gauss, seq, Some(&epoch), body)
 }
 
@@ -351,7 +598,11 @@ fn a_follower_leaves_its_leader_for_one_of_a_lower_rank_only_when_it_is_silent()
         if ms % 100 == 0 {
             election.handle(of_edge(ms, 8, beat(ms)), now);
         }
-        assert_eq!(election.leader(), Some(&NodeName::from_static("edge")), "after {ms} ms");
+        assert_eq!(
+            election.leader(),
+            Some(&NodeName::from_static("edge")),
+            "after {ms} ms"
+        );
     }
     let mut now = NOW + std::time::Duration::from_millis(1000);
     election.handle(claim_of_gauss(1000), now);
@@ -373,13 +624,28 @@ fn a_resignation_of_a_stranger_neither_mutes_nor_deafens() {
     election.handle(of_edge(1, 8, beat(1)), NOW);
     for (seq, term) in [(1, MAX_TERM), (2, 8 + MAX_TERM_STEP / 2)] {
         let epoch = Epoch::new(8 + MAX_TERM_STEP / 2, gauss.clone());
-        let lie = message(&gauss, seq, None, Body::Resign { epoch, last_round: 0 });
-        election.handle(ElectionInput::Receive { message: ElectionMessage { term, ..lie } }, NOW);
+        let lie = message(
+            &gauss,
+            seq,
+            None,
+            Body::Resign {
+                epoch,
+                last_round: 0,
+            },
+        );
+        election.handle(
+            ElectionInput::Receive {
+                message: ElectionMessage { term, ..lie },
+            },
+            NOW,
+        );
     }
     for ms in (50..3000).step_by(50) {
         for effect in election.handle(of_edge(ms, 8, beat(ms)), NOW + Duration::from_millis(ms)) {
             if let ElectionEffect::Send { message, .. } = effect {
-                assert!(ElectionMessage::decode(&message.encode(crate::wire::Encoding::Cbor)).is_ok());
+                assert!(
+                    ElectionMessage::decode(&message.encode(crate::wire::Encoding::Cbor)).is_ok()
+                );
             }
         }
         assert_eq!(election.leader(), Some(&NodeName::from_static("edge")));
@@ -388,21 +654,54 @@ fn a_resignation_of_a_stranger_neither_mutes_nor_deafens() {
 
 #[test]
 fn a_liar_that_waits_for_the_end_of_the_leader_does_not_come_before_the_standby() {
-    let config = ElectionConfig { priority: 120, ..ElectionConfig::default() };
+    let config = ElectionConfig {
+        priority: 120,
+        ..ElectionConfig::default()
+    };
     let mut election = Election::new(config, NodeName::from_static("euclid"), 7, NOW);
-    let health = Health { broker: true, fuser: true, gateway: true, reports: true, settings: true, load_percent: 0 };
+    let health = Health {
+        broker: true,
+        fuser: true,
+        gateway: true,
+        reports: true,
+        settings: true,
+        load_percent: 0,
+    };
     election.handle(ElectionInput::Health { health }, NOW);
     election.handle(of_edge(1, 8, beat(1)), NOW);
-    let ElectionInput::Receive { message } = claim_of_gauss(1) else { panic!("no message") };
-    let candidacy = Candidacy { priority: 50, ..message.candidacy };
-    election.handle(ElectionInput::Receive { message: ElectionMessage { candidacy, ..message } }, NOW);
+    let ElectionInput::Receive { message } = claim_of_gauss(1) else {
+        panic!("no message")
+    };
+    let candidacy = Candidacy {
+        priority: 50,
+        ..message.candidacy
+    };
+    election.handle(
+        ElectionInput::Receive {
+            message: ElectionMessage {
+                candidacy,
+                ..message
+            },
+        },
+        NOW,
+    );
     let mut now = NOW + Duration::from_millis(10);
-    election.handle(ElectionInput::PeerGone { peer: NodeName::from_static("edge") }, now);
+    election.handle(
+        ElectionInput::PeerGone {
+            peer: NodeName::from_static("edge"),
+        },
+        now,
+    );
     while election.next_deadline() < NOW + Duration::from_millis(20) {
         now = election.next_deadline();
         election.tick(now);
     }
-    assert!(election.is_leading(), "{:?} {:?}", election.state, election.next_deadline());
+    assert!(
+        election.is_leading(),
+        "{:?} {:?}",
+        election.state,
+        election.next_deadline()
+    );
 }
 
 #[test]
@@ -413,7 +712,18 @@ fn a_node_that_heard_a_liar_first_follows_the_leader_of_the_others() {
     assert_eq!(election.leader(), Some(&NodeName::from_static("gauss")));
     let epoch = Epoch::new(10, leader.clone());
     for from in [&hopper, &noether] {
-        election.handle(received(from, 1, Some(&epoch), Body::Status { over: None, no_login: Vec::new() }), NOW);
+        election.handle(
+            received(
+                from,
+                1,
+                Some(&epoch),
+                Body::Status {
+                    over: None,
+                    no_login: Vec::new(),
+                },
+            ),
+            NOW,
+        );
     }
     election.handle(received(&leader, 1, Some(&epoch), beat(1)), NOW);
     assert_eq!(election.leader(), Some(&leader));
@@ -445,11 +755,25 @@ fn a_claim_waits_no_longer_for_being_repeated() {
 #[test]
 fn the_parts_of_a_node_depose_no_leader() {
     let (mut election, mut now) = (euclid(), NOW);
-    let (gauss, hopper) = (NodeName::from_static("gauss"), NodeName::from_static("hopper"));
+    let (gauss, hopper) = (
+        NodeName::from_static("gauss"),
+        NodeName::from_static("hopper"),
+    );
     let mut seq = 0;
     let mut status = |election: &mut Election, from: &NodeName, epoch: Option<&Epoch>, now| {
         seq += 1;
-        election.handle(received(from, seq, epoch, Body::Status { over: None, no_login: Vec::new() }), now);
+        election.handle(
+            received(
+                from,
+                seq,
+                epoch,
+                Body::Status {
+                    over: None,
+                    no_login: Vec::new(),
+                },
+            ),
+            now,
+        );
     };
     while !election.is_leading() {
         status(&mut election, &gauss, None, now);
@@ -475,17 +799,28 @@ fn a_first_boot_beside_a_liar_is_no_separate_cell() {
     election.handle(received(&gauss, 1, Some(&lie), beat_after(None)), NOW);
     assert_eq!(election.leader(), Some(&gauss), "nobody else is there");
     let effects = election.handle(of_edge(1, 8, beat(1)), NOW);
-    assert!(effects.contains(&ElectionEffect::PersistTerm { term: 9 }), "{effects:?}");
+    assert!(
+        effects.contains(&ElectionEffect::PersistTerm { term: 9 }),
+        "{effects:?}"
+    );
     assert_eq!(election.leader(), Some(&NodeName::from_static("edge")));
     election.handle(received(&gauss, 2, Some(&lie), beat_after(None)), NOW);
-    let gone = ElectionInput::PeerGone { peer: NodeName::from_static("edge") };
+    let gone = ElectionInput::PeerGone {
+        peer: NodeName::from_static("edge"),
+    };
     election.handle(gone, NOW);
-    assert_eq!((election.leader(), election.term()), (Some(&NodeName::from_static("euclid")), 9));
+    assert_eq!(
+        (election.leader(), election.term()),
+        (Some(&NodeName::from_static("euclid")), 9)
+    );
 }
 
 #[test]
 fn who_has_followed_a_leader_for_a_while_believes_no_lower_term() {
-    let (gauss, edge) = (NodeName::from_static("gauss"), NodeName::from_static("edge"));
+    let (gauss, edge) = (
+        NodeName::from_static("gauss"),
+        NodeName::from_static("edge"),
+    );
     let old = Epoch::new(1_800_000_000, edge.clone());
     let mut election = euclid_after(0);
     let mut now = NOW;
@@ -493,6 +828,17 @@ fn who_has_followed_a_leader_for_a_while_believes_no_lower_term() {
         election.handle(received(&edge, seq, Some(&old), beat(seq)), now);
         now = now + Duration::from_millis(100);
     }
-    election.handle(received(&gauss, 1, Some(&Epoch::new(1, gauss.clone())), beat_after(None)), now);
-    assert_eq!((election.leader(), election.term()), (Some(&edge), old.term));
+    election.handle(
+        received(
+            &gauss,
+            1,
+            Some(&Epoch::new(1, gauss.clone())),
+            beat_after(None),
+        ),
+        now,
+    );
+    assert_eq!(
+        (election.leader(), election.term()),
+        (Some(&edge), old.term)
+    );
 }

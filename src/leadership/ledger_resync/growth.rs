@@ -24,11 +24,21 @@ const MARK_VOTES: u64 = 32;
 /// True for saved evidence within the bounds of evidence that is received for the first time.
 pub fn is_plausible(share: &LedgerShare) -> bool {
     let (unknown, never) = (GrowthLimit::default(), Timestamp::default());
-    let mut terms = share.entries.iter().map(|entry| entry.epoch).chain(share.marks.iter().map(|mark| mark.epoch));
+    let mut terms = share
+        .entries
+        .iter()
+        .map(|entry| entry.epoch)
+        .chain(share.marks.iter().map(|mark| mark.epoch));
     share.check(&Limits::default()).is_ok()
         && terms.all(|term| term <= MAX_FIRST_TERM)
-        && share.entries.iter().all(|entry| unknown.admits(entry, never))
-        && share.marks.iter().all(|mark| unknown.admits_mark(mark, never))
+        && share
+            .entries
+            .iter()
+            .all(|entry| unknown.admits(entry, never))
+        && share
+            .marks
+            .iter()
+            .all(|mark| unknown.admits_mark(mark, never))
 }
 
 /// Number of votes of each count when this node first heard of it, with the time.
@@ -43,25 +53,38 @@ impl GrowthLimit {
     /// No clock says how long it was down.
     pub(super) fn of(ledger: &ReputationLedger, now: Timestamp) -> Self {
         let mut limit = Self::default();
-        ledger.entries().for_each(|entry| limit.note_entry(&entry, now));
-        ledger.marks().for_each(|mark| limit.note_mark(&mark, ledger, now));
+        ledger
+            .entries()
+            .for_each(|entry| limit.note_entry(&entry, now));
+        ledger
+            .marks()
+            .for_each(|mark| limit.note_mark(&mark, ledger, now));
         limit
     }
 
     /// True if a count is plausible. The first one of a vehicle and label is noted by [`Self::note`].
     pub(super) fn admits(&self, entry: &LedgerEntry, now: Timestamp) -> bool {
-        self.admits_votes(&key_of(entry), entry.correct.saturating_add(entry.incorrect), now)
+        self.admits_votes(
+            &key_of(entry),
+            entry.correct.saturating_add(entry.incorrect),
+            now,
+        )
     }
 
     /// True if a mark is plausible.
     pub(super) fn admits_mark(&self, mark: &LedgerMark, now: Timestamp) -> bool {
         let votes = mark.correct.saturating_add(mark.incorrect);
-        votes == mark.number.saturating_mul(MARK_VOTES) && self.admits_votes(&key_of_mark(mark), votes, now)
+        votes == mark.number.saturating_mul(MARK_VOTES)
+            && self.admits_votes(&key_of_mark(mark), votes, now)
     }
 
     /// Notes the counts of a share that the ledger has now.
     pub(super) fn note(&mut self, share: &LedgerShare, ledger: &ReputationLedger, now: Timestamp) {
-        for entry in share.entries.iter().filter(|entry| !ledger.lacks_entry(entry)) {
+        for entry in share
+            .entries
+            .iter()
+            .filter(|entry| !ledger.lacks_entry(entry))
+        {
             self.note_entry(entry, now);
         }
         for mark in share.marks.iter().filter(|mark| !ledger.lacks_mark(mark)) {
@@ -70,12 +93,17 @@ impl GrowthLimit {
     }
 
     fn note_entry(&mut self, entry: &LedgerEntry, now: Timestamp) {
-        self.first.entry(key_of(entry)).or_insert((now, entry.correct.saturating_add(entry.incorrect)));
+        self.first
+            .entry(key_of(entry))
+            .or_insert((now, entry.correct.saturating_add(entry.incorrect)));
     }
 
     /// Notes a mark with the counts beside it: a lane that is heard of late has marks of long ago.
     fn note_mark(&mut self, mark: &LedgerMark, ledger: &ReputationLedger, now: Timestamp) {
-        let votes = mark.correct.saturating_add(mark.incorrect).max(ledger.votes_of(mark));
+        let votes = mark
+            .correct
+            .saturating_add(mark.incorrect)
+            .max(ledger.votes_of(mark));
         self.first.entry(key_of_mark(mark)).or_insert((now, votes));
     }
 
@@ -90,17 +118,27 @@ impl GrowthLimit {
     }
 
     fn admits_votes(&self, key: &EntryKey, votes: u64, now: Timestamp) -> bool {
-        let Some((at, first)) = self.first.get(key) else { return votes <= MAX_FIRST_VOTES };
+        let Some((at, first)) = self.first.get(key) else {
+            return votes <= MAX_FIRST_VOTES;
+        };
         votes <= first + ALLOWANCE + now.since(*at).as_millis() as u64 * MAX_VOTES_PER_S / 1000
     }
 }
 
 fn key_of(entry: &LedgerEntry) -> EntryKey {
     let lane = Epoch::new(entry.epoch, entry.aggregator.clone());
-    EntryKey { lane, node: entry.node.clone(), label: entry.label.clone() }
+    EntryKey {
+        lane,
+        node: entry.node.clone(),
+        label: entry.label.clone(),
+    }
 }
 
 fn key_of_mark(mark: &LedgerMark) -> EntryKey {
     let lane = Epoch::new(mark.epoch, mark.aggregator.clone());
-    EntryKey { lane, node: mark.node.clone(), label: Default::default() }
+    EntryKey {
+        lane,
+        node: mark.node.clone(),
+        label: Default::default(),
+    }
 }

@@ -26,7 +26,10 @@ const PERIOD: u32 = 10;
 
 impl Candidate {
     fn new(node: &str) -> Self {
-        let leadership = Leadership { term: u64::MAX, ..Leadership::default() };
+        let leadership = Leadership {
+            term: u64::MAX,
+            ..Leadership::default()
+        };
         Self {
             resync: LedgerResync::new(name(node), PERIOD),
             ledger: ReputationLedger::default(),
@@ -40,20 +43,39 @@ impl Candidate {
     }
 
     fn record(&mut self, term: u64, vehicle: &str) -> Vec<LedgerShare> {
-        let evidence = Evidence { node: name(vehicle), label: "ABC123".into(), correct: true };
-        self.resync.record(&Epoch::new(term, self.resync.name.clone()), &[evidence], &mut self.ledger)
+        let evidence = Evidence {
+            node: name(vehicle),
+            label: "ABC123".into(),
+            correct: true,
+        };
+        self.resync.record(
+            &Epoch::new(term, self.resync.name.clone()),
+            &[evidence],
+            &mut self.ledger,
+        )
     }
 
     fn merge(&mut self, share: &LedgerShare, at_ms: u64) -> Result<Merged, RejectReason> {
         let candidates = ["a", "b1", "b2", "edge", "gauss", "leader", "other"].map(name);
         let now = Timestamp(at_ms * 1000);
-        self.resync.merge(share, &mut self.ledger, &candidates, &self.leadership, now, now)
+        self.resync.merge(
+            share,
+            &mut self.ledger,
+            &candidates,
+            &self.leadership,
+            now,
+            now,
+        )
     }
 
     /// Lets snapshot periods pass; returns what is shared.
     fn wait(&mut self, periods: u32) -> Vec<LedgerShare> {
         let now = Timestamp(self.now_ms * 1000);
-        let tick = |_| self.resync.tick(&mut self.ledger, &self.leadership, now).shares;
+        let tick = |_| {
+            self.resync
+                .tick(&mut self.ledger, &self.leadership, now)
+                .shares
+        };
         (0..periods * PERIOD).flat_map(tick).collect()
     }
 
@@ -63,7 +85,11 @@ impl Candidate {
         while self.now_ms < at_ms {
             self.now_ms = (self.now_ms + 1000).min(at_ms);
             let now = Timestamp(self.now_ms * 1000);
-            shares.extend(self.resync.tick(&mut self.ledger, &self.leadership, now).shares);
+            shares.extend(
+                self.resync
+                    .tick(&mut self.ledger, &self.leadership, now)
+                    .shares,
+            );
         }
         shares
     }
@@ -71,29 +97,49 @@ impl Candidate {
     /// Takes in shares; returns what comes back.
     fn hear(&mut self, shares: &[LedgerShare]) -> Vec<LedgerShare> {
         let now_ms = self.now_ms;
-        shares.iter().flat_map(|share| self.merge(share, now_ms).unwrap().shares).collect()
+        shares
+            .iter()
+            .flat_map(|share| self.merge(share, now_ms).unwrap().shares)
+            .collect()
     }
 
     fn vehicles(&self) -> Vec<String> {
-        self.ledger.entries().map(|entry| entry.node.to_string()).collect()
+        self.ledger
+            .entries()
+            .map(|entry| entry.node.to_string())
+            .collect()
     }
 
     fn incorrect(&self, vehicle: &str) -> u64 {
-        self.ledger.totals().get(&name(vehicle)).map_or(0, |(_, incorrect)| *incorrect)
+        self.ledger
+            .totals()
+            .get(&name(vehicle))
+            .map_or(0, |(_, incorrect)| *incorrect)
     }
 }
 
 /// A leadership that is followed.
 fn following(term: u64, leader: &str) -> Leadership {
     let epoch = Some(Epoch::new(term, name(leader)));
-    Leadership { position: Position::Following, epoch, standby: None, term, is_deserted: false, is_yielding: false }
+    Leadership {
+        position: Position::Following,
+        epoch,
+        standby: None,
+        term,
+        is_deserted: false,
+        is_yielding: false,
+    }
 }
 
 /// The candidate `euclid`, which follows `edge` in term 7 and has led before.
 fn euclid() -> Candidate {
     let mut euclid = Candidate::new("euclid");
     euclid.leadership = following(7, "edge");
-    let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
+    let own = Evidence {
+        node: name("gauss"),
+        label: "cup".into(),
+        correct: true,
+    };
     euclid.ledger.record(3, &name("euclid"), &own);
     euclid
 }
@@ -112,7 +158,14 @@ fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> LedgerSha
 
 fn slander(epoch: u64, aggregator: &str, incorrect: u64) -> LedgerEntry {
     let (aggregator, node, label) = (name(aggregator), name("gauss"), "cup".into());
-    LedgerEntry { epoch, aggregator, node, label, correct: 0, incorrect }
+    LedgerEntry {
+        epoch,
+        aggregator,
+        node,
+        label,
+        correct: 0,
+        incorrect,
+    }
 }
 
 #[test]
@@ -124,7 +177,14 @@ fn evidence_of_vehicles_strangers_and_later_terms_is_refused() {
     }
     assert_eq!(euclid.incorrect("gauss"), 0);
 
-    let merged = euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 1), slander(8, "edge", 1000)]), 0);
+    let merged = euclid.merge(
+        &share(
+            "edge",
+            Some(7),
+            vec![slander(7, "edge", 1), slander(8, "edge", 1000)],
+        ),
+        0,
+    );
     let merged = merged.unwrap();
     assert!(merged.is_news && merged.refused == [RejectReason::UnknownTerm]);
     assert_eq!(euclid.incorrect("gauss"), 1);
@@ -133,27 +193,56 @@ fn evidence_of_vehicles_strangers_and_later_terms_is_refused() {
 #[test]
 fn only_the_leader_tells_what_it_counts_while_it_leads() {
     let mut euclid = euclid();
-    euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 3)]), 0).unwrap();
-    let merged = euclid.merge(&share("other", None, vec![slander(7, "edge", 1_000_000_000)]), 0).unwrap();
-    assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Unattested][..]));
-    euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 4)]), 100).unwrap();
+    euclid
+        .merge(&share("edge", Some(7), vec![slander(7, "edge", 3)]), 0)
+        .unwrap();
+    let merged = euclid
+        .merge(
+            &share("other", None, vec![slander(7, "edge", 1_000_000_000)]),
+            0,
+        )
+        .unwrap();
+    assert_eq!(
+        (merged.is_news, &merged.refused[..]),
+        (false, &[RejectReason::Unattested][..])
+    );
+    euclid
+        .merge(&share("edge", Some(7), vec![slander(7, "edge", 4)]), 100)
+        .unwrap();
     assert_eq!(euclid.incorrect("gauss"), 4);
 }
 
 #[test]
 fn the_counts_of_a_leadership_that_is_known_do_not_leap() {
     let mut euclid = euclid();
-    euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 3)]), 0).unwrap();
+    euclid
+        .merge(&share("edge", Some(7), vec![slander(7, "edge", 3)]), 0)
+        .unwrap();
     euclid.leadership = following(8, "leader");
     for (forged, at_ms) in [(1_000_000_000, 1000), (1_000_000, 2000)] {
-        let merged = euclid.merge(&share("other", None, vec![slander(7, "edge", forged)]), at_ms).unwrap();
-        assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Implausible][..]));
+        let merged = euclid
+            .merge(
+                &share("other", None, vec![slander(7, "edge", forged)]),
+                at_ms,
+            )
+            .unwrap();
+        assert_eq!(
+            (merged.is_news, &merged.refused[..]),
+            (false, &[RejectReason::Implausible][..])
+        );
     }
     let first = slander(8, "leader", MAX_FIRST_VOTES + 1);
-    assert!(!euclid.merge(&share("leader", Some(8), vec![first]), 2000).unwrap().is_news);
+    assert!(
+        !euclid
+            .merge(&share("leader", Some(8), vec![first]), 2000)
+            .unwrap()
+            .is_news
+    );
     assert_eq!(euclid.incorrect("gauss"), 3);
     // Shares that were lost meanwhile.
-    euclid.merge(&share("other", None, vec![slander(7, "edge", 900)]), 3000).unwrap();
+    euclid
+        .merge(&share("other", None, vec![slander(7, "edge", 900)]), 3000)
+        .unwrap();
     assert_eq!(euclid.incorrect("gauss"), 900);
 }
 
@@ -161,16 +250,22 @@ fn the_counts_of_a_leadership_that_is_known_do_not_leap() {
 fn nobody_writes_in_the_lane_of_a_node_that_leads() {
     let mut euclid = euclid();
     euclid.lead(7);
-    euclid.merge(&share("edge", None, vec![slander(7, "euclid", 1000)]), 0).unwrap();
+    euclid
+        .merge(&share("edge", None, vec![slander(7, "euclid", 1000)]), 0)
+        .unwrap();
     assert_eq!(euclid.incorrect("gauss"), 0);
 }
 
 #[test]
 fn a_candidate_that_invents_lanes_does_not_displace_the_leaders() {
     let mut euclid = euclid();
-    let forged = (0..2 * MAX_LANES).map(|n| slander(7, &format!("forger{n:03}"), 0)).collect();
+    let forged = (0..2 * MAX_LANES)
+        .map(|n| slander(7, &format!("forger{n:03}"), 0))
+        .collect();
     euclid.merge(&share("gauss", None, forged), 0).unwrap();
-    euclid.merge(&share("edge", Some(7), vec![slander(7, "edge", 1)]), 0).unwrap();
+    euclid
+        .merge(&share("edge", Some(7), vec![slander(7, "edge", 1)]), 0)
+        .unwrap();
     assert_eq!(euclid.incorrect("gauss"), 1);
 }
 
@@ -179,34 +274,77 @@ fn leaders_that_change_with_every_share_are_not_answered_each_time() {
     let mut euclid = euclid();
     let mut sent = Vec::new();
     for at_ms in 0..1000 {
-        euclid.leadership = Leadership { term: 7, ..following(1 + at_ms % 7, "gauss") };
-        sent.extend(euclid.merge(&share("gauss", Some(1 + at_ms % 7), Vec::new()), at_ms).unwrap().shares);
+        euclid.leadership = Leadership {
+            term: 7,
+            ..following(1 + at_ms % 7, "gauss")
+        };
+        sent.extend(
+            euclid
+                .merge(&share("gauss", Some(1 + at_ms % 7), Vec::new()), at_ms)
+                .unwrap()
+                .shares,
+        );
     }
-    for (from, term, at_ms) in [("gauss", u64::MAX, 1000), ("edge", 7, 6000), ("edge", 7, 20_000)] {
+    for (from, term, at_ms) in [
+        ("gauss", u64::MAX, 1000),
+        ("edge", 7, 6000),
+        ("edge", 7, 20_000),
+    ] {
         euclid.leadership = following(7, from);
-        sent.extend(euclid.merge(&share(from, Some(term), Vec::new()), at_ms).unwrap().shares);
+        sent.extend(
+            euclid
+                .merge(&share(from, Some(term), Vec::new()), at_ms)
+                .unwrap()
+                .shares,
+        );
     }
     assert_eq!(sent.len(), 2, "at once, and when some time has passed");
-    assert!(sent.iter().flat_map(|share| &share.entries).all(|entry| entry.aggregator == name("euclid")));
+    assert!(
+        sent.iter()
+            .flat_map(|share| &share.entries)
+            .all(|entry| entry.aggregator == name("euclid"))
+    );
 }
 
 #[test]
 fn a_candidate_that_says_it_leads_does_not_have_others_send_all_evidence() {
     let mut euclid = euclid();
-    assert_eq!(euclid.merge(&share("edge", Some(7), Vec::new()), 0).unwrap().shares.len(), 1, "it has led");
+    assert_eq!(
+        euclid
+            .merge(&share("edge", Some(7), Vec::new()), 0)
+            .unwrap()
+            .shares
+            .len(),
+        1,
+        "it has led"
+    );
     for at_s in 1..600 {
         for (from, term) in [("gauss", at_s % 8), ("edge", 7)] {
-            let merged = euclid.merge(&share(from, Some(term), Vec::new()), at_s * 1000).unwrap();
+            let merged = euclid
+                .merge(&share(from, Some(term), Vec::new()), at_s * 1000)
+                .unwrap();
             assert_eq!(merged.shares, [], "{from} after {at_s} s");
         }
     }
     euclid.leadership = following(8, "gauss");
-    assert_eq!(euclid.merge(&share("gauss", Some(8), Vec::new()), 600_000).unwrap().shares.len(), 1, "it leads now");
+    assert_eq!(
+        euclid
+            .merge(&share("gauss", Some(8), Vec::new()), 600_000)
+            .unwrap()
+            .shares
+            .len(),
+        1,
+        "it leads now"
+    );
 }
 
 #[test]
 fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains() {
-    let (mut a, mut b1, mut b2) = (Candidate::new("a"), Candidate::new("b1"), Candidate::new("b2"));
+    let (mut a, mut b1, mut b2) = (
+        Candidate::new("a"),
+        Candidate::new("b1"),
+        Candidate::new("b2"),
+    );
     a.lead(1);
     b1.lead(2);
     b1.record(2, "euclid");
@@ -225,7 +363,11 @@ fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains
 
 #[test]
 fn what_only_followers_know_of_a_leader_that_is_gone_reaches_the_next() {
-    let (mut a, mut b1, mut b2) = (Candidate::new("a"), Candidate::new("b1"), Candidate::new("b2"));
+    let (mut a, mut b1, mut b2) = (
+        Candidate::new("a"),
+        Candidate::new("b1"),
+        Candidate::new("b2"),
+    );
     b1.lead(2);
     b1.record(2, "euclid");
     b2.hear(&b1.wait(1));
@@ -253,9 +395,13 @@ fn a_candidate_that_never_led_is_silent_when_it_hears_a_leader() {
 fn what_a_round_says_is_shared_at_once_and_that_there_is_nothing_too() {
     let mut leader = Candidate::new("leader");
     leader.lead(1);
-    let [empty] = &leader.resync.snapshot(&leader.ledger)[..] else { panic!("one share") };
+    let [empty] = &leader.resync.snapshot(&leader.ledger)[..] else {
+        panic!("one share")
+    };
     assert_eq!((empty.epoch, empty.entries.len()), (Some(1), 0));
-    let [share] = &leader.record(1, "euclid")[..] else { panic!("one share") };
+    let [share] = &leader.record(1, "euclid")[..] else {
+        panic!("one share")
+    };
     assert_eq!((share.entries.len(), share.entries[0].correct), (1, 1));
 }
 
@@ -266,22 +412,37 @@ fn a_leader_that_has_counted_much_is_believed_in_its_next_rounds() {
     (0..100_000).for_each(|_| drop(edge.record(7, "gauss")));
     euclid.hear(&sign(edge.resync.snapshot(&edge.ledger)));
     let later = (0..32).flat_map(|_| sign(edge.record(7, "gauss")));
-    let refused: Vec<_> = later.flat_map(|share| euclid.merge(&share, 3000).unwrap().refused).collect();
-    assert_eq!((refused, euclid.ledger.totals()), (Vec::new(), edge.ledger.totals()));
+    let refused: Vec<_> = later
+        .flat_map(|share| euclid.merge(&share, 3000).unwrap().refused)
+        .collect();
+    assert_eq!(
+        (refused, euclid.ledger.totals()),
+        (Vec::new(), edge.ledger.totals())
+    );
 }
 
 /// A candidate of a cell with certificates that follows.
 fn signing(node: &str, term: u64, leader: &str) -> Candidate {
     let leadership = following(term, leader);
-    Candidate { resync: LedgerResync::signed(name(node), PERIOD), leadership, ..Candidate::new(node) }
+    Candidate {
+        resync: LedgerResync::signed(name(node), PERIOD),
+        leadership,
+        ..Candidate::new(node)
+    }
 }
 
 /// Shares as others get them: signed by those whose lane they are.
 fn sign(shares: Vec<LedgerShare>) -> Vec<LedgerShare> {
     let sign = |share: LedgerShare| {
         let aggregator = share.lane().map(|lane| lane.leader.to_string());
-        let signature = |certificate| LedgerSignature { certificate, signature: "signature".into() };
-        LedgerShare { signed: share.signed.clone().or(aggregator.map(signature)), ..share }
+        let signature = |certificate| LedgerSignature {
+            certificate,
+            signature: "signature".into(),
+        };
+        LedgerShare {
+            signed: share.signed.clone().or(aggregator.map(signature)),
+            ..share
+        }
     };
     shares.into_iter().map(sign).collect()
 }
@@ -291,11 +452,33 @@ fn evidence_without_a_signature_is_refused_where_all_sign() {
     let mut euclid = signing("euclid", 7, "edge");
     let honest = share("edge", Some(7), vec![slander(7, "edge", 1)]);
     assert_eq!(euclid.merge(&honest, 0), Err(RejectReason::BadSignature));
-    let mixed = share("edge", Some(7), vec![slander(7, "edge", 1), slander(6, "gauss", 1)]);
-    let signed = LedgerSignature { certificate: "edge".into(), signature: "signature".into() };
-    assert_eq!(euclid.merge(&LedgerShare { signed: Some(signed), ..mixed }, 0), Err(RejectReason::BadSignature));
-    let empty = euclid.merge(&share("edge", Some(7), Vec::new()), 0).unwrap();
-    assert_eq!((empty.is_news, empty.refused), (false, Vec::new()), "there is nothing to sign");
+    let mixed = share(
+        "edge",
+        Some(7),
+        vec![slander(7, "edge", 1), slander(6, "gauss", 1)],
+    );
+    let signed = LedgerSignature {
+        certificate: "edge".into(),
+        signature: "signature".into(),
+    };
+    assert_eq!(
+        euclid.merge(
+            &LedgerShare {
+                signed: Some(signed),
+                ..mixed
+            },
+            0
+        ),
+        Err(RejectReason::BadSignature)
+    );
+    let empty = euclid
+        .merge(&share("edge", Some(7), Vec::new()), 0)
+        .unwrap();
+    assert_eq!(
+        (empty.is_news, empty.refused),
+        (false, Vec::new()),
+        "there is nothing to sign"
+    );
     euclid.hear(&sign(vec![honest]));
     assert_eq!(euclid.incorrect("gauss"), 1);
 }
@@ -303,11 +486,27 @@ fn evidence_without_a_signature_is_refused_where_all_sign() {
 #[test]
 fn what_was_signed_together_is_taken_together() {
     let mut euclid = signing("euclid", 7, "edge");
-    let slanders =
-        vec![slander(7, "edge", 1), LedgerEntry { label: "vase".into(), ..slander(7, "edge", u64::MAX >> 11) }];
-    let merged = euclid.merge(&sign(vec![share("edge", Some(7), slanders)])[0], 0).unwrap();
-    assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Implausible][..]));
-    assert_eq!((euclid.incorrect("gauss"), euclid.ledger.statements().count()), (0, 0));
+    let slanders = vec![
+        slander(7, "edge", 1),
+        LedgerEntry {
+            label: "vase".into(),
+            ..slander(7, "edge", u64::MAX >> 11)
+        },
+    ];
+    let merged = euclid
+        .merge(&sign(vec![share("edge", Some(7), slanders)])[0], 0)
+        .unwrap();
+    assert_eq!(
+        (merged.is_news, &merged.refused[..]),
+        (false, &[RejectReason::Implausible][..])
+    );
+    assert_eq!(
+        (
+            euclid.incorrect("gauss"),
+            euclid.ledger.statements().count()
+        ),
+        (0, 0)
+    );
 }
 
 #[test]
@@ -318,13 +517,27 @@ fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
     let forged = sign(vec![share("gauss", None, vec![slander(6, "gauss", 1000)])]);
     for node in [&mut edge, &mut euclid] {
         let merged = node.merge(&forged[0], 0).unwrap();
-        assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Unattested][..]));
+        assert_eq!(
+            (merged.is_news, &merged.refused[..]),
+            (false, &[RejectReason::Unattested][..])
+        );
         let sent = [node.wait(3), node.resync.snapshot(&node.ledger)].concat();
-        assert!(sent.iter().all(LedgerShare::is_empty), "nor is it passed on");
+        assert!(
+            sent.iter().all(LedgerShare::is_empty),
+            "nor is it passed on"
+        );
     }
     euclid.leadership = following(8, "gauss");
-    euclid.hear(&sign(vec![share("gauss", Some(8), vec![slander(8, "gauss", 3)])]));
-    assert_eq!(euclid.incorrect("gauss"), 3, "a leader is believed while it leads");
+    euclid.hear(&sign(vec![share(
+        "gauss",
+        Some(8),
+        vec![slander(8, "gauss", 3)],
+    )]));
+    assert_eq!(
+        euclid.incorrect("gauss"),
+        3,
+        "a leader is believed while it leads"
+    );
     let over = EVIDENCE_TRIAL.as_millis() as u64;
     euclid.wait_until(over);
     euclid.leadership = following(9, "edge");
@@ -332,8 +545,13 @@ fn a_lane_that_a_candidate_invents_for_itself_counts_nowhere() {
     euclid.merge(&late[0], over + 1000).unwrap();
     assert_eq!(euclid.incorrect("gauss"), 4, "and in its last word");
     let later = sign(vec![share("gauss", None, vec![slander(8, "gauss", 5)])]);
-    let merged = euclid.merge(&later[0], over + 1000 + LAST_WORD_TIME.as_millis() as u64).unwrap();
-    assert_eq!((merged.is_news, &merged.refused[..]), (false, &[RejectReason::Unattested][..]));
+    let merged = euclid
+        .merge(&later[0], over + 1000 + LAST_WORD_TIME.as_millis() as u64)
+        .unwrap();
+    assert_eq!(
+        (merged.is_news, &merged.refused[..]),
+        (false, &[RejectReason::Unattested][..])
+    );
 }
 
 #[test]
@@ -352,14 +570,25 @@ fn what_a_dead_leader_signed_is_passed_on_as_it_was_and_goes_with_its_certificat
     (euclid.leadership, edge.leadership) = (following(8, "leader"), following(8, "leader"));
     euclid.hear(std::slice::from_ref(&news));
     let passed_on = euclid.wait(4);
-    assert!(passed_on.iter().all(|share| share.signed == said[0].signed && share.node == name("other")));
+    assert!(
+        passed_on
+            .iter()
+            .all(|share| share.signed == said[0].signed && share.node == name("other"))
+    );
     gauss.hear(&passed_on);
     assert_eq!(gauss.ledger.totals(), edge.ledger.totals());
     let statements = gauss.ledger.statements().count();
-    assert!((2..=3 * REPEATS as usize).contains(&statements), "{statements}");
+    assert!(
+        (2..=3 * REPEATS as usize).contains(&statements),
+        "{statements}"
+    );
 
     assert!(!gauss.ledger.retain_statements(|_| true));
-    assert!(gauss.ledger.retain_statements(|share| share.signed != said[0].signed));
+    assert!(
+        gauss
+            .ledger
+            .retain_statements(|share| share.signed != said[0].signed)
+    );
     assert_eq!((gauss.ledger.totals().len(), gauss.ledger.lanes()), (0, 0));
 }
 
@@ -370,11 +599,20 @@ fn a_node_that_lost_the_last_of_its_counts_learns_it_from_others_and_signs_it_ag
     before.record(7, "gauss");
     edge.ledger = before.ledger.clone();
     let lost = sign(before.record(7, "gauss"));
-    edge.hear(&[LedgerShare { node: name("other"), ..lost[0].clone() }]);
+    edge.hear(&[LedgerShare {
+        node: name("other"),
+        ..lost[0].clone()
+    }]);
     assert_eq!(edge.ledger.totals(), before.ledger.totals());
     edge.lead(9);
-    let [share] = &edge.resync.snapshot(&edge.ledger)[..] else { panic!("one lane") };
-    assert_eq!((share.entries[0].correct, &share.signed), (2, &None), "to be signed");
+    let [share] = &edge.resync.snapshot(&edge.ledger)[..] else {
+        panic!("one lane")
+    };
+    assert_eq!(
+        (share.entries[0].correct, &share.signed),
+        (2, &None),
+        "to be signed"
+    );
 }
 
 #[test]
@@ -383,10 +621,15 @@ fn statements_that_later_ones_replace_are_dropped() {
     edge.lead(7);
     for round in 0..2000 {
         let said = sign(edge.record(7, ["euclid", "gauss", "other"][round % 3]));
-        said.iter().for_each(|share| drop(euclid.merge(share, round as u64 * 100).unwrap()));
+        said.iter()
+            .for_each(|share| drop(euclid.merge(share, round as u64 * 100).unwrap()));
     }
     assert_eq!(euclid.ledger.totals(), edge.ledger.totals());
-    assert!(euclid.ledger.statements().count() < 128, "{}", euclid.ledger.statements().count());
+    assert!(
+        euclid.ledger.statements().count() < 128,
+        "{}",
+        euclid.ledger.statements().count()
+    );
     let mut copy = ReputationLedger::default();
     for share in euclid.ledger.statements() {
         copy.merge_statement(share, None);
@@ -401,7 +644,10 @@ fn statements_that_later_ones_replace_are_dropped() {
 fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back() {
     let (mut leader, mut euclid) = (Candidate::new("leader"), Candidate::new("other"));
     leader.lead(7);
-    leader.leadership = Leadership { position: Position::Leading, ..following(7, "leader") };
+    leader.leadership = Leadership {
+        position: Position::Leading,
+        ..following(7, "leader")
+    };
     (0..900).for_each(|_| drop(leader.record(7, "liar")));
     euclid.leadership = following(7, "leader");
     euclid.ledger = ReputationLedger::reset(Timestamp(5_000_000));
@@ -410,7 +656,11 @@ fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back()
     for (share, at_ms) in poisoned.iter().zip(6000..) {
         answers.extend(euclid.merge(share, at_ms).unwrap().shares);
     }
-    assert_eq!((answers.len(), euclid.vehicles().len()), (1, 0), "a node that follows tells its leader");
+    assert_eq!(
+        (answers.len(), euclid.vehicles().len()),
+        (1, 0),
+        "a node that follows tells its leader"
+    );
     assert!(leader.merge(&answers[0], 6010).unwrap().is_news);
     assert_eq!(leader.vehicles(), [""; 0]);
     leader.hear(&poisoned);
@@ -418,8 +668,14 @@ fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back()
     euclid.hear(&leader.record(7, "gauss"));
     assert_eq!(euclid.vehicles(), ["gauss"]);
     let far = Timestamp(0) + 2 * MAX_RESET_AHEAD;
-    let forged = LedgerShare { reset_at_us: Some(far), ..share("other", None, Vec::new()) };
-    assert!(!leader.merge(&forged, 7000).unwrap().is_news, "a reset from a far future would be the last");
+    let forged = LedgerShare {
+        reset_at_us: Some(far),
+        ..share("other", None, Vec::new())
+    };
+    assert!(
+        !leader.merge(&forged, 7000).unwrap().is_news,
+        "a reset from a far future would be the last"
+    );
     assert_eq!(leader.vehicles(), ["gauss"]);
 }
 
@@ -428,10 +684,18 @@ fn a_reset_on_one_node_empties_all_ledgers_and_old_evidence_does_not_come_back()
 fn the_votes_after_a_heal_are_the_latest() {
     let config = ReputationConfig::default();
     let mut edge = Candidate::new("edge");
-    let vote = |correct| Evidence { node: name("euclid"), label: "cup".into(), correct };
+    let vote = |correct| Evidence {
+        node: name("euclid"),
+        label: "cup".into(),
+        correct,
+    };
     edge.lead(2);
     let vote_of = |edge: &mut Candidate, term, correct| {
-        edge.resync.record(&Epoch::new(term, name("edge")), &[vote(correct)], &mut edge.ledger);
+        edge.resync.record(
+            &Epoch::new(term, name("edge")),
+            &[vote(correct)],
+            &mut edge.ledger,
+        );
     };
     (0..10).for_each(|_| vote_of(&mut edge, 2, true));
     (0..600).for_each(|_| edge.ledger.record(3, &name("gauss"), &vote(true)));
@@ -446,7 +710,15 @@ fn the_votes_after_a_heal_are_the_latest() {
 fn a_leadership_counts_in_one_lane_however_often_its_term_is_renewed() {
     let (mut edge, mut gauss) = (Candidate::new("edge"), Candidate::new("gauss"));
     for candidate in [&mut edge, &mut gauss] {
-        candidate.ledger.record(1, &name("a"), &Evidence { node: name("hopper"), label: "cup".into(), correct: true });
+        candidate.ledger.record(
+            1,
+            &name("a"),
+            &Evidence {
+                node: name("hopper"),
+                label: "cup".into(),
+                correct: true,
+            },
+        );
     }
     for term in 2..2 + 2 * MAX_LANES as u64 {
         edge.lead(term);
@@ -457,10 +729,22 @@ fn a_leadership_counts_in_one_lane_however_often_its_term_is_renewed() {
         };
         gauss.hear(&edge.record(term, "euclid"));
     }
-    let merged = gauss.merge(&share("other", None, vec![slander(2, "edge", 1)]), 100_000).unwrap();
-    assert_eq!(merged.refused, [RejectReason::Unattested], "its leader alone tells of it");
+    let merged = gauss
+        .merge(&share("other", None, vec![slander(2, "edge", 1)]), 100_000)
+        .unwrap();
+    assert_eq!(
+        merged.refused,
+        [RejectReason::Unattested],
+        "its leader alone tells of it"
+    );
     for candidate in [&edge, &gauss] {
-        assert!(candidate.vehicles().contains(&"hopper".to_owned()), "evidence of an earlier leader is forgotten");
-        assert_eq!(candidate.ledger.totals()[&name("euclid")].0, 2 * MAX_LANES as u64);
+        assert!(
+            candidate.vehicles().contains(&"hopper".to_owned()),
+            "evidence of an earlier leader is forgotten"
+        );
+        assert_eq!(
+            candidate.ledger.totals()[&name("euclid")].0,
+            2 * MAX_LANES as u64
+        );
     }
 }

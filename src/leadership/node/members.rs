@@ -28,25 +28,37 @@ impl Members {
     pub(super) fn part_with(&mut self, name: &NodeName, now: Timestamp) {
         self.departed.retain(|_, (_, until)| now < *until);
         if let Some(broker) = self.living.remove(name).and_then(|member| member.broker) {
-            self.departed.insert(name.clone(), (broker, now + DEPARTED_TIME));
+            self.departed
+                .insert(name.clone(), (broker, now + DEPARTED_TIME));
         }
     }
 
     /// True if this run of a member is known.
     pub(super) fn knows(&self, member: &SeenMember) -> bool {
-        self.living.get(&member.name).is_some_and(|known| known.run == member.run)
+        self.living
+            .get(&member.name)
+            .is_some_and(|known| known.run == member.run)
     }
 
     /// Members that a restarted membership has not found again in [`REDISCOVERY_TIME`].
     pub(super) fn long_missing(&mut self, found: &[SeenMember], now: Timestamp) -> Vec<NodeName> {
         let is_found = |name: &&NodeName| found.iter().any(|member| member.name == **name);
-        let missing: Vec<_> = self.living.keys().filter(|name| !is_found(name)).cloned().collect();
+        let missing: Vec<_> = self
+            .living
+            .keys()
+            .filter(|name| !is_found(name))
+            .cloned()
+            .collect();
         if missing.is_empty() {
             self.missing_since = None;
             return missing;
         }
         let since = *self.missing_since.get_or_insert(now);
-        if now.since(since) < REDISCOVERY_TIME { Vec::new() } else { missing }
+        if now.since(since) < REDISCOVERY_TIME {
+            Vec::new()
+        } else {
+            missing
+        }
     }
 
     /// The run of a living member.
@@ -61,16 +73,28 @@ impl Members {
 
     /// Nodes whose broker is, or was a moment ago, at this address.
     pub(super) fn at(&self, broker: &BrokerAddress, now: Timestamp) -> Vec<NodeName> {
-        let living = self.living.values().filter_map(|member| Some((&member.name, member.broker.as_ref()?)));
-        let departed =
-            self.departed.iter().filter(|(name, (_, until))| now < *until && !self.living.contains_key(*name));
+        let living = self
+            .living
+            .values()
+            .filter_map(|member| Some((&member.name, member.broker.as_ref()?)));
+        let departed = self
+            .departed
+            .iter()
+            .filter(|(name, (_, until))| now < *until && !self.living.contains_key(*name));
         let departed = departed.map(|(name, (broker, _))| (name, broker));
-        living.chain(departed).filter(|(_, at)| *at == broker).map(|(name, _)| name.clone()).collect()
+        living
+            .chain(departed)
+            .filter(|(_, at)| *at == broker)
+            .map(|(name, _)| name.clone())
+            .collect()
     }
 
     /// Members on other machines, which do not reach a broker on this one's loopback.
     pub(super) fn elsewhere(&self) -> impl Iterator<Item = &NodeName> {
-        self.living.values().filter(|member| !member.is_on_this_machine).map(|member| &member.name)
+        self.living
+            .values()
+            .filter(|member| !member.is_on_this_machine)
+            .map(|member| &member.name)
     }
 }
 
@@ -84,7 +108,12 @@ mod tests {
 
     fn member(name: &'static str, port: u16) -> SeenMember {
         let broker = Some(format!("10.0.0.1:{port}").parse().unwrap());
-        SeenMember { name: NodeName::from_static(name), run: 1, broker, is_on_this_machine: false }
+        SeenMember {
+            name: NodeName::from_static(name),
+            run: 1,
+            broker,
+            is_on_this_machine: false,
+        }
     }
 
     #[test]
@@ -94,7 +123,10 @@ mod tests {
         members.place(edge.clone());
         assert_eq!(members.at(&broker, at(0)), std::slice::from_ref(&edge.name));
         members.part_with(&edge.name, at(0));
-        assert_eq!(members.at(&broker, at(4999)), std::slice::from_ref(&edge.name));
+        assert_eq!(
+            members.at(&broker, at(4999)),
+            std::slice::from_ref(&edge.name)
+        );
         assert_eq!(members.at(&broker, at(5000)), []);
     }
 
@@ -106,6 +138,9 @@ mod tests {
         let found = [member("gauss", 2)];
         assert_eq!(members.long_missing(&[], at(0)), []);
         assert_eq!(members.long_missing(&found, at(1999)), []);
-        assert_eq!(members.long_missing(&found, at(2000)), [NodeName::from_static("edge")]);
+        assert_eq!(
+            members.long_missing(&found, at(2000)),
+            [NodeName::from_static("edge")]
+        );
     }
 }

@@ -34,9 +34,15 @@ struct Scene {
 
 impl Scene {
     fn new(role: Role, external: Option<&str>) -> Self {
-        let plane = DataPlane { external: external.map(|at| at.parse().unwrap()), embedded: external.is_none() };
+        let plane = DataPlane {
+            external: external.map(|at| at.parse().unwrap()),
+            embedded: external.is_none(),
+        };
         let settings = NodeSettings {
-            election: ElectionConfig { role, ..ElectionConfig::default() },
+            election: ElectionConfig {
+                role,
+                ..ElectionConfig::default()
+            },
             plane,
             round_period: Duration::from_millis(100),
             keeps_reputations: true,
@@ -44,10 +50,22 @@ impl Scene {
         };
         let machine = LeadershipNode::new(settings, 0, &Leadership::default(), START);
         let (members, effects) = (Vec::new(), Vec::new());
-        let mut scene = Self { machine, now: START, rounds_due: 0, members, effects, seq: 0 };
+        let mut scene = Self {
+            machine,
+            now: START,
+            rounds_due: 0,
+            members,
+            effects,
+            seq: 0,
+        };
         if role != Role::Cav {
-            scene.take(Input::OwnBroker { address: Some(broker(1)) });
-            scene.take(Input::LinkChanged { broker: broker(1).into(), state: LinkState::Up });
+            scene.take(Input::OwnBroker {
+                address: Some(broker(1)),
+            });
+            scene.take(Input::LinkChanged {
+                broker: broker(1).into(),
+                state: LinkState::Up,
+            });
         }
         scene
     }
@@ -55,11 +73,16 @@ impl Scene {
     /// A fit candidate that follows `edge` in term 7, whose standby it is.
     fn standing_by() -> Self {
         let mut scene = Self::new(Role::Auto, None);
-        scene.take(Input::MemberAlive { member: member("edge", 2) });
+        scene.take(Input::MemberAlive {
+            member: member("edge", 2),
+        });
         scene.members.push(member("edge", 2));
         scene.run_for(1000);
         scene.beat();
-        scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Up });
+        scene.take(Input::LinkChanged {
+            broker: broker(2).into(),
+            state: LinkState::Up,
+        });
         assert_eq!(scene.machine.leadership.position, Position::StandingBy);
         assert!(scene.machine.health.is_fit());
         scene.effects.clear();
@@ -70,9 +93,11 @@ impl Scene {
     fn take(&mut self, input: Input) {
         for effect in self.machine.handle(input, self.now) {
             let answer = match effect {
-                Effect::Look => {
-                    Input::Looked { rounds_due: self.rounds_due, load_percent: 0, members: self.members.clone() }
-                }
+                Effect::Look => Input::Looked {
+                    rounds_due: self.rounds_due,
+                    load_percent: 0,
+                    members: self.members.clone(),
+                },
                 Effect::AskParts => Input::PartsAnswered {
                     sample: HealthSample {
                         broker_serves: true,
@@ -109,7 +134,12 @@ impl Scene {
             from: name("edge"),
             run: 1,
             seq: self.seq,
-            candidacy: Candidacy { role: Role::Edge, priority: 100, load: 0, fit: true },
+            candidacy: Candidacy {
+                role: Role::Edge,
+                priority: 100,
+                load: 0,
+                fit: true,
+            },
             term: epoch.term,
             epoch: Some(epoch),
             hears_you: true,
@@ -126,7 +156,11 @@ impl Scene {
 
     fn hear_in(&mut self, epoch: Epoch, body: Body) {
         let message = self.message(epoch, body);
-        self.take(Input::Receive { from: name("edge"), rights: Rights::ALL, message });
+        self.take(Input::Receive {
+            from: name("edge"),
+            rights: Rights::ALL,
+            message,
+        });
     }
 
     fn beat(&mut self) {
@@ -155,7 +189,12 @@ impl Scene {
 }
 
 fn member(node: &str, host: u8) -> SeenMember {
-    SeenMember { name: name(node), run: 1, broker: Some(broker(host).into()), is_on_this_machine: false }
+    SeenMember {
+        name: name(node),
+        run: 1,
+        broker: Some(broker(host).into()),
+        is_on_this_machine: false,
+    }
 }
 
 #[test]
@@ -163,38 +202,77 @@ fn a_leadership_is_shown_before_it_is_carried_out_and_its_term_goes_to_disk_befo
     let mut scene = Scene::new(Role::Auto, None);
     scene.run_for(1300);
     let leads = |effect: &Effect| matches!(effect, Effect::TellLeadership { leadership } if leadership.is_leading());
-    let persists = scene.position_of(|effect| matches!(effect, Effect::PersistTerm { term: 1 })).unwrap();
+    let persists = scene
+        .position_of(|effect| matches!(effect, Effect::PersistTerm { term: 1 }))
+        .unwrap();
     let tells = scene.position_of(leads).unwrap();
-    let lead = scene.position_of(|effect| matches!(effect, Effect::Lead { .. })).unwrap();
+    let lead = scene
+        .position_of(|effect| matches!(effect, Effect::Lead { .. }))
+        .unwrap();
     assert!(persists < tells && tells < lead);
 }
 
 #[test]
 fn a_link_that_was_up_and_is_refused_ends_its_leader_at_once() {
     let mut scene = Scene::standing_by();
-    scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Down });
+    scene.take(Input::LinkChanged {
+        broker: broker(2).into(),
+        state: LinkState::Down,
+    });
     assert_eq!(scene.machine.leadership.position, Position::StandingBy);
-    scene.take(Input::LinkChanged { broker: broker(2).into(), state: LinkState::Refused });
+    scene.take(Input::LinkChanged {
+        broker: broker(2).into(),
+        state: LinkState::Refused,
+    });
     assert!(scene.machine.leadership.is_leading());
-    assert!(scene.notices().contains(&&Notice::ProcessGone { peer: name("edge"), broker: broker(2).into() }));
+    assert!(scene.notices().contains(&&Notice::ProcessGone {
+        peer: name("edge"),
+        broker: broker(2).into()
+    }));
 }
 
 #[test]
 fn with_one_broker_for_all_the_last_will_of_the_leaders_run_ends_it() {
     let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
-    scene.take(Input::LinkChanged { broker: "10.0.0.9:1883".parse().unwrap(), state: LinkState::Up });
-    scene.take(Input::MemberAlive { member: member("edge", 2) });
+    scene.take(Input::LinkChanged {
+        broker: "10.0.0.9:1883".parse().unwrap(),
+        state: LinkState::Up,
+    });
+    scene.take(Input::MemberAlive {
+        member: member("edge", 2),
+    });
     scene.members.push(member("edge", 2));
     scene.run_for(1000);
     scene.beat();
     let (living, earlier) = (Uuid::from_u128(2), Uuid::from_u128(1));
-    let status = |id, state| NodeStatus { node: name("edge"), id, state, ..status(Role::Edge) };
-    scene.take(Input::StatusHeard { status: status(living, NodeState::Aggregating) });
-    scene.take(Input::StatusHeard { status: status(earlier, NodeState::Offline) });
-    assert_eq!(scene.machine.leadership.leader(), Some(&name("edge")), "the will of a run before this one");
-    scene.take(Input::StatusHeard { status: status(living, NodeState::Aggregating) });
-    scene.take(Input::StatusHeard { status: status(living, NodeState::Offline) });
-    assert!(scene.notices().contains(&&Notice::LeaderDisconnected { peer: name("edge") }));
+    let status = |id, state| NodeStatus {
+        node: name("edge"),
+        id,
+        state,
+        ..status(Role::Edge)
+    };
+    scene.take(Input::StatusHeard {
+        status: status(living, NodeState::Aggregating),
+    });
+    scene.take(Input::StatusHeard {
+        status: status(earlier, NodeState::Offline),
+    });
+    assert_eq!(
+        scene.machine.leadership.leader(),
+        Some(&name("edge")),
+        "the will of a run before this one"
+    );
+    scene.take(Input::StatusHeard {
+        status: status(living, NodeState::Aggregating),
+    });
+    scene.take(Input::StatusHeard {
+        status: status(living, NodeState::Offline),
+    });
+    assert!(
+        scene
+            .notices()
+            .contains(&&Notice::LeaderDisconnected { peer: name("edge") })
+    );
     assert_ne!(scene.machine.leadership.leader(), Some(&name("edge")));
 }
 
@@ -202,20 +280,43 @@ fn with_one_broker_for_all_the_last_will_of_the_leaders_run_ends_it() {
 #[test]
 fn a_false_last_will_ends_a_leader_once_in_each_of_its_runs() {
     let mut scene = Scene::new(Role::Auto, Some("10.0.0.9:1883"));
-    scene.take(Input::LinkChanged { broker: "10.0.0.9:1883".parse().unwrap(), state: LinkState::Up });
+    scene.take(Input::LinkChanged {
+        broker: "10.0.0.9:1883".parse().unwrap(),
+        state: LinkState::Up,
+    });
     for (attempt, run, is_ended) in [(0, 1, true), (1, 1, false), (2, 1, false), (3, 2, true)] {
-        let edge = SeenMember { run, ..member("edge", 2) };
+        let edge = SeenMember {
+            run,
+            ..member("edge", 2)
+        };
         scene.members = vec![edge.clone()];
         scene.take(Input::MemberAlive { member: edge });
         scene.run_for(1000);
         let successors = vec![name("euclid")];
-        let beat =
-            Body::Beat { every_ms: 50, round: 40, followers: 2, after: None, successors, life: LifeSign::default() };
+        let beat = Body::Beat {
+            every_ms: 50,
+            round: 40,
+            followers: 2,
+            after: None,
+            successors,
+            life: LifeSign::default(),
+        };
         scene.hear_in(Epoch::new(7 + 2 * attempt, name("edge")), beat);
-        assert_eq!(scene.machine.leadership.leader(), Some(&name("edge")), "attempt {attempt}");
+        assert_eq!(
+            scene.machine.leadership.leader(),
+            Some(&name("edge")),
+            "attempt {attempt}"
+        );
         for state in [NodeState::Aggregating, NodeState::Offline] {
             let (node, id) = (name("edge"), Uuid::from_u128(attempt.into()));
-            scene.take(Input::StatusHeard { status: NodeStatus { node, id, state, ..status(Role::Edge) } });
+            scene.take(Input::StatusHeard {
+                status: NodeStatus {
+                    node,
+                    id,
+                    state,
+                    ..status(Role::Edge)
+                },
+            });
         }
         let is_gone = scene.machine.leadership.leader() != Some(&name("edge"));
         assert_eq!(is_gone, is_ended, "attempt {attempt}");
@@ -231,7 +332,9 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
         let mut ready = None;
         for ms in 0..1200 {
             if evidence_at == Some(ms) {
-                scene.take(Input::EvidenceReceived { from: name("gauss") });
+                scene.take(Input::EvidenceReceived {
+                    from: name("gauss"),
+                });
                 scene.take(Input::EvidenceReceived { from: name("edge") });
             }
             if ms % 50 == 0 {
@@ -239,8 +342,7 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
                 scene.hear(Body::Offer);
             }
             scene.run_for(1);
-            let is_ready =
-                |effect: &Effect| matches!(effect, Effect::Send { message, .. } if message.body == Body::Ready);
+            let is_ready = |effect: &Effect| matches!(effect, Effect::Send { message, .. } if message.body == Body::Ready);
             if ready.is_none() && scene.position_of(is_ready).is_some() {
                 ready = Some(scene.now.since(offered_at).as_millis());
             }
@@ -250,15 +352,23 @@ fn a_handover_waits_for_links_and_for_the_leaders_evidence_but_not_for_ever() {
 }
 
 /// A leader to which a better candidate says that it is ready. It can log in at `broker`, if one is given.
-fn leading_beside_a_ready_challenger(external: Option<SocketAddr>, broker: Option<SocketAddr>) -> Scene {
+fn leading_beside_a_ready_challenger(
+    external: Option<SocketAddr>,
+    broker: Option<SocketAddr>,
+) -> Scene {
     leading_beside(external, broker, "edge")
 }
 
 /// The same, where the broker has the certificate of `shown`.
 fn leading_beside(external: Option<SocketAddr>, broker: Option<SocketAddr>, shown: &str) -> Scene {
     let mut scene = Scene::new(Role::Auto, None);
-    scene.machine.links = Links::new(DataPlane { external: external.map(Into::into), embedded: true });
-    scene.take(Input::MemberAlive { member: member("edge", 2) });
+    scene.machine.links = Links::new(DataPlane {
+        external: external.map(Into::into),
+        embedded: true,
+    });
+    scene.take(Input::MemberAlive {
+        member: member("edge", 2),
+    });
     scene.members.push(member("edge", 2));
     scene.run_for(1300);
     assert!(scene.machine.leadership.is_leading());
@@ -266,16 +376,31 @@ fn leading_beside(external: Option<SocketAddr>, broker: Option<SocketAddr>, show
     for ms in 0..4500 {
         if let Some(broker) = broker.filter(|_| ms == 1000) {
             if external.is_none() {
-                scene.take(Input::BrokerProven { broker: broker.into(), node: name(shown) });
+                scene.take(Input::BrokerProven {
+                    broker: broker.into(),
+                    node: name(shown),
+                });
             }
-            scene.take(Input::LinkChanged { broker: broker.into(), state: LinkState::Up });
+            scene.take(Input::LinkChanged {
+                broker: broker.into(),
+                state: LinkState::Up,
+            });
         }
         if ms % 50 == 0 {
-            scene.hear_in(epoch.clone(), Body::Status { over: None, no_login: Vec::new() });
+            scene.hear_in(
+                epoch.clone(),
+                Body::Status {
+                    over: None,
+                    no_login: Vec::new(),
+                },
+            );
             scene.hear_in(epoch.clone(), Body::Ready);
         }
         if ms % 100 == 0 {
-            scene.take(Input::RoundAccepted { epoch: epoch.clone(), round: ms / 100 });
+            scene.take(Input::RoundAccepted {
+                epoch: epoch.clone(),
+                round: ms / 100,
+            });
         }
         scene.run_for(1);
     }
@@ -289,7 +414,9 @@ fn is_yield(effect: &Effect) -> bool {
 #[test]
 fn a_round_is_held_before_the_word_that_yields_the_next() {
     let scene = leading_beside_a_ready_challenger(None, Some(broker(2)));
-    let yielded = scene.position_of(is_yield).expect("a better candidate is handed the lead");
+    let yielded = scene
+        .position_of(is_yield)
+        .expect("a better candidate is handed the lead");
     assert_eq!(scene.effects[yielded - 1], Effect::HoldRound);
     let snapshot = scene.position_of(|effect| *effect == Effect::SendSnapshot { to: name("edge") });
     assert!(snapshot.is_some_and(|snapshot| snapshot < yielded));
@@ -302,18 +429,27 @@ fn the_lead_is_not_handed_to_a_node_whose_broker_refuses_the_leader() {
         let scene = leading_beside_a_ready_challenger(external, None);
         assert_eq!(scene.position_of(is_yield), None, "{external:?}");
         assert!(scene.machine.leadership.is_leading());
-        assert!(scene.notices().contains(&&Notice::NotServed { challenger: name("edge") }));
+        assert!(scene.notices().contains(&&Notice::NotServed {
+            challenger: name("edge")
+        }));
     }
     let both = leading_beside_a_ready_challenger(Some(broker(9)), Some(broker(9)));
-    assert!(both.position_of(is_yield).is_some(), "all use the external broker");
+    assert!(
+        both.position_of(is_yield).is_some(),
+        "all use the external broker"
+    );
 }
 
 #[test]
 fn the_lead_is_not_handed_to_a_node_in_whose_place_another_broker_is() {
     let scene = leading_beside(None, Some(broker(2)), "gauss");
     assert_eq!(scene.position_of(is_yield), None);
-    assert!(scene.notices().contains(&&Notice::NotServed { challenger: name("edge") }));
-    assert!(scene.notices().contains(&&Notice::NoLogin { at: vec![name("edge")] }));
+    assert!(scene.notices().contains(&&Notice::NotServed {
+        challenger: name("edge")
+    }));
+    assert!(scene.notices().contains(&&Notice::NoLogin {
+        at: vec![name("edge")]
+    }));
 }
 
 #[test]
@@ -335,15 +471,30 @@ fn a_late_wake_up_lets_waiting_messages_speak_first() {
 fn a_gateway_started_anew_is_told_links_and_status_again() {
     let mut scene = Scene::standing_by();
     scene.take(Input::GatewayRestarted);
-    let [links] =
-        &scene.effects.iter().filter(|effect| matches!(effect, Effect::SetLinks { .. })).collect::<Vec<_>>()[..]
+    let [links] = &scene
+        .effects
+        .iter()
+        .filter(|effect| matches!(effect, Effect::SetLinks { .. }))
+        .collect::<Vec<_>>()[..]
     else {
         panic!("links are told once: {:?}", scene.effects)
     };
-    let Effect::SetLinks { links } = links else { return };
+    let Effect::SetLinks { links } = links else {
+        return;
+    };
     assert_eq!(links.brokers, [broker(1).into(), broker(2).into()]);
-    assert!(scene.position_of(|effect| matches!(effect, Effect::PublishStatus { .. })).is_some());
-    assert!(scene.notices().iter().any(|notice| matches!(notice, Notice::Unfit { .. })), "it has no links yet");
+    assert!(
+        scene
+            .position_of(|effect| matches!(effect, Effect::PublishStatus { .. }))
+            .is_some()
+    );
+    assert!(
+        scene
+            .notices()
+            .iter()
+            .any(|notice| matches!(notice, Notice::Unfit { .. })),
+        "it has no links yet"
+    );
 }
 
 #[test]
@@ -355,20 +506,38 @@ fn a_vehicle_asks_no_parts_and_never_says_that_it_is_fit() {
         assert!(!effects.contains(&Effect::AskParts));
         scene.effects.extend(effects);
     }
-    let statuses: Vec<_> = scene.effects.iter().filter(|e| matches!(e, Effect::PublishStatus { .. })).collect();
-    let [Effect::PublishStatus { status }] = statuses[..] else { panic!("one status: {statuses:?}") };
-    assert_eq!((status.fit, status.state, status.epoch), (None, NodeState::Following, 0));
+    let statuses: Vec<_> = scene
+        .effects
+        .iter()
+        .filter(|e| matches!(e, Effect::PublishStatus { .. }))
+        .collect();
+    let [Effect::PublishStatus { status }] = statuses[..] else {
+        panic!("one status: {statuses:?}")
+    };
+    assert_eq!(
+        (status.fit, status.state, status.epoch),
+        (None, NodeState::Following, 0)
+    );
 }
 
 #[test]
 fn a_node_that_others_do_not_reach_is_not_fit_and_says_so_once() {
     let mut scene = Scene::new(Role::Auto, None);
-    scene.take(Input::OwnBroker { address: Some(SocketAddr::from(([127, 0, 0, 1], 1883))) });
-    scene.take(Input::LinkChanged { broker: "127.0.0.1:1883".parse().unwrap(), state: LinkState::Up });
+    scene.take(Input::OwnBroker {
+        address: Some(SocketAddr::from(([127, 0, 0, 1], 1883))),
+    });
+    scene.take(Input::LinkChanged {
+        broker: "127.0.0.1:1883".parse().unwrap(),
+        state: LinkState::Up,
+    });
     scene.members.push(member("gauss", 3));
     scene.run_for(3000);
     assert!(!scene.machine.health.is_fit());
-    let told = scene.notices().into_iter().filter(|notice| matches!(notice, Notice::OutOfReach { .. })).count();
+    let told = scene
+        .notices()
+        .into_iter()
+        .filter(|notice| matches!(notice, Notice::OutOfReach { .. }))
+        .count();
     assert_eq!(told, 1);
 }
 
@@ -385,15 +554,23 @@ fn a_machine_started_anew_uses_no_term_that_it_may_have_led_in() {
     };
     let settings = NodeSettings {
         election: ElectionConfig::default(),
-        plane: DataPlane { external: None, embedded: true },
+        plane: DataPlane {
+            external: None,
+            embedded: true,
+        },
         round_period: Duration::from_millis(100),
         keeps_reputations: false,
         status: status(Role::Auto),
     };
     let mut scene = Scene::new(Role::Auto, None);
     scene.machine = LeadershipNode::new(settings, 4, &before, START);
-    scene.take(Input::OwnBroker { address: Some(broker(1)) });
-    scene.take(Input::LinkChanged { broker: broker(1).into(), state: LinkState::Up });
+    scene.take(Input::OwnBroker {
+        address: Some(broker(1)),
+    });
+    scene.take(Input::LinkChanged {
+        broker: broker(1).into(),
+        state: LinkState::Up,
+    });
     scene.run_for(2000);
     let led = scene.effects.iter().find_map(|effect| match effect {
         Effect::Lead { epoch, .. } => Some(epoch.term),
@@ -407,9 +584,25 @@ fn a_message_in_anothers_name_is_dropped() {
     let mut scene = Scene::standing_by();
     let mut before = scene.machine.clone();
     let ended = Epoch::new(7, name("edge"));
-    let message = scene.message(ended.clone(), Body::Resign { epoch: ended, last_round: 40 });
-    scene.take(Input::Receive { from: name("gauss"), rights: Rights::ALL, message });
-    assert_eq!(scene.notices(), [&Notice::Misattributed { from: name("gauss"), claimed: name("edge") }]);
+    let message = scene.message(
+        ended.clone(),
+        Body::Resign {
+            epoch: ended,
+            last_round: 40,
+        },
+    );
+    scene.take(Input::Receive {
+        from: name("gauss"),
+        rights: Rights::ALL,
+        message,
+    });
+    assert_eq!(
+        scene.notices(),
+        [&Notice::Misattributed {
+            from: name("gauss"),
+            claimed: name("edge")
+        }]
+    );
     before.deadline = scene.machine.deadline;
     assert_eq!(scene.machine, before);
 }
@@ -417,16 +610,31 @@ fn a_message_in_anothers_name_is_dropped() {
 /// Times after the start at which a node is followed, as far as its certificate allows it to lead.
 fn is_followed(rights: Rights) -> bool {
     let mut scene = Scene::new(Role::Auto, None);
-    scene.take(Input::MemberAlive { member: member("edge", 2) });
+    scene.take(Input::MemberAlive {
+        member: member("edge", 2),
+    });
     for _ in 0..10 {
         let successors = vec![name("euclid")];
-        let body =
-            Body::Beat { every_ms: 50, round: 40, followers: 1, after: None, successors, life: LifeSign::default() };
+        let body = Body::Beat {
+            every_ms: 50,
+            round: 40,
+            followers: 1,
+            after: None,
+            successors,
+            life: LifeSign::default(),
+        };
         let message = scene.message(Epoch::new(7, name("edge")), body);
-        scene.take(Input::Receive { from: name("edge"), rights, message });
+        scene.take(Input::Receive {
+            from: name("edge"),
+            rights,
+            message,
+        });
         scene.run_for(50);
     }
-    let overreached = scene.notices().iter().any(|notice| matches!(notice, Notice::Overreached { .. }));
+    let overreached = scene
+        .notices()
+        .iter()
+        .any(|notice| matches!(notice, Notice::Overreached { .. }));
     assert_eq!(overreached, !rights.allow(Role::Edge, 100));
     scene.machine.election().leader() == Some(&name("edge"))
 }
@@ -434,8 +642,17 @@ fn is_followed(rights: Rights) -> bool {
 #[test]
 fn a_beat_of_a_node_that_may_not_lead_is_not_followed() {
     assert!(is_followed(Rights::ALL));
-    assert!(is_followed(Rights { priority: 100, ..Rights::from(Role::Edge) }));
-    assert!(is_followed(Rights { priority: 50, ..Rights::from(Role::Auto) }), "as an auto node");
+    assert!(is_followed(Rights {
+        priority: 100,
+        ..Rights::from(Role::Edge)
+    }));
+    assert!(
+        is_followed(Rights {
+            priority: 50,
+            ..Rights::from(Role::Auto)
+        }),
+        "as an auto node"
+    );
     assert!(!is_followed(Rights::NONE));
 }
 
@@ -443,10 +660,29 @@ fn a_beat_of_a_node_that_may_not_lead_is_not_followed() {
 #[test]
 fn who_only_follows_declares_nothing_by_its_priority() {
     let mut scene = Scene::new(Role::Auto, None);
-    let mut message = scene.message(Epoch::new(7, name("edge")), Body::Status { over: None, no_login: Vec::new() });
-    (message.epoch, message.candidacy.role, message.candidacy.priority) = (None, Role::Cav, 100);
-    scene.take(Input::Receive { from: name("edge"), rights: Rights::NONE, message });
-    assert!(!scene.notices().iter().any(|notice| matches!(notice, Notice::Overreached { .. })));
+    let mut message = scene.message(
+        Epoch::new(7, name("edge")),
+        Body::Status {
+            over: None,
+            no_login: Vec::new(),
+        },
+    );
+    (
+        message.epoch,
+        message.candidacy.role,
+        message.candidacy.priority,
+    ) = (None, Role::Cav, 100);
+    scene.take(Input::Receive {
+        from: name("edge"),
+        rights: Rights::NONE,
+        message,
+    });
+    assert!(
+        !scene
+            .notices()
+            .iter()
+            .any(|notice| matches!(notice, Notice::Overreached { .. }))
+    );
 }
 
 /// A leader hands its lead to an `edge`, but not to a node that only says that it is one.
@@ -454,23 +690,52 @@ fn who_only_follows_declares_nothing_by_its_priority() {
 fn a_declared_role_beyond_the_certificate_takes_no_lead() {
     for (role, is_offered) in [(Role::Edge, true), (Role::Auto, false)] {
         let mut scene = Scene::new(Role::Auto, None);
-        scene.take(Input::OwnBroker { address: Some(broker(1)) });
-        scene.take(Input::LinkChanged { broker: broker(1).into(), state: LinkState::Up });
+        scene.take(Input::OwnBroker {
+            address: Some(broker(1)),
+        });
+        scene.take(Input::LinkChanged {
+            broker: broker(1).into(),
+            state: LinkState::Up,
+        });
         scene.run_for(2000);
         assert!(scene.machine.election().is_leading());
-        scene.take(Input::MemberAlive { member: member("zeno", 2) });
+        scene.take(Input::MemberAlive {
+            member: member("zeno", 2),
+        });
         for _ in 0..100 {
             let epoch = scene.machine.election().epoch().unwrap().clone();
             let message = ElectionMessage {
                 from: name("zeno"),
-                ..scene.message(epoch, Body::Status { over: None, no_login: Vec::new() })
+                ..scene.message(
+                    epoch,
+                    Body::Status {
+                        over: None,
+                        no_login: Vec::new(),
+                    },
+                )
             };
-            let rights = Rights { priority: 100, ..Rights::from(role) };
-            scene.take(Input::Receive { from: name("zeno"), rights, message });
+            let rights = Rights {
+                priority: 100,
+                ..Rights::from(role)
+            };
+            scene.take(Input::Receive {
+                from: name("zeno"),
+                rights,
+                message,
+            });
             scene.run_for(50);
         }
         let offered = scene.position_of(|effect| {
-            matches!(effect, Effect::Send { message: ElectionMessage { body: Body::Offer, .. }, .. })
+            matches!(
+                effect,
+                Effect::Send {
+                    message: ElectionMessage {
+                        body: Body::Offer,
+                        ..
+                    },
+                    ..
+                }
+            )
         });
         assert_eq!(offered.is_some(), is_offered, "{role:?}");
     }

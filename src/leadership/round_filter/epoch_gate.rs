@@ -16,7 +16,10 @@ pub struct EpochGate {
 impl EpochGate {
     /// A gate that has admitted nothing and refuses terms below `floor`.
     pub fn new(floor: u64) -> Self {
-        Self { floor, latest: None }
+        Self {
+            floor,
+            latest: None,
+        }
     }
 
     /// Takes round `round` of `epoch`, or refuses it.
@@ -55,18 +58,30 @@ mod tests {
     fn the_gate_refuses_old_epochs_and_repeated_rounds() {
         let mut gate = EpochGate::default();
         assert_eq!(gate.admit(&epoch(3, "edge"), 88), Ok(()));
-        assert_eq!(gate.admit(&epoch(3, "edge"), 88), Err(RejectReason::Superseded));
+        assert_eq!(
+            gate.admit(&epoch(3, "edge"), 88),
+            Err(RejectReason::Superseded)
+        );
         assert_eq!(gate.admit(&epoch(3, "edge"), 89), Ok(()));
         assert_eq!(gate.admit(&epoch(4, "euclid"), 90), Ok(()));
-        assert_eq!(gate.admit(&epoch(3, "edge"), 91), Err(RejectReason::Superseded));
-        assert_eq!(gate.admit(&epoch(4, "edge"), 91), Err(RejectReason::Superseded));
+        assert_eq!(
+            gate.admit(&epoch(3, "edge"), 91),
+            Err(RejectReason::Superseded)
+        );
+        assert_eq!(
+            gate.admit(&epoch(4, "edge"), 91),
+            Err(RejectReason::Superseded)
+        );
         assert_eq!(gate.latest(), Some((&epoch(4, "euclid"), 90)));
     }
 
     #[test]
     fn a_restarted_node_refuses_terms_below_the_persisted_one() {
         let mut gate = EpochGate::new(7);
-        assert_eq!(gate.admit(&epoch(6, "edge"), 500), Err(RejectReason::Superseded));
+        assert_eq!(
+            gate.admit(&epoch(6, "edge"), 500),
+            Err(RejectReason::Superseded)
+        );
         assert_eq!(gate.admit(&epoch(7, "edge"), 1), Ok(()));
     }
 }

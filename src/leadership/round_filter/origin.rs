@@ -39,7 +39,9 @@ impl Origin {
         match (signature(), broker) {
             (SignatureState::Valid, _) => Some(Self::Proven),
             (SignatureState::Invalid, Some(_)) => None,
-            (SignatureState::Invalid, None) | (SignatureState::Unverifiable, _) => Some(Self::Claimed),
+            (SignatureState::Invalid, None) | (SignatureState::Unverifiable, _) => {
+                Some(Self::Claimed)
+            }
         }
     }
 }
@@ -53,7 +55,8 @@ mod tests {
         use SignatureState::{Invalid, Unverifiable, Valid};
 
         let [edge, euclid] = ["edge", "euclid"].map(NodeName::from_static);
-        let of = |broker: Option<&NodeName>, signature| Origin::of(Some(&edge), broker, || signature);
+        let of =
+            |broker: Option<&NodeName>, signature| Origin::of(Some(&edge), broker, || signature);
         for (broker, signature, expected) in [
             (Some(&edge), Invalid, Some(Origin::Proven)),
             (Some(&euclid), Valid, Some(Origin::Proven)),
@@ -65,6 +68,10 @@ mod tests {
         ] {
             assert_eq!(of(broker, signature), expected, "{broker:?} {signature:?}");
         }
-        assert_eq!(Origin::of(None, Some(&edge), || Invalid), None, "it names no aggregator");
+        assert_eq!(
+            Origin::of(None, Some(&edge), || Invalid),
+            None,
+            "it names no aggregator"
+        );
     }
 }

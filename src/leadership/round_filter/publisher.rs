@@ -24,7 +24,12 @@ struct Publisher {
 
 impl PublisherFilter {
     /// True if a node may publish for all now.
-    pub fn may_publish(&mut self, name: &NodeName, leadership: &Leadership, now: Timestamp) -> bool {
+    pub fn may_publish(
+        &mut self,
+        name: &NodeName,
+        leadership: &Leadership,
+        now: Timestamp,
+    ) -> bool {
         match leadership.leader() {
             None => true,
             Some(leader) if leader == name => {
@@ -34,7 +39,9 @@ impl PublisherFilter {
             Some(_) => [&self.last, &self.before]
                 .into_iter()
                 .flatten()
-                .any(|publisher| publisher.name == *name && now.since(publisher.at) < FAREWELL_TIME),
+                .any(|publisher| {
+                    publisher.name == *name && now.since(publisher.at) < FAREWELL_TIME
+                }),
         }
     }
 
@@ -42,7 +49,10 @@ impl PublisherFilter {
         if self.last.as_ref().is_some_and(|last| last.name != *name) {
             self.before = self.last.take();
         }
-        self.last = Some(Publisher { name: name.clone(), at: now });
+        self.last = Some(Publisher {
+            name: name.clone(),
+            at: now,
+        });
     }
 }
 
@@ -63,16 +73,25 @@ mod tests {
             is_yielding: false,
         };
         let mut filter = PublisherFilter::default();
-        let [edge, euclid, gauss] = ["edge", "euclid", "gauss"].map(|name| NodeName::new(name).unwrap());
+        let [edge, euclid, gauss] =
+            ["edge", "euclid", "gauss"].map(|name| NodeName::new(name).unwrap());
         let mut may = |name: &NodeName, leadership: &Leadership, ms: u64| {
             filter.may_publish(name, leadership, Timestamp(ms * 1000))
         };
-        assert!(may(&gauss, &Leadership::default(), 0), "nobody is known to lead");
         assert!(
-            may(&edge, &led_by("edge"), 0) && !may(&euclid, &led_by("edge"), 0) && !may(&gauss, &led_by("edge"), 0)
+            may(&gauss, &Leadership::default(), 0),
+            "nobody is known to lead"
+        );
+        assert!(
+            may(&edge, &led_by("edge"), 0)
+                && !may(&euclid, &led_by("edge"), 0)
+                && !may(&gauss, &led_by("edge"), 0)
         );
         let next = led_by("euclid");
-        assert!(may(&edge, &next, 100) && may(&euclid, &next, 200) && may(&edge, &next, 999), "its last round");
+        assert!(
+            may(&edge, &next, 100) && may(&euclid, &next, 200) && may(&edge, &next, 999),
+            "its last round"
+        );
         assert!(!may(&edge, &next, 1000), "its time is over");
         assert!(!may(&gauss, &next, 200));
     }

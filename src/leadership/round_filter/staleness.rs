@@ -4,7 +4,9 @@ use std::time::Duration;
 
 use crate::admission::live_stream::LiveStream;
 use crate::admission::minimum_delay::MinimumDelay;
-use crate::leadership::timers::{LEADER_DELAY_MEMORY, LIVE_STREAM_TIME, MAX_ROUND_AGE, MAX_ROUND_WAIT};
+use crate::leadership::timers::{
+    LEADER_DELAY_MEMORY, LIVE_STREAM_TIME, MAX_ROUND_AGE, MAX_ROUND_WAIT,
+};
 use crate::model::epoch::Epoch;
 use crate::model::time::Timestamp;
 
@@ -61,9 +63,17 @@ impl LeadersDelay {
 
     /// Takes a round; returns how long it waited, as far as is known.
     fn observe(&mut self, fused_at: Timestamp, received_at: Timestamp) -> Duration {
-        let (last_fused_at, last_received_at) = std::mem::replace(&mut self.last, (fused_at, received_at));
-        let (made_in, came_in) = (fused_at.since(last_fused_at), received_at.since(last_received_at));
-        self.live_for = if 2 * came_in >= made_in { self.live_for + came_in } else { Duration::ZERO };
+        let (last_fused_at, last_received_at) =
+            std::mem::replace(&mut self.last, (fused_at, received_at));
+        let (made_in, came_in) = (
+            fused_at.since(last_fused_at),
+            received_at.since(last_received_at),
+        );
+        self.live_for = if 2 * came_in >= made_in {
+            self.live_for + came_in
+        } else {
+            Duration::ZERO
+        };
         self.is_learnt |= self.live_for >= LIVE_STREAM_TIME;
         // A later round with an earlier stamp: the leader's clock was set back. It was made after the last one, so it has
         // waited for no longer than that, and the time since.
@@ -71,14 +81,20 @@ impl LeadersDelay {
         let delay_us = received_at.micros_from(fused_at);
         if fused_at < last_fused_at && longest_wait <= MAX_ROUND_WAIT {
             self.least = MinimumDelay::new(received_at);
-            self.least.observe(delay_us.saturating_sub(longest_wait.as_micros() as i64), received_at);
+            self.least.observe(
+                delay_us.saturating_sub(longest_wait.as_micros() as i64),
+                received_at,
+            );
             (self.is_bound, self.candidate) = (true, None);
         }
         self.least.observe(delay_us, received_at);
-        let mut waited = Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs());
+        let mut waited =
+            Duration::from_micros(delay_us.saturating_sub(self.least.least()).unsigned_abs());
         if waited <= MAX_ROUND_WAIT && !self.is_bound {
             self.candidate = None;
-        } else if let Some(least_us) = LiveStream::observe(&mut self.candidate, fused_at, received_at, TOLERANCE_US) {
+        } else if let Some(least_us) =
+            LiveStream::observe(&mut self.candidate, fused_at, received_at, TOLERANCE_US)
+        {
             self.least = MinimumDelay::new(received_at);
             self.least.observe(least_us, received_at);
             self.is_bound = false;
@@ -98,7 +114,11 @@ const TOLERANCE_US: i64 = 250_000;
 impl StalenessFilter {
     /// A filter of a node that starts: nothing can have waited for it before.
     pub fn new(now: Timestamp) -> Self {
-        Self { delays: Vec::new(), newest_at: now, resumed_at: None }
+        Self {
+            delays: Vec::new(),
+            newest_at: now,
+            resumed_at: None,
+        }
     }
 
     /// True if a round of `epoch`, whose order is right, spent no more than [`MAX_ROUND_WAIT`] in queues. A node that was
@@ -107,7 +127,8 @@ impl StalenessFilter {
     /// The first round of a leadership is fresh: its clock is not known. After a time without rounds, since the start too,
     /// it is not, because it may have waited; then a stream has to be live for [`LIVE_STREAM_TIME`] first.
     pub fn is_fresh(&mut self, epoch: &Epoch, fused_at: Timestamp, received_at: Timestamp) -> bool {
-        let has_resumed = received_at.since(std::mem::replace(&mut self.newest_at, received_at)) > MAX_ROUND_AGE;
+        let has_resumed =
+            received_at.since(std::mem::replace(&mut self.newest_at, received_at)) > MAX_ROUND_AGE;
         if has_resumed {
             self.resumed_at = Some(received_at);
         }
@@ -116,14 +137,22 @@ impl StalenessFilter {
             let is_recent = || received_at.since(delay.last.1) <= LEADER_DELAY_MEMORY;
             (delay.is_learnt || !has_resumed) && (of == epoch || is_recent())
         });
-        let known = self.delays.iter().position(|(of, _)| of.leader == epoch.leader);
-        let known = known.map(|at| self.delays.remove(at)).filter(|(of, delay)| {
-            // A clock that was set while another node led says nothing about the delay.
-            of == epoch || delay.distance(fused_at, received_at) <= LEADER_DELAY_MEMORY
-        });
+        let known = self
+            .delays
+            .iter()
+            .position(|(of, _)| of.leader == epoch.leader);
+        let known = known
+            .map(|at| self.delays.remove(at))
+            .filter(|(of, delay)| {
+                // A clock that was set while another node led says nothing about the delay.
+                of == epoch || delay.distance(fused_at, received_at) <= LEADER_DELAY_MEMORY
+            });
         let known = known.map(|(_, delay)| delay);
-        let has_waited = self.resumed_at.is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_ROUND_AGE);
-        let mut delay = known.unwrap_or_else(|| LeadersDelay::new(!has_waited, fused_at, received_at));
+        let has_waited = self
+            .resumed_at
+            .is_some_and(|resumed_at| received_at.since(resumed_at) <= MAX_ROUND_AGE);
+        let mut delay =
+            known.unwrap_or_else(|| LeadersDelay::new(!has_waited, fused_at, received_at));
         let waited = delay.observe(fused_at, received_at);
         let is_fresh = delay.is_learnt && waited <= MAX_ROUND_WAIT;
         if self.delays.len() == MAX_LEADERS {
@@ -148,12 +177,20 @@ mod tests {
     #[test]
     fn rounds_that_waited_are_old_whatever_the_leaders_clock_says() {
         for ahead in [0, 3_600_000] {
-            let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+            let (epoch, mut filter) = (
+                Epoch::new(3, NodeName::from_static("edge")),
+                StalenessFilter::new(ms(0)),
+            );
             for round in 0..20 {
-                assert!(filter.is_fresh(&epoch, ms(ahead + 100 * round), ms(100 * round + 2)), "round {round}");
+                assert!(
+                    filter.is_fresh(&epoch, ms(ahead + 100 * round), ms(100 * round + 2)),
+                    "round {round}"
+                );
             }
             // Stopped for three seconds, the node finds thirty rounds.
-            let fresh: Vec<_> = (20..50).filter(|n| filter.is_fresh(&epoch, ms(ahead + 100 * n), ms(5002))).collect();
+            let fresh: Vec<_> = (20..50)
+                .filter(|n| filter.is_fresh(&epoch, ms(ahead + 100 * n), ms(5002)))
+                .collect();
             assert_eq!(fresh, Vec::from_iter(41..50));
         }
     }
@@ -161,8 +198,16 @@ mod tests {
     #[test]
     fn a_new_leadership_has_a_clock_of_its_own() {
         let mut filter = StalenessFilter::new(ms(60_000));
-        assert!(filter.is_fresh(&Epoch::new(3, NodeName::from_static("edge")), ms(0), ms(60_000)));
-        assert!(filter.is_fresh(&Epoch::new(4, NodeName::from_static("gauss")), ms(0), ms(60_300)));
+        assert!(filter.is_fresh(
+            &Epoch::new(3, NodeName::from_static("edge")),
+            ms(0),
+            ms(60_000)
+        ));
+        assert!(filter.is_fresh(
+            &Epoch::new(4, NodeName::from_static("gauss")),
+            ms(0),
+            ms(60_300)
+        ));
     }
 
     #[test]
@@ -174,7 +219,8 @@ mod tests {
         assert!((0..30).all(|n| filter.is_fresh(&epoch(n), ms(100 * n), ms(100 * n + 2))));
         // A slow reader gets each round later than the one before, up to 4 s late.
         let late = |n: u64| 100 * (n - 30);
-        let oldest = (30..70).filter(|n| filter.is_fresh(&epoch(*n), ms(100 * n), ms(100 * n + late(*n))));
+        let oldest =
+            (30..70).filter(|n| filter.is_fresh(&epoch(*n), ms(100 * n), ms(100 * n + late(*n))));
         assert_eq!(oldest.map(late).max(), Some(900));
     }
 
@@ -191,22 +237,31 @@ mod tests {
 
     #[test]
     fn of_a_leadership_that_began_while_the_node_was_stopped_only_what_is_made_now_is_taken() {
-        let (edge, gauss) =
-            (Epoch::new(3, NodeName::from_static("edge")), Epoch::new(4, NodeName::from_static("gauss")));
+        let (edge, gauss) = (
+            Epoch::new(3, NodeName::from_static("edge")),
+            Epoch::new(4, NodeName::from_static("gauss")),
+        );
         let mut filter = StalenessFilter::new(ms(0));
         assert!(filter.is_fresh(&edge, ms(0), ms(1)));
         // Stopped for eleven seconds, it hands out a round of its own, and then finds those of its successor.
         assert!(filter.is_fresh(&edge, ms(11_000), ms(11_000)));
-        let waiting = (5..110).filter(|n| filter.is_fresh(&gauss, ms(7 + 100 * n), ms(11_001 + 3 * n))).count();
+        let waiting = (5..110)
+            .filter(|n| filter.is_fresh(&gauss, ms(7 + 100 * n), ms(11_001 + 3 * n)))
+            .count();
         assert_eq!(waiting, 0, "however slowly they come");
-        let live: Vec<_> = (115..125).filter(|n| filter.is_fresh(&gauss, ms(7 + 100 * n), ms(9 + 100 * n))).collect();
+        let live: Vec<_> = (115..125)
+            .filter(|n| filter.is_fresh(&gauss, ms(7 + 100 * n), ms(9 + 100 * n)))
+            .collect();
         assert_eq!(live, Vec::from_iter(117..125));
     }
 
     #[test]
     fn a_leader_whose_clock_was_set_is_believed_at_once() {
         for step_ms in [5_000, -5_000, -31_536_000_000_i64] {
-            let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+            let (epoch, mut filter) = (
+                Epoch::new(3, NodeName::from_static("edge")),
+                StalenessFilter::new(ms(0)),
+            );
             let refused = (0..100).filter(|n| {
                 let fused_at = ms(100 * n).shifted(if *n < 50 { 0 } else { 1000 * step_ms });
                 !filter.is_fresh(&epoch, fused_at, ms(100 * n + 1))
@@ -217,38 +272,65 @@ mod tests {
 
     #[test]
     fn rounds_that_waited_are_old_though_the_leaders_clock_was_set_back_meanwhile() {
-        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+        let (epoch, mut filter) = (
+            Epoch::new(3, NodeName::from_static("edge")),
+            StalenessFilter::new(ms(0)),
+        );
         let made = |n: u64| ms(100 * n).shifted(if n < 30 { 0 } else { -5_000_000 });
         assert!((0..20).all(|n| filter.is_fresh(&epoch, made(n), ms(100 * n + 2))));
         // Stopped for three seconds, the node finds thirty rounds; the clock was set in the midst of them.
-        let fresh: Vec<_> = (20..50).filter(|n| filter.is_fresh(&epoch, made(*n), ms(5002))).collect();
+        let fresh: Vec<_> = (20..50)
+            .filter(|n| filter.is_fresh(&epoch, made(*n), ms(5002)))
+            .collect();
         assert!(fresh.iter().all(|n| *n > 40), "{fresh:?}");
     }
 
     #[test]
     fn a_node_that_is_stopped_as_it_starts_takes_only_what_is_made_now() {
-        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+        let (epoch, mut filter) = (
+            Epoch::new(3, NodeName::from_static("edge")),
+            StalenessFilter::new(ms(0)),
+        );
         assert!((1..30).all(|n| !filter.is_fresh(&epoch, ms(100 * n), ms(3000))));
-        let live: Vec<_> = (30..40).filter(|n| filter.is_fresh(&epoch, ms(100 * n), ms(100 * n + 2))).collect();
+        let live: Vec<_> = (30..40)
+            .filter(|n| filter.is_fresh(&epoch, ms(100 * n), ms(100 * n + 2)))
+            .collect();
         assert_eq!(live, Vec::from_iter(32..40));
     }
 
     #[test]
     fn a_way_that_became_longer_is_believed_in_the_end() {
-        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+        let (epoch, mut filter) = (
+            Epoch::new(3, NodeName::from_static("edge")),
+            StalenessFilter::new(ms(0)),
+        );
         let is_fresh = |n: u64, filter: &mut StalenessFilter| {
-            filter.is_fresh(&epoch, ms(100 * n), ms(100 * n + if n < 10 { 1 } else { 1500 }))
+            filter.is_fresh(
+                &epoch,
+                ms(100 * n),
+                ms(100 * n + if n < 10 { 1 } else { 1500 }),
+            )
         };
         assert!((0..10).all(|n| is_fresh(n, &mut filter)));
         assert!(!is_fresh(10, &mut filter));
-        assert_eq!((11..250).map(|n| is_fresh(n, &mut filter)).last(), Some(true));
+        assert_eq!(
+            (11..250).map(|n| is_fresh(n, &mut filter)).last(),
+            Some(true)
+        );
     }
 
     #[test]
     fn a_clock_that_is_set_back_makes_no_older_rounds_fresh() {
-        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+        let (epoch, mut filter) = (
+            Epoch::new(3, NodeName::from_static("edge")),
+            StalenessFilter::new(ms(0)),
+        );
         let mut is_fresh = |made_ms: u64, set_back_s: i64, waited_ms| {
-            filter.is_fresh(&epoch, ms(made_ms).shifted(-1_000_000 * set_back_s), ms(made_ms + waited_ms))
+            filter.is_fresh(
+                &epoch,
+                ms(made_ms).shifted(-1_000_000 * set_back_s),
+                ms(made_ms + waited_ms),
+            )
         };
         assert!((0..20).all(|n| is_fresh(100 * n, 0, 2)));
         assert!(is_fresh(2000, 0, 800) && is_fresh(2100, 5, 790), "in time");
@@ -260,9 +342,16 @@ mod tests {
 
     #[test]
     fn rounds_go_on_after_a_silence_in_which_the_leaders_clock_was_set_back() {
-        let (epoch, mut filter) = (Epoch::new(3, NodeName::from_static("edge")), StalenessFilter::new(ms(0)));
+        let (epoch, mut filter) = (
+            Epoch::new(3, NodeName::from_static("edge")),
+            StalenessFilter::new(ms(0)),
+        );
         let mut is_fresh = |made_ms: u64, set_back_s: i64, waited_ms| {
-            filter.is_fresh(&epoch, ms(made_ms).shifted(-1_000_000 * set_back_s), ms(made_ms + waited_ms))
+            filter.is_fresh(
+                &epoch,
+                ms(made_ms).shifted(-1_000_000 * set_back_s),
+                ms(made_ms + waited_ms),
+            )
         };
         assert!((0..20).all(|n| is_fresh(100 * n, 0, 2)));
         // Nothing tells how long the first of them waited. Once they are known to be live, they may be late again.
@@ -272,11 +361,21 @@ mod tests {
 
     #[test]
     fn a_node_that_runs_for_a_moment_between_two_stops_learns_no_delay_from_them() {
-        let (old, new) = (NodeName::from_static("euclid"), NodeName::from_static("edge"));
-        let (old, new, mut filter) = (Epoch::new(1, old), Epoch::new(2, new), StalenessFilter::new(ms(0)));
+        let (old, new) = (
+            NodeName::from_static("euclid"),
+            NodeName::from_static("edge"),
+        );
+        let (old, new, mut filter) = (
+            Epoch::new(1, old),
+            Epoch::new(2, new),
+            StalenessFilter::new(ms(0)),
+        );
         assert!((0..20).all(|round| filter.is_fresh(&old, ms(100 * round), ms(100 * round + 2))));
         // Stopped until 5 s, for a moment, and until 6.1 s: of the moment, the older rounds alone passed other checks.
         assert!((20..41).all(|round| !filter.is_fresh(&new, ms(100 * round), ms(5000))));
-        assert!(!filter.is_fresh(&new, ms(5060), ms(6100)), "a round of 1.04 s ago");
+        assert!(
+            !filter.is_fresh(&new, ms(5060), ms(6100)),
+            "a round of 1.04 s ago"
+        );
     }
 }

@@ -91,7 +91,10 @@ impl SuccessionFilter {
     /// A filter for a topic whose last message is retained. It believes any term from `floor` on while nobody is known to lead, and
     /// the second message may be many rounds later than the first.
     pub fn of_retained(floor: u64) -> Self {
-        Self { is_retained: true, ..Self::new(floor) }
+        Self {
+            is_retained: true,
+            ..Self::new(floor)
+        }
     }
 
     /// Takes round `round` of `epoch`, or refuses it, given what the election says.
@@ -106,10 +109,16 @@ impl SuccessionFilter {
         leadership: &Leadership,
     ) -> Result<(), Refusal> {
         let elected = leadership.present_epoch();
-        if let Some(elected) =
-            elected.filter(|elected| self.elected.as_ref().is_none_or(|last| last.epoch != **elected))
-        {
-            self.elected = Some(Elected { epoch: elected.clone(), last_round: None, heard_at: received_at });
+        if let Some(elected) = elected.filter(|elected| {
+            self.elected
+                .as_ref()
+                .is_none_or(|last| last.epoch != **elected)
+        }) {
+            self.elected = Some(Elected {
+                epoch: elected.clone(),
+                last_round: None,
+                heard_at: received_at,
+            });
             self.overruled.take_if(|leader| *leader != elected.leader);
         }
         match elected {
@@ -121,7 +130,9 @@ impl SuccessionFilter {
                 let standby = leadership.standby.as_ref().filter(|_| !is_staying);
                 self.admit_other(epoch, round, received_at, elected, standby)
             }
-            None if self.is_strange(epoch, leadership.term, received_at) => Err(Refusal::NotElected),
+            None if self.is_strange(epoch, leadership.term, received_at) => {
+                Err(Refusal::NotElected)
+            }
             None => self.admit_in_order(epoch, round, received_at, true),
         }
     }
@@ -136,7 +147,12 @@ impl SuccessionFilter {
             return false;
         }
         let vouched = known_term..=known_term.saturating_add(TERMS_AHEAD);
-        if vouched.contains(&epoch.term) || self.gate.latest().is_some_and(|(latest, _)| latest == epoch) {
+        if vouched.contains(&epoch.term)
+            || self
+                .gate
+                .latest()
+                .is_some_and(|(latest, _)| latest == epoch)
+        {
             return false;
         }
         match &mut self.stranger {
@@ -146,7 +162,11 @@ impl SuccessionFilter {
             }
             Some(stranger) if received_at.since(stranger.last) < EPOCH_MEMORY => true,
             _ => {
-                self.stranger = Some(Stranger { epoch: epoch.clone(), since: received_at, last: received_at });
+                self.stranger = Some(Stranger {
+                    epoch: epoch.clone(),
+                    since: received_at,
+                    last: received_at,
+                });
                 true
             }
         }
@@ -154,8 +174,18 @@ impl SuccessionFilter {
 
     /// The elected is heard even after somebody else with a later epoch, unless that one is likely to be the next
     /// elected.
-    fn admit_elected(&mut self, epoch: &Epoch, round: u64, received_at: Timestamp) -> Result<(), Refusal> {
-        if self.elected.as_ref().and_then(|elected| elected.last_round).is_some_and(|last| round <= last) {
+    fn admit_elected(
+        &mut self,
+        epoch: &Epoch,
+        round: u64,
+        received_at: Timestamp,
+    ) -> Result<(), Refusal> {
+        if self
+            .elected
+            .as_ref()
+            .and_then(|elected| elected.last_round)
+            .is_some_and(|last| round <= last)
+        {
             return Err(Refusal::Repeated);
         }
         if self.gate.latest().is_some_and(|(latest, _)| latest > epoch) {
@@ -182,8 +212,14 @@ impl SuccessionFilter {
         standby: Option<&NodeName>,
     ) -> Result<(), Refusal> {
         if epoch > elected {
-            let known = self.elected.as_ref().filter(|known| received_at.since(known.heard_at) < ELECTED_SILENCE);
-            let goes_on = self.gate.latest().is_some_and(|(latest, _)| latest == epoch);
+            let known = self
+                .elected
+                .as_ref()
+                .filter(|known| received_at.since(known.heard_at) < ELECTED_SILENCE);
+            let goes_on = self
+                .gate
+                .latest()
+                .is_some_and(|(latest, _)| latest == epoch);
             let usurps = known.is_some_and(|known| match known.last_round {
                 None if goes_on => false,
                 _ => !known.is_succeeded_by(epoch, round, standby),
@@ -210,10 +246,16 @@ impl SuccessionFilter {
         let is_first = self.gate.latest().is_none();
         let silence = received_at.since(*self.newest_at.get_or_insert(received_at));
         let quiet = silence >= EPOCH_MEMORY;
-        let limit = |last: u64| last.saturating_add(MAX_ROUNDS_AHEAD).saturating_add(max_rounds_in(silence));
+        let limit = |last: u64| {
+            last.saturating_add(MAX_ROUNDS_AHEAD)
+                .saturating_add(max_rounds_in(silence))
+        };
         if !quiet
             && !self.newest_is_retained
-            && self.gate.latest().is_some_and(|(latest, last)| latest == epoch && round > limit(last))
+            && self
+                .gate
+                .latest()
+                .is_some_and(|(latest, last)| latest == epoch && round > limit(last))
         {
             return Err(Refusal::Implausible);
         }
@@ -226,7 +268,8 @@ impl SuccessionFilter {
             Some((latest, _)) if latest == epoch => Refusal::Repeated,
             _ => Refusal::Superseded,
         })?;
-        (self.newest_at, self.newest_is_retained) = (Some(received_at), is_first && self.is_retained);
+        (self.newest_at, self.newest_is_retained) =
+            (Some(received_at), is_first && self.is_retained);
         Ok(())
     }
 }
@@ -254,7 +297,10 @@ mod tests {
     }
 
     fn seeking(term: u64) -> Leadership {
-        Leadership { term, ..Leadership::default() }
+        Leadership {
+            term,
+            ..Leadership::default()
+        }
     }
 
     fn at(ms: u64) -> Timestamp {
@@ -274,7 +320,10 @@ mod tests {
         assert_eq!(admit(90_000, 1400), Err(Refusal::Implausible));
         let mut filter = SuccessionFilter::new(0);
         let mut admit = |round, ms| filter.admit(&elected, round, at(ms), &leadership);
-        assert_eq!([admit(1, 0), admit(1700, 300)], [Ok(()), Err(Refusal::Implausible)]);
+        assert_eq!(
+            [admit(1, 0), admit(1700, 300)],
+            [Ok(()), Err(Refusal::Implausible)]
+        );
     }
 
     #[test]
@@ -283,7 +332,11 @@ mod tests {
         let leadership = led_by(elected.clone(), Some("euclid"));
         let mut filter = SuccessionFilter::of_retained(0);
         for round in 0..100 {
-            assert_eq!(filter.admit(&elected, round, at(100 * round), &leadership), Ok(()), "round {round}");
+            assert_eq!(
+                filter.admit(&elected, round, at(100 * round), &leadership),
+                Ok(()),
+                "round {round}"
+            );
             let refused = filter.admit(&forged, round, at(100 * round + 50), &leadership);
             assert_eq!(refused, Err(Refusal::NotElected));
         }
@@ -296,10 +349,15 @@ mod tests {
         let mut filter = SuccessionFilter::of_retained(0);
         let mut lost = Vec::new();
         for round in 0..100 {
-            if filter.admit(&elected, round, at(100 * round), &leadership).is_err() {
+            if filter
+                .admit(&elected, round, at(100 * round), &leadership)
+                .is_err()
+            {
                 lost.push(round);
             }
-            filter.admit(&forged, round + 1, at(100 * round + 50), &leadership).ok();
+            filter
+                .admit(&forged, round + 1, at(100 * round + 50), &leadership)
+                .ok();
         }
         assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
     }
@@ -314,14 +372,27 @@ mod tests {
             // Every 10 s.
             let elected = epoch(7 + 2 * (round / 100), "edge");
             let leadership = led_by(elected.clone(), Some("euclid"));
-            if filter.admit(&elected, round, at(100 * round), &leadership).is_err() {
+            if filter
+                .admit(&elected, round, at(100 * round), &leadership)
+                .is_err()
+            {
                 lost.push(round);
             }
-            filter.admit(&forged(elected.term), round + 1, at(100 * round + 50), &leadership).ok();
+            filter
+                .admit(
+                    &forged(elected.term),
+                    round + 1,
+                    at(100 * round + 50),
+                    &leadership,
+                )
+                .ok();
         }
         assert_eq!(lost, [1, 2, 3, 4, 5], "half a second, and never again");
         let after = led_by(epoch(40, "gauss"), Some("euclid"));
-        assert_eq!(filter.admit(&epoch(40, "gauss"), 1001, at(100_100), &after), Ok(()));
+        assert_eq!(
+            filter.admit(&epoch(40, "gauss"), 1001, at(100_100), &after),
+            Ok(())
+        );
         let taken_over = filter.admit(&epoch(41, "euclid"), 1002, at(100_200), &after);
         assert_eq!(taken_over, Ok(()), "beside another leader it has credit");
     }
@@ -330,28 +401,52 @@ mod tests {
     fn the_next_leader_is_taken_before_word_of_its_election_came() {
         let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
         let mut filter = SuccessionFilter::of_retained(0);
-        let (before, after) = (led_by(old.clone(), Some("euclid")), led_by(new.clone(), None));
+        let (before, after) = (
+            led_by(old.clone(), Some("euclid")),
+            led_by(new.clone(), None),
+        );
         assert_eq!(filter.admit(&old, 1, at(0), &before), Ok(()));
         assert_eq!(filter.admit(&new, 2, at(100), &before), Ok(()));
-        assert_eq!(filter.admit(&old, 2, at(110), &before), Err(Refusal::Superseded), "no way back");
+        assert_eq!(
+            filter.admit(&old, 2, at(110), &before),
+            Err(Refusal::Superseded),
+            "no way back"
+        );
         assert_eq!(filter.admit(&new, 3, at(200), &after), Ok(()));
         let unknown = epoch(9, "gauss");
-        assert_eq!(filter.admit(&unknown, 4, at(300), &after), Err(Refusal::NotElected));
-        assert_eq!(filter.admit(&unknown, 5, at(500), &after), Ok(()), "the elected has fallen silent");
+        assert_eq!(
+            filter.admit(&unknown, 4, at(300), &after),
+            Err(Refusal::NotElected)
+        );
+        assert_eq!(
+            filter.admit(&unknown, 5, at(500), &after),
+            Ok(()),
+            "the elected has fallen silent"
+        );
     }
 
     /// The standby took over while the leader was cut off. Its rounds come again before word of its election.
     #[test]
     fn a_leader_takes_no_round_of_another_beside_its_own_before_it_yields() {
         let (own, next) = (epoch(7, "edge"), epoch(8, "euclid"));
-        let leading = Leadership { position: Position::Leading, ..led_by(own.clone(), Some("euclid")) };
+        let leading = Leadership {
+            position: Position::Leading,
+            ..led_by(own.clone(), Some("euclid"))
+        };
         let mut filter = SuccessionFilter::new(0);
         for round in 1..20 {
-            assert_eq!(filter.admit(&own, round, at(100 * round), &leading), Ok(()), "round {round}");
+            assert_eq!(
+                filter.admit(&own, round, at(100 * round), &leading),
+                Ok(()),
+                "round {round}"
+            );
             let refused = filter.admit(&next, round + 1, at(100 * round + 50), &leading);
             assert_eq!(refused, Err(Refusal::NotElected));
         }
-        let yielding = Leadership { is_yielding: true, ..leading };
+        let yielding = Leadership {
+            is_yielding: true,
+            ..leading
+        };
         assert_eq!(filter.admit(&next, 20, at(2000), &yielding), Ok(()));
     }
 
@@ -360,14 +455,22 @@ mod tests {
         let (edge, leadership) = (epoch(7, "edge"), led_by(epoch(7, "edge"), Some("euclid")));
         let mut filter = SuccessionFilter::new(0);
         for round in 1..100 {
-            assert_eq!(filter.admit(&edge, round, at(100 * round), &leadership), Ok(()), "round {round}");
+            assert_eq!(
+                filter.admit(&edge, round, at(100 * round), &leadership),
+                Ok(()),
+                "round {round}"
+            );
             let forged = filter.admit(&edge, MAX_INTEGER, at(100 * round + 50), &leadership);
             assert_eq!(forged, Err(Refusal::Implausible));
         }
         let after_a_gap = filter.admit(&edge, 120, at(12_000), &leadership);
         assert_eq!(after_a_gap, Ok(()), "rounds that were lost on the way");
         let after_a_sleep = filter.admit(&edge, 100_000, at(15_000), &leadership);
-        assert_eq!(after_a_sleep, Ok(()), "a machine whose clock stood still while it slept");
+        assert_eq!(
+            after_a_sleep,
+            Ok(()),
+            "a machine whose clock stood still while it slept"
+        );
     }
 
     #[test]
@@ -377,15 +480,26 @@ mod tests {
         let mut filter = SuccessionFilter::of_retained(0);
         assert_eq!(filter.admit(&before, 41, at(0), &leadership), Ok(()));
         assert_eq!(filter.admit(&renewed, 42, at(100), &leadership), Ok(()));
-        assert_eq!(filter.admit(&before, 42, at(110), &leadership), Err(Refusal::Superseded));
+        assert_eq!(
+            filter.admit(&before, 42, at(110), &leadership),
+            Err(Refusal::Superseded)
+        );
     }
 
     #[test]
     fn a_saved_term_does_not_shut_out_for_good_who_publishes_without_any_election() {
         let (unelected, leadership) = (epoch(3, "aggregator"), seeking(50));
         let mut filter = SuccessionFilter::new(50);
-        let taken = |round: &u64| filter.admit(&unelected, *round, at(100 * round), &leadership).is_ok();
-        assert_eq!((0..60).find(taken), Some(35), "half a second to be believed, and three for what was saved");
+        let taken = |round: &u64| {
+            filter
+                .admit(&unelected, *round, at(100 * round), &leadership)
+                .is_ok()
+        };
+        assert_eq!(
+            (0..60).find(taken),
+            Some(35),
+            "half a second to be believed, and three for what was saved"
+        );
     }
 
     #[test]
@@ -394,10 +508,22 @@ mod tests {
         let leadership = led_by(elected.clone(), Some("edge"));
         let mut filter = SuccessionFilter::of_retained(0);
         assert_eq!(filter.admit(&elected, 42, at(0), &leadership), Ok(()));
-        assert_eq!(filter.admit(&lone, 3, at(50), &leadership), Err(Refusal::NotElected), "it has just started");
-        assert_eq!(filter.admit(&lone, 9000, at(50), &leadership), Err(Refusal::NotElected), "it was alone for long");
+        assert_eq!(
+            filter.admit(&lone, 3, at(50), &leadership),
+            Err(Refusal::NotElected),
+            "it has just started"
+        );
+        assert_eq!(
+            filter.admit(&lone, 9000, at(50), &leadership),
+            Err(Refusal::NotElected),
+            "it was alone for long"
+        );
         assert_eq!(filter.admit(&elected, 43, at(100), &leadership), Ok(()));
-        assert_eq!(filter.admit(&epoch(5, "edge"), 44, at(200), &leadership), Ok(()), "it takes over");
+        assert_eq!(
+            filter.admit(&epoch(5, "edge"), 44, at(200), &leadership),
+            Ok(()),
+            "it takes over"
+        );
     }
 
     #[test]
@@ -408,11 +534,26 @@ mod tests {
             let mut filter = SuccessionFilter::new(0);
             for round in 0..3 {
                 let refused = filter.admit(&rival, round, at(100 * round), &leadership);
-                assert_eq!(refused, Err(Refusal::NotElected), "{standby:?}, round {round}");
+                assert_eq!(
+                    refused,
+                    Err(Refusal::NotElected),
+                    "{standby:?}, round {round}"
+                );
             }
-            assert_eq!(filter.admit(&elected, 0, at(210), &leadership), Ok(()), "its first word comes late");
-            assert_eq!(filter.admit(&rival, 3, at(300), &leadership), Err(Refusal::NotElected));
-            assert_eq!(filter.admit(&rival, 5, at(500), &leadership), Ok(()), "the elected is silent");
+            assert_eq!(
+                filter.admit(&elected, 0, at(210), &leadership),
+                Ok(()),
+                "its first word comes late"
+            );
+            assert_eq!(
+                filter.admit(&rival, 3, at(300), &leadership),
+                Err(Refusal::NotElected)
+            );
+            assert_eq!(
+                filter.admit(&rival, 5, at(500), &leadership),
+                Ok(()),
+                "the elected is silent"
+            );
         }
     }
 
@@ -422,11 +563,25 @@ mod tests {
         let mut filter = SuccessionFilter::new(0);
         assert_eq!(filter.admit(&rival, 1, at(0), &seeking(1)), Ok(()));
         let leadership = led_by(elected.clone(), None);
-        assert_eq!(filter.admit(&elected, 1, at(20), &leadership), Err(Refusal::Superseded));
-        assert_eq!(filter.admit(&rival, 2, at(100), &leadership), Ok(()), "one of both goes on");
+        assert_eq!(
+            filter.admit(&elected, 1, at(20), &leadership),
+            Err(Refusal::Superseded)
+        );
+        assert_eq!(
+            filter.admit(&rival, 2, at(100), &leadership),
+            Ok(()),
+            "one of both goes on"
+        );
         let leadership = led_by(renewed.clone(), None);
-        assert_eq!(filter.admit(&renewed, 5, at(420), &leadership), Ok(()), "it leads on in a term above both");
-        assert_eq!(filter.admit(&rival, 6, at(430), &leadership), Err(Refusal::Superseded));
+        assert_eq!(
+            filter.admit(&renewed, 5, at(420), &leadership),
+            Ok(()),
+            "it leads on in a term above both"
+        );
+        assert_eq!(
+            filter.admit(&rival, 6, at(430), &leadership),
+            Err(Refusal::Superseded)
+        );
     }
 
     #[test]
@@ -435,8 +590,15 @@ mod tests {
         let mut filter = SuccessionFilter::new(0);
         assert_eq!(filter.admit(&later, 40, at(0), &seeking(5)), Ok(()));
         let leadership = led_by(elected.clone(), None);
-        let passes = (1..10).map(|n| filter.admit(&elected, 40 + n, at(100 * n), &leadership).is_ok());
-        assert_eq!(passes.collect::<Vec<_>>(), [[false; 5].as_slice(), &[true; 4]].concat());
+        let passes = (1..10).map(|n| {
+            filter
+                .admit(&elected, 40 + n, at(100 * n), &leadership)
+                .is_ok()
+        });
+        assert_eq!(
+            passes.collect::<Vec<_>>(),
+            [[false; 5].as_slice(), &[true; 4]].concat()
+        );
     }
 
     #[test]
@@ -448,13 +610,28 @@ mod tests {
             let forged = epoch(1 << 40 | round, "mallory");
             let refused = filter.admit(&forged, round, at(100 * round), &seeking_in_7);
             assert_eq!(refused, Err(Refusal::NotElected), "round {round}");
-            assert_eq!(filter.admit(&next, round, at(100 * round + 1), &seeking_in_7), Ok(()), "round {round}");
+            assert_eq!(
+                filter.admit(&next, round, at(100 * round + 1), &seeking_in_7),
+                Ok(()),
+                "round {round}"
+            );
         }
         let later = epoch(12, "euclid");
-        assert_eq!(filter.admit(&later, 20, at(10_000), &seeking_in_7), Err(Refusal::NotElected));
+        assert_eq!(
+            filter.admit(&later, 20, at(10_000), &seeking_in_7),
+            Err(Refusal::NotElected)
+        );
         let seeking_in_12 = seeking(12);
-        assert_eq!(filter.admit(&later, 21, at(10_100), &seeking_in_12), Ok(()), "the election has heard of it");
-        assert_eq!(filter.admit(&next, 22, at(20_000), &seeking_in_12), Err(Refusal::NotElected), "it is over");
+        assert_eq!(
+            filter.admit(&later, 21, at(10_100), &seeking_in_12),
+            Ok(()),
+            "the election has heard of it"
+        );
+        assert_eq!(
+            filter.admit(&next, 22, at(20_000), &seeking_in_12),
+            Err(Refusal::NotElected),
+            "it is over"
+        );
     }
 
     #[test]
@@ -464,10 +641,22 @@ mod tests {
             for term in [3, 1_763_683_200] {
                 let unelected = epoch(term, "aggregator");
                 let start = 100_000 * (1 + u64::from(term > 3));
-                let taken =
-                    |round: &u64| filter.admit(&unelected, *round, at(start + period_ms * round), &seeking(7)).is_ok();
+                let taken = |round: &u64| {
+                    filter
+                        .admit(
+                            &unelected,
+                            *round,
+                            at(start + period_ms * round),
+                            &seeking(7),
+                        )
+                        .is_ok()
+                };
                 let taken: Vec<_> = (0..8).filter(taken).collect();
-                assert_eq!(taken, Vec::from_iter(believed_from..8), "term {term} every {period_ms} ms");
+                assert_eq!(
+                    taken,
+                    Vec::from_iter(believed_from..8),
+                    "term {term} every {period_ms} ms"
+                );
             }
         }
     }
@@ -477,9 +666,15 @@ mod tests {
         let (old, new) = (epoch(7, "edge"), epoch(8, "euclid"));
         let mut filter = SuccessionFilter::of_retained(0);
         let after = led_by(new.clone(), None);
-        assert_eq!(filter.admit(&old, 1, at(0), &led_by(old.clone(), None)), Ok(()));
+        assert_eq!(
+            filter.admit(&old, 1, at(0), &led_by(old.clone(), None)),
+            Ok(())
+        );
         assert_eq!(filter.admit(&old, 2, at(100), &after), Ok(()));
         assert_eq!(filter.admit(&new, 3, at(200), &after), Ok(()));
-        assert_eq!(filter.admit(&old, 4, at(300), &after), Err(Refusal::Superseded));
+        assert_eq!(
+            filter.admit(&old, 4, at(300), &after),
+            Err(Refusal::Superseded)
+        );
     }
 }

@@ -10,7 +10,10 @@ fn at(s: u64) -> Timestamp {
 }
 
 fn counts(correct: u64, incorrect: u64) -> CellCounts {
-    CellCounts { all: Counts { correct, incorrect }, ..CellCounts::default() }
+    CellCounts {
+        all: Counts { correct, incorrect },
+        ..CellCounts::default()
+    }
 }
 
 /// A broker that keeps the last message of each topic.
@@ -19,13 +22,20 @@ struct Retained(BTreeMap<(NodeName, NodeName), CellReputation>);
 
 impl Retained {
     /// Carries out what a leader does now; returns filters that it subscribes to and ends, and messages.
-    fn serve(&mut self, exchange: &mut ReputationExchange, now: Timestamp) -> (Vec<String>, Vec<String>, usize) {
+    fn serve(
+        &mut self,
+        exchange: &mut ReputationExchange,
+        now: Timestamp,
+    ) -> (Vec<String>, Vec<String>, usize) {
         let (mut begun, mut ended, mut sent) = (Vec::new(), Vec::new(), 0);
         for step in exchange.next(now, 8) {
             match step {
                 ExchangeStep::Subscribe(filters) => {
                     for message in self.0.values() {
-                        let topic = ReputationTopic { vehicle: message.vehicle.clone(), cell: message.cell.clone() };
+                        let topic = ReputationTopic {
+                            vehicle: message.vehicle.clone(),
+                            cell: message.cell.clone(),
+                        };
                         let all = ReputationTopic::filter_of_vehicle(&message.vehicle);
                         if filters.contains(&topic.path()) || filters.contains(&all) {
                             exchange.hear(message, now);
@@ -37,7 +47,8 @@ impl Retained {
                 ExchangeStep::Publish(message) => {
                     sent += 1;
                     exchange.hear(&message, now);
-                    self.0.insert((message.vehicle.clone(), message.cell.clone()), message);
+                    self.0
+                        .insert((message.vehicle.clone(), message.cell.clone()), message);
                 }
             }
         }
@@ -62,7 +73,10 @@ fn a_cells_first_word_about_a_vehicle_is_told_at_once_and_further_counts_once_a_
     let present = [name("euclid"), name("gauss")].into();
     let ms = |ms: u64| at(0) + Duration::from_millis(ms);
     exchange.set_present(&present);
-    assert!(cells_in_news(&mut exchange, ms(0)).is_empty(), "an earlier leader may have told more");
+    assert!(
+        cells_in_news(&mut exchange, ms(0)).is_empty(),
+        "an earlier leader may have told more"
+    );
     let hear = |exchange: &mut ReputationExchange, vehicle: &str, wrong: u64, now| {
         exchange.hear(&counts(0, wrong).message(name("b"), name(vehicle)), now)
     };
@@ -76,14 +90,30 @@ fn a_cells_first_word_about_a_vehicle_is_told_at_once_and_further_counts_once_a_
     }
     assert_eq!(told, [30, 1040, 1520, 2530]);
     exchange.set_present(&present);
-    assert_eq!(cells_in_news(&mut exchange, ms(3000)), ["b"], "an aggregator that began anew");
+    assert_eq!(
+        cells_in_news(&mut exchange, ms(3000)),
+        ["b"],
+        "an aggregator that began anew"
+    );
     exchange.set_present(&[name("euclid"), name("gauss"), name("noether")].into());
-    assert_eq!(exchange.take_news(ms(3001)), None, "of whom nobody has said anything");
+    assert_eq!(
+        exchange.take_news(ms(3001)),
+        None,
+        "of whom nobody has said anything"
+    );
     exchange.count(&name("gauss"), counts(5, 0), ms(4000));
-    assert_eq!(exchange.take_news(ms(5000)), None, "nor contradicted anybody");
+    assert_eq!(
+        exchange.take_news(ms(5000)),
+        None,
+        "nor contradicted anybody"
+    );
     assert!(hear(&mut exchange, "gauss", 50, ms(5000)) && exchange.take_news(ms(6000)).is_some());
     exchange.count(&name("gauss"), counts(50, 0), ms(6000));
-    assert_eq!(cells_in_news(&mut exchange, ms(7000)), ["b"], "which is worth less now");
+    assert_eq!(
+        cells_in_news(&mut exchange, ms(7000)),
+        ["b"],
+        "which is worth less now"
+    );
 }
 
 #[test]
@@ -96,17 +126,37 @@ fn a_leader_asks_about_who_is_present_and_about_nobody_else() {
     }
     exchange.connect();
     exchange.set_present(&[name("euclid")].into());
-    assert_eq!(region.serve(&mut exchange, at(0)), (vec!["ecod/v1/rep/euclid/+".into()], Vec::new(), 0));
+    assert_eq!(
+        region.serve(&mut exchange, at(0)),
+        (vec!["ecod/v1/rep/euclid/+".into()], Vec::new(), 0)
+    );
     assert_eq!(cells_in_news(&mut exchange, at(1)), ["a", "c"]);
-    assert_eq!(region.serve(&mut exchange, at(1)), Default::default(), "once");
+    assert_eq!(
+        region.serve(&mut exchange, at(1)),
+        Default::default(),
+        "once"
+    );
 
     exchange.set_present(&[name("gauss")].into());
-    assert!(cells_in_news(&mut exchange, at(2)).is_empty(), "what is said of those who left is forgotten");
-    let (begun, ended) = (vec!["ecod/v1/rep/gauss/+".into()], vec!["ecod/v1/rep/euclid/+".into()]);
+    assert!(
+        cells_in_news(&mut exchange, at(2)).is_empty(),
+        "what is said of those who left is forgotten"
+    );
+    let (begun, ended) = (
+        vec!["ecod/v1/rep/gauss/+".into()],
+        vec!["ecod/v1/rep/euclid/+".into()],
+    );
     assert_eq!(region.serve(&mut exchange, at(2)), (begun, ended, 0));
-    assert!(!exchange.hear(&counts(0, 1).message(name("a"), name("euclid")), at(2)), "and is no news");
+    assert!(
+        !exchange.hear(&counts(0, 1).message(name("a"), name("euclid")), at(2)),
+        "and is no news"
+    );
     exchange.connect();
-    assert_eq!(region.serve(&mut exchange, at(3)).0, ["ecod/v1/rep/gauss/+"], "a new connection knows nothing");
+    assert_eq!(
+        region.serve(&mut exchange, at(3)).0,
+        ["ecod/v1/rep/gauss/+"],
+        "a new connection knows nothing"
+    );
 }
 
 #[test]
@@ -136,8 +186,14 @@ fn whoever_turns_is_told_of_soon() {
     let euclid = name("euclid");
     exchange.set_present(&[euclid.clone()].into());
     let remembered = |wrong: u64| CellCounts {
-        all: Counts { correct: 10_000, incorrect: wrong },
-        old: Counts { correct: 9_500 + wrong, incorrect: 0 },
+        all: Counts {
+            correct: 10_000,
+            incorrect: wrong,
+        },
+        old: Counts {
+            correct: 9_500 + wrong,
+            incorrect: 0,
+        },
         ..CellCounts::default()
     };
     exchange.count(&euclid, remembered(0), at(0));
@@ -152,14 +208,25 @@ fn without_a_connection_the_latest_counts_wait_and_those_with_most_votes_are_kep
     let mut exchange = ReputationExchange::new(name("a"));
     for votes in 1..=10 {
         for number in 0..MAX_WAITING as u64 + 100 {
-            exchange.count(&name(&format!("v{number}")), counts(votes * number, 0), at(0));
+            exchange.count(
+                &name(&format!("v{number}")),
+                counts(votes * number, 0),
+                at(0),
+            );
         }
     }
-    assert_eq!((exchange.vehicles.len(), exchange.dropped() > 0), (MAX_WAITING, true));
+    assert_eq!(
+        (exchange.vehicles.len(), exchange.dropped() > 0),
+        (MAX_WAITING, true)
+    );
     let mut region = Retained::default();
     exchange.connect();
     (0..600).for_each(|tick| _ = region.serve(&mut exchange, at(tick)));
-    assert_eq!((region.0.len(), exchange.vehicles.len()), (MAX_WAITING, 0), "each once, and nothing waits any more");
+    assert_eq!(
+        (region.0.len(), exchange.vehicles.len()),
+        (MAX_WAITING, 0),
+        "each once, and nothing waits any more"
+    );
     assert_eq!(region.of("v1123", "a"), Some((11_230, 0)));
 }
 
@@ -171,7 +238,10 @@ fn a_message_that_is_lost_is_repeated() {
     exchange.count(&euclid, counts(30, 2), at(0));
     let mut publishes = |second| {
         let steps = exchange.next(at(second), 8);
-        steps.iter().filter(|step| matches!(step, ExchangeStep::Publish(_))).count()
+        steps
+            .iter()
+            .filter(|step| matches!(step, ExchangeStep::Publish(_)))
+            .count()
     };
     let sent: Vec<_> = (0..30).filter(|second| publishes(*second) > 0).collect();
     assert_eq!(sent, [2, 12, 22]);
@@ -188,7 +258,10 @@ fn a_message_that_is_lost_is_repeated() {
 #[test]
 fn a_leader_that_knows_less_than_its_region_lowers_nothing_but_by_a_reset() {
     let mut region = Retained::default();
-    region.0.insert((name("euclid"), name("a")), counts(400, 7).message(name("a"), name("euclid")));
+    region.0.insert(
+        (name("euclid"), name("a")),
+        counts(400, 7).message(name("a"), name("euclid")),
+    );
     let mut exchange = ReputationExchange::new(name("a"));
     exchange.set_present(&[name("euclid")].into());
     let mut count = |exchange: &mut ReputationExchange, counts, from: u64| {
@@ -197,18 +270,53 @@ fn a_leader_that_knows_less_than_its_region_lowers_nothing_but_by_a_reset() {
         region.of("euclid", "a")
     };
     assert_eq!(count(&mut exchange, counts(3, 200), 0), Some((400, 200)));
-    let reset = |correct, incorrect, second| CellCounts { reset_at: at(second), ..counts(correct, incorrect) };
-    assert_eq!(count(&mut exchange, reset(1, 0, 25), 30), Some((1, 0)), "after a reset they begin anew");
+    let reset = |correct, incorrect, second| CellCounts {
+        reset_at: at(second),
+        ..counts(correct, incorrect)
+    };
+    assert_eq!(
+        count(&mut exchange, reset(1, 0, 25), 30),
+        Some((1, 0)),
+        "after a reset they begin anew"
+    );
     assert_eq!(count(&mut exchange, reset(2, 0, 25), 60), Some((2, 0)));
     let mut late = ReputationExchange::new(name("a"));
     late.set_present(&[name("euclid")].into());
-    assert_eq!(count(&mut late, counts(500, 9), 90), Some((2, 0)), "a node that has not heard of it undoes nothing");
-    let later = CellCounts { old: Counts { correct: 400, incorrect: 0 }, ..counts(600, 10) };
-    assert_eq!(count(&mut late, later, 120), Some((102, 1)), "and counts on");
+    assert_eq!(
+        count(&mut late, counts(500, 9), 90),
+        Some((2, 0)),
+        "a node that has not heard of it undoes nothing"
+    );
+    let later = CellCounts {
+        old: Counts {
+            correct: 400,
+            incorrect: 0,
+        },
+        ..counts(600, 10)
+    };
+    assert_eq!(
+        count(&mut late, later, 120),
+        Some((102, 1)),
+        "and counts on"
+    );
     late.connect();
-    let latest = CellCounts { old: Counts { correct: 510, incorrect: 0 }, ..counts(700, 10) };
-    assert_eq!(count(&mut late, latest, 150), Some((202, 1)), "on each connection");
-    assert_eq!(count(&mut late, reset(500, 20, 25), 180), Some((500, 20)), "until it has heard of it");
+    let latest = CellCounts {
+        old: Counts {
+            correct: 510,
+            incorrect: 0,
+        },
+        ..counts(700, 10)
+    };
+    assert_eq!(
+        count(&mut late, latest, 150),
+        Some((202, 1)),
+        "on each connection"
+    );
+    assert_eq!(
+        count(&mut late, reset(500, 20, 25), 180),
+        Some((500, 20)),
+        "until it has heard of it"
+    );
     let told = region.0.values().next().unwrap();
     assert_eq!(
         (told.reset_at_us, told.old_correct),
@@ -238,24 +346,33 @@ fn a_region_that_answers_late_loses_nothing() {
     exchange.set_present(&[euclid.clone()].into());
     exchange.count(&euclid, counts(3, 200), at(0));
     let sent = |exchange: &mut ReputationExchange, second| {
-        exchange.next(at(second), 8).into_iter().find_map(|step| match step {
-            ExchangeStep::Publish(message) => Some(message),
-            _ => None,
-        })
+        exchange
+            .next(at(second), 8)
+            .into_iter()
+            .find_map(|step| match step {
+                ExchangeStep::Publish(message) => Some(message),
+                _ => None,
+            })
     };
     assert_eq!(sent(&mut exchange, 0), None);
     let message = sent(&mut exchange, 3).unwrap();
     // The retained message comes first, then the one that has replaced it.
     exchange.hear(&counts(400, 7).message(name("a"), euclid.clone()), at(4));
     exchange.hear(&message, at(4));
-    assert_eq!(sent(&mut exchange, 13), Some(counts(400, 200).message(name("a"), euclid)));
+    assert_eq!(
+        sent(&mut exchange, 13),
+        Some(counts(400, 200).message(name("a"), euclid))
+    );
 }
 
 #[test]
 fn a_leader_that_leaves_tells_all_that_it_may_and_never_what_others_said() {
     let mut exchange = ReputationExchange::new(name("a"));
     exchange.count(&name("euclid"), counts(30, 2), at(0));
-    assert!(exchange.farewell(at(0)).is_empty(), "it does not know yet what the region has");
+    assert!(
+        exchange.farewell(at(0)).is_empty(),
+        "it does not know yet what the region has"
+    );
     exchange.set_present(&[name("euclid"), name("gauss")].into());
     exchange.next(at(0), 8);
     assert!(exchange.hear(&counts(0, 50).message(name("b"), name("gauss")), at(0)));

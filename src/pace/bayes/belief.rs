@@ -78,15 +78,22 @@ pub(super) struct Increments {
 impl Increments {
     pub(super) fn new(config: &PaceConfig) -> Self {
         let (p_d, p_f) = (config.detection_probability, config.false_alarm_probability);
-        Self { hit_nats: (p_d / p_f).ln(), miss_nats: ((1.0 - p_f) / (1.0 - p_d)).ln() }
+        Self {
+            hit_nats: (p_d / p_f).ln(),
+            miss_nats: ((1.0 - p_f) / (1.0 - p_d)).ln(),
+        }
     }
 }
 
 impl VehicleBelief {
     /// Keeps the beliefs about places that there still are, under their present numbers.
     pub(super) fn move_places(&mut self, place_now: impl Fn(Place) -> Option<Place>) {
-        let known = std::mem::take(&mut self.places).into_iter().zip(std::mem::take(&mut self.beliefs));
-        let mut kept: Vec<_> = known.filter_map(|(place, belief)| Some((place_now(place)?, belief))).collect();
+        let known = std::mem::take(&mut self.places)
+            .into_iter()
+            .zip(std::mem::take(&mut self.beliefs));
+        let mut kept: Vec<_> = known
+            .filter_map(|(place, belief)| Some((place_now(place)?, belief)))
+            .collect();
         kept.sort_by_key(|(place, _)| *place);
         (self.places, self.beliefs) = kept.into_iter().unzip();
         self.oldest_seen = self.beliefs.iter().map(|belief| belief.last_seen).min();
@@ -100,11 +107,18 @@ impl VehicleBelief {
         increments: Increments,
         config: &PaceConfig,
     ) {
-        let elapsed_s = self.last_capture.map_or(f64::INFINITY, |last| captured_at.since(last).as_secs_f64());
-        let independence =
-            if elapsed_s < config.independent_after_s { elapsed_s / config.independent_after_s } else { 1.0 };
-        let increments =
-            Increments { hit_nats: increments.hit_nats * independence, miss_nats: increments.miss_nats * independence };
+        let elapsed_s = self
+            .last_capture
+            .map_or(f64::INFINITY, |last| captured_at.since(last).as_secs_f64());
+        let independence = if elapsed_s < config.independent_after_s {
+            elapsed_s / config.independent_after_s
+        } else {
+            1.0
+        };
+        let increments = Increments {
+            hit_nats: increments.hit_nats * independence,
+            miss_nats: increments.miss_nats * independence,
+        };
         self.last_capture = Some(captured_at);
         self.add_places(observations);
         let outdated = captured_at - config.max_age();
@@ -136,9 +150,12 @@ impl VehicleBelief {
         if added.is_empty() {
             return;
         }
-        let known = std::mem::take(&mut self.places).into_iter().zip(std::mem::take(&mut self.beliefs));
-        let mut all: Vec<(Place, Belief)> =
-            known.chain(added.into_iter().map(|place| (place, Belief::default()))).collect();
+        let known = std::mem::take(&mut self.places)
+            .into_iter()
+            .zip(std::mem::take(&mut self.beliefs));
+        let mut all: Vec<(Place, Belief)> = known
+            .chain(added.into_iter().map(|place| (place, Belief::default())))
+            .collect();
         all.sort_by_key(|(place, _)| *place);
         (self.places, self.beliefs) = all.into_iter().unzip();
     }
@@ -147,7 +164,11 @@ impl VehicleBelief {
     pub(super) fn forget_before(&mut self, limit: Timestamp) -> Option<Timestamp> {
         if self.oldest_seen.is_some_and(|oldest| oldest < limit) {
             let mut beliefs = self.beliefs.iter();
-            self.places.retain(|_| beliefs.next().is_some_and(|belief| belief.last_seen >= limit));
+            self.places.retain(|_| {
+                beliefs
+                    .next()
+                    .is_some_and(|belief| belief.last_seen >= limit)
+            });
             self.beliefs.retain(|belief| belief.last_seen >= limit);
             self.oldest_seen = self.beliefs.iter().map(|belief| belief.last_seen).min();
         }
@@ -156,12 +177,21 @@ impl VehicleBelief {
 
     /// The vehicle's beliefs under its name.
     pub(super) fn items_of(&self, node: &NodeName) -> VehicleItems<'_, Belief> {
-        VehicleItems { node: node.clone(), places: &self.places, items: &self.beliefs }
+        VehicleItems {
+            node: node.clone(),
+            places: &self.places,
+            items: &self.beliefs,
+        }
     }
 }
 
 impl Belief {
-    fn update(&mut self, found: Option<&PerceivedObject>, increments: Increments, config: &PaceConfig) {
+    fn update(
+        &mut self,
+        found: Option<&PerceivedObject>,
+        increments: Increments,
+        config: &PaceConfig,
+    ) {
         match found {
             Some(object) => self.hit(object, increments, config),
             None => self.miss(increments, config),
@@ -175,13 +205,20 @@ impl Belief {
         for evidence in &mut self.labels {
             let is_same = evidence.label == object.label;
             is_known |= is_same;
-            evidence.nats = (evidence.nats + if is_same { nats } else { -nats }).min(config.evidence_limit);
+            evidence.nats =
+                (evidence.nats + if is_same { nats } else { -nats }).min(config.evidence_limit);
         }
         if !is_known {
-            self.labels.push(LabelEvidence { label: object.label.clone(), nats: nats.min(config.evidence_limit) });
+            self.labels.push(LabelEvidence {
+                label: object.label.clone(),
+                nats: nats.min(config.evidence_limit),
+            });
         }
         self.anything = (self.anything + nats).min(config.evidence_limit);
-        self.position = Some((Point2::new(object.x_m, object.y_m), config.covariance(object)));
+        self.position = Some((
+            Point2::new(object.x_m, object.y_m),
+            config.covariance(object),
+        ));
     }
 
     fn miss(&mut self, increments: Increments, config: &PaceConfig) {
@@ -192,6 +229,9 @@ impl Belief {
     }
 
     pub(super) fn nats_for(&self, label: &Label) -> f64 {
-        self.labels.iter().find(|evidence| evidence.label == *label).map_or(0.0, |evidence| evidence.nats)
+        self.labels
+            .iter()
+            .find(|evidence| evidence.label == *label)
+            .map_or(0.0, |evidence| evidence.nats)
     }
 }

@@ -24,11 +24,17 @@ pub(super) struct AgreedLabel<'a> {
 impl<'a> LabelScores<'a> {
     pub(super) fn of(beliefs: &[NamedBelief<'a>]) -> Self {
         // A separate pass: its loads, which take most of the time, do not wait for each other.
-        let absence: f64 = beliefs.iter().map(|(_, belief)| belief.anything.min(0.0)).sum();
+        let absence: f64 = beliefs
+            .iter()
+            .map(|(_, belief)| belief.anything.min(0.0))
+            .sum();
         let mut labels: SmallVec<[(&'a Label, f64); 4]> = SmallVec::new();
         for (_, belief) in beliefs {
             for evidence in &belief.labels {
-                match labels.iter_mut().find(|(label, _)| **label == evidence.label) {
+                match labels
+                    .iter_mut()
+                    .find(|(label, _)| **label == evidence.label)
+                {
                     Some((_, nats)) => *nats += evidence.nats,
                     None => labels.push((&evidence.label, evidence.nats)),
                 }
@@ -41,12 +47,26 @@ impl<'a> LabelScores<'a> {
     }
 
     /// The label with the most evidence, or the published one unless it is `switch_lead` behind.
-    pub(super) fn winner(&self, published: Option<&Label>, switch_lead: f64) -> Option<AgreedLabel<'a>> {
-        let best = self.labels.iter().max_by(|a, b| a.1.total_cmp(&b.1).then_with(|| b.0.cmp(a.0)))?;
+    pub(super) fn winner(
+        &self,
+        published: Option<&Label>,
+        switch_lead: f64,
+    ) -> Option<AgreedLabel<'a>> {
+        let best = self
+            .labels
+            .iter()
+            .max_by(|a, b| a.1.total_cmp(&b.1).then_with(|| b.0.cmp(a.0)))?;
         let holds = |nats: f64| nats > best.1 - switch_lead && nats > 0.0;
-        let kept = self.labels.iter().find(|(label, nats)| Some(*label) == published && holds(*nats));
+        let kept = self
+            .labels
+            .iter()
+            .find(|(label, nats)| Some(*label) == published && holds(*nats));
         let (label, nats) = kept.unwrap_or(best);
-        let total: f64 = self.labels.iter().map(|(_, nats)| (nats - best.1).exp()).sum();
+        let total: f64 = self
+            .labels
+            .iter()
+            .map(|(_, nats)| (nats - best.1).exp())
+            .sum();
         let posterior = (nats - best.1).exp() / (total + (-best.1).exp());
         (*nats > 0.0).then_some(AgreedLabel { label, posterior })
     }
@@ -68,11 +88,18 @@ impl WeightedMean {
     pub(super) fn add(&mut self, position: &Point2<f64>, covariance: &Covariance, floor_m: f64) {
         let Covariance { xx, xy, yy } = *covariance + Covariance::isotropic(floor_m);
         let per_determinant = 1.0 / (xx * yy - xy * xy);
-        let (xx, xy, yy) = (yy * per_determinant, -xy * per_determinant, xx * per_determinant);
+        let (xx, xy, yy) = (
+            yy * per_determinant,
+            -xy * per_determinant,
+            xx * per_determinant,
+        );
         self.xx += xx;
         self.xy += xy;
         self.yy += yy;
-        self.sum += Vector2::new(xx * position.x + xy * position.y, xy * position.x + yy * position.y);
+        self.sum += Vector2::new(
+            xx * position.x + xy * position.y,
+            xy * position.x + yy * position.y,
+        );
     }
 
     /// The mean; `None` without positions, or where their covariances are too large for a result.
@@ -92,10 +119,18 @@ mod tests {
     fn a_label_that_is_no_longer_believed_gives_way_to_one_that_is() {
         let (car, van) = (Label::from("car"), Label::from("van"));
         let winner = |nats_of_car: f64| {
-            let scores = LabelScores { labels: [(&car, nats_of_car), (&van, 0.3)].into_iter().collect() };
-            scores.winner(Some(&car), 0.5).map(|winner| winner.label.clone())
+            let scores = LabelScores {
+                labels: [(&car, nats_of_car), (&van, 0.3)].into_iter().collect(),
+            };
+            scores
+                .winner(Some(&car), 0.5)
+                .map(|winner| winner.label.clone())
         };
-        assert_eq!(winner(0.1), Some(car.clone()), "van does not lead by 0.5 nats");
+        assert_eq!(
+            winner(0.1),
+            Some(car.clone()),
+            "van does not lead by 0.5 nats"
+        );
         assert_eq!(winner(-0.1), Some(van.clone()));
     }
 }

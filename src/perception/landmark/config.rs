@@ -33,12 +33,19 @@ pub struct LandmarkConfig {
 
 fn check_label(key: &str, text: &str) -> Result<(), ConfigError> {
     let allowed = format!("1 to {MAX_NAME_BYTES} bytes without control characters");
-    if is_label(text) { Ok(()) } else { Err(ConfigError::new(key, format!("{text:?}"), allowed)) }
+    if is_label(text) {
+        Ok(())
+    } else {
+        Err(ConfigError::new(key, format!("{text:?}"), allowed))
+    }
 }
 
 /// Checks the labels of a list of synonyms.
 pub(crate) fn check_synonyms(synonyms: &BTreeMap<Label, Label>) -> Result<(), ConfigError> {
-    synonyms.iter().flat_map(|(other, label)| [other, label]).try_for_each(|label| check_label("synonyms", label))
+    synonyms
+        .iter()
+        .flat_map(|(other, label)| [other, label])
+        .try_for_each(|label| check_label("synonyms", label))
 }
 
 /// A vacancy sign.
@@ -56,7 +63,14 @@ pub struct VacancyConfig {
 impl LandmarkConfig {
     /// A location that can be read from all around, without a sign or other labels; `x_m` east and `y_m` north.
     pub fn at(id: impl Into<LandmarkId>, x_m: f64, y_m: f64) -> Self {
-        Self { id: id.into(), x_m, y_m, facing_deg: None, vacancy: None, synonyms: BTreeMap::new() }
+        Self {
+            id: id.into(),
+            x_m,
+            y_m,
+            facing_deg: None,
+            vacancy: None,
+            synonyms: BTreeMap::new(),
+        }
     }
 
     /// Checks one location.
@@ -85,9 +99,13 @@ impl LandmarkConfig {
         let mut ids = BTreeSet::new();
         for (index, location) in locations.iter().enumerate() {
             let section = format!("landmarks[{index}]");
-            location.validate().map_err(|error| error.within(&section))?;
+            location
+                .validate()
+                .map_err(|error| error.within(&section))?;
             if !ids.insert(&location.id) {
-                return Err(ConfigError::new("id", format!("{:?}", location.id), "unique").within(&section));
+                return Err(
+                    ConfigError::new("id", format!("{:?}", location.id), "unique").within(&section),
+                );
             }
         }
         Ok(())
@@ -96,8 +114,10 @@ impl LandmarkConfig {
 
 impl From<&LandmarkConfig> for Landmark {
     fn from(config: &LandmarkConfig) -> Self {
-        let sign =
-            |sign: &VacancyConfig| VacancySign { label: sign.label.clone(), position: Point2::new(sign.x_m, sign.y_m) };
+        let sign = |sign: &VacancyConfig| VacancySign {
+            label: sign.label.clone(),
+            position: Point2::new(sign.x_m, sign.y_m),
+        };
         Self {
             id: config.id.clone(),
             position: Point2::new(config.x_m, config.y_m),
@@ -106,7 +126,10 @@ impl From<&LandmarkConfig> for Landmark {
             synonyms: config
                 .synonyms
                 .iter()
-                .map(|(from, label)| Synonym { from: from.clone(), label: label.clone() })
+                .map(|(from, label)| Synonym {
+                    from: from.clone(),
+                    label: label.clone(),
+                })
                 .collect(),
         }
     }
@@ -125,7 +148,11 @@ impl From<&Landmark> for LandmarkConfig {
             y_m: landmark.position.y,
             facing_deg: landmark.facing_rad.map(f64::to_degrees),
             vacancy: landmark.vacancy.as_ref().map(sign),
-            synonyms: landmark.synonyms.iter().map(|s| (s.from.clone(), s.label.clone())).collect(),
+            synonyms: landmark
+                .synonyms
+                .iter()
+                .map(|s| (s.from.clone(), s.label.clone()))
+                .collect(),
         }
     }
 }
@@ -138,12 +165,42 @@ mod tests {
     fn texts_that_no_receiver_would_take_are_refused() {
         let place = LandmarkConfig::at("slot-0", 0.0, 0.0);
         assert_eq!(place.validate(), Ok(()));
-        let sign = |label: &str| Some(VacancyConfig { label: label.into(), x_m: 0.0, y_m: 0.0 });
+        let sign = |label: &str| {
+            Some(VacancyConfig {
+                label: label.into(),
+                x_m: 0.0,
+                y_m: 0.0,
+            })
+        };
         for (wrong, key) in [
-            (LandmarkConfig { id: "a\tb".into(), ..place.clone() }, "id"),
-            (LandmarkConfig { vacancy: sign(""), ..place.clone() }, "vacancy.label"),
-            (LandmarkConfig { vacancy: sign(&"x".repeat(65)), ..place.clone() }, "vacancy.label"),
-            (LandmarkConfig { synonyms: [("".into(), "cup".into())].into(), ..place.clone() }, "synonyms"),
+            (
+                LandmarkConfig {
+                    id: "a\tb".into(),
+                    ..place.clone()
+                },
+                "id",
+            ),
+            (
+                LandmarkConfig {
+                    vacancy: sign(""),
+                    ..place.clone()
+                },
+                "vacancy.label",
+            ),
+            (
+                LandmarkConfig {
+                    vacancy: sign(&"x".repeat(65)),
+                    ..place.clone()
+                },
+                "vacancy.label",
+            ),
+            (
+                LandmarkConfig {
+                    synonyms: [("".into(), "cup".into())].into(),
+                    ..place.clone()
+                },
+                "synonyms",
+            ),
         ] {
             assert_eq!(wrong.validate().unwrap_err().key, key);
         }

@@ -32,7 +32,8 @@ impl Grid {
     pub(super) fn new(points: impl IntoIterator<Item = GridPoint>, cell_m: f64) -> Self {
         let mut points: Vec<_> = points.into_iter().collect();
         let buckets = (2 * points.len()).next_power_of_two();
-        let bucket_of = |at: Point2<f64>| bucket(cell_index(at.x, cell_m), cell_index(at.y, cell_m), buckets);
+        let bucket_of =
+            |at: Point2<f64>| bucket(cell_index(at.x, cell_m), cell_index(at.y, cell_m), buckets);
         points.sort_by_key(|point| (bucket_of(point.position), point.landmark));
         let mut ends = vec![0; buckets];
         for (index, point) in points.iter().enumerate() {
@@ -41,8 +42,15 @@ impl Grid {
         for bucket in 1..buckets {
             ends[bucket] = ends[bucket].max(ends[bucket - 1]);
         }
-        let points = points.into_iter().map(|point| (cell_index(point.position.y, cell_m), point)).collect();
-        Self { cell_m, points, ends }
+        let points = points
+            .into_iter()
+            .map(|point| (cell_index(point.position.y, cell_m), point))
+            .collect();
+        Self {
+            cell_m,
+            points,
+            ends,
+        }
     }
 
     /// True if there are no points.
@@ -58,21 +66,40 @@ impl Grid {
     ) -> impl Iterator<Item = (&GridPoint, Vector2<f64>)> + '_ {
         let first = cell_index(point.x - radius_m, self.cell_m);
         let columns = cell_index(point.x + radius_m, self.cell_m).abs_diff(first) as usize;
-        let rows = cell_index(point.y - radius_m, self.cell_m)..=cell_index(point.y + radius_m, self.cell_m);
-        rows.flat_map(move |row| self.row_cells(first, columns, row).filter(move |(at, _)| *at == row))
-            .map(move |(_, candidate)| (candidate, point - candidate.position))
-            .filter(move |(_, offset)| offset.norm_squared() <= radius_m * radius_m)
+        let rows = cell_index(point.y - radius_m, self.cell_m)
+            ..=cell_index(point.y + radius_m, self.cell_m);
+        rows.flat_map(move |row| {
+            self.row_cells(first, columns, row)
+                .filter(move |(at, _)| *at == row)
+        })
+        .map(move |(_, candidate)| (candidate, point - candidate.position))
+        .filter(move |(_, offset)| offset.norm_squared() <= radius_m * radius_m)
     }
 
     /// The points in the buckets of a cell and of the `more` next ones of its row, with all others in these buckets.
-    fn row_cells(&self, first: i32, more: usize, row: i32) -> impl Iterator<Item = &(i32, GridPoint)> {
+    fn row_cells(
+        &self,
+        first: i32,
+        more: usize,
+        row: i32,
+    ) -> impl Iterator<Item = &(i32, GridPoint)> {
         let buckets = self.ends.len();
         let first = bucket(first, row, buckets);
         let last = first + more.min(buckets - 1);
-        let start = |bucket: usize| if bucket == 0 { 0 } else { self.ends[bucket - 1] as usize };
+        let start = |bucket: usize| {
+            if bucket == 0 {
+                0
+            } else {
+                self.ends[bucket - 1] as usize
+            }
+        };
         let straight = &self.points[start(first)..self.ends[last.min(buckets - 1)] as usize];
         // Beyond the last bucket comes the first.
-        let around = if last < buckets { 0 } else { self.ends[last - buckets] as usize };
+        let around = if last < buckets {
+            0
+        } else {
+            self.ends[last - buckets] as usize
+        };
         straight.iter().chain(&self.points[..around])
     }
 }

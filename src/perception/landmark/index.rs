@@ -55,7 +55,10 @@ impl LandmarkIndex {
             has_sign: landmarks[index].vacancy.is_some(),
         };
         let objects = landmarks.iter().map(|l| l.position).enumerate().map(point);
-        let signs = landmarks.iter().enumerate().filter_map(|(index, l)| Some((index, l.vacancy.as_ref()?.position)));
+        let signs = landmarks
+            .iter()
+            .enumerate()
+            .filter_map(|(index, l)| Some((index, l.vacancy.as_ref()?.position)));
         let (mut low, mut high) = (Point2::from([f64::MAX; 2]), Point2::from([f64::MIN; 2]));
         for Landmark { position, .. } in &landmarks {
             (low, high) = (low.inf(position), high.sup(position));
@@ -63,7 +66,11 @@ impl LandmarkIndex {
         Self {
             corners: [low, high],
             ids: landmarks.iter().map(|l| l.id.clone()).collect(),
-            by_id: landmarks.iter().enumerate().map(|(index, l)| (l.id.clone(), index)).collect(),
+            by_id: landmarks
+                .iter()
+                .enumerate()
+                .map(|(index, l)| (l.id.clone(), index))
+                .collect(),
             objects: Grid::new(objects, 4.0 * radius_m),
             vacancy_signs: Grid::new(signs.map(point), 4.0 * radius_m),
             landmarks,
@@ -72,7 +79,10 @@ impl LandmarkIndex {
 
     /// An index of these landmarks and then of more, for queries of about `radius_m` metres.
     pub fn extended(&self, more: Vec<Landmark>, radius_m: f64) -> Self {
-        Self::new(self.landmarks.iter().cloned().chain(more).collect(), radius_m)
+        Self::new(
+            self.landmarks.iter().cloned().chain(more).collect(),
+            radius_m,
+        )
     }
 
     /// The landmarks in configuration order.
@@ -87,12 +97,18 @@ impl LandmarkIndex {
 
     /// The same for ids that mostly come in configuration order: `expected` is tried first.
     pub fn position_near(&self, id: &LandmarkId, expected: usize) -> Option<usize> {
-        if self.ids.get(expected) == Some(id) { Some(expected) } else { self.position_of(id) }
+        if self.ids.get(expected) == Some(id) {
+            Some(expected)
+        } else {
+            self.position_of(id)
+        }
     }
 
     /// Landmarks whose object position is within `radius_m` of a point in metres, in no particular order.
     pub fn within(&self, point: &Point2<f64>, radius_m: f64) -> impl Iterator<Item = usize> {
-        self.objects.within(*point, radius_m).map(|(near, _)| near.landmark as usize)
+        self.objects
+            .within(*point, radius_m)
+            .map(|(near, _)| near.landmark as usize)
     }
 
     /// True if a point in metres is at most `margin_m` and their extent away from the landmarks, along each axis.
@@ -114,10 +130,13 @@ impl LandmarkIndex {
         gate: &LandmarkGate,
     ) -> Option<LandmarkCandidate> {
         // A fold and not `min_by`, which takes the first candidate apart and thus prevents plain loops.
-        self.candidates(label, *point, *covariance, *gate).fold(None, |best, candidate| match best {
-            Some(best) if candidate.compare(&best) != Ordering::Less => Some(best),
-            _ => Some(candidate),
-        })
+        self.candidates(label, *point, *covariance, *gate).fold(
+            None,
+            |best, candidate| match best {
+                Some(best) if candidate.compare(&best) != Ordering::Less => Some(best),
+                _ => Some(candidate),
+            },
+        )
     }
 
     /// All landmarks within the gate of a detection, as for [`Self::best`], in no particular order.
@@ -151,6 +170,8 @@ impl LandmarkIndex {
 
 impl LandmarkCandidate {
     fn compare(&self, other: &Self) -> Ordering {
-        self.mahalanobis_squared.total_cmp(&other.mahalanobis_squared).then(self.landmark.cmp(&other.landmark))
+        self.mahalanobis_squared
+            .total_cmp(&other.mahalanobis_squared)
+            .then(self.landmark.cmp(&other.landmark))
     }
 }

@@ -10,10 +10,15 @@ use super::{LineOfSight, ObjectSize, Projection};
 use crate::model::detection::BoundingBox;
 
 /// Similar triangles on the height. Of a level camera it is parallel to the image's columns: z = f_y · height / box height.
-pub(super) fn line_of_sight(bounds: &BoundingBox, size: &ObjectSize, projection: &Projection) -> Option<LineOfSight> {
+pub(super) fn line_of_sight(
+    bounds: &BoundingBox,
+    size: &ObjectSize,
+    projection: &Projection,
+) -> Option<LineOfSight> {
     if projection.mount.is_tilted() {
         let (foot, head) = foot_and_head(bounds, projection);
-        return upright(&foot, &head, size, HalfDepth::flat()).map(|estimate| estimate.along(&foot, 0.0));
+        return upright(&foot, &head, size, HalfDepth::flat())
+            .map(|estimate| estimate.along(&foot, 0.0));
     }
     let camera = &projection.intrinsics;
     let forward_m = camera.fy * size.height_m / bounds.height();
@@ -25,19 +30,41 @@ pub(super) fn line_of_sight(bounds: &BoundingBox, size: &ObjectSize, projection:
 ///
 /// Its sides meet in the vanishing point of verticals. A point of the foot in column x is below one in column
 /// scale · x + shift of the head. So the foot is as wide as both its own edges and those below the head's leave it.
-pub(super) fn foot_and_head(bounds: &BoundingBox, projection: &Projection) -> (LevelSight, LevelSight) {
-    let Projection { intrinsics: camera, to_level, .. } = projection;
-    let BoundingBox { x_min, y_min, x_max, y_max } = *bounds;
+pub(super) fn foot_and_head(
+    bounds: &BoundingBox,
+    projection: &Projection,
+) -> (LevelSight, LevelSight) {
+    let Projection {
+        intrinsics: camera,
+        to_level,
+        ..
+    } = projection;
+    let BoundingBox {
+        x_min,
+        y_min,
+        x_max,
+        y_max,
+    } = *bounds;
     let up = to_level.row(2);
-    let vanishing = [camera.fx * up[0] + camera.cx * up[2], camera.fy * up[1] + camera.cy * up[2]];
+    let vanishing = [
+        camera.fx * up[0] + camera.cx * up[2],
+        camera.fy * up[1] + camera.cy * up[2],
+    ];
     let rise = (y_max - y_min) / (y_min * up[2] - vanishing[1]);
     let scale = 1.0 / (1.0 + rise * up[2]);
     let shift = rise * vanishing[0] * scale;
     let below = |x_px: f64| (x_px - shift) / scale;
-    let foot_px =
-        if scale > 0.0 { (x_min.max(below(x_min)) + x_max.min(below(x_max))) / 2.0 } else { bounds.center().x };
+    let foot_px = if scale > 0.0 {
+        (x_min.max(below(x_min)) + x_max.min(below(x_max))) / 2.0
+    } else {
+        bounds.center().x
+    };
     let foot = LevelSight::of(&Point2::new(foot_px, y_max), Source::FootRow, projection);
-    let head = LevelSight::of(&Point2::new(scale * foot_px + shift, y_min), Source::HeadRow, projection);
+    let head = LevelSight::of(
+        &Point2::new(scale * foot_px + shift, y_min),
+        Source::HeadRow,
+        projection,
+    );
     (foot, head)
 }
 
@@ -45,7 +72,12 @@ pub(super) fn foot_and_head(bounds: &BoundingBox, projection: &Projection) -> (L
 ///
 /// The foot is its near edge. The head is its near edge from below and its far edge from above, so that
 /// d = (height + half depth · (foot + |head|)) / (foot − head).
-pub(super) fn upright(foot: &LevelSight, head: &LevelSight, size: &ObjectSize, half: HalfDepth) -> Option<Estimate> {
+pub(super) fn upright(
+    foot: &LevelSight,
+    head: &LevelSight,
+    size: &ObjectSize,
+    half: HalfDepth,
+) -> Option<Estimate> {
     let span = foot.slope - head.slope;
     let half_m = half.mean_m * foot.depth_factor;
     let depth_share = (foot.slope + head.slope.abs()) / span;

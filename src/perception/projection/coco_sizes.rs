@@ -10,11 +10,19 @@ use super::ObjectSize;
 
 /// The usual size of a kind of COCO.
 pub(super) fn of(label: &str) -> Option<&'static ObjectSize> {
-    SIZES.iter().find(|(name, _)| *name == label).map(|(_, size)| size)
+    SIZES
+        .iter()
+        .find(|(name, _)| *name == label)
+        .map(|(_, size)| size)
 }
 
 const fn size(width_m: f64, length_m: f64, height_m: f64, relative_sigma: f64) -> ObjectSize {
-    ObjectSize { width_m, height_m, length_m: Some(length_m), relative_sigma }
+    ObjectSize {
+        width_m,
+        height_m,
+        length_m: Some(length_m),
+        relative_sigma,
+    }
 }
 
 #[rustfmt::skip]

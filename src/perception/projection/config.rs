@@ -59,7 +59,12 @@ pub struct ObjectSize {
 impl ObjectSize {
     /// A square of the given side, with the default uncertainty.
     pub fn square(side_m: f64) -> Self {
-        Self { width_m: side_m, height_m: side_m, length_m: None, relative_sigma: default_relative_sigma() }
+        Self {
+            width_m: side_m,
+            height_m: side_m,
+            length_m: None,
+            relative_sigma: default_relative_sigma(),
+        }
     }
 
     fn validate(&self) -> Result<(), ConfigError> {
@@ -86,7 +91,10 @@ pub struct ObjectSizes {
 impl ObjectSizes {
     /// The size of a label: listed, default, or usual for a label of COCO.
     pub fn of(&self, label: &str) -> Option<&ObjectSize> {
-        self.labels.get(label).or(self.default.as_ref()).or_else(|| coco_sizes::of(label))
+        self.labels
+            .get(label)
+            .or(self.default.as_ref())
+            .or_else(|| coco_sizes::of(label))
     }
 
     /// Checks every size.
@@ -97,9 +105,10 @@ impl ObjectSizes {
         if let Some(size) = &self.default {
             size.validate().map_err(|e| e.within("default"))?;
         }
-        self.labels
-            .iter()
-            .try_for_each(|(label, size)| size.validate().map_err(|e| e.within(&format!("labels.{label}"))))
+        self.labels.iter().try_for_each(|(label, size)| {
+            size.validate()
+                .map_err(|e| e.within(&format!("labels.{label}")))
+        })
     }
 }
 

@@ -29,7 +29,11 @@ impl Estimate {
         if (self.distance_m - other.distance_m).powi(2) > CONFLICT_SIGMAS.powi(2) * variance {
             return None;
         }
-        let weight = if variance > 0.0 { (-other.errors.dot(&difference) / variance).clamp(0.0, 1.0) } else { 0.5 };
+        let weight = if variance > 0.0 {
+            (-other.errors.dot(&difference) / variance).clamp(0.0, 1.0)
+        } else {
+            0.5
+        };
         Some(Self {
             distance_m: weight * self.distance_m + (1.0 - weight) * other.distance_m,
             errors: weight * self.errors + (1.0 - weight) * other.errors,

@@ -27,7 +27,10 @@ impl HalfDepth {
         let mean_m = (length + width) / PI;
         let mean_square = (length * length + width * width) / 8.0 + length * width / (2.0 * PI);
         let spread = (mean_square - mean_m * mean_m).max(0.0).sqrt();
-        Self { mean_m, sigma_m: spread.hypot(mean_m * size.relative_sigma) }
+        Self {
+            mean_m,
+            sigma_m: spread.hypot(mean_m * size.relative_sigma),
+        }
     }
 
     /// That of an object of this size, or as deep as its box is wide where the foot is on the ground.
@@ -42,31 +45,59 @@ impl HalfDepth {
         }
         let distance_m = projection.mount.height_m.unwrap_or(0.0) / foot.slope;
         let mean_m = distance_m * bounds.width() / projection.intrinsics.fx / 2.0;
-        Self { mean_m, sigma_m: mean_m * UNKNOWN_DEPTH_SIGMA }
+        Self {
+            mean_m,
+            sigma_m: mean_m * UNKNOWN_DEPTH_SIGMA,
+        }
     }
 
     /// Standard deviation in metres of the middle of a box from the middle of its object at this distance: the nearer side
     /// looks larger. Of an object whose footprint the upper edge of the image cuts, any part may be in view.
-    pub(super) fn middle_sigma_m(&self, distance_m: f64, cut: Cut, head: &LevelSight, projection: &Projection) -> f64 {
+    pub(super) fn middle_sigma_m(
+        &self,
+        distance_m: f64,
+        cut: Cut,
+        head: &LevelSight,
+        projection: &Projection,
+    ) -> f64 {
         let far_m = distance_m + self.mean_m * head.depth_factor;
-        let is_cut = cut.upper && projection.mount.height_m.is_some_and(|height_m| head.slope * far_m > height_m);
+        let is_cut = cut.upper
+            && projection
+                .mount
+                .height_m
+                .is_some_and(|height_m| head.slope * far_m > height_m);
         let nearer_m = self.mean_m * self.mean_m / distance_m;
-        if is_cut { nearer_m.max(self.mean_m / 3f64.sqrt()) } else { nearer_m }
+        if is_cut {
+            nearer_m.max(self.mean_m / 3f64.sqrt())
+        } else {
+            nearer_m
+        }
     }
 
     /// The size of the object with the width that is seen at an unknown yaw, which is distributed as its depth is.
     pub(super) fn seen_width(&self, size: &ObjectSize) -> ObjectSize {
-        ObjectSize { width_m: 2.0 * self.mean_m, relative_sigma: self.sigma_m / self.mean_m, ..*size }
+        ObjectSize {
+            width_m: 2.0 * self.mean_m,
+            relative_sigma: self.sigma_m / self.mean_m,
+            ..*size
+        }
     }
 
     /// That of a flat object.
     pub(super) fn flat() -> Self {
-        Self { mean_m: 0.0, sigma_m: 0.0 }
+        Self {
+            mean_m: 0.0,
+            sigma_m: 0.0,
+        }
     }
 }
 
 /// The middle of the object whose foot is on the ground; `None` without a foot clearly below the horizon.
-pub(super) fn from_foot(foot: &LevelSight, half: HalfDepth, projection: &Projection) -> Option<Estimate> {
+pub(super) fn from_foot(
+    foot: &LevelSight,
+    half: HalfDepth,
+    projection: &Projection,
+) -> Option<Estimate> {
     let drop_m = projection.mount.height_m?;
     let mut estimate = on_plane(foot, drop_m, &camera_height(projection))?;
     estimate.distance_m += half.mean_m * foot.depth_factor;
@@ -107,5 +138,8 @@ fn on_plane(sight: &LevelSight, drop_m: f64, drop_errors: &Errors) -> Option<Est
         return None;
     }
     let slope_errors = sight.errors * (distance_m / sight.slope / (1.0 - relative * relative));
-    Some(Estimate { distance_m, errors: drop_errors / sight.slope - slope_errors })
+    Some(Estimate {
+        distance_m,
+        errors: drop_errors / sight.slope - slope_errors,
+    })
 }

@@ -26,7 +26,12 @@ const MAX_DEPTH_FACTOR: f64 = 2.0;
 impl LevelSight {
     /// The line of sight of `pixel`, on the row of a box's edge.
     pub(super) fn of(pixel: &Point2<f64>, edge: Source, projection: &Projection) -> Self {
-        let Projection { config, intrinsics, to_level, .. } = projection;
+        let Projection {
+            config,
+            intrinsics,
+            to_level,
+            ..
+        } = projection;
         let ray = to_level * intrinsics.ray(pixel);
         let square = ray.x * ray.x + ray.y * ray.y;
         let level = square.sqrt();
@@ -34,9 +39,18 @@ impl LevelSight {
         let column_px = config.pixel_sigma_px * std::f64::consts::FRAC_1_SQRT_2;
         let axis = to_level * Vector3::z();
         let turns = [
-            (Some(edge), to_level * Vector3::new(0.0, config.pixel_sigma_px / intrinsics.fy, 0.0)),
-            (None, to_level * Vector3::new(column_px / intrinsics.fx, 0.0, 0.0)),
-            (Some(Source::Pitch), Vector3::y().cross(&ray) * config.tilt_sigma_rad),
+            (
+                Some(edge),
+                to_level * Vector3::new(0.0, config.pixel_sigma_px / intrinsics.fy, 0.0),
+            ),
+            (
+                None,
+                to_level * Vector3::new(column_px / intrinsics.fx, 0.0, 0.0),
+            ),
+            (
+                Some(Source::Pitch),
+                Vector3::y().cross(&ray) * config.tilt_sigma_rad,
+            ),
             (Some(Source::Roll), axis.cross(&ray) * config.tilt_sigma_rad),
         ];
         let (mut errors, mut variance) = (Errors::zeros(), 0.0);
@@ -49,8 +63,18 @@ impl LevelSight {
         }
         // The row's direction on the ground, up to scale.
         let along_row = to_level * Vector3::new(1.0, 0.0, 0.0);
-        let (forward, left) = (ray.x * along_row.z - ray.z * along_row.x, ray.y * along_row.z - ray.z * along_row.y);
-        let depth_factor = (forward.hypot(left) * level / (ray.x * left - ray.y * forward).abs()).min(MAX_DEPTH_FACTOR);
-        Self { bearing_rad: ray.y.atan2(ray.x), turn_rad: variance.sqrt(), slope: -ray.z / level, depth_factor, errors }
+        let (forward, left) = (
+            ray.x * along_row.z - ray.z * along_row.x,
+            ray.y * along_row.z - ray.z * along_row.y,
+        );
+        let depth_factor = (forward.hypot(left) * level / (ray.x * left - ray.y * forward).abs())
+            .min(MAX_DEPTH_FACTOR);
+        Self {
+            bearing_rad: ray.y.atan2(ray.x),
+            turn_rad: variance.sqrt(),
+            slope: -ray.z / level,
+            depth_factor,
+            errors,
+        }
     }
 }

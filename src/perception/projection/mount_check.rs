@@ -57,11 +57,15 @@ impl MountCheck {
         captured_at: Timestamp,
         projection: &Projection,
     ) -> Option<f64> {
-        if self.sampled_at.is_some_and(|last| captured_at.since(last) < SAMPLE_PERIOD) {
+        if self
+            .sampled_at
+            .is_some_and(|last| captured_at.since(last) < SAMPLE_PERIOD)
+        {
             return None;
         }
         self.sampled_at = Some(captured_at);
-        self.offsets.retain(|offset| captured_at.since(offset.captured_at) < WINDOW);
+        self.offsets
+            .retain(|offset| captured_at.since(offset.captured_at) < WINDOW);
         let offset = |(detection, cut)| projection.foot_offset(detection, cut, captured_at);
         let mut offsets: Vec<_> = boxes.into_iter().filter_map(offset).collect();
         // Near ones and far ones.
@@ -79,15 +83,24 @@ impl MountCheck {
         };
         let slopes = sorted(|offset| offset.expected_slope);
         let (count, tenth) = (slopes.len(), slopes.len() / 10);
-        let time = self.offsets.back()?.captured_at.since(self.offsets.front()?.captured_at);
-        if count < MIN_BOXES || time < MIN_TIME || slopes[count - 1 - tenth] < MIN_SLOPE_RATIO * slopes[tenth] {
+        let time = self
+            .offsets
+            .back()?
+            .captured_at
+            .since(self.offsets.front()?.captured_at);
+        if count < MIN_BOXES
+            || time < MIN_TIME
+            || slopes[count - 1 - tenth] < MIN_SLOPE_RATIO * slopes[tenth]
+        {
             return None;
         }
         let sigmas = sorted(|offset| offset.angle_rad / offset.sigma_rad)[count / 2];
         let angle_rad = sorted(|offset| offset.angle_rad)[count / 2];
-        let agrees = |offset: &&FootOffset| (offset.angle_rad - angle_rad).abs() < 2.0 * offset.sigma_rad;
+        let agrees =
+            |offset: &&FootOffset| (offset.angle_rad - angle_rad).abs() < 2.0 * offset.sigma_rad;
         let agreeing = self.offsets.iter().filter(agrees).count();
-        (sigmas.abs() > CONFLICT_SIGMAS && agreeing as f64 >= MIN_AGREEMENT * count as f64).then_some(angle_rad)
+        (sigmas.abs() > CONFLICT_SIGMAS && agreeing as f64 >= MIN_AGREEMENT * count as f64)
+            .then_some(angle_rad)
     }
 }
 
@@ -95,15 +108,24 @@ impl Projection {
     /// The angle between the foot of a box and where its height makes one expect it. None where they cannot be compared: the
     /// image cuts the box, it is of a target, or the ground plays no part. Nor without the camera's height and an object that
     /// stands.
-    fn foot_offset(&self, detection: &Detection, cut: Cut, captured_at: Timestamp) -> Option<FootOffset> {
+    fn foot_offset(
+        &self,
+        detection: &Detection,
+        cut: Cut,
+        captured_at: Timestamp,
+    ) -> Option<FootOffset> {
         let bounds = &detection.bounding_box;
         let label = detection.label.as_str();
         let stands = STANDING.contains(&label) || self.config.sizes.labels.contains_key(label);
-        let is_grounded = matches!(self.config.ranging, Ranging::Auto | Ranging::Ground) && detection.corners.is_none();
+        let is_grounded = matches!(self.config.ranging, Ranging::Auto | Ranging::Ground)
+            && detection.corners.is_none();
         if !stands || !is_grounded || !bounds.is_valid() || cut.upper || cut.lower {
             return None;
         }
-        let (camera_m, size) = (self.mount.height_m?, self.config.sizes.of(&detection.label)?);
+        let (camera_m, size) = (
+            self.mount.height_m?,
+            self.config.sizes.of(&detection.label)?,
+        );
         let (foot, head) = box_height::foot_and_head(bounds, self);
         let half = HalfDepth::of_size(size);
         let upright = box_height::upright(&foot, &head, size, half)?;
@@ -113,7 +135,8 @@ impl Projection {
         }
         let expected_slope = camera_m / near_m;
         let mut errors = foot.errors + upright.errors * (expected_slope / near_m);
-        errors[Source::Depth as usize] -= half.sigma_m * foot.depth_factor * expected_slope / near_m;
+        errors[Source::Depth as usize] -=
+            half.sigma_m * foot.depth_factor * expected_slope / near_m;
         errors[Source::CameraHeight as usize] -= self.config.height_sigma_m / near_m;
         Some(FootOffset {
             captured_at,

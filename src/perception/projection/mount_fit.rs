@@ -90,23 +90,49 @@ pub fn fit_mount(
     if boxes.len() < MIN_BOXES {
         return Err(MountFitError::TooFewBoxes(boxes.len()));
     }
-    let mut heights: Vec<f64> = boxes.iter().map(|person| person.bounding_box.height()).collect();
+    let mut heights: Vec<f64> = boxes
+        .iter()
+        .map(|person| person.bounding_box.height())
+        .collect();
     heights.sort_by(f64::total_cmp);
     let ratio = heights[heights.len() * 9 / 10] / heights[heights.len() / 10];
     if ratio < MIN_HEIGHT_RATIO {
         return Err(MountFitError::OneDistance(ratio));
     }
-    let boxes = boxes.iter().step_by(boxes.len().div_ceil(MAX_BOXES)).copied().collect();
-    let config = ProjectionConfig { pixel_sigma_px, ..ProjectionConfig::default() };
-    let fit = HeightFit { boxes, people, size: *size, config, intrinsics: *intrinsics, mount: *mount };
-    let (start, grown, _) =
-        fit.improved((fit.start(), vec![1.0; fit.people]), |off| (FREEDOM + 1.0) / (FREEDOM + off * off));
+    let boxes = boxes
+        .iter()
+        .step_by(boxes.len().div_ceil(MAX_BOXES))
+        .copied()
+        .collect();
+    let config = ProjectionConfig {
+        pixel_sigma_px,
+        ..ProjectionConfig::default()
+    };
+    let fit = HeightFit {
+        boxes,
+        people,
+        size: *size,
+        config,
+        intrinsics: *intrinsics,
+        mount: *mount,
+    };
+    let (start, grown, _) = fit.improved((fit.start(), vec![1.0; fit.people]), |off| {
+        (FREEDOM + 1.0) / (FREEDOM + off * off)
+    });
     // Errors beyond a few medians count no more.
-    let mut off: Vec<f64> =
-        fit.errors(&start, &grown).iter().flatten().map(|e| e.in_sigmas(e.own_sigma).abs()).collect();
+    let mut off: Vec<f64> = fit
+        .errors(&start, &grown)
+        .iter()
+        .flatten()
+        .map(|e| e.in_sigmas(e.own_sigma).abs())
+        .collect();
     off.sort_by(f64::total_cmp);
-    let scale = off.get(off.len() / 2).map_or(1.0, |median| (median * NORMAL_MEDIAN).max(MIN_SCALE));
-    let (found, _, covariance) = fit.improved((start, grown), |off| (-(off / scale / WELSCH).powi(2)).exp());
+    let scale = off
+        .get(off.len() / 2)
+        .map_or(1.0, |median| (median * NORMAL_MEDIAN).max(MIN_SCALE));
+    let (found, _, covariance) = fit.improved((start, grown), |off| {
+        (-(off / scale / WELSCH).powi(2)).exp()
+    });
     let covariance = covariance * (scale * scale);
     let model = Vector3::new(MODEL_TILT_RAD, MODEL_TILT_RAD, MODEL_HEIGHT);
     let variance = covariance.diagonal() + model.component_mul(&model);
@@ -114,7 +140,12 @@ pub fn fit_mount(
     let pitch_sigma_deg = pitch_sigma_rad.to_degrees();
     if pitch_sigma_deg <= MAX_PITCH_SIGMA_DEG && height_sigma.is_finite() {
         let height_sigma_m = found.z.exp() * height_sigma;
-        Ok(MountEstimate { mount: fit.mount(&found), pitch_sigma_rad, roll_sigma_rad, height_sigma_m })
+        Ok(MountEstimate {
+            mount: fit.mount(&found),
+            pitch_sigma_rad,
+            roll_sigma_rad,
+            height_sigma_m,
+        })
     } else {
         Err(MountFitError::Undetermined(pitch_sigma_deg))
     }
@@ -133,8 +164,10 @@ fn linked(frames: &[Vec<BoundingBox>]) -> (Vec<PersonBox>, usize) {
     for frame in frames {
         let mut now = Vec::with_capacity(frame.len());
         for bounding_box in frame {
-            let overlap = |other: &PersonBox| other.bounding_box.intersection_over_union(bounding_box);
-            let nearest = (0..before.len()).max_by(|a, b| overlap(&before[*a]).total_cmp(&overlap(&before[*b])));
+            let overlap =
+                |other: &PersonBox| other.bounding_box.intersection_over_union(bounding_box);
+            let nearest = (0..before.len())
+                .max_by(|a, b| overlap(&before[*a]).total_cmp(&overlap(&before[*b])));
             let person = match nearest.filter(|index| overlap(&before[*index]) >= MIN_OVERLAP) {
                 Some(index) => before.swap_remove(index).person,
                 None => {
@@ -142,7 +175,10 @@ fn linked(frames: &[Vec<BoundingBox>]) -> (Vec<PersonBox>, usize) {
                     people - 1
                 }
             };
-            now.push(PersonBox { bounding_box: *bounding_box, person });
+            now.push(PersonBox {
+                bounding_box: *bounding_box,
+                person,
+            });
         }
         all.extend_from_slice(&now);
         before = now;
@@ -191,7 +227,12 @@ struct PersonSums {
 
 impl HeightFit {
     fn mount(&self, at: &Vector3<f64>) -> Mount {
-        Mount { pitch_rad: at.x, roll_rad: at.y, height_m: Some(at.z.exp()), ..self.mount }
+        Mount {
+            pitch_rad: at.x,
+            roll_rad: at.y,
+            height_m: Some(at.z.exp()),
+            ..self.mount
+        }
     }
 
     fn projection(&self, at: &Vector3<f64>) -> Projection {
@@ -200,7 +241,8 @@ impl HeightFit {
 
     /// The likeliest of a grid of angles, each with the median of the heights that the boxes give.
     fn start(&self) -> Vector3<f64> {
-        let angles = PITCHES_DEG.flat_map(|pitch_deg| ROLLS_DEG.map(|roll_deg| (f64::from(pitch_deg), roll_deg)));
+        let angles = PITCHES_DEG
+            .flat_map(|pitch_deg| ROLLS_DEG.map(|roll_deg| (f64::from(pitch_deg), roll_deg)));
         let candidates = angles.filter_map(|(pitch_deg, roll_deg)| {
             let level = Vector3::new(pitch_deg.to_radians(), roll_deg.to_radians(), 0.0);
             let projection = self.projection(&level);
@@ -211,42 +253,65 @@ impl HeightFit {
             };
             let mut heights: Vec<f64> = self.boxes.iter().filter_map(height).collect();
             heights.sort_by(f64::total_cmp);
-            Some(Vector3::new(level.x, level.y, heights.get(heights.len() / 2)?.ln()))
+            Some(Vector3::new(
+                level.x,
+                level.y,
+                heights.get(heights.len() / 2)?.ln(),
+            ))
         });
         let costed = candidates.map(|candidate| (self.cost(&candidate), candidate));
-        costed.min_by(|a, b| a.0.total_cmp(&b.0)).map_or_else(Vector3::zeros, |(_, candidate)| candidate)
+        costed
+            .min_by(|a, b| a.0.total_cmp(&b.0))
+            .map_or_else(Vector3::zeros, |(_, candidate)| candidate)
     }
 
     /// The negative logarithm of the likelihood, of people of unknown height.
     fn cost(&self, at: &Vector3<f64>) -> f64 {
         let cost = |error: Option<HeadError>| match error {
-            Some(HeadError { error, own_sigma, foot_sigma, by_height }) => {
-                let sigma = own_sigma.hypot(foot_sigma).hypot(by_height * self.size.relative_sigma);
-                sigma.ln() + (FREEDOM + 1.0) / 2.0 * (error * error / (sigma * sigma * FREEDOM)).ln_1p()
+            Some(HeadError {
+                error,
+                own_sigma,
+                foot_sigma,
+                by_height,
+            }) => {
+                let sigma = own_sigma
+                    .hypot(foot_sigma)
+                    .hypot(by_height * self.size.relative_sigma);
+                sigma.ln()
+                    + (FREEDOM + 1.0) / 2.0 * (error * error / (sigma * sigma * FREEDOM)).ln_1p()
             }
             None => NO_FOOT_COST,
         };
         let errors = self.errors(at, &vec![1.0; self.people]);
-        errors.into_iter().map(cost).sum::<f64>() + at.y * at.y / (2.0 * ROLL_PRIOR_RAD * ROLL_PRIOR_RAD)
+        errors.into_iter().map(cost).sum::<f64>()
+            + at.y * at.y / (2.0 * ROLL_PRIOR_RAD * ROLL_PRIOR_RAD)
     }
 
     /// The head's error of each box, `None` if its foot is above the horizon; `grown` are the heights of the people relative
     /// to the mean.
     fn errors(&self, at: &Vector3<f64>, grown: &[f64]) -> Vec<Option<HeadError>> {
-        let (projection, height_m, half) = (self.projection(at), at.z.exp(), HalfDepth::of_size(&self.size));
+        let (projection, height_m, half) = (
+            self.projection(at),
+            at.z.exp(),
+            HalfDepth::of_size(&self.size),
+        );
         let error = |person: &PersonBox| {
             let (foot, head) = box_height::foot_and_head(&person.bounding_box, &projection);
             if foot.slope <= MIN_SLOPE {
                 return None;
             }
             // The foot is the near edge of a person, and the head is above the middle.
-            let (near_m, drop_m) = (height_m / foot.slope, height_m - self.size.height_m * grown[person.person]);
+            let (near_m, drop_m) = (
+                height_m / foot.slope,
+                height_m - self.size.height_m * grown[person.person],
+            );
             let head_m = near_m + half.mean_m * foot.depth_factor;
             let by_distance = drop_m / (head_m * head_m);
             let by_height = self.size.height_m / head_m;
             // In shares of the person's height, so that their errors say nothing of its size.
             let step_m = self.size.height_m * grown[person.person] * STEP_SIGMA;
-            let foot_m = (foot.errors[Source::FootRow as usize] * near_m / foot.slope).hypot(step_m);
+            let foot_m =
+                (foot.errors[Source::FootRow as usize] * near_m / foot.slope).hypot(step_m);
             Some(HeadError {
                 error: head.slope - drop_m / head_m,
                 own_sigma: head.errors[Source::HeadRow as usize].hypot(by_height * GAIT_SIGMA),
@@ -268,9 +333,13 @@ impl HeightFit {
         let spread = self.size.relative_sigma.max(MIN_SPREAD).powi(-2);
         for _ in 0..MAX_STEPS {
             let errors = self.errors(&at, &grown);
-            let moved: [Vec<Option<HeadError>>; 3] =
-                std::array::from_fn(|axis| self.errors(&(at + Matrix3::identity().column(axis) * STEP), &grown));
-            let taller = self.errors(&at, &grown.iter().map(|grown| grown + STEP).collect::<Vec<_>>());
+            let moved: [Vec<Option<HeadError>>; 3] = std::array::from_fn(|axis| {
+                self.errors(&(at + Matrix3::identity().column(axis) * STEP), &grown)
+            });
+            let taller = self.errors(
+                &at,
+                &grown.iter().map(|grown| grown + STEP).collect::<Vec<_>>(),
+            );
             let roll_prior = ROLL_PRIOR_RAD.powi(-2);
             let mut information = Matrix3::from_diagonal(&Vector3::new(0.0, roll_prior, 0.0));
             let mut gradient = Vector3::new(0.0, roll_prior * at.y, 0.0);
@@ -294,15 +363,30 @@ impl HeightFit {
                 person.gradient += weight * by_height * off;
                 person.shared += slopes * (weight * by_height);
             }
-            for PersonSums { information: own, gradient: own_gradient, shared } in &people {
+            for PersonSums {
+                information: own,
+                gradient: own_gradient,
+                shared,
+            } in &people
+            {
                 information -= shared * shared.transpose() / *own;
                 gradient -= shared * (own_gradient / own);
             }
-            let Some(inverse) = information.try_inverse() else { break };
+            let Some(inverse) = information.try_inverse() else {
+                break;
+            };
             covariance = inverse;
             let step = inverse * gradient;
             let share = (MAX_STEP / step.amax()).min(1.0);
-            for (grown, PersonSums { information, gradient, shared }) in grown.iter_mut().zip(&people) {
+            for (
+                grown,
+                PersonSums {
+                    information,
+                    gradient,
+                    shared,
+                },
+            ) in grown.iter_mut().zip(&people)
+            {
                 *grown -= share * (gradient - shared.dot(&step)) / information;
             }
             at -= step * share;

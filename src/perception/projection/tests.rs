@@ -13,12 +13,28 @@ fn camera() -> Intrinsics {
 }
 
 fn projection(ranging: Ranging) -> Projection {
-    let sizes = ObjectSizes { default: Some(ObjectSize::square(SIDE_M)), ..ObjectSizes::default() };
-    Projection::new(ProjectionConfig { ranging, sizes, ..ProjectionConfig::default() }, camera(), Mount::default())
+    let sizes = ObjectSizes {
+        default: Some(ObjectSize::square(SIDE_M)),
+        ..ObjectSizes::default()
+    };
+    Projection::new(
+        ProjectionConfig {
+            ranging,
+            sizes,
+            ..ProjectionConfig::default()
+        },
+        camera(),
+        Mount::default(),
+    )
 }
 
 fn detection(bounding_box: BoundingBox) -> Detection {
-    Detection { label: "QR1".into(), confidence: 0.9, bounding_box, corners: None }
+    Detection {
+        label: "QR1".into(),
+        confidence: 0.9,
+        bounding_box,
+        corners: None,
+    }
 }
 
 /// The box of an upright board of side `SIDE_M` whose middle is at `range_m` and `bearing_rad` and whose normal is
@@ -26,10 +42,15 @@ fn detection(bounding_box: BoundingBox) -> Detection {
 fn board(range_m: f64, bearing_rad: f64, yaw_rad: f64) -> BoundingBox {
     let (forward, left) = (range_m * bearing_rad.cos(), range_m * bearing_rad.sin());
     let half = SIDE_M / 2.0;
-    let corners = [(-half, -half), (half, -half), (half, half), (-half, half)].map(|(along, down)| {
-        let point = Point3::new(along * yaw_rad.cos() - left, down, forward + along * yaw_rad.sin());
-        camera().project(&point).expect("before the camera")
-    });
+    let corners =
+        [(-half, -half), (half, -half), (half, half), (-half, half)].map(|(along, down)| {
+            let point = Point3::new(
+                along * yaw_rad.cos() - left,
+                down,
+                forward + along * yaw_rad.sin(),
+            );
+            camera().project(&point).expect("before the camera")
+        });
     BoundingBox::around(&corners)
 }
 
@@ -115,10 +136,22 @@ proptest! {
 #[test]
 fn yaw_leaves_the_range_by_height_alone_and_stretches_the_range_by_width() {
     let seen = detection(board(0.5, 0.0, 60f64.to_radians()));
-    let range =
-        |ranging| projection(ranging).place(&seen, Cut::default(), None, &Pose::new(0.0, 0.0, 0.0)).unwrap().x_m;
-    assert!((range(Ranging::BoxHeight) - 0.5).abs() < 0.03, "{}", range(Ranging::BoxHeight));
-    assert!(range(Ranging::BoxWidth) > 0.95, "{}", range(Ranging::BoxWidth));
+    let range = |ranging| {
+        projection(ranging)
+            .place(&seen, Cut::default(), None, &Pose::new(0.0, 0.0, 0.0))
+            .unwrap()
+            .x_m
+    };
+    assert!(
+        (range(Ranging::BoxHeight) - 0.5).abs() < 0.03,
+        "{}",
+        range(Ranging::BoxHeight)
+    );
+    assert!(
+        range(Ranging::BoxWidth) > 0.95,
+        "{}",
+        range(Ranging::BoxWidth)
+    );
 }
 
 #[test]
@@ -144,14 +177,20 @@ fn uncertainty_grows_with_distance_and_lies_along_the_sight() {
         );
         placed.unwrap().covariance().unwrap()
     };
-    assert!(at(2.0).xx > 4.0 * at(1.0).xx, "range error grows faster than the distance");
+    assert!(
+        at(2.0).xx > 4.0 * at(1.0).xx,
+        "range error grows faster than the distance"
+    );
     assert!(at(2.0).xx > at(2.0).yy);
     let exact = ProjectionConfig {
         pixel_sigma_px: 0.0,
         heading_sigma_rad: 0.0,
         position_sigma_m: 0.0,
         sizes: ObjectSizes {
-            default: Some(ObjectSize { relative_sigma: 0.0, ..ObjectSize::square(SIDE_M) }),
+            default: Some(ObjectSize {
+                relative_sigma: 0.0,
+                ..ObjectSize::square(SIDE_M)
+            }),
             ..ObjectSizes::default()
         },
         ..ProjectionConfig::default()
@@ -170,27 +209,45 @@ fn uncertainty_grows_with_distance_and_lies_along_the_sight() {
 fn each_unusable_detection_has_its_reason() {
     let origin = Pose::new(0.0, 0.0, 0.0);
     let reason = |projection: &Projection, seen: &Detection, target: Option<Point3<f64>>| {
-        projection.place(seen, projection.cut(seen), target.as_ref(), &origin).expect_err("unusable").as_str()
+        projection
+            .place(seen, projection.cut(seen), target.as_ref(), &origin)
+            .expect_err("unusable")
+            .as_str()
     };
     let whole = detection(board(0.5, 0.0, 0.0));
     let sizeless = Projection::new(ProjectionConfig::default(), camera(), Mount::default());
     assert_eq!(reason(&sizeless, &whole, None), "unknown_size");
 
-    let flat = detection(BoundingBox { x_max: whole.bounding_box.x_min, ..whole.bounding_box });
-    assert_eq!(reason(&projection(Ranging::BoxWidth), &flat, None), "degenerate_box");
+    let flat = detection(BoundingBox {
+        x_max: whole.bounding_box.x_min,
+        ..whole.bounding_box
+    });
+    assert_eq!(
+        reason(&projection(Ranging::BoxWidth), &flat, None),
+        "degenerate_box"
+    );
 
     let clipped = |ranging, seen: &Detection| {
         let projection = projection(ranging);
         let placed = projection.place(seen, projection.cut(seen), None, &origin);
         placed.is_err_and(|error| error.as_str() == "clipped")
     };
-    let cut_below = detection(BoundingBox { y_max: 480.0, ..whole.bounding_box });
+    let cut_below = detection(BoundingBox {
+        y_max: 480.0,
+        ..whole.bounding_box
+    });
     assert!(clipped(Ranging::BoxHeight, &cut_below) && !clipped(Ranging::BoxWidth, &cut_below));
-    let cut_left = detection(BoundingBox { x_min: 0.0, ..whole.bounding_box });
+    let cut_left = detection(BoundingBox {
+        x_min: 0.0,
+        ..whole.bounding_box
+    });
     assert!(clipped(Ranging::BoxWidth, &cut_left) && !clipped(Ranging::BoxHeight, &cut_left));
 
     for target in [Point3::new(0.0, 0.0, -1.0), Point3::new(f64::NAN, 0.0, 1.0)] {
-        assert_eq!(reason(&projection(Ranging::Corners), &whole, Some(target)), "invalid_corners");
+        assert_eq!(
+            reason(&projection(Ranging::Corners), &whole, Some(target)),
+            "invalid_corners"
+        );
     }
 }
 
@@ -198,20 +255,31 @@ fn each_unusable_detection_has_its_reason() {
 fn labels_of_coco_have_usual_sizes_unless_a_size_is_configured() {
     let usual = ObjectSizes::default();
     let person = usual.of("person").unwrap();
-    assert!((1.5..1.9).contains(&person.height_m) && person.relative_sigma > 0.05, "{person:?}");
+    assert!(
+        (1.5..1.9).contains(&person.height_m) && person.relative_sigma > 0.05,
+        "{person:?}"
+    );
     assert_eq!(usual.of("QR1"), None);
-    let own = ObjectSizes { default: Some(ObjectSize::square(SIDE_M)), ..ObjectSizes::default() };
+    let own = ObjectSizes {
+        default: Some(ObjectSize::square(SIDE_M)),
+        ..ObjectSizes::default()
+    };
     assert_eq!(own.of("person"), Some(&ObjectSize::square(SIDE_M)));
 }
 
 #[test]
 fn listed_sizes_win_over_the_default_and_are_checked() {
-    let text =
-        r#"{"default": {"width_m": 0.05, "height_m": 0.05}, "labels": {"cup": {"width_m": 0.08, "height_m": 0.1}}}"#;
+    let text = r#"{"default": {"width_m": 0.05, "height_m": 0.05}, "labels": {"cup": {"width_m": 0.08, "height_m": 0.1}}}"#;
     let mut sizes: ObjectSizes = serde_json::from_str(text).unwrap();
     assert_eq!(sizes.of("cup").map(|s| s.height_m), Some(0.1));
     assert_eq!(sizes.of("ABCD123").map(|s| s.height_m), Some(0.05));
     sizes.labels.get_mut("cup").unwrap().height_m = 0.0;
-    let config = ProjectionConfig { sizes, ..ProjectionConfig::default() };
-    assert_eq!(config.validate().expect_err("zero height").key, "sizes.labels.cup.height_m");
+    let config = ProjectionConfig {
+        sizes,
+        ..ProjectionConfig::default()
+    };
+    assert_eq!(
+        config.validate().expect_err("zero height").key,
+        "sizes.labels.cup.height_m"
+    );
 }

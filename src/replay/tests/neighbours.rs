@@ -22,30 +22,67 @@ fn neighbours(ms: u64) -> Arc<[NeighbourObject]> {
         velocity_mps: Some([10.0, 0.0]),
         first_seen_us: Some(at(0) - Duration::from_secs(5)),
         existence: Some(0.9),
-        ..FusedObject::new(Uuid::from_u128(number), "car", 0.9, x_m, y_m, Covariance::isotropic(0.3))
+        ..FusedObject::new(
+            Uuid::from_u128(number),
+            "car",
+            0.9,
+            x_m,
+            y_m,
+            Covariance::isotropic(0.3),
+        )
     };
     let cell = NodeName::from_static("west");
     let objects = [of(7, car_at(ms - 100), 0.0), of(8, -40.0, 0.0)];
-    objects.map(|object| NeighbourObject { cell: cell.clone(), age_s: 0.1, object }).into()
+    objects
+        .map(|object| NeighbourObject {
+            cell: cell.clone(),
+            age_s: 0.1,
+            object,
+        })
+        .into()
 }
 
 /// A cell says of the only vehicle that it was mostly wrong.
 fn slander() -> Command {
     let mut reputations = ForeignReputations::default();
-    let counts = CellCounts { all: Counts { correct: 1, incorrect: 30 }, ..CellCounts::default() };
-    reputations.merge(&NodeName::from_static("west"), &NodeName::from_static("euclid"), counts);
-    Command::TakeForeign { reputations: Arc::new(reputations) }
+    let counts = CellCounts {
+        all: Counts {
+            correct: 1,
+            incorrect: 30,
+        },
+        ..CellCounts::default()
+    };
+    reputations.merge(
+        &NodeName::from_static("west"),
+        &NodeName::from_static("euclid"),
+        counts,
+    );
+    Command::TakeForeign {
+        reputations: Arc::new(reputations),
+    }
 }
 
 #[test]
 fn a_journal_gives_the_same_maps_with_what_neighbours_see_and_say_and_objects_that_came_over() {
-    let fusion = FusionConfig { algorithms: Algorithms::Pace, ..FusionConfig::default() };
+    let fusion = FusionConfig {
+        algorithms: Algorithms::Pace,
+        ..FusionConfig::default()
+    };
     let mut live = Aggregator::new_standby(fusion.clone(), Vec::new(), at(0));
     let mut journal = JournalReplay::new(fusion, Vec::new());
     let ledger = Arc::new(ReputationLedger::default());
-    journal.entry(&JournalEntry { at_us: at(0), event: JournalEvent::Start { ledger } });
+    journal.entry(&JournalEntry {
+        at_us: at(0),
+        event: JournalEvent::Start { ledger },
+    });
     let (mut maps, mut replayed): (Vec<GlobalMap>, Vec<GlobalMap>) = Default::default();
-    let map = |line| if let FusedLine::Map(map) = line { Some(map) } else { None };
+    let map = |line| {
+        if let FusedLine::Map(map) = line {
+            Some(map)
+        } else {
+            None
+        }
+    };
     let lead = Command::Lead {
         epoch: crate::model::epoch::Epoch::new(3, NodeName::from_static("edge")),
         first_round: 1,
@@ -54,38 +91,93 @@ fn a_journal_gives_the_same_maps_with_what_neighbours_see_and_say_and_objects_th
     for ms in (50..4000).step_by(50) {
         let mut commands = Vec::new();
         commands.extend((ms == 50).then(|| lead.clone()));
-        commands.extend((ms == 150).then_some(Command::SetCellOffset { offset_us: 1_000_000 }));
+        commands.extend((ms == 150).then_some(Command::SetCellOffset {
+            offset_us: 1_000_000,
+        }));
         if ms % 500 == 0 && ms <= 2000 {
-            commands.push(Command::TakeNeighbours { objects: neighbours(ms), stated_at: at(ms) });
+            commands.push(Command::TakeNeighbours {
+                objects: neighbours(ms),
+                stated_at: at(ms),
+            });
         }
         commands.extend((ms == 2500).then(slander));
         commands.push(Command::Tick);
         for command in commands {
             maps.extend(live.command(&command, at(ms)).and_then(|fused| fused.map));
-            let json = serde_json::to_vec(&JournalEntry { at_us: at(ms), event: JournalEvent::Command(command) });
+            let json = serde_json::to_vec(&JournalEntry {
+                at_us: at(ms),
+                event: JournalEvent::Command(command),
+            });
             let entry: JournalEntry = serde_json::from_slice(&json.unwrap()).unwrap();
             replayed.extend(journal.entry(&entry).into_iter().filter_map(map));
         }
         if ms >= 1000 && ms % 100 == 50 {
             let car = PerceivedObject::new("car", 0.9, car_at(ms - 10), 0.0);
             let stamp = at(ms - 10).shifted(if ms < 150 { 0 } else { 1_000_000 });
-            let seen =
-                ObjectReport { objects: vec![car], ..ObjectReport::new(NodeName::from_static("euclid"), ms, stamp) };
+            let seen = ObjectReport {
+                objects: vec![car],
+                ..ObjectReport::new(NodeName::from_static("euclid"), ms, stamp)
+            };
             let seen = Arc::new(seen);
-            maps.extend(live.report(ReportKind::Detections, &seen, at(ms)).unwrap().and_then(|fused| fused.map));
-            replayed.extend(journal.report(ReportKind::Detections, &seen, at(ms)).into_iter().filter_map(map));
+            maps.extend(
+                live.report(ReportKind::Detections, &seen, at(ms))
+                    .unwrap()
+                    .and_then(|fused| fused.map),
+            );
+            replayed.extend(
+                journal
+                    .report(ReportKind::Detections, &seen, at(ms))
+                    .into_iter()
+                    .filter_map(map),
+            );
         }
     }
-    assert_eq!(serde_json::to_string(&maps).unwrap(), serde_json::to_string(&replayed).unwrap());
-    let ids = |map: &GlobalMap| -> Vec<u128> { map.neighbour_objects.iter().map(|o| o.object.id.as_u128()).collect() };
-    let at_time = |ms: u64| maps.iter().rfind(|map| map.fused_at_us <= at(ms + 1000)).unwrap();
+    assert_eq!(
+        serde_json::to_string(&maps).unwrap(),
+        serde_json::to_string(&replayed).unwrap()
+    );
+    let ids = |map: &GlobalMap| -> Vec<u128> {
+        map.neighbour_objects
+            .iter()
+            .map(|o| o.object.id.as_u128())
+            .collect()
+    };
+    let at_time = |ms: u64| {
+        maps.iter()
+            .rfind(|map| map.fused_at_us <= at(ms + 1000))
+            .unwrap()
+    };
     assert_eq!(ids(at_time(900)), [7, 8]);
     assert_eq!(ids(at_time(1600)), [8], "it has come over");
-    let came = at_time(1600).objects.iter().find(|object| object.id.as_u128() == 7).unwrap();
-    assert_eq!(came.first_seen_us, Some(at(1000) - Duration::from_secs(5)), "in the cell's time");
-    assert!(at_time(3300).neighbour_objects.iter().all(|near| near.age_s <= 1.5));
+    let came = at_time(1600)
+        .objects
+        .iter()
+        .find(|object| object.id.as_u128() == 7)
+        .unwrap();
+    assert_eq!(
+        came.first_seen_us,
+        Some(at(1000) - Duration::from_secs(5)),
+        "in the cell's time"
+    );
+    assert!(
+        at_time(3300)
+            .neighbour_objects
+            .iter()
+            .all(|near| near.age_s <= 1.5)
+    );
     assert_eq!(ids(at_time(3300)), [8]);
     assert_eq!(ids(at_time(3700)), [], "too old");
-    let existence = |ms: u64| at_time(ms).objects.iter().filter_map(|object| object.existence).fold(0.0, f64::max);
-    assert!(existence(2600) < existence(2400) - 0.02, "{} {}", existence(2400), existence(2600));
+    let existence = |ms: u64| {
+        at_time(ms)
+            .objects
+            .iter()
+            .filter_map(|object| object.existence)
+            .fold(0.0, f64::max)
+    };
+    assert!(
+        existence(2600) < existence(2400) - 0.02,
+        "{} {}",
+        existence(2400),
+        existence(2600)
+    );
 }

@@ -19,7 +19,12 @@ fn two_people_side_by_side_stay_two_though_one_is_overlooked_at_times() {
         let round = tracker.close(at(frame));
         if frame > 20 {
             ids.extend(sure(&round).iter().map(|object| object.id));
-            assert_eq!(sure(&round).len(), 2, "in frame {frame}: {:?}", round.objects);
+            assert_eq!(
+                sure(&round).len(),
+                2,
+                "in frame {frame}: {:?}",
+                round.objects
+            );
         }
     }
     assert_eq!(ids.len(), 2);
@@ -30,13 +35,31 @@ fn a_person_at_the_door_of_a_vehicle_is_not_taken_for_it() {
     let mut tracker = tracker();
     for frame in 0..40 {
         let pose = Some(WirePose::new(0.0, 0.0, 0.0));
-        let objects = if frame % 4 == 3 { vec![] } else { vec![person(0.0, 1.6)] };
-        tracker.observe(ObjectReport { pose, ..report("euclid", frame, objects) }, at(frame));
+        let objects = if frame % 4 == 3 {
+            vec![]
+        } else {
+            vec![person(0.0, 1.6)]
+        };
+        tracker.observe(
+            ObjectReport {
+                pose,
+                ..report("euclid", frame, objects)
+            },
+            at(frame),
+        );
         let round = tracker.close(at(frame));
         if frame > 10 {
-            let mut labels: Vec<_> = sure(&round).iter().map(|object| object.label.to_string()).collect();
+            let mut labels: Vec<_> = sure(&round)
+                .iter()
+                .map(|object| object.label.to_string())
+                .collect();
             labels.sort();
-            assert_eq!(labels, ["car", "person"], "in frame {frame}: {:?}", round.objects);
+            assert_eq!(
+                labels,
+                ["car", "person"],
+                "in frame {frame}: {:?}",
+                round.objects
+            );
         }
     }
 }
@@ -50,10 +73,21 @@ fn a_vehicle_that_comes_up_beside_a_person_does_not_carry_it_away() {
         tracker.observe(report("gauss", frame, vec![person(0.0, 2.0)]), at(frame));
         if frame >= 20 {
             let pose = Some(WirePose::new(0.8 * (frame - 20) as f64, 0.0, 0.0));
-            tracker.observe(ObjectReport { pose, ..report("euclid", frame, vec![]) }, at(frame));
+            tracker.observe(
+                ObjectReport {
+                    pose,
+                    ..report("euclid", frame, vec![])
+                },
+                at(frame),
+            );
         }
         let round = tracker.close(at(frame));
-        of_person.extend(sure(&round).iter().filter(|object| object.label == "person").map(|object| object.id));
+        of_person.extend(
+            sure(&round)
+                .iter()
+                .filter(|object| object.label == "person")
+                .map(|object| object.id),
+        );
     }
     assert_eq!(of_person.len(), 1);
 }
@@ -64,16 +98,35 @@ fn nobody_is_blamed_for_what_is_hidden_behind_what_it_sees() {
     let mut tracker = tracker();
     let mut wrong = 0;
     for frame in 0..150 {
-        let trucks: Vec<_> = (0..5).map(|n| car(f64::from(n) * 8.0 - 16.0, 10.0)).collect();
+        let trucks: Vec<_> = (0..5)
+            .map(|n| car(f64::from(n) * 8.0 - 16.0, 10.0))
+            .collect();
         let people = (0..5).map(|n| person(f64::from(n) * 16.0 - 32.0, 20.0));
         let all: Vec<_> = trucks.iter().cloned().chain(people).collect();
-        let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
-        for (node, y_m, objects) in [("hidden", 0.0, trucks), ("left", 15.0, all.clone()), ("right", 16.0, all)] {
+        let view = Some(FieldOfView {
+            range_m: 60.0,
+            angle_rad: std::f64::consts::TAU,
+        });
+        for (node, y_m, objects) in [
+            ("hidden", 0.0, trucks),
+            ("left", 15.0, all.clone()),
+            ("right", 16.0, all),
+        ] {
             let pose = Some(WirePose::new(if y_m > 0.0 { 50.0 } else { 0.0 }, y_m, 0.0));
-            tracker.observe(ObjectReport { pose, view, ..report(node, frame, objects) }, at(frame));
+            tracker.observe(
+                ObjectReport {
+                    pose,
+                    view,
+                    ..report(node, frame, objects)
+                },
+                at(frame),
+            );
         }
         let evidence = tracker.close(at(frame)).evidence;
-        wrong += evidence.iter().filter(|word| word.node == name("hidden") && !word.correct).count();
+        wrong += evidence
+            .iter()
+            .filter(|word| word.node == name("hidden") && !word.correct)
+            .count();
     }
     assert_eq!(wrong, 0);
 }

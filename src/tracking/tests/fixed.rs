@@ -18,7 +18,13 @@ impl Camera {
             let (sin, cos) = (n as f64 * std::f64::consts::TAU / count as f64 + 0.6).sin_cos();
             let place = Vector2::new(cos, sin) * 15.0;
             let offset = Vector2::new(noise(rng, 0.5), noise(rng, 0.5));
-            Self { node: format!("camera-{n}"), place, offset, turned_rad: noise(rng, 0.01), is_posed }
+            Self {
+                node: format!("camera-{n}"),
+                place,
+                offset,
+                turned_rad: noise(rng, 0.01),
+                is_posed,
+            }
         };
         (0..count).map(camera).collect()
     }
@@ -35,7 +41,10 @@ impl Camera {
             }
         }
         let pose = WirePose::new(self.place.x, self.place.y, 0.0);
-        ObjectReport { pose: self.is_posed.then_some(pose), ..report(&self.node, frame, objects) }
+        ObjectReport {
+            pose: self.is_posed.then_some(pose),
+            ..report(&self.node, frame, objects)
+        }
     }
 }
 
@@ -59,19 +68,30 @@ struct Common {
 
 /// The common part of all corrections, and the largest remaining error between two cameras, each at the centre of its
 /// rotation: metres and radians.
-fn common_and_rest(tracker: &Tracker, round: &TracksRound, cameras: &[Camera]) -> (Common, f64, f64) {
+fn common_and_rest(
+    tracker: &Tracker,
+    round: &TracksRound,
+    cameras: &[Camera],
+) -> (Common, f64, f64) {
     let mut common = Common::default();
     let mut rests = Vec::new();
     for camera in cameras {
         let node = name(&camera.node);
-        let Some(correction) = round.pose_corrections.get(&node) else { continue };
+        let Some(correction) = round.pose_corrections.get(&node) else {
+            continue;
+        };
         let arm = Vector2::from(correction.about_m) - camera.place;
         let wrong = camera.offset + nalgebra::Rotation2::new(camera.turned_rad) * arm - arm;
         let offset = Vector2::new(correction.dx_m, correction.dy_m);
         common.offset += offset;
         common.rotation_rad += correction.dheading_rad;
-        let pose_bias = tracker.sensors.by_name(&node).map(|sensor| &sensor.pose_bias);
-        common.delay_s += pose_bias.map_or(0.0, |pose_bias| pose_bias.delay_s(&TracksConfig::default().bias_prior()));
+        let pose_bias = tracker
+            .sensors
+            .by_name(&node)
+            .map(|sensor| &sensor.pose_bias);
+        common.delay_s += pose_bias.map_or(0.0, |pose_bias| {
+            pose_bias.delay_s(&TracksConfig::default().bias_prior())
+        });
         rests.push((offset + wrong, correction.dheading_rad + camera.turned_rad));
     }
     let count = rests.len().max(1) as f64;
@@ -80,7 +100,11 @@ fn common_and_rest(tracker: &Tracker, round: &TracksRound, cameras: &[Camera]) -
     common.delay_s /= count;
     let pairs = || rests.iter().flat_map(|a| rests.iter().map(move |b| (a, b)));
     let apart_m = pairs().map(|(a, b)| (a.0 - b.0).norm()).fold(0.0, f64::max);
-    (common, apart_m, pairs().map(|(a, b)| (a.1 - b.1).abs()).fold(0.0, f64::max))
+    (
+        common,
+        apart_m,
+        pairs().map(|(a, b)| (a.1 - b.1).abs()).fold(0.0, f64::max),
+    )
 }
 
 /// An hour at two frames a second. A radian of rotation in common moves what is 15 m away by 15 m, a second of delay the
@@ -100,17 +124,35 @@ fn nothing_moves_the_map_of_fixed_cameras() {
             let (common, apart_m, apart_rad) = common_and_rest(&tracker, &round, &cameras);
             if frame > 600 {
                 assert_eq!(round.pose_corrections.len(), count, "at frame {frame}");
-                let Common { offset, rotation_rad, delay_s } = common;
-                let figures = [offset.norm(), 15.0 * rotation_rad.abs(), 2.0 * delay_s.abs(), apart_m, apart_rad];
-                sums.iter_mut().zip(figures).for_each(|(sum, figure)| *sum += figure);
+                let Common {
+                    offset,
+                    rotation_rad,
+                    delay_s,
+                } = common;
+                let figures = [
+                    offset.norm(),
+                    15.0 * rotation_rad.abs(),
+                    2.0 * delay_s.abs(),
+                    apart_m,
+                    apart_rad,
+                ];
+                sums.iter_mut()
+                    .zip(figures)
+                    .for_each(|(sum, figure)| *sum += figure);
                 rounds += 1.0;
             }
         }
         let [shifted_m, turned_m, delayed_m, apart_m, apart_rad] = sums.map(|sum| sum / rounds);
         let scene = format!("{count} cameras, poses {is_posed}");
         let common = [shifted_m, turned_m, delayed_m];
-        assert!(common.iter().all(|moved_m| *moved_m < 0.02), "{scene}: {common:?} m in common");
-        assert!(apart_m < 0.1 && apart_rad < 0.005, "{scene}: {apart_m} m and {apart_rad} rad apart");
+        assert!(
+            common.iter().all(|moved_m| *moved_m < 0.02),
+            "{scene}: {common:?} m in common"
+        );
+        assert!(
+            apart_m < 0.1 && apart_rad < 0.005,
+            "{scene}: {apart_m} m and {apart_rad} rad apart"
+        );
     }
 }
 
@@ -124,21 +166,41 @@ fn a_camera_that_declares_to_stand_is_aligned_and_stays_so() {
         let mut tracker = tracker();
         let mut corrections = Vec::new();
         for frame in (0..8000).step_by(5) {
-            let people = if frame < 500 { people(frame) } else { Vec::new() };
+            let people = if frame < 500 {
+                people(frame)
+            } else {
+                Vec::new()
+            };
             for camera in &cameras {
-                let mut report = ObjectReport { moving: Some(false), ..camera.report(frame, &people, &mut rng) };
-                report.pose.iter_mut().for_each(|pose| pose.x_m += noise(&mut rng, 0.01));
+                let mut report = ObjectReport {
+                    moving: Some(false),
+                    ..camera.report(frame, &people, &mut rng)
+                };
+                report
+                    .pose
+                    .iter_mut()
+                    .for_each(|pose| pose.x_m += noise(&mut rng, 0.01));
                 tracker.observe(report, at(frame));
             }
             let round = tracker.close(at(frame));
             if matches!(frame, 500 | 7995) {
-                let kept = cameras.iter().filter_map(|camera| round.pose_corrections.get(&name(&camera.node)));
-                corrections.push(kept.map(|kept| Vector2::new(kept.dx_m, kept.dy_m)).collect::<Vec<_>>());
+                let kept = cameras
+                    .iter()
+                    .filter_map(|camera| round.pose_corrections.get(&name(&camera.node)));
+                corrections.push(
+                    kept.map(|kept| Vector2::new(kept.dx_m, kept.dy_m))
+                        .collect::<Vec<_>>(),
+                );
                 let (_, apart_m, _) = common_and_rest(&tracker, &round, &cameras);
-                assert!(apart_m < 0.2, "poses {is_posed}: {apart_m} m apart at frame {frame}");
+                assert!(
+                    apart_m < 0.2,
+                    "poses {is_posed}: {apart_m} m apart at frame {frame}"
+                );
             }
         }
-        let [before, after] = &corrections[..] else { panic!("{corrections:?}") };
+        let [before, after] = &corrections[..] else {
+            panic!("{corrections:?}")
+        };
         assert_eq!((before.len(), after.len()), (2, 2), "{corrections:?}");
         let is_kept = before.iter().zip(after).all(|(a, b)| (a - b).norm() < 0.02);
         assert!(is_kept, "poses {is_posed}: from {before:?} to {after:?}");
@@ -158,30 +220,46 @@ fn a_camera_does_not_take_over_the_error_of_a_vehicle_however_often_it_reports()
         let mut corrected_m = Vec::new();
         for frame in 0..3000 {
             if frame % camera_every == 0 {
-                tracker.observe(observers[0].report(frame, &people(frame), &mut rng), at(frame));
+                tracker.observe(
+                    observers[0].report(frame, &people(frame), &mut rng),
+                    at(frame),
+                );
             }
             let mut report = observers[1].report(frame, &people(frame), &mut rng);
             // Estimates of a pose differ while the vehicle waits.
-            report.pose.iter_mut().for_each(|pose| pose.x_m += noise(&mut rng, 0.01));
+            report
+                .pose
+                .iter_mut()
+                .for_each(|pose| pose.x_m += noise(&mut rng, 0.01));
             tracker.observe(report, at(frame));
             let round = tracker.close(at(frame));
             if frame >= 2000 {
-                let [camera, vehicle] = [0, 1].map(|n| round.pose_corrections[&name(&observers[n].node)].dx_m);
+                let [camera, vehicle] =
+                    [0, 1].map(|n| round.pose_corrections[&name(&observers[n].node)].dx_m);
                 corrected_m.push(Vector2::new(camera, vehicle));
             }
         }
         let mean = corrected_m.iter().sum::<Vector2<f64>>() / corrected_m.len() as f64;
         let is_left_alone = mean.x.abs() < 0.1 && (-0.5..-0.2).contains(&mean.y);
-        assert!(is_left_alone, "every {camera_every}: camera and vehicle are corrected by {mean:?}");
+        assert!(
+            is_left_alone,
+            "every {camera_every}: camera and vehicle are corrected by {mean:?}"
+        );
     }
 }
 
 /// Mean offset of the objects of a map from the people that are nearest.
 fn off(round: &TracksRound, people: &[Vector2<f64>]) -> Vector2<f64> {
-    let cars = sure(round).into_iter().filter(|object| object.vehicle.is_none());
+    let cars = sure(round)
+        .into_iter()
+        .filter(|object| object.vehicle.is_none());
     let offset = |object: &FusedObject| {
-        let offsets = people.iter().map(|person| Vector2::new(object.x_m, object.y_m) - person);
-        offsets.min_by(|a, b| a.norm().total_cmp(&b.norm())).unwrap_or_default()
+        let offsets = people
+            .iter()
+            .map(|person| Vector2::new(object.x_m, object.y_m) - person);
+        offsets
+            .min_by(|a, b| a.norm().total_cmp(&b.norm()))
+            .unwrap_or_default()
     };
     let offsets: Vec<_> = cars.map(offset).collect();
     offsets.iter().sum::<Vector2<f64>>() / offsets.len().max(1) as f64
@@ -206,8 +284,12 @@ fn the_map_stays_where_it_is_when_a_camera_leaves() {
             _ => {}
         }
     }
-    let [with, without] = [with, without].map(|off| off.iter().sum::<Vector2<f64>>() / off.len() as f64);
-    assert!((with - without).norm() < 0.05, "from {with:?} to {without:?}");
+    let [with, without] =
+        [with, without].map(|off| off.iter().sum::<Vector2<f64>>() / off.len() as f64);
+    assert!(
+        (with - without).norm() < 0.05,
+        "from {with:?} to {without:?}"
+    );
 }
 
 /// Two cameras stand for an hour; the third, wrong by 0.9 m more, joins then.
@@ -230,13 +312,19 @@ fn a_camera_that_joins_an_hour_later_is_aligned_and_does_not_pull_the_others() {
                 35_000..36_000 => before.push(common.offset),
                 38_000.. => {
                     after.push(common.offset);
-                    rest_m = rest_m.max(rest).max(common_and_rest(&tracker, &round, &cameras).1);
+                    rest_m = rest_m
+                        .max(rest)
+                        .max(common_and_rest(&tracker, &round, &cameras).1);
                 }
                 _ => {}
             }
         }
-        let [before, after] = [before, after].map(|common| common.iter().sum::<Vector2<f64>>() / common.len() as f64);
-        assert!((after - before).norm() < 0.05, "poses {is_posed}: from {before:?} to {after:?}");
+        let [before, after] =
+            [before, after].map(|common| common.iter().sum::<Vector2<f64>>() / common.len() as f64);
+        assert!(
+            (after - before).norm() < 0.05,
+            "poses {is_posed}: from {before:?} to {after:?}"
+        );
         assert!(rest_m < 0.2, "poses {is_posed}: {rest_m} m apart");
     }
 }

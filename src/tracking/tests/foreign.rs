@@ -6,7 +6,11 @@ use super::*;
 use crate::wire::NeighbourObject;
 
 fn stated(cell: &str, age_s: f64, object: FusedObject) -> NeighbourObject {
-    NeighbourObject { cell: name(cell), age_s, object }
+    NeighbourObject {
+        cell: name(cell),
+        age_s,
+        object,
+    }
 }
 
 /// A car that a neighbouring cell follows.
@@ -17,15 +21,30 @@ fn foreign_car(number: u128, x_m: f64, y_m: f64, velocity_mps: [f64; 2]) -> Fuse
         velocity_mps: Some(velocity_mps),
         age_s: Some(0.05),
         first_seen_us: Some(Timestamp(START.0 - 20_000_000)),
-        ..FusedObject::new(Uuid::from_u128(number), "car", 0.95, x_m, y_m, Covariance::isotropic(0.3))
+        ..FusedObject::new(
+            Uuid::from_u128(number),
+            "car",
+            0.95,
+            x_m,
+            y_m,
+            Covariance::isotropic(0.3),
+        )
     }
 }
 
 /// A report with a view all around from the middle of the scene.
 fn watching(node: &str, frame: u64, objects: Vec<PerceivedObject>) -> ObjectReport {
     let pose = crate::model::geometry::Pose::new(0.0, -8.0, 0.0).into();
-    let view = FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU };
-    ObjectReport { pose: Some(pose), moving: Some(false), view: Some(view), ..report(node, frame, objects) }
+    let view = FieldOfView {
+        range_m: 60.0,
+        angle_rad: std::f64::consts::TAU,
+    };
+    ObjectReport {
+        pose: Some(pose),
+        moving: Some(false),
+        view: Some(view),
+        ..report(node, frame, objects)
+    }
 }
 
 #[test]
@@ -38,23 +57,53 @@ fn an_object_that_comes_over_keeps_its_identity_and_its_velocity() {
         if frame % 5 == 0 && frame <= 15 {
             let car = stated("west", 0.1, foreign_car(7, x_m - 1.0, 0.0, [10.0, 0.0]));
             tracker.take_neighbours(std::slice::from_ref(&car), at(frame));
-            assert_eq!(tracker.hides(&car), frame > 10, "shown as the neighbour's until it is this cell's");
+            assert_eq!(
+                tracker.hides(&car),
+                frame > 10,
+                "shown as the neighbour's until it is this cell's"
+            );
         }
-        let seen = if frame < 10 { Vec::new() } else { vec![car(x_m, 0.1), car(0.0, 20.0)] };
+        let seen = if frame < 10 {
+            Vec::new()
+        } else {
+            vec![car(x_m, 0.1), car(0.0, 20.0)]
+        };
         tracker.observe(report("euclid", frame, seen), at(frame));
         let round = tracker.close(at(frame));
-        assert!(frame >= 10 || round.objects.is_empty(), "a neighbour's object is no object of this cell");
+        assert!(
+            frame >= 10 || round.objects.is_empty(),
+            "a neighbour's object is no object of this cell"
+        );
         if frame == 11 {
-            let velocity = round.objects.iter().find_map(|object| object.velocity_mps).unwrap();
-            assert!((velocity[0] - 10.0).abs() < 2.5, "after two detections: {velocity:?}");
+            let velocity = round
+                .objects
+                .iter()
+                .find_map(|object| object.velocity_mps)
+                .unwrap();
+            assert!(
+                (velocity[0] - 10.0).abs() < 2.5,
+                "after two detections: {velocity:?}"
+            );
         }
         if frame >= 10 {
-            let here = round.objects.iter().filter(|object| near(object, x_m, 0.0, 1.5));
+            let here = round
+                .objects
+                .iter()
+                .filter(|object| near(object, x_m, 0.0, 1.5));
             ids.extend(here.map(|object| (object.id.as_u128(), object.first_seen_us)));
         }
     }
-    assert_eq!(ids, BTreeSet::from([(7, Some(Timestamp(START.0 - 20_000_000)))]));
-    assert_eq!(tracker.hand_overs(), HandOvers { begun: 1, renamed: 0 });
+    assert_eq!(
+        ids,
+        BTreeSet::from([(7, Some(Timestamp(START.0 - 20_000_000)))])
+    );
+    assert_eq!(
+        tracker.hand_overs(),
+        HandOvers {
+            begun: 1,
+            renamed: 0
+        }
+    );
 }
 
 /// Two cells that see the same eight cars; `later` frames after the first, the second begins. Maps go both ways twice a
@@ -65,26 +114,46 @@ fn two_cells(later: u64) -> [Vec<Uuid>; 2] {
     let mut begun: Vec<Uuid> = Vec::new();
     let mut changes = 0;
     let ids = |objects: &[FusedObject]| {
-        let mut placed: Vec<_> = objects.iter().map(|object| (object.x_m.round() as i64, object.id)).collect();
+        let mut placed: Vec<_> = objects
+            .iter()
+            .map(|object| (object.x_m.round() as i64, object.id))
+            .collect();
         placed.sort_unstable();
         placed.into_iter().map(|(_, id)| id).collect::<Vec<Uuid>>()
     };
     for frame in 0..150 {
         let before = maps.clone();
-        for (number, cell) in cells.iter_mut().enumerate().filter(|(number, _)| *number == 0 || frame >= later) {
+        for (number, cell) in cells
+            .iter_mut()
+            .enumerate()
+            .filter(|(number, _)| *number == 0 || frame >= later)
+        {
             if frame % 5 == 0 && frame > later + 10 {
-                let theirs = before[1 - number].iter().map(|object| stated("other", 0.1, object.clone()));
+                let theirs = before[1 - number]
+                    .iter()
+                    .map(|object| stated("other", 0.1, object.clone()));
                 cell.take_neighbours(&theirs.collect::<Vec<_>>(), at(frame));
             }
             for node in ["euclid", "gauss"] {
-                let cars = (0..8).map(|place| car(10.0 * f64::from(place) - 35.0, 0.05 * number as f64));
-                cell.observe(watching(&format!("{node}-{number}"), frame, cars.collect()), at(frame));
+                let cars =
+                    (0..8).map(|place| car(10.0 * f64::from(place) - 35.0, 0.05 * number as f64));
+                cell.observe(
+                    watching(&format!("{node}-{number}"), frame, cars.collect()),
+                    at(frame),
+                );
             }
             let objects: Vec<FusedObject> = cell.close(at(frame)).objects;
-            let objects: Vec<_> = objects.into_iter().filter(|object| object.confidence > 0.5).collect();
+            let objects: Vec<_> = objects
+                .into_iter()
+                .filter(|object| object.confidence > 0.5)
+                .collect();
             let known = ids(&before[number]);
             if known.len() == 8 && objects.len() == 8 {
-                changes += known.iter().zip(ids(&objects)).filter(|(before, after)| *before != after).count();
+                changes += known
+                    .iter()
+                    .zip(ids(&objects))
+                    .filter(|(before, after)| *before != after)
+                    .count();
             }
             maps[number] = objects;
         }
@@ -94,9 +163,18 @@ fn two_cells(later: u64) -> [Vec<Uuid>; 2] {
     }
     let ends: Vec<Uuid> = maps.iter().flat_map(|objects| ids(objects)).collect();
     assert_eq!((begun.len(), ends.len()), (16, 16));
-    assert!(begun[..8].iter().all(|id| !begun[8..].contains(id)), "each cell began with its own identities");
-    assert!(changes <= 8, "each object changes its identity once, in one of the cells: {changes} changes");
-    assert_eq!(cells.map(|cell| cell.trust_in_cell(&name("other"))), [1.0, 1.0]);
+    assert!(
+        begun[..8].iter().all(|id| !begun[8..].contains(id)),
+        "each cell began with its own identities"
+    );
+    assert!(
+        changes <= 8,
+        "each object changes its identity once, in one of the cells: {changes} changes"
+    );
+    assert_eq!(
+        cells.map(|cell| cell.trust_in_cell(&name("other"))),
+        [1.0, 1.0]
+    );
     [ends, begun]
 }
 
@@ -110,7 +188,9 @@ fn two_cells_agree_on_the_identity_of_the_older_track() {
 #[test]
 fn of_two_tracks_as_old_the_smaller_identity_stays() {
     let [ends, begun] = two_cells(0);
-    let smaller: Vec<Uuid> = (0..8).map(|place| begun[place].min(begun[8 + place])).collect();
+    let smaller: Vec<Uuid> = (0..8)
+        .map(|place| begun[place].min(begun[8 + place]))
+        .collect();
     assert_eq!(ends[..8], smaller);
     assert_eq!(ends[8..], smaller);
 }
@@ -132,12 +212,18 @@ fn lied_to(
             let cars = (0..6).map(|place| {
                 let speed_mps = [10.0, -10.0, 5.0, -5.0, 0.0, 0.0][place];
                 let x_m = speed_mps * (frame as f64 / 10.0 - 6.0) * 0.5;
-                car(x_m + noise(&mut rng, 0.3), 8.0 * place as f64 + noise(&mut rng, 0.3))
+                car(
+                    x_m + noise(&mut rng, 0.3),
+                    8.0 * place as f64 + noise(&mut rng, 0.3),
+                )
             });
             tracker.observe(watching(node, frame, cars.collect()), at(frame));
         }
         let round = tracker.close(at(frame));
-        let mut sure: Vec<[f64; 2]> = sure(&round).iter().map(|object| [object.x_m, object.y_m]).collect();
+        let mut sure: Vec<[f64; 2]> = sure(&round)
+            .iter()
+            .map(|object| [object.x_m, object.y_m])
+            .collect();
         sure.sort_by(|a, b| a[1].total_cmp(&b[1]));
         rounds.push(sure);
         objects = round.objects;
@@ -148,16 +234,30 @@ fn lied_to(
 #[test]
 fn a_cell_whose_objects_nobody_sees_is_believed_no_more() {
     let mut tracker = tracker();
-    let ghost = |number: u128| stated("liar", 0.1, foreign_car(number, 4.0 * number as f64 - 20.0, -20.0, [0.0, 0.0]));
+    let ghost = |number: u128| {
+        stated(
+            "liar",
+            0.1,
+            foreign_car(number, 4.0 * number as f64 - 20.0, -20.0, [0.0, 0.0]),
+        )
+    };
     lied_to(&mut tracker, |_, _| (0..8).map(ghost).collect());
     assert_eq!(tracker.trust_in_cell(&name("liar")), 0.0);
     assert!(tracker.hides(&ghost(1)));
     // Nothing of it is handed over: a car that comes to where a ghost is has an identity of this cell.
     for frame in 120..125 {
         tracker.take_neighbours(&[ghost(1)], at(frame));
-        tracker.observe(watching("euclid", frame, vec![car(-16.0, -20.0)]), at(frame));
+        tracker.observe(
+            watching("euclid", frame, vec![car(-16.0, -20.0)]),
+            at(frame),
+        );
         let round = tracker.close(at(frame));
-        assert!(round.objects.iter().all(|object| object.id != Uuid::from_u128(1)));
+        assert!(
+            round
+                .objects
+                .iter()
+                .all(|object| object.id != Uuid::from_u128(1))
+        );
     }
 }
 
@@ -165,9 +265,17 @@ fn a_cell_whose_objects_nobody_sees_is_believed_no_more() {
 fn a_cell_that_changes_identities_all_the_time_is_judged_too() {
     let mut tracker = tracker();
     lied_to(&mut tracker, |frame, _| {
-        let ghost =
-            |number: u128| foreign_car(1000 * u128::from(frame) + number, 4.0 * number as f64 - 20.0, -20.0, [0.0; 2]);
-        (0..8).map(|number| stated("liar", 0.1, ghost(number))).collect()
+        let ghost = |number: u128| {
+            foreign_car(
+                1000 * u128::from(frame) + number,
+                4.0 * number as f64 - 20.0,
+                -20.0,
+                [0.0; 2],
+            )
+        };
+        (0..8)
+            .map(|number| stated("liar", 0.1, ghost(number)))
+            .collect()
     });
     assert_eq!(tracker.trust_in_cell(&name("liar")), 0.0);
 }

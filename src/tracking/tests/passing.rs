@@ -12,64 +12,114 @@ fn log_odds_of_a_car(is_passed: bool) -> f64 {
         tracker.observe(report("euclid", frame, vec![car(0.0, 0.0)]), at(frame));
         for n in 0..20 {
             let is_passing = is_passed && frame / 5 == n;
-            let x_m = if is_passing { 0.0 } else { 1000.0 + 50.0 * n as f64 };
-            tracker.observe(report(&format!("v{n:02}"), frame, vec![car(x_m, 0.0)]), at(frame));
+            let x_m = if is_passing {
+                0.0
+            } else {
+                1000.0 + 50.0 * n as f64
+            };
+            tracker.observe(
+                report(&format!("v{n:02}"), frame, vec![car(x_m, 0.0)]),
+                at(frame),
+            );
         }
         round = tracker.close(at(frame));
     }
-    let existence = round.objects.iter().find(|object| near(object, 0.0, 0.0, 1.0)).unwrap().existence.unwrap();
+    let existence = round
+        .objects
+        .iter()
+        .find(|object| near(object, 0.0, 0.0, 1.0))
+        .unwrap()
+        .existence
+        .unwrap();
     (existence / (1.0 - existence)).ln()
 }
 
 #[test]
 fn whoever_has_passed_an_object_looks_at_it_no_more() {
     let [passed, alone] = [true, false].map(log_odds_of_a_car);
-    assert!((passed - alone).abs() < 0.2, "log-odds are {passed} after twenty have passed, {alone} if nobody has");
+    assert!(
+        (passed - alone).abs() < 0.2,
+        "log-odds are {passed} after twenty have passed, {alone} if nobody has"
+    );
 }
 
 /// Existence of a car that `believer` states alone, with `liar` beside it or not, while two that look there see nothing.
 fn existence_of_a_ghost(is_liar_beside: bool) -> f64 {
     let mut tracker = tracker();
-    tracker.sensors.dormant.keep([(name("liar"), TrustCounts::new(0.0, 40.0, &ReputationConfig::default()))]);
+    tracker.sensors.dormant.keep([(
+        name("liar"),
+        TrustCounts::new(0.0, 40.0, &ReputationConfig::default()),
+    )]);
     let mut round = TracksRound::default();
     for frame in 0..15 {
-        let believers = ["believer", "liar"].into_iter().take(1 + usize::from(is_liar_beside));
+        let believers = ["believer", "liar"]
+            .into_iter()
+            .take(1 + usize::from(is_liar_beside));
         for node in believers {
             tracker.observe(report(node, frame, vec![car(0.0, 20.0)]), at(frame));
         }
         for (n, node) in ["a", "b"].into_iter().enumerate() {
-            let pose = Some(WirePose::new(10.0 * n as f64, 0.0, std::f64::consts::FRAC_PI_2));
-            let view = Some(FieldOfView { range_m: 60.0, angle_rad: 3.0 });
+            let pose = Some(WirePose::new(
+                10.0 * n as f64,
+                0.0,
+                std::f64::consts::FRAC_PI_2,
+            ));
+            let view = Some(FieldOfView {
+                range_m: 60.0,
+                angle_rad: 3.0,
+            });
             let seen = vec![car(5.0, 8.0), car(-20.0, 30.0), car(30.0, 30.0)];
-            tracker.observe(ObjectReport { pose, view, ..report(node, frame, seen) }, at(frame));
+            tracker.observe(
+                ObjectReport {
+                    pose,
+                    view,
+                    ..report(node, frame, seen)
+                },
+                at(frame),
+            );
         }
         round = tracker.close(at(frame));
     }
-    let ghost = round.objects.iter().find(|object| near(object, 0.0, 20.0, 1.0));
+    let ghost = round
+        .objects
+        .iter()
+        .find(|object| near(object, 0.0, 20.0, 1.0));
     ghost.map_or(0.0, |object| object.existence.unwrap())
 }
 
 #[test]
 fn a_liar_is_no_second_witness() {
     let [with_liar, without] = [true, false].map(existence_of_a_ghost);
-    assert!(with_liar < without + 0.02, "{with_liar} with a liar beside, {without} without");
+    assert!(
+        with_liar < without + 0.02,
+        "{with_liar} with a liar beside, {without} without"
+    );
 }
 
 #[test]
 fn a_vehicle_of_little_trust_is_not_believed_the_more_for_it() {
     let existence = |wrong: f64| {
         let mut tracker = tracker();
-        tracker.sensors.dormant.keep([(name("fool"), TrustCounts::new(0.0, wrong, &ReputationConfig::default()))]);
+        tracker.sensors.dormant.keep([(
+            name("fool"),
+            TrustCounts::new(0.0, wrong, &ReputationConfig::default()),
+        )]);
         let mut round = TracksRound::default();
         for frame in 0..20 {
             tracker.observe(report("fool", frame, vec![car(0.0, 0.0)]), at(frame));
             round = tracker.close(at(frame));
         }
-        round.objects.first().map_or(0.0, |object| object.existence.unwrap())
+        round
+            .objects
+            .first()
+            .map_or(0.0, |object| object.existence.unwrap())
     };
     let by_distrust: Vec<f64> = [0.0, 3.0, 5.0, 6.0].map(existence).into();
     println!("{by_distrust:?}");
-    assert!(by_distrust.is_sorted_by(|more, less| more >= less) && by_distrust[3] < 0.5, "{by_distrust:?}");
+    assert!(
+        by_distrust.is_sorted_by(|more, less| more >= less) && by_distrust[3] < 0.5,
+        "{by_distrust:?}"
+    );
 }
 
 /// The vehicle that leaves has seen a duplicate of a parked car in its last frame. The two that stay see the car a metre apart.
@@ -80,34 +130,52 @@ fn a_duplicate_goes_when_the_vehicle_that_stated_it_has_left() {
     for frame in 0..100 {
         tracker.observe(report("b", frame, vec![car(-0.5, 0.0)]), at(frame));
         tracker.observe(report("c", frame, vec![car(0.5, 0.0)]), at(frame));
-        let seen = if frame < 5 { vec![car(-0.5, 0.0), car(0.5, 0.0)] } else { vec![car(1000.0, 0.0)] };
+        let seen = if frame < 5 {
+            vec![car(-0.5, 0.0), car(0.5, 0.0)]
+        } else {
+            vec![car(1000.0, 0.0)]
+        };
         tracker.observe(report("a", frame, seen), at(frame));
         round = tracker.close(at(frame));
     }
-    let cars = sure(&round).iter().filter(|object| near(object, 0.0, 0.0, 2.0)).count();
+    let cars = sure(&round)
+        .iter()
+        .filter(|object| near(object, 0.0, 0.0, 2.0))
+        .count();
     assert_eq!(cars, 1, "{:?}", sure(&round));
 }
 
 #[test]
 fn a_heading_of_another_aggregator_gives_way_to_the_course() {
     let (mut leader, mut newcomer) = (tracker(), tracker());
-    let drive = |tracker: &mut Tracker, frames: std::ops::Range<u64>, place: fn(f64) -> [f64; 2]| {
-        let mut round = TracksRound::default();
-        for frame in frames {
-            let [x_m, y_m] = place(frame as f64);
-            tracker.observe(report("euclid", frame, vec![car(x_m, y_m)]), at(frame));
-            round = tracker.close(at(frame));
-        }
-        round
-    };
+    let drive =
+        |tracker: &mut Tracker, frames: std::ops::Range<u64>, place: fn(f64) -> [f64; 2]| {
+            let mut round = TracksRound::default();
+            for frame in frames {
+                let [x_m, y_m] = place(frame as f64);
+                tracker.observe(report("euclid", frame, vec![car(x_m, y_m)]), at(frame));
+                round = tracker.close(at(frame));
+            }
+            round
+        };
     let east = drive(&mut leader, 0..30, |frame| [frame, 0.0]);
     let heading_rad = sure(&east)[0].heading_rad.unwrap();
     assert!(heading_rad.abs() < 0.1, "{heading_rad}");
-    let map = GlobalMap { objects: east.objects, ..GlobalMap::new(&Epoch::new(1, name("edge")), 30, at(29)) };
+    let map = GlobalMap {
+        objects: east.objects,
+        ..GlobalMap::new(&Epoch::new(1, name("edge")), 30, at(29))
+    };
     newcomer.adopt_map(&map, at(29));
     let taken_over = newcomer.close(at(29));
-    assert_eq!(taken_over.objects[0].heading_rad, Some(heading_rad), "until more is known");
+    assert_eq!(
+        taken_over.objects[0].heading_rad,
+        Some(heading_rad),
+        "until more is known"
+    );
     let north = drive(&mut newcomer, 30..70, |frame| [30.0, frame - 30.0]);
     let heading_rad = sure(&north)[0].heading_rad.unwrap();
-    assert!((heading_rad - std::f64::consts::FRAC_PI_2).abs() < 0.2, "{heading_rad}");
+    assert!(
+        (heading_rad - std::f64::consts::FRAC_PI_2).abs() < 0.2,
+        "{heading_rad}"
+    );
 }

@@ -16,10 +16,16 @@ fn whoever_fabricates_or_hides_objects_loses_its_trust() {
     }
     for false_one in ["hider", "liar"] {
         let (right, wrong) = counts[&name(false_one)];
-        assert!(wrong > 10 && wrong > 2 * right, "{false_one} {right} {wrong}");
+        assert!(
+            wrong > 10 && wrong > 2 * right,
+            "{false_one} {right} {wrong}"
+        );
     }
     let round = tracker.close(at(150));
-    let invented = sure(&round).iter().filter(|object| (object.y_m - 25.0).abs() < 3.0).count();
+    let invented = sure(&round)
+        .iter()
+        .filter(|object| (object.y_m - 25.0).abs() < 3.0)
+        .count();
     assert_eq!(invented, 0, "nobody believes a liar");
 }
 
@@ -30,11 +36,20 @@ fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
     let mut contributors = 0;
     for frame in 0..40 {
         for vehicle in 0..50 {
-            tracker.observe(report(&format!("v{vehicle:02}"), frame, vec![car(0.0, 0.0)]), at(frame));
+            tracker.observe(
+                report(&format!("v{vehicle:02}"), frame, vec![car(0.0, 0.0)]),
+                at(frame),
+            );
         }
         let round = tracker.close(at(frame));
         contributors = round.objects[0].contributors.len();
-        judged.extend(round.evidence.into_iter().filter(|word| word.correct).map(|word| word.node));
+        judged.extend(
+            round
+                .evidence
+                .into_iter()
+                .filter(|word| word.correct)
+                .map(|word| word.node),
+        );
     }
     assert_eq!((judged.len(), contributors), (32, 32));
 }
@@ -42,10 +57,18 @@ fn of_more_vehicles_than_an_object_has_room_for_the_first_are_judged() {
 #[test]
 fn whoever_sees_an_object_is_heard_before_those_who_overlook_it() {
     let mut sensors = Sensors::new(ReputationConfig::default());
-    let mut id = |n: u32| sensors.hear(&name(&format!("v{n}")), at(0), &TracksConfig::default()).0.id;
+    let mut id = |n: u32| {
+        sensors
+            .hear(&name(&format!("v{n}")), at(0), &TracksConfig::default())
+            .0
+            .id
+    };
     let ids: Vec<SensorId> = (0..=100).map(&mut id).collect();
     let mut history = DetectionHistory::default();
-    let with_slot = ids[..100].iter().filter(|id| history.for_look(**id, at(0)).is_some()).count();
+    let with_slot = ids[..100]
+        .iter()
+        .filter(|id| history.for_look(**id, at(0)).is_some())
+        .count();
     assert!(with_slot < 100 && history.for_look(ids[100], at(1)).is_none());
     assert!(history.for_hit(ids[100], at(1)).is_some());
     assert!(history.has_room(ids[100], at(1)) && !history.has_room(ids[0], at(1)));
@@ -57,18 +80,34 @@ fn one_sure_vehicle_does_not_outweigh_all_that_see_nothing() {
     let mut tracker = tracker();
     let mut round = TracksRound::default();
     for frame in 0..30 {
-        let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
+        let view = Some(FieldOfView {
+            range_m: 60.0,
+            angle_rad: std::f64::consts::TAU,
+        });
         for (n, node) in ["a", "b", "c", "d", "liar"].into_iter().enumerate() {
             let pose = Some(WirePose::new(n as f64 * 6.0, 0.0, 0.0));
-            let mut objects: Vec<_> = (0..5).map(|n| car(f64::from(n) * 8.0 - 4.0, -15.0)).collect();
+            let mut objects: Vec<_> = (0..5)
+                .map(|n| car(f64::from(n) * 8.0 - 4.0, -15.0))
+                .collect();
             if node == "liar" {
                 objects.push(PerceivedObject::new("car", 0.99, 12.0, 25.0));
             }
-            tracker.observe(ObjectReport { pose, view, ..report(node, frame, objects) }, at(frame));
+            tracker.observe(
+                ObjectReport {
+                    pose,
+                    view,
+                    ..report(node, frame, objects)
+                },
+                at(frame),
+            );
         }
         round = tracker.close(at(frame));
     }
-    assert!(sure(&round).iter().all(|object| object.y_m < 10.0), "{:?}", sure(&round));
+    assert!(
+        sure(&round).iter().all(|object| object.y_m < 10.0),
+        "{:?}",
+        sure(&round)
+    );
     assert!(sure(&round).len() >= 5);
 }
 
@@ -79,15 +118,22 @@ fn a_liar_that_was_silent_is_still_a_liar() {
     let mut tracker = tracker();
     liars(&mut tracker);
     let mut round = tracker.close(at(400));
-    assert!(round.objects.is_empty() && tracker.sensors.iter().next().is_none(), "all are forgotten");
-    let strangers = (0..2 * DormantCounts::MAX).map(|n| (name(&format!("z{n}")), TrustCounts::default()));
+    assert!(
+        round.objects.is_empty() && tracker.sensors.iter().next().is_none(),
+        "all are forgotten"
+    );
+    let strangers =
+        (0..2 * DormantCounts::MAX).map(|n| (name(&format!("z{n}")), TrustCounts::default()));
     tracker.sensors.dormant.keep(strangers.collect::<Vec<_>>());
     for frame in 400..420 {
         tracker.observe(report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
         tracker.observe(report("newcomer", frame, vec![car(50.0, 25.0)]), at(frame));
         round = tracker.close(at(frame));
     }
-    let believed: Vec<_> = sure(&round).iter().map(|object| object.x_m.round()).collect();
+    let believed: Vec<_> = sure(&round)
+        .iter()
+        .map(|object| object.x_m.round())
+        .collect();
     assert_eq!(believed, [50.0], "{:?}", round.objects);
 }
 
@@ -99,9 +145,19 @@ fn of_the_silent_those_are_forgotten_of_whom_least_is_known() {
         (name("liar"), TrustCounts::new(0.0, 40.0, &config)),
         (name("hero"), TrustCounts::new(40.0, 0.0, &config)),
     ]);
-    dormant.keep((0..2 * DormantCounts::MAX).map(|n| (name(&format!("a{n}")), TrustCounts::new(1.0, 0.0, &config))));
-    assert_eq!((dormant.of(&name("liar")).trust(&config), dormant.of(&name("hero")).trust(&config)), (0.0, 1.0));
-    let known = (0..2 * DormantCounts::MAX).filter(|n| dormant.of(&name(&format!("a{n}"))) != TrustCounts::default());
+    dormant.keep(
+        (0..2 * DormantCounts::MAX)
+            .map(|n| (name(&format!("a{n}")), TrustCounts::new(1.0, 0.0, &config))),
+    );
+    assert_eq!(
+        (
+            dormant.of(&name("liar")).trust(&config),
+            dormant.of(&name("hero")).trust(&config)
+        ),
+        (0.0, 1.0)
+    );
+    let known = (0..2 * DormantCounts::MAX)
+        .filter(|n| dormant.of(&name(&format!("a{n}"))) != TrustCounts::default());
     assert_eq!(known.count(), DormantCounts::MAX - 2);
 }
 
@@ -109,7 +165,11 @@ fn of_the_silent_those_are_forgotten_of_whom_least_is_known() {
 #[test]
 fn whoever_votes_wrongly_is_not_believed_in_tracks() {
     let mut tracker = tracker();
-    let wrong = |node: &str| Evidence { node: name(node), label: "cup".into(), correct: false };
+    let wrong = |node: &str| Evidence {
+        node: name(node),
+        label: "cup".into(),
+        correct: false,
+    };
     let mut round = TracksRound::default();
     for frame in 0..20 {
         tracker.observe(report("liar", frame, vec![car(0.0, 25.0)]), at(frame));
@@ -117,26 +177,42 @@ fn whoever_votes_wrongly_is_not_believed_in_tracks() {
         tracker.learn(&[wrong("liar"), wrong("unheard")]);
         round = tracker.close(at(frame));
     }
-    let believed: Vec<_> = sure(&round).iter().map(|object| object.x_m.round()).collect();
+    let believed: Vec<_> = sure(&round)
+        .iter()
+        .map(|object| object.x_m.round())
+        .collect();
     assert_eq!(believed, [50.0], "{:?}", round.objects);
 }
 
 /// Four honest vehicles, one that hides most objects and one that invents them; returns the right and wrong words.
 fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
     let mut rng = ChaCha8Rng::seed_from_u64(5);
-    let view = Some(FieldOfView { range_m: 60.0, angle_rad: std::f64::consts::TAU });
+    let view = Some(FieldOfView {
+        range_m: 60.0,
+        angle_rad: std::f64::consts::TAU,
+    });
     let mut counts: BTreeMap<NodeName, (u32, u32)> = BTreeMap::new();
     for frame in 0..150 {
-        for (n, node) in ["a", "b", "c", "d", "hider", "liar"].into_iter().enumerate() {
+        for (n, node) in ["a", "b", "c", "d", "hider", "liar"]
+            .into_iter()
+            .enumerate()
+        {
             let pose = Some(WirePose::new(n as f64 * 6.0, 0.0, 0.0));
-            let places = (0..10).map(|n| (n as f64 * 4.0 - 4.0, if n % 2 == 0 { 12.0 } else { -12.0 }));
-            let mut objects: Vec<_> = places.map(|(x, y)| car(x + noise(&mut rng, 0.2), y)).collect();
+            let places =
+                (0..10).map(|n| (n as f64 * 4.0 - 4.0, if n % 2 == 0 { 12.0 } else { -12.0 }));
+            let mut objects: Vec<_> = places
+                .map(|(x, y)| car(x + noise(&mut rng, 0.2), y))
+                .collect();
             match node {
                 "hider" => objects.truncate(2),
                 "liar" => objects = (0..10).map(|n| car(n as f64 * 5.0, 25.0)).collect(),
                 _ => {}
             }
-            let report = ObjectReport { pose, view, ..report(node, frame, objects) };
+            let report = ObjectReport {
+                pose,
+                view,
+                ..report(node, frame, objects)
+            };
             tracker.observe(report, at(frame));
         }
         for evidence in tracker.close(at(frame)).evidence {
@@ -151,16 +227,30 @@ fn liars(tracker: &mut Tracker) -> BTreeMap<NodeName, (u32, u32)> {
 #[test]
 fn a_vehicle_that_invents_objects_makes_those_of_others_hardly_less_sure() {
     let least_existence = |invented: usize| {
-        let (mut tracker, mut rng, mut round) = (tracker(), ChaCha8Rng::seed_from_u64(1), TracksRound::default());
+        let (mut tracker, mut rng, mut round) = (
+            tracker(),
+            ChaCha8Rng::seed_from_u64(1),
+            TracksRound::default(),
+        );
         for frame in 0..50 {
-            tracker.observe(report("a", frame, (0..5).map(|n| car(f64::from(n) * 8.0, 0.0)).collect()), at(frame));
+            tracker.observe(
+                report(
+                    "a",
+                    frame,
+                    (0..5).map(|n| car(f64::from(n) * 8.0, 0.0)).collect(),
+                ),
+                at(frame),
+            );
             let mut place = || 1500.0 + noise(&mut rng, 500.0);
-            let clutter = (0..invented).map(|_| PerceivedObject::new("car", 0.5, place(), place())).collect();
+            let clutter = (0..invented)
+                .map(|_| PerceivedObject::new("car", 0.5, place(), place()))
+                .collect();
             tracker.observe(report("flooder", frame, clutter), at(frame));
             round = tracker.close(at(frame));
         }
         let cars = round.objects.iter().filter(|object| object.x_m < 100.0);
-        cars.map(|object| object.existence.unwrap()).fold(1.0, f64::min)
+        cars.map(|object| object.existence.unwrap())
+            .fold(1.0, f64::min)
     };
     let (without, beside) = (least_existence(0), least_existence(300));
     assert!(

@@ -16,21 +16,38 @@ impl WeightedVoting {
         let mut dependence = Dependence::of_stored();
         let mut calibration = ConfidenceCalibration::new(self.config.calibration_votes);
         let mut by_name = vec![0; self.names.len()];
-        self.vehicles.values().enumerate().for_each(|(rank, &vehicle)| by_name[vehicle] = rank);
+        self.vehicles
+            .values()
+            .enumerate()
+            .for_each(|(rank, &vehicle)| by_name[vehicle] = rank);
         for landmark_votes in self.landmarks.values_mut() {
-            landmark_votes.votes.iter_mut().for_each(|vote| vote.compared = false);
-            landmark_votes.compare(&mut dependence, &mut calibration, |vehicle| by_name[vehicle]);
+            landmark_votes
+                .votes
+                .iter_mut()
+                .for_each(|vote| vote.compared = false);
+            landmark_votes.compare(&mut dependence, &mut calibration, |vehicle| {
+                by_name[vehicle]
+            });
         }
         dependence.fit(&vec![true; self.names.len()]);
         let online = std::mem::replace(&mut self.dependence, dependence);
         let settled = std::mem::replace(&mut self.calibration, calibration);
         self.start_again(START_SWEEPS);
-        let in_turn = (self.model.clone(), self.calibration.clone(), self.landmarks.clone());
+        let in_turn = (
+            self.model.clone(),
+            self.calibration.clone(),
+            self.landmarks.clone(),
+        );
         let before = self.log_probability();
         (0..passes).for_each(|_| self.judge_together());
         let after = self.log_probability();
-        let judged = self.landmarks.values().filter(|landmark_votes| landmark_votes.has_several_voters());
-        let votes: usize = judged.map(|landmark_votes| landmark_votes.votes.len()).sum();
+        let judged = self
+            .landmarks
+            .values()
+            .filter(|landmark_votes| landmark_votes.has_several_voters());
+        let votes: usize = judged
+            .map(|landmark_votes| landmark_votes.votes.len())
+            .sum();
         if before - after > MAX_LOSS * votes as f64 {
             (self.model, self.calibration, self.landmarks) = in_turn;
             // By their order in time, labels that lead by little stay.
@@ -47,11 +64,18 @@ impl WeightedVoting {
     /// Log of the probability of all votes, each predicted from the other votes on the landmark and those on others.
     fn log_probability(&mut self) -> f64 {
         let mut sum = 0.0;
-        for landmark_votes in self.landmarks.values().filter(|landmark_votes| landmark_votes.has_several_voters()) {
+        for landmark_votes in self
+            .landmarks
+            .values()
+            .filter(|landmark_votes| landmark_votes.has_several_voters())
+        {
             let votes = landmark_votes.weighted_votes();
             self.model.add_live(&votes, &landmark_votes.posterior, -1.0);
             self.model.refresh(votes.iter().map(|vote| vote.vehicle));
-            sum += self.model.judge(&votes, &landmark_votes.candidates()).log_probability;
+            sum += self
+                .model
+                .judge(&votes, &landmark_votes.candidates())
+                .log_probability;
             self.model.add_live(&votes, &landmark_votes.posterior, 1.0);
         }
         sum
@@ -66,12 +90,19 @@ impl WeightedVoting {
         }
         self.calibration.clear_live();
         for landmark_votes in self.landmarks.values_mut() {
-            let judged = self.model.judge(&landmark_votes.weighted_votes(), &landmark_votes.candidates());
+            let judged = self.model.judge(
+                &landmark_votes.weighted_votes(),
+                &landmark_votes.candidates(),
+            );
             landmark_votes.take(judged, &mut self.calibration);
         }
         self.model.clear_live();
         for landmark_votes in self.landmarks.values_mut() {
-            self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, 1.0);
+            self.model.add_live(
+                &landmark_votes.weighted_votes(),
+                &landmark_votes.posterior,
+                1.0,
+            );
             landmark_votes.published = None;
             landmark_votes.publish(0.0);
         }
@@ -91,7 +122,9 @@ impl WeightedVoting {
         let landmarks: Vec<_> = self.landmarks.keys().cloned().collect();
         for _ in 0..sweeps {
             let weights = self.calibration.weights();
-            landmarks.iter().for_each(|landmark| self.judge(landmark, &weights));
+            landmarks
+                .iter()
+                .for_each(|landmark| self.judge(landmark, &weights));
         }
     }
 
@@ -104,9 +137,16 @@ impl WeightedVoting {
             landmark_votes.published = None;
             landmark_votes.counted = true;
             landmark_votes.weigh(&self.dependence, &self.calibration, &weights);
-            landmark_votes.votes.iter_mut().for_each(|vote| vote.agreement = None);
+            landmark_votes
+                .votes
+                .iter_mut()
+                .for_each(|vote| vote.agreement = None);
             landmark_votes.posterior = landmark_votes.majority();
-            self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, 1.0);
+            self.model.add_live(
+                &landmark_votes.weighted_votes(),
+                &landmark_votes.posterior,
+                1.0,
+            );
         }
     }
 }

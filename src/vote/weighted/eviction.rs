@@ -12,7 +12,10 @@ use crate::vote::dawid_skene::VehicleEvidence;
 impl WeightedVoting {
     /// Forgets vehicles with their votes and the evidence about them; other vehicles take their indices.
     pub(super) fn evict_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
-        let gone: BTreeSet<usize> = nodes.iter().filter_map(|node| self.vehicles.remove(node)).collect();
+        let gone: BTreeSet<usize> = nodes
+            .iter()
+            .filter_map(|node| self.vehicles.remove(node))
+            .collect();
         let is_theirs = |vote: &StoredVote| gone.contains(&vote.vehicle);
         for landmark in self.landmarks_where(|l| l.votes.iter().any(is_theirs)) {
             self.remove_votes(&landmark, is_theirs);
@@ -28,11 +31,19 @@ impl WeightedVoting {
     }
 
     fn landmarks_where(&self, is_affected: impl Fn(&LandmarkVotes) -> bool) -> Vec<LandmarkId> {
-        self.landmarks.iter().filter(|(_, votes)| is_affected(votes)).map(|(landmark, _)| landmark.clone()).collect()
+        self.landmarks
+            .iter()
+            .filter(|(_, votes)| is_affected(votes))
+            .map(|(landmark, _)| landmark.clone())
+            .collect()
     }
 
     /// The index of a label; `stated` is the vehicle that stated it and when.
-    pub(super) fn label(&mut self, label: &Label, stated: Option<(usize, Timestamp)>) -> LabelIndex {
+    pub(super) fn label(
+        &mut self,
+        label: &Label,
+        stated: Option<(usize, Timestamp)>,
+    ) -> LabelIndex {
         let index = self.labels.intern(label, stated);
         if self.model.labels() < self.labels.len() {
             self.model.add_label();
@@ -48,13 +59,17 @@ impl WeightedVoting {
         let gone = self.labels.make_room(&self.model.support());
         let is_gone = |label: LabelIndex| gone.contains(&label);
         let is_affected = |l: &LandmarkVotes| {
-            l.votes.iter().any(|vote| is_gone(vote.label)) || l.posterior.iter().any(|(label, _)| is_gone(*label))
+            l.votes.iter().any(|vote| is_gone(vote.label))
+                || l.posterior.iter().any(|(label, _)| is_gone(*label))
         };
         let mut forgotten = 0;
         for landmark in self.landmarks_where(is_affected) {
             // Without settling: the other votes would become evidence more often than by their age.
             self.remove_live(&landmark);
-            forgotten += self.landmarks.get_mut(&landmark).map_or(0, |l| l.forget_labels(is_gone));
+            forgotten += self
+                .landmarks
+                .get_mut(&landmark)
+                .map_or(0, |l| l.forget_labels(is_gone));
             self.changed.insert(landmark);
         }
         for vote in self.landmarks.values_mut().flat_map(|l| &mut l.votes) {

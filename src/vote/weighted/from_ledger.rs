@@ -17,7 +17,11 @@ impl WeightedVoting {
     /// tie those in the latest lanes. A ledger counts by stated label only: the truth behind a wrong vote is taken to
     /// be any other label with equal probability.
     pub(super) fn take_over(&mut self, ledger: &ReputationLedger, limits: &VoteConfig) {
-        let own = |node: &NodeName| self.vehicles.get(node).map_or(0, |&vehicle| self.counts[vehicle].total());
+        let own = |node: &NodeName| {
+            self.vehicles
+                .get(node)
+                .map_or(0, |&vehicle| self.counts[vehicle].total())
+        };
         let (heard, mut others): (Vec<_>, Vec<_>) = ledger
             .remembered(self.config.memory_votes, own)
             .into_iter()
@@ -25,23 +29,37 @@ impl WeightedVoting {
         let lanes = ledger.latest_lanes();
         others.sort_by_cached_key(|(node, labels)| {
             let correct: f64 = labels.values().map(|(correct, _)| correct).sum();
-            (Reverse(correct.round() as u64), Reverse(lanes.get(node).copied()), node.clone())
+            (
+                Reverse(correct.round() as u64),
+                Reverse(lanes.get(node).copied()),
+                node.clone(),
+            )
         });
         others.truncate(limits.max_vehicles.saturating_sub(self.vehicles.len()));
         let known = [heard, others].concat();
         self.take_over_labels(&known, limits.max_labels);
         // Evidence that is no longer in the ledger does not count any more.
-        self.model.vehicles.iter_mut().for_each(|vehicle| vehicle.inherited = Confusion::default());
-        self.model.inherit_coupling(known.iter().map(|(_, labels)| labels));
+        self.model
+            .vehicles
+            .iter_mut()
+            .for_each(|vehicle| vehicle.inherited = Confusion::default());
+        self.model
+            .inherit_coupling(known.iter().map(|(_, labels)| labels));
         for (node, labels) in known {
             let mut inherited = Confusion::default();
             for (label, (correct, incorrect)) in labels {
-                let Some(label) = self.labels.index(&label) else { continue };
+                let Some(label) = self.labels.index(&label) else {
+                    continue;
+                };
                 inherited.add(label, label, correct);
-                let others: Vec<_> = (0..self.labels.len() as LabelIndex).filter(|l| *l != label).collect();
+                let others: Vec<_> = (0..self.labels.len() as LabelIndex)
+                    .filter(|l| *l != label)
+                    .collect();
                 let each = incorrect / others.len().max(1) as f64;
                 if each > 0.0 {
-                    others.into_iter().for_each(|truth| inherited.add(truth, label, each));
+                    others
+                        .into_iter()
+                        .for_each(|truth| inherited.add(truth, label, each));
                 }
             }
             let vehicle = self.vehicle(&node);

@@ -10,7 +10,9 @@ impl WeightedVoting {
     /// Sets the next expiry of a landmark: when its oldest vote goes stale.
     pub(super) fn schedule_expiry(&mut self, landmark: &LandmarkId) {
         let freshness = self.freshness();
-        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
+        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
+            return;
+        };
         let oldest = landmark_votes.votes.iter().map(|vote| vote.at).min();
         let due = oldest.map(|at| at + freshness);
         if let Some(before) = std::mem::replace(&mut landmark_votes.due, due) {
@@ -23,19 +25,31 @@ impl WeightedVoting {
     pub(super) fn expire(&mut self, now: Timestamp) {
         let freshness = self.freshness();
         while self.expiries.first().is_some_and(|(due, _)| *due <= now) {
-            let Some((_, landmark)) = self.expiries.pop_first() else { break };
+            let Some((_, landmark)) = self.expiries.pop_first() else {
+                break;
+            };
             self.remove_votes(&landmark, |vote| vote.at + freshness <= now);
             self.schedule_expiry(&landmark);
         }
     }
 
     /// Removes the votes that `is_past` selects, after all votes on the landmark have been settled.
-    pub(super) fn remove_votes(&mut self, landmark: &LandmarkId, is_past: impl Fn(&StoredVote) -> bool) {
-        if !self.landmarks.get(landmark).is_some_and(|l| l.votes.iter().any(&is_past)) {
+    pub(super) fn remove_votes(
+        &mut self,
+        landmark: &LandmarkId,
+        is_past: impl Fn(&StoredVote) -> bool,
+    ) {
+        if !self
+            .landmarks
+            .get(landmark)
+            .is_some_and(|l| l.votes.iter().any(&is_past))
+        {
             return;
         }
         self.settle_votes(landmark);
-        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
+        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
+            return;
+        };
         landmark_votes.votes.retain(|vote| !is_past(vote));
         if landmark_votes.votes.is_empty() {
             landmark_votes.published = None;
@@ -48,7 +62,11 @@ impl WeightedVoting {
         if let Some(landmark_votes) = self.landmarks.get_mut(landmark)
             && std::mem::take(&mut landmark_votes.counted)
         {
-            self.model.add_live(&landmark_votes.weighted_votes(), &landmark_votes.posterior, -1.0);
+            self.model.add_live(
+                &landmark_votes.weighted_votes(),
+                &landmark_votes.posterior,
+                -1.0,
+            );
             for vote in &mut landmark_votes.votes {
                 if let Some(agreement) = vote.agreement.take() {
                     self.calibration.count(vote.band, agreement, -1.0);
@@ -63,21 +81,35 @@ impl WeightedVoting {
     /// still lack.
     pub(super) fn settle_votes(&mut self, landmark: &LandmarkId) {
         self.remove_live(landmark);
-        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else { return };
+        let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
+            return;
+        };
         if landmark_votes.has_several_voters() {
             // The model judges a vote by the others: a vehicle that decides alone must not prove itself right to it.
             let judged = landmark_votes.votes.iter().filter(|vote| vote.judged);
             let settled: Vec<_> = judged
-                .map(|vote| (*vote, self.model.leave_one_out(&landmark_votes.posterior, &vote.weighted())))
+                .map(|vote| {
+                    (
+                        *vote,
+                        self.model
+                            .leave_one_out(&landmark_votes.posterior, &vote.weighted()),
+                    )
+                })
                 .collect();
             for (vote, others) in settled {
-                self.model.settle(&vote.weighted(), &others, &landmark_votes.posterior);
-                self.calibration.settle(vote.band, probability(&others, vote.label));
+                self.model
+                    .settle(&vote.weighted(), &others, &landmark_votes.posterior);
+                self.calibration
+                    .settle(vote.band, probability(&others, vote.label));
                 let correct = landmark_votes.published == Some(vote.label);
                 self.counts[vote.vehicle].add(correct);
                 if vote.at >= self.recorded_from {
                     let (node, label) = (&self.names[vote.vehicle], self.labels.name(vote.label));
-                    self.evidence.push(Evidence { node: node.clone(), label: label.clone(), correct });
+                    self.evidence.push(Evidence {
+                        node: node.clone(),
+                        label: label.clone(),
+                        correct,
+                    });
                 }
             }
         }

@@ -3,7 +3,10 @@ use super::*;
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 
 fn voting(freshness_s: f64) -> WeightedVoting {
-    WeightedVoting::new(WeightedConfig { freshness_s, ..WeightedConfig::default() })
+    WeightedVoting::new(WeightedConfig {
+        freshness_s,
+        ..WeightedConfig::default()
+    })
 }
 
 fn add_vote(voting: &mut WeightedVoting, landmark: &str, node: &str, ms: u64) {
@@ -21,7 +24,12 @@ fn add_vote(voting: &mut WeightedVoting, landmark: &str, node: &str, ms: u64) {
 fn votes_that_never_go_stale_leave_one_due_time_a_landmark() {
     let mut voting = voting(1e9);
     for n in 0..300 {
-        add_vote(&mut voting, ["x", "y", "z"][n % 3], ["a", "b"][n % 2], 10 * n as u64);
+        add_vote(
+            &mut voting,
+            ["x", "y", "z"][n % 3],
+            ["a", "b"][n % 2],
+            10 * n as u64,
+        );
     }
     assert_eq!(voting.expiries.len(), 3);
     voting.remove_landmark(&"x".into());
@@ -34,12 +42,22 @@ fn every_vote_goes_stale_in_its_time() {
     for (node, ms) in [("a", 0), ("b", 1500), ("a", 1000), ("c", 400)] {
         add_vote(&mut voting, "x", node, ms);
     }
-    for (ms, voters) in
-        [(2399, &["a", "b", "c"][..]), (2400, &["a", "b"]), (2999, &["a", "b"]), (3000, &["b"]), (3500, &[])]
-    {
+    for (ms, voters) in [
+        (2399, &["a", "b", "c"][..]),
+        (2400, &["a", "b"]),
+        (2999, &["a", "b"]),
+        (3000, &["b"]),
+        (3500, &[]),
+    ] {
         voting.close(START + Duration::from_millis(ms));
         let contributors = voting.verdict(&"x".into()).unwrap().contributors;
-        assert!(contributors.iter().map(NodeName::as_str).eq(voters.iter().copied()), "{ms} ms: {contributors:?}");
+        assert!(
+            contributors
+                .iter()
+                .map(NodeName::as_str)
+                .eq(voters.iter().copied()),
+            "{ms} ms: {contributors:?}"
+        );
     }
     assert!(voting.expiries.is_empty());
 }

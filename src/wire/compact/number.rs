@@ -33,9 +33,17 @@ const BEYOND_HALF: u64 = (1 << 42) - 1;
 const BEYOND_SINGLE: u64 = (1 << 29) - 1;
 
 impl Form<f64> for Millimetres {
-    fn encode<C, W: Write>(metres: &f64, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+    fn encode<C, W: Write>(
+        metres: &f64,
+        e: &mut Encoder<W>,
+        _: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
         let millimetres = (metres * 1000.0).round();
-        if millimetres.abs() <= MAX_MILLIMETRES { e.i64(millimetres as i64)?.ok() } else { e.f64(millimetres)?.ok() }
+        if millimetres.abs() <= MAX_MILLIMETRES {
+            e.i64(millimetres as i64)?.ok()
+        } else {
+            e.f64(millimetres)?.ok()
+        }
     }
 
     fn decode<C>(d: &mut Decoder<'_>, _: &mut C) -> Result<f64, decode::Error> {
@@ -44,7 +52,11 @@ impl Form<f64> for Millimetres {
 }
 
 impl Form<f64> for Half {
-    fn encode<C, W: Write>(value: &f64, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+    fn encode<C, W: Write>(
+        value: &f64,
+        e: &mut Encoder<W>,
+        _: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
         write_half(*value, Rounding::Nearest, e)
     }
 
@@ -54,7 +66,11 @@ impl Form<f64> for Half {
 }
 
 impl Form<f64> for Single {
-    fn encode<C, W: Write>(value: &f64, e: &mut Encoder<W>, _: &mut C) -> Result<(), encode::Error<W::Error>> {
+    fn encode<C, W: Write>(
+        value: &f64,
+        e: &mut Encoder<W>,
+        _: &mut C,
+    ) -> Result<(), encode::Error<W::Error>> {
         write_single(*value, Rounding::Nearest, e)
     }
 
@@ -121,7 +137,11 @@ fn is_short(value: f64) -> bool {
     value.fract() == 0.0 && (-24.0..24.0).contains(&value)
 }
 
-fn write_half<W: Write>(value: f64, rounding: Rounding, e: &mut Encoder<W>) -> Result<(), encode::Error<W::Error>> {
+fn write_half<W: Write>(
+    value: f64,
+    rounding: Rounding,
+    e: &mut Encoder<W>,
+) -> Result<(), encode::Error<W::Error>> {
     if !value.is_finite() {
         return e.f64(value)?.ok();
     }
@@ -133,7 +153,11 @@ fn write_half<W: Write>(value: f64, rounding: Rounding, e: &mut Encoder<W>) -> R
     }
 }
 
-fn write_single<W: Write>(value: f64, rounding: Rounding, e: &mut Encoder<W>) -> Result<(), encode::Error<W::Error>> {
+fn write_single<W: Write>(
+    value: f64,
+    rounding: Rounding,
+    e: &mut Encoder<W>,
+) -> Result<(), encode::Error<W::Error>> {
     if !value.is_finite() {
         return e.f64(value)?.ok();
     }

@@ -2,10 +2,11 @@ use super::*;
 use crate::model::geometry::Covariance;
 use crate::model::origin::GeographicOrigin;
 use crate::wire::{
-    CellDescription, CellMap, CellReputation, ContentHash, DescriptionStatus, Encoding, FieldOfView, ForeignVotes,
-    FusedObject, GlobalMap, LabelReading, LandmarkState, Limits, NeighbourObject, NodeState, NodeStatus, ObjectReport,
-    Payload, PerceivedObject, PoseCorrection, Reputation, Reputations, Role, SCHEMA_VERSION, Trouble, Verdict,
-    Verdicts, WirePose, decode, encode,
+    CellDescription, CellMap, CellReputation, ContentHash, DescriptionStatus, Encoding,
+    FieldOfView, ForeignVotes, FusedObject, GlobalMap, LabelReading, LandmarkState, Limits,
+    NeighbourObject, NodeState, NodeStatus, ObjectReport, Payload, PerceivedObject, PoseCorrection,
+    Reputation, Reputations, Role, SCHEMA_VERSION, Trouble, Verdict, Verdicts, WirePose, decode,
+    encode,
 };
 
 fn report() -> ObjectReport {
@@ -17,7 +18,11 @@ fn report() -> ObjectReport {
             ..PerceivedObject::new("ABCD123", 0.93, 0.25, -70.0)
         }],
         seen: Some(vec!["slot-0".into(), "slot-1".into()]),
-        ..ObjectReport::new(NodeName::from_static("euclid"), 412, Timestamp(1_732_154_400_123_456))
+        ..ObjectReport::new(
+            NodeName::from_static("euclid"),
+            412,
+            Timestamp(1_732_154_400_123_456),
+        )
     }
 }
 
@@ -27,7 +32,10 @@ fn a_report_keeps_its_form() {
     let expected = "87 01 66 65 75 63 6c 69 64 19 01 9c 1b 00 06 27 62 9f b7 2a 40 \
         81 86 67 41 42 43 44 31 32 33 f9 3b 71 18 fa 3a 00 01 11 6f 83 f9 0e 8e 00 f9 06 8e 66 73 6c 6f 74 2d 30 \
         83 19 02 62 19 01 cc fa 40 38 51 ec 82 66 73 6c 6f 74 2d 30 66 73 6c 6f 74 2d 31";
-    let written: Vec<String> = encode(&report(), Encoding::Compact).iter().map(|byte| format!("{byte:02x}")).collect();
+    let written: Vec<String> = encode(&report(), Encoding::Compact)
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect();
     assert_eq!(written.join(" "), expected);
 }
 
@@ -35,8 +43,14 @@ fn a_report_keeps_its_form() {
 fn survives<T: Payload + PartialEq + std::fmt::Debug>(payload: &T) {
     let bytes = encode(payload, Encoding::Compact);
     assert!(is_compact(bytes[0]));
-    assert_eq!(decode::<T>(&bytes, &Limits::default()).as_ref(), Ok(payload));
-    assert!(bytes.len() * 2 < encode(payload, Encoding::Json).len(), "less than half of the JSON");
+    assert_eq!(
+        decode::<T>(&bytes, &Limits::default()).as_ref(),
+        Ok(payload)
+    );
+    assert!(
+        bytes.len() * 2 < encode(payload, Encoding::Json).len(),
+        "less than half of the JSON"
+    );
 }
 
 /// With numbers that need no rounding.
@@ -50,7 +64,10 @@ fn every_field_of_every_payload_survives() {
             roll_rad: Some(-0.125),
             ..WirePose::new(0.61, 0.46, 2.875)
         }),
-        view: Some(FieldOfView { range_m: 60.0, angle_rad: 6.25 }),
+        view: Some(FieldOfView {
+            range_m: 60.0,
+            angle_rad: 6.25,
+        }),
         frame_yaw_rate_radps: Some(-0.375),
         moving: Some(false),
         ..report_without_rounding()
@@ -72,7 +89,10 @@ fn every_field_of_every_payload_survives() {
                 y_m: 123_456.789,
                 contributors: vec![node("edge")],
                 observers: vec![node("edge"), node("euclid")],
-                readings: vec![LabelReading { label: "EMPTY".into(), nodes: vec![NodeName::from_static("galileo")] }],
+                readings: vec![LabelReading {
+                    label: "EMPTY".into(),
+                    nodes: vec![NodeName::from_static("galileo")],
+                }],
             },
             LandmarkState {
                 id: "slot-1".into(),
@@ -104,13 +124,30 @@ fn every_field_of_every_payload_survives() {
         }],
         pose_corrections: [(
             node("gauss"),
-            PoseCorrection { about_m: [1.0, 2.0], dx_m: 0.2, dy_m: -0.1, dheading_rad: 0.015625, pairs: 12.5 },
+            PoseCorrection {
+                about_m: [1.0, 2.0],
+                dx_m: 0.2,
+                dy_m: -0.1,
+                dheading_rad: 0.015625,
+                pairs: 12.5,
+            },
         )]
         .into(),
         neighbour_objects: vec![NeighbourObject {
             cell: node("lot-2"),
             age_s: 0.125,
-            object: FusedObject::new(Uuid::max(), "car", 0.5, 7.5, -1.25, Covariance { xx: 0.25, xy: 0.0, yy: 0.5 }),
+            object: FusedObject::new(
+                Uuid::max(),
+                "car",
+                0.5,
+                7.5,
+                -1.25,
+                Covariance {
+                    xx: 0.25,
+                    xy: 0.0,
+                    yy: 0.5,
+                },
+            ),
         }],
     };
     survives(&map);
@@ -118,7 +155,12 @@ fn every_field_of_every_payload_survives() {
         schema: SCHEMA_VERSION,
         cell: node("lot-1"),
         sent_at_us: fused_at_us,
-        origin: GeographicOrigin { latitude_deg: 48.8584, longitude_deg: 2.2945, height_m: 30.5, rotation_deg: -5.0 },
+        origin: GeographicOrigin {
+            latitude_deg: 48.8584,
+            longitude_deg: 2.2945,
+            height_m: 30.5,
+            rotation_deg: -5.0,
+        },
         map,
     });
     survives(&Verdicts {
@@ -136,10 +178,34 @@ fn every_field_of_every_payload_survives() {
             contributors: vec![node("euclid")],
         }],
     });
-    let reputation = Reputation { score: 0.625, correct: 410, incorrect: 22, foreign: None };
-    let foreign = Some(ForeignVotes { correct: 0.5, incorrect: 4.5 });
-    let reputations = [(node("euclid"), reputation), (node("gauss"), Reputation { foreign, ..reputation })].into();
-    survives(&Reputations { schema: SCHEMA_VERSION, aggregator: Some(node("edge")), epoch: 3, round: 88, reputations });
+    let reputation = Reputation {
+        score: 0.625,
+        correct: 410,
+        incorrect: 22,
+        foreign: None,
+    };
+    let foreign = Some(ForeignVotes {
+        correct: 0.5,
+        incorrect: 4.5,
+    });
+    let reputations = [
+        (node("euclid"), reputation),
+        (
+            node("gauss"),
+            Reputation {
+                foreign,
+                ..reputation
+            },
+        ),
+    ]
+    .into();
+    survives(&Reputations {
+        schema: SCHEMA_VERSION,
+        aggregator: Some(node("edge")),
+        epoch: 3,
+        round: 88,
+        reputations,
+    });
     survives(&CellReputation {
         schema: SCHEMA_VERSION,
         cell: node("lot-1"),
@@ -163,7 +229,11 @@ fn every_field_of_every_payload_survives() {
         epoch: 3,
         aggregator: Some(node("edge")),
         fit: Some(true),
-        description: Some(DescriptionStatus { version: 7, hash: ContentHash([9; 32]), problem: Some("no".into()) }),
+        description: Some(DescriptionStatus {
+            version: 7,
+            hash: ContentHash([9; 32]),
+            problem: Some("no".into()),
+        }),
         troubles: vec![Trouble {
             kind: "clock_off".into(),
             about: Some("late".into()),
@@ -184,7 +254,11 @@ fn report_without_rounding() -> ObjectReport {
         scores: [("car".into(), 0.75), ("truck".into(), 0.25)].into(),
         ..PerceivedObject::new("car", 0.75, 99_999_999.999, -0.001)
     };
-    ObjectReport { objects: vec![object], pose: None, ..report() }
+    ObjectReport {
+        objects: vec![object],
+        pose: None,
+        ..report()
+    }
 }
 
 /// As other programs write: floats of any width where an integer would do, arrays without a count, and more places than
@@ -193,18 +267,48 @@ fn report_without_rounding() -> ObjectReport {
 fn what_others_write_is_read() {
     let mut bytes = Vec::new();
     let mut e = Encoder::new(&mut bytes);
-    let object = |e: &mut Encoder<&mut Vec<u8>>| -> Result<(), encode::Error<std::convert::Infallible>> {
-        e.array(11)?.str("car")?.f64(0.5)?.f64(1500.0)?.i64(-20)?;
-        e.array(3)?.f32(0.25)?.u8(0)?.f16(0.5)?;
-        e.null()?.null()?.null()?.null()?.map(0)?.array(1)?.str("of a later version")?.ok()
-    };
-    e.begin_array().unwrap().u8(1).unwrap().str("euclid").unwrap().u8(7).unwrap().u32(5).unwrap();
+    let object =
+        |e: &mut Encoder<&mut Vec<u8>>| -> Result<(), encode::Error<std::convert::Infallible>> {
+            e.array(11)?.str("car")?.f64(0.5)?.f64(1500.0)?.i64(-20)?;
+            e.array(3)?.f32(0.25)?.u8(0)?.f16(0.5)?;
+            e.null()?
+                .null()?
+                .null()?
+                .null()?
+                .map(0)?
+                .array(1)?
+                .str("of a later version")?
+                .ok()
+        };
+    e.begin_array()
+        .unwrap()
+        .u8(1)
+        .unwrap()
+        .str("euclid")
+        .unwrap()
+        .u8(7)
+        .unwrap()
+        .u32(5)
+        .unwrap();
     e.begin_array().unwrap();
     object(&mut e).unwrap();
-    e.end().unwrap().null().unwrap().null().unwrap().null().unwrap().null().unwrap().null().unwrap();
+    e.end()
+        .unwrap()
+        .null()
+        .unwrap()
+        .null()
+        .unwrap()
+        .null()
+        .unwrap()
+        .null()
+        .unwrap()
+        .null()
+        .unwrap();
     e.bool(true).unwrap().end().unwrap();
     let report: ObjectReport = decode(&bytes, &Limits::default()).unwrap();
-    let expected =
-        PerceivedObject { covariance_m2: Some([0.25, 0.0, 0.5]), ..PerceivedObject::new("car", 0.5, 1.5, -0.02) };
+    let expected = PerceivedObject {
+        covariance_m2: Some([0.25, 0.0, 0.5]),
+        ..PerceivedObject::new("car", 0.5, 1.5, -0.02)
+    };
     assert_eq!((report.seq, report.objects), (7, vec![expected]));
 }

@@ -8,7 +8,8 @@ use super::*;
 use crate::model::epoch::Epoch;
 use crate::model::names::{Label, NodeName};
 use crate::wire::{
-    Encoding, ForeignVotes, NeighbourObject, NodeState, Reputation, Role, decode, decode_entries, encode,
+    Encoding, ForeignVotes, NeighbourObject, NodeState, Reputation, Role, decode, decode_entries,
+    encode,
 };
 
 fn edge() -> NodeName {
@@ -38,11 +39,28 @@ fn map() -> GlobalMap {
             age_s: Some(0.1),
             first_seen_us: Some(Timestamp(1_732_154_390_000_000)),
             vehicle: Some(edge()),
-            ..FusedObject::new(Uuid::nil(), "car", 0.8, 1.0, 2.0, Covariance { xx: 0.1, xy: 0.0, yy: 0.2 })
+            ..FusedObject::new(
+                Uuid::nil(),
+                "car",
+                0.8,
+                1.0,
+                2.0,
+                Covariance {
+                    xx: 0.1,
+                    xy: 0.0,
+                    yy: 0.2,
+                },
+            )
         }],
         pose_corrections: [(
             edge(),
-            PoseCorrection { about_m: [1.0, 2.0], dx_m: 0.2, dy_m: -0.1, dheading_rad: 0.01, pairs: 12.5 },
+            PoseCorrection {
+                about_m: [1.0, 2.0],
+                dx_m: 0.2,
+                dy_m: -0.1,
+                dheading_rad: 0.01,
+                pairs: 12.5,
+            },
         )]
         .into(),
         ..GlobalMap::new(&Epoch::new(3, edge()), 88, Timestamp(1_732_154_400_123_456))
@@ -54,7 +72,12 @@ fn cell_map() -> CellMap {
         schema: SCHEMA_VERSION,
         cell: NodeName::from_static("lot-1"),
         sent_at_us: Timestamp(1_732_154_400_130_000),
-        origin: GeographicOrigin { latitude_deg: 48.8, longitude_deg: 2.3, height_m: 30.0, rotation_deg: 5.0 },
+        origin: GeographicOrigin {
+            latitude_deg: 48.8,
+            longitude_deg: 2.3,
+            height_m: 30.0,
+            rotation_deg: 5.0,
+        },
         map: map(),
     }
 }
@@ -78,9 +101,20 @@ fn verdicts() -> Verdicts {
 }
 
 fn reputations() -> Reputations {
-    let reputation = Reputation { score: 0.62, correct: 410, incorrect: 22, foreign: None };
+    let reputation = Reputation {
+        score: 0.62,
+        correct: 410,
+        incorrect: 22,
+        foreign: None,
+    };
     let reputations = [(edge(), reputation)].into();
-    Reputations { schema: SCHEMA_VERSION, aggregator: Some(edge()), epoch: 3, round: 88, reputations }
+    Reputations {
+        schema: SCHEMA_VERSION,
+        aggregator: Some(edge()),
+        epoch: 3,
+        round: 88,
+        reputations,
+    }
 }
 
 fn cell_reputation() -> CellReputation {
@@ -133,8 +167,16 @@ fn each_flawed_entry_is_left_out<T: Payload + PartialEq + std::fmt::Debug>(
             let (received, invalid) = decode_entries::<T>(&sent, &Limits::default()).unwrap();
             let reasons: Vec<_> = invalid.iter().map(|entry| entry.reason).collect();
             assert_eq!(reasons, [*expected], "flaw {index} in {encoding:?}");
-            assert_eq!(invalid[0].contributors, [edge()], "flaw {index} in {encoding:?}");
-            assert_eq!(without(&received) + 1, without(&sound()), "flaw {index} in {encoding:?}");
+            assert_eq!(
+                invalid[0].contributors,
+                [edge()],
+                "flaw {index} in {encoding:?}"
+            );
+            assert_eq!(
+                without(&received) + 1,
+                without(&sound()),
+                "flaw {index} in {encoding:?}"
+            );
         }
     }
 }
@@ -145,12 +187,17 @@ type Flaw<T> = (fn(&mut T), RejectReason);
 /// Spoils a sound payload in every listed way and sends it; CBOR, because JSON has no word for NaN.
 fn each_flaw_has_its_reason<T: Payload>(sound: impl Fn() -> T, flaws: &[Flaw<T>]) {
     for encoding in [Encoding::Cbor, Encoding::Compact] {
-        let received = |payload: &T| decode::<T>(&encode(payload, encoding), &Limits::default()).err();
+        let received =
+            |payload: &T| decode::<T>(&encode(payload, encoding), &Limits::default()).err();
         assert_eq!(received(&sound()), None);
         for (index, (spoil, expected)) in flaws.iter().enumerate() {
             let mut payload = sound();
             spoil(&mut payload);
-            assert_eq!(received(&payload), Some(*expected), "flaw {index} in {encoding:?}");
+            assert_eq!(
+                received(&payload),
+                Some(*expected),
+                "flaw {index} in {encoding:?}"
+            );
         }
     }
 }
@@ -165,8 +212,14 @@ fn each_flaw_of_a_map_has_its_reason() {
         &[
             (|m| m.epoch = 1 << 53, RejectReason::OutOfRange),
             (|m| m.round = u64::MAX, RejectReason::OutOfRange),
-            (|m| m.fused_at_us = Timestamp(u64::MAX), RejectReason::OutOfRange),
-            (|m| m.oldest_capture_us = Some(Timestamp(1 << 53)), RejectReason::OutOfRange),
+            (
+                |m| m.fused_at_us = Timestamp(u64::MAX),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |m| m.oldest_capture_us = Some(Timestamp(1 << 53)),
+                RejectReason::OutOfRange,
+            ),
         ],
     );
     each_flawed_entry_is_left_out(
@@ -175,25 +228,82 @@ fn each_flaw_of_a_map_has_its_reason() {
         &[
             (|m| m.landmarks[0].x_m = f64::NAN, RejectReason::NotFinite),
             (|m| m.landmarks[0].y_m = 1e9, RejectReason::NotFinite),
-            (|m| m.landmarks[0].confidence = 1.01, RejectReason::ConfidenceOutOfRange),
-            (|m| m.landmarks[0].confidence = f64::NAN, RejectReason::NotFinite),
-            (|m| m.landmarks[0].id = "".into(), RejectReason::InvalidLabel),
-            (|m| m.landmarks[0].label = Some("a\tb".into()), RejectReason::InvalidLabel),
-            (|m| m.objects[0].x_m = f64::NEG_INFINITY, RejectReason::NotFinite),
-            (|m| m.objects[0].covariance_m2 = [-0.1, 0.0, 0.2], RejectReason::NotFinite),
-            (|m| m.objects[0].covariance_m2 = [1e21, 0.0, 0.2], RejectReason::NotFinite),
-            (|m| m.objects[0].covariance_m2[1] = f64::INFINITY, RejectReason::NotFinite),
-            (|m| m.objects[0].confidence = -0.5, RejectReason::ConfidenceOutOfRange),
-            (|m| m.objects[0].label = "x".repeat(65).into(), RejectReason::InvalidLabel),
-            (|m| m.objects[0].existence = Some(1.5), RejectReason::ConfidenceOutOfRange),
-            (|m| m.objects[0].scores = [("".into(), 0.5)].into(), RejectReason::InvalidLabel),
-            (|m| m.objects[0].velocity_mps = Some([f64::NAN, 0.0]), RejectReason::NotFinite),
-            (|m| m.objects[0].velocity_mps = Some([0.0, 1e9]), RejectReason::OutOfRange),
-            (|m| m.objects[0].heading_rad = Some(f64::INFINITY), RejectReason::NotFinite),
-            (|m| m.objects[0].size_m = Some([4.0, -1.0]), RejectReason::OutOfRange),
-            (|m| m.objects[0].age_s = Some(-1.0), RejectReason::OutOfRange),
-            (|m| m.objects[0].first_seen_us = Some(Timestamp(1 << 53)), RejectReason::OutOfRange),
-            (|m| edge_of(m).dheading_rad = f64::NAN, RejectReason::NotFinite),
+            (
+                |m| m.landmarks[0].confidence = 1.01,
+                RejectReason::ConfidenceOutOfRange,
+            ),
+            (
+                |m| m.landmarks[0].confidence = f64::NAN,
+                RejectReason::NotFinite,
+            ),
+            (
+                |m| m.landmarks[0].id = "".into(),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |m| m.landmarks[0].label = Some("a\tb".into()),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |m| m.objects[0].x_m = f64::NEG_INFINITY,
+                RejectReason::NotFinite,
+            ),
+            (
+                |m| m.objects[0].covariance_m2 = [-0.1, 0.0, 0.2],
+                RejectReason::NotFinite,
+            ),
+            (
+                |m| m.objects[0].covariance_m2 = [1e21, 0.0, 0.2],
+                RejectReason::NotFinite,
+            ),
+            (
+                |m| m.objects[0].covariance_m2[1] = f64::INFINITY,
+                RejectReason::NotFinite,
+            ),
+            (
+                |m| m.objects[0].confidence = -0.5,
+                RejectReason::ConfidenceOutOfRange,
+            ),
+            (
+                |m| m.objects[0].label = "x".repeat(65).into(),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |m| m.objects[0].existence = Some(1.5),
+                RejectReason::ConfidenceOutOfRange,
+            ),
+            (
+                |m| m.objects[0].scores = [("".into(), 0.5)].into(),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |m| m.objects[0].velocity_mps = Some([f64::NAN, 0.0]),
+                RejectReason::NotFinite,
+            ),
+            (
+                |m| m.objects[0].velocity_mps = Some([0.0, 1e9]),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |m| m.objects[0].heading_rad = Some(f64::INFINITY),
+                RejectReason::NotFinite,
+            ),
+            (
+                |m| m.objects[0].size_m = Some([4.0, -1.0]),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |m| m.objects[0].age_s = Some(-1.0),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |m| m.objects[0].first_seen_us = Some(Timestamp(1 << 53)),
+                RejectReason::OutOfRange,
+            ),
+            (
+                |m| edge_of(m).dheading_rad = f64::NAN,
+                RejectReason::NotFinite,
+            ),
             (|m| edge_of(m).dx_m = f64::INFINITY, RejectReason::NotFinite),
             (|m| edge_of(m).pairs = -1.0, RejectReason::OutOfRange),
         ],
@@ -206,7 +316,10 @@ fn each_flaw_of_verdicts_has_its_reason() {
         verdicts,
         &[
             (|v| v.epoch = 1 << 53, RejectReason::OutOfRange),
-            (|v| v.fused_at_us = Timestamp(1 << 53), RejectReason::OutOfRange),
+            (
+                |v| v.fused_at_us = Timestamp(1 << 53),
+                RejectReason::OutOfRange,
+            ),
         ],
     );
     each_flawed_entry_is_left_out(
@@ -214,13 +327,28 @@ fn each_flaw_of_verdicts_has_its_reason() {
         |verdicts| verdicts.verdicts.len(),
         &[
             (|v| v.verdicts[0].score = f64::NAN, RejectReason::NotFinite),
-            (|v| v.verdicts[0].margin = f64::INFINITY, RejectReason::NotFinite),
+            (
+                |v| v.verdicts[0].margin = f64::INFINITY,
+                RejectReason::NotFinite,
+            ),
             (|v| v.verdicts[0].margin = -0.02, RejectReason::OutOfRange),
             (|v| v.verdicts[0].score = 1e300, RejectReason::OutOfRange),
-            (|v| v.verdicts[0].votes = [("cup".into(), f64::NAN)].into(), RejectReason::NotFinite),
-            (|v| v.verdicts[0].votes = [("".into(), 1.0)].into(), RejectReason::InvalidLabel),
-            (|v| v.verdicts[0].landmark = "".into(), RejectReason::InvalidLabel),
-            (|v| v.verdicts[0].label = Some("".into()), RejectReason::InvalidLabel),
+            (
+                |v| v.verdicts[0].votes = [("cup".into(), f64::NAN)].into(),
+                RejectReason::NotFinite,
+            ),
+            (
+                |v| v.verdicts[0].votes = [("".into(), 1.0)].into(),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |v| v.verdicts[0].landmark = "".into(),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |v| v.verdicts[0].label = Some("".into()),
+                RejectReason::InvalidLabel,
+            ),
         ],
     );
 }
@@ -230,7 +358,10 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
     fn edges(reputations: &mut Reputations) -> &mut Reputation {
         reputations.reputations.get_mut(&edge()).unwrap()
     }
-    each_flaw_has_its_reason(reputations, &[(|r| r.round = 1 << 53, RejectReason::OutOfRange)]);
+    each_flaw_has_its_reason(
+        reputations,
+        &[(|r| r.round = 1 << 53, RejectReason::OutOfRange)],
+    );
     each_flawed_entry_is_left_out(
         reputations,
         |reputations| reputations.reputations.len(),
@@ -240,8 +371,24 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
             (|r| edges(r).score = -0.1, RejectReason::OutOfRange),
             (|r| edges(r).correct = u64::MAX, RejectReason::OutOfRange),
             (|r| edges(r).incorrect = 1 << 53, RejectReason::OutOfRange),
-            (|r| edges(r).foreign = Some(ForeignVotes { correct: -1.0, incorrect: 0.0 }), RejectReason::OutOfRange),
-            (|r| edges(r).foreign = Some(ForeignVotes { correct: 0.0, incorrect: f64::NAN }), RejectReason::NotFinite),
+            (
+                |r| {
+                    edges(r).foreign = Some(ForeignVotes {
+                        correct: -1.0,
+                        incorrect: 0.0,
+                    })
+                },
+                RejectReason::OutOfRange,
+            ),
+            (
+                |r| {
+                    edges(r).foreign = Some(ForeignVotes {
+                        correct: 0.0,
+                        incorrect: f64::NAN,
+                    })
+                },
+                RejectReason::NotFinite,
+            ),
         ],
     );
     each_flaw_has_its_reason(
@@ -250,7 +397,10 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
             (|r| r.schema = 2, RejectReason::UnknownSchema),
             (|r| r.correct = 1 << 53, RejectReason::OutOfRange),
             (|r| r.incorrect = u64::MAX, RejectReason::OutOfRange),
-            (|r| r.reset_at_us = Some(Timestamp(u64::MAX)), RejectReason::OutOfRange),
+            (
+                |r| r.reset_at_us = Some(Timestamp(u64::MAX)),
+                RejectReason::OutOfRange,
+            ),
             (|r| r.old_correct = 411, RejectReason::Implausible),
             (|r| r.old_incorrect = 23, RejectReason::Implausible),
         ],
@@ -261,26 +411,51 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
             (|s| s.epoch = 1 << 53, RejectReason::OutOfRange),
             (|s| s.version = String::new(), RejectReason::InvalidLabel),
             (|s| s.version = "0".repeat(1000), RejectReason::InvalidLabel),
-            (|s| s.troubles = vec![s.troubles[0].clone(); MAX_TROUBLES + 1], RejectReason::TooManyObjects),
-            (|s| s.troubles[0].cause = "x".repeat(MAX_TROUBLE_TEXT + 1), RejectReason::TooLarge),
-            (|s| s.troubles[0].remedy = "run\nthis".into(), RejectReason::InvalidLabel),
+            (
+                |s| s.troubles = vec![s.troubles[0].clone(); MAX_TROUBLES + 1],
+                RejectReason::TooManyObjects,
+            ),
+            (
+                |s| s.troubles[0].cause = "x".repeat(MAX_TROUBLE_TEXT + 1),
+                RejectReason::TooLarge,
+            ),
+            (
+                |s| s.troubles[0].remedy = "run\nthis".into(),
+                RejectReason::InvalidLabel,
+            ),
             (|s| s.troubles[0].kind.clear(), RejectReason::InvalidLabel),
-            (|s| s.page = Some("javascript:1".into()), RejectReason::InvalidLabel),
-            (|s| s.troubles[0].about = Some("a\u{202E}b".into()), RejectReason::InvalidLabel),
+            (
+                |s| s.page = Some("javascript:1".into()),
+                RejectReason::InvalidLabel,
+            ),
+            (
+                |s| s.troubles[0].about = Some("a\u{202E}b".into()),
+                RejectReason::InvalidLabel,
+            ),
         ],
     );
 }
 
 #[test]
 fn what_an_aggregator_sends_may_be_larger_than_a_report() {
-    let limits = Limits { payload_bytes: 256, map_bytes: 4096, ..Limits::default() };
+    let limits = Limits {
+        payload_bytes: 256,
+        map_bytes: 4096,
+        ..Limits::default()
+    };
     let mut large = map();
     large.landmarks = vec![large.landmarks[0].clone(); 10];
     let bytes = encode(&large, Encoding::Json);
     assert!(bytes.len() > limits.payload_bytes);
     assert_eq!(decode(&bytes, &limits), Ok(large));
-    assert_eq!(decode::<GlobalMap>(&[b' '; 4097], &limits), Err(RejectReason::TooLarge));
-    assert_eq!(decode::<NodeStatus>(&[b' '; 257], &limits), Err(RejectReason::TooLarge));
+    assert_eq!(
+        decode::<GlobalMap>(&[b' '; 4097], &limits),
+        Err(RejectReason::TooLarge)
+    );
+    assert_eq!(
+        decode::<NodeStatus>(&[b' '; 257], &limits),
+        Err(RejectReason::TooLarge)
+    );
 }
 
 #[test]
@@ -288,8 +463,15 @@ fn a_map_from_tomorrow_is_rejected_and_one_from_a_clock_a_little_ahead_is_not() 
     let now = Timestamp(1_732_154_400_000_000);
     let hour = 3_600_000_000;
     assert_eq!(check_fused_at(now.shifted(hour - 1), now), Ok(()));
-    assert_eq!(check_fused_at(now.shifted(hour), now), Err(RejectReason::FromTheFuture));
-    assert_eq!(check_fused_at(now.shifted(-30 * hour), now), Ok(()), "order is by epoch and round, not by time");
+    assert_eq!(
+        check_fused_at(now.shifted(hour), now),
+        Err(RejectReason::FromTheFuture)
+    );
+    assert_eq!(
+        check_fused_at(now.shifted(-30 * hour), now),
+        Ok(()),
+        "order is by epoch and round, not by time"
+    );
 }
 
 /// Numbers as junk has them: any bit pattern, and the bounds.
@@ -340,17 +522,51 @@ fn a_map_for_others_is_taken_with_a_place_on_earth_alone() {
         decode::<CellMap>(&encode(&cell_map(), encoding), &limits).unwrap();
     }
     let rejected = |message: CellMap| message.check(&limits).unwrap_err();
-    let origin = GeographicOrigin { latitude_deg: 91.0, ..cell_map().origin };
-    assert_eq!(rejected(CellMap { origin, ..cell_map() }), RejectReason::OutOfRange);
-    let origin = GeographicOrigin { longitude_deg: f64::NAN, ..cell_map().origin };
-    assert_eq!(rejected(CellMap { origin, ..cell_map() }), RejectReason::NotFinite);
+    let origin = GeographicOrigin {
+        latitude_deg: 91.0,
+        ..cell_map().origin
+    };
+    assert_eq!(
+        rejected(CellMap {
+            origin,
+            ..cell_map()
+        }),
+        RejectReason::OutOfRange
+    );
+    let origin = GeographicOrigin {
+        longitude_deg: f64::NAN,
+        ..cell_map().origin
+    };
+    assert_eq!(
+        rejected(CellMap {
+            origin,
+            ..cell_map()
+        }),
+        RejectReason::NotFinite
+    );
     let map = GlobalMap { schema: 2, ..map() };
-    assert_eq!(rejected(CellMap { map, ..cell_map() }), RejectReason::UnknownSchema);
+    assert_eq!(
+        rejected(CellMap { map, ..cell_map() }),
+        RejectReason::UnknownSchema
+    );
     let mut message = cell_map();
-    let object = FusedObject { confidence: 2.0, ..message.map.objects[0].clone() };
-    message.map.neighbour_objects = vec![NeighbourObject { cell: edge(), age_s: 0.1, object }];
+    let object = FusedObject {
+        confidence: 2.0,
+        ..message.map.objects[0].clone()
+    };
+    message.map.neighbour_objects = vec![NeighbourObject {
+        cell: edge(),
+        age_s: 0.1,
+        object,
+    }];
     let invalid = message.remove_invalid();
-    assert_eq!(invalid, [InvalidEntry { reason: RejectReason::ConfidenceOutOfRange, contributors: vec![edge()] }]);
+    assert_eq!(
+        invalid,
+        [InvalidEntry {
+            reason: RejectReason::ConfidenceOutOfRange,
+            contributors: vec![edge()]
+        }]
+    );
     assert_eq!(message.map, cell_map().map);
 }
 
@@ -374,12 +590,35 @@ fn the_largest_valid_numbers_are_valid_after_the_rounding_of_every_encoding() {
         dheading_rad: -ANGLE_BOUND_RAD,
         pairs: COUNT_BOUND,
     };
-    let map = GlobalMap { objects: vec![object], pose_corrections: [(edge(), correction)].into(), ..map() };
-    let verdict = Verdict { score: SCORE_BOUND, margin: SCORE_BOUND, ..verdicts().verdicts[0].clone() };
-    let verdicts = Verdicts { verdicts: vec![verdict], ..verdicts() };
+    let map = GlobalMap {
+        objects: vec![object],
+        pose_corrections: [(edge(), correction)].into(),
+        ..map()
+    };
+    let verdict = Verdict {
+        score: SCORE_BOUND,
+        margin: SCORE_BOUND,
+        ..verdicts().verdicts[0].clone()
+    };
+    let verdicts = Verdicts {
+        verdicts: vec![verdict],
+        ..verdicts()
+    };
     for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
         let limits = Limits::default();
-        assert_eq!(decode_entries::<GlobalMap>(&encode(&map, encoding), &limits).unwrap().1, [], "{encoding:?}");
-        assert_eq!(decode_entries::<Verdicts>(&encode(&verdicts, encoding), &limits).unwrap().1, [], "{encoding:?}");
+        assert_eq!(
+            decode_entries::<GlobalMap>(&encode(&map, encoding), &limits)
+                .unwrap()
+                .1,
+            [],
+            "{encoding:?}"
+        );
+        assert_eq!(
+            decode_entries::<Verdicts>(&encode(&verdicts, encoding), &limits)
+                .unwrap()
+                .1,
+            [],
+            "{encoding:?}"
+        );
     }
 }

@@ -31,8 +31,18 @@ pub(super) struct MapLog {
 
 impl MapLog {
     /// A log of a cell's maps while its vehicle is present there.
-    pub(super) fn new(path: PathBuf, cell: NodeName, present_cell: watch::Receiver<NodeName>) -> Self {
-        Self { path, cell, present_cell, file: None, retry_at: Timestamp::default() }
+    pub(super) fn new(
+        path: PathBuf,
+        cell: NodeName,
+        present_cell: watch::Receiver<NodeName>,
+    ) -> Self {
+        Self {
+            path,
+            cell,
+            present_cell,
+            file: None,
+            retry_at: Timestamp::default(),
+        }
     }
 
     /// Appends a map. A failure is logged, and ends attempts for [`RETRY_PAUSE`].
@@ -50,16 +60,27 @@ impl MapLog {
     }
 
     fn write(&mut self, map: &ReceivedMap) -> io::Result<()> {
-        let mut line = serde_json::to_vec(&LogLine { cell: &self.cell, map })?;
+        let mut line = serde_json::to_vec(&LogLine {
+            cell: &self.cell,
+            map,
+        })?;
         line.push(b'\n');
-        if self.file.as_ref().is_some_and(|(_, bytes)| *bytes >= MAX_BYTES) {
+        if self
+            .file
+            .as_ref()
+            .is_some_and(|(_, bytes)| *bytes >= MAX_BYTES)
+        {
             self.file = None;
             fs::rename(&self.path, with_suffix(&self.path, ".1"))?;
         }
         let (file, bytes) = match &mut self.file {
             Some(file) => file,
             None => {
-                let mut file = File::options().create(true).read(true).append(true).open(&self.path)?;
+                let mut file = File::options()
+                    .create(true)
+                    .read(true)
+                    .append(true)
+                    .open(&self.path)?;
                 if ends_within_a_line(&mut file)? {
                     file.write_all(b"\n")?;
                 }
@@ -112,7 +133,10 @@ mod tests {
             "landmarks": [], "objects": []
         }))
         .unwrap();
-        ReceivedMap { received_at, map: Arc::new(map) }
+        ReceivedMap {
+            received_at,
+            map: Arc::new(map),
+        }
     }
 
     #[test]
@@ -126,8 +150,13 @@ mod tests {
         log.append(&map(Timestamp(1)));
         log.append(&map(Timestamp(2)));
         let lines = std::fs::read_to_string(&path).unwrap();
-        let whole = lines.lines().filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
-        assert_eq!(whole.collect::<Vec<_>>(), [map(Timestamp(1)), map(Timestamp(2))]);
+        let whole = lines
+            .lines()
+            .filter_map(|line| serde_json::from_str::<ReceivedMap>(line).ok());
+        assert_eq!(
+            whole.collect::<Vec<_>>(),
+            [map(Timestamp(1)), map(Timestamp(2))]
+        );
     }
 
     #[test]
@@ -140,7 +169,11 @@ mod tests {
         let mut log = MapLog::new(path.clone(), cell, present_cell);
         log.append(&map(Timestamp(1)));
         log.append(&map(Timestamp(2)));
-        let size = |name: &str| std::fs::metadata(directory.path().join(name)).unwrap().len();
+        let size = |name: &str| {
+            std::fs::metadata(directory.path().join(name))
+                .unwrap()
+                .len()
+        };
         assert!(size("maps.jsonl.1") > MAX_BYTES && size("maps.jsonl") < 1000);
     }
 
@@ -160,8 +193,22 @@ mod tests {
         present.send_replace(NodeName::from_static("lot-2"));
         log.append(&map(Timestamp(0) + RETRY_PAUSE));
         let lines = std::fs::read_to_string(&path).unwrap();
-        let logged: Vec<ReceivedMap> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-        assert_eq!(logged, [map(Timestamp(0) + RETRY_PAUSE), map(Timestamp(0) + RETRY_PAUSE)]);
-        assert!(lines.lines().all(|line| line.starts_with(r#"{"cell":"lot-1","received_at_us":"#)), "{lines}");
+        let logged: Vec<ReceivedMap> = lines
+            .lines()
+            .map(|line| serde_json::from_str(line).unwrap())
+            .collect();
+        assert_eq!(
+            logged,
+            [
+                map(Timestamp(0) + RETRY_PAUSE),
+                map(Timestamp(0) + RETRY_PAUSE)
+            ]
+        );
+        assert!(
+            lines
+                .lines()
+                .all(|line| line.starts_with(r#"{"cell":"lot-1","received_at_us":"#)),
+            "{lines}"
+        );
     }
 }

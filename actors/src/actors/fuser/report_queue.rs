@@ -36,7 +36,12 @@ struct Waiting {
 impl Default for Waiting {
     fn default() -> Self {
         let objects = KeyedThrottle::new(OBJECT_BURST, Duration::from_secs(1) / MAX_OBJECTS_HZ);
-        Self { objects, next: 0, reports: BTreeMap::new(), places: BTreeMap::new() }
+        Self {
+            objects,
+            next: 0,
+            reports: BTreeMap::new(),
+            places: BTreeMap::new(),
+        }
     }
 }
 
@@ -67,20 +72,40 @@ impl LatestReportQueue {
         let mut waiting = self.waiting();
         let is_first = waiting.reports.is_empty();
         let (key, captured_at) = ((report.node.clone(), *kind), report.captured_at_us);
-        if waiting.places.get(&key).is_some_and(|(_, known)| *known > captured_at) {
-            return PushOutcome { is_first, has_replaced: true, is_over_budget: false };
+        if waiting
+            .places
+            .get(&key)
+            .is_some_and(|(_, known)| *known > captured_at)
+        {
+            return PushOutcome {
+                is_first,
+                has_replaced: true,
+                is_over_budget: false,
+            };
         }
         let count = u32::try_from(report.objects.len()).unwrap_or(u32::MAX);
         let received_at = delivery.received_at;
-        if count > 0 && !waiting.objects.allow_many(&key.0.vehicle(), count, received_at) {
-            return PushOutcome { is_first: false, has_replaced: false, is_over_budget: true };
+        if count > 0
+            && !waiting
+                .objects
+                .allow_many(&key.0.vehicle(), count, received_at)
+        {
+            return PushOutcome {
+                is_first: false,
+                has_replaced: false,
+                is_over_budget: true,
+            };
         }
         let place = waiting.next;
         waiting.next += 1;
         waiting.reports.insert(place, delivery);
         let older = waiting.places.insert(key, (place, captured_at));
         let has_replaced = older.is_some_and(|(older, _)| waiting.reports.remove(&older).is_some());
-        PushOutcome { is_first, has_replaced, is_over_budget: false }
+        PushOutcome {
+            is_first,
+            has_replaced,
+            is_over_budget: false,
+        }
     }
 
     /// Empties the queue, in order of arrival.
@@ -105,29 +130,55 @@ mod tests {
     fn the_latest_of_each_vehicle_and_kind_waits() {
         let queue = LatestReportQueue::default();
         let push = |node: &str, kind, seq| {
-            let report = Arc::new(ObjectReport::new(NodeName::new(node).unwrap(), seq, Timestamp(seq)));
-            queue.push(Delivery::local(QueuedReport { kind, report }, Timestamp(seq)))
+            let report = Arc::new(ObjectReport::new(
+                NodeName::new(node).unwrap(),
+                seq,
+                Timestamp(seq),
+            ));
+            queue.push(Delivery::local(
+                QueuedReport { kind, report },
+                Timestamp(seq),
+            ))
         };
         use ReportKind::{Detections, VoteDetections};
         assert_eq!(
             push("mallory", Detections, 0),
-            PushOutcome { is_first: true, has_replaced: false, is_over_budget: false }
+            PushOutcome {
+                is_first: true,
+                has_replaced: false,
+                is_over_budget: false
+            }
         );
         assert_eq!(
             push("euclid", Detections, 1),
-            PushOutcome { is_first: false, has_replaced: false, is_over_budget: false }
+            PushOutcome {
+                is_first: false,
+                has_replaced: false,
+                is_over_budget: false
+            }
         );
         for seq in 2..1000 {
             assert_eq!(
                 push("mallory", Detections, seq),
-                PushOutcome { is_first: false, has_replaced: true, is_over_budget: false }
+                PushOutcome {
+                    is_first: false,
+                    has_replaced: true,
+                    is_over_budget: false
+                }
             );
         }
         push("mallory", VoteDetections, 1000);
-        let taken: Vec<_> = queue.drain().iter().map(|delivery| delivery.received_at.micros()).collect();
+        let taken: Vec<_> = queue
+            .drain()
+            .iter()
+            .map(|delivery| delivery.received_at.micros())
+            .collect();
         assert_eq!(taken, [1, 999, 1000]);
         assert!(push("euclid", Detections, 1001).is_first);
-        assert!(push("euclid", Detections, 1000).has_replaced, "the later capture stays, whichever came first");
+        assert!(
+            push("euclid", Detections, 1000).has_replaced,
+            "the later capture stays, whichever came first"
+        );
         assert_eq!(queue.drain()[0].received_at.micros(), 1001);
     }
 
@@ -140,13 +191,23 @@ mod tests {
                 objects: vec![object; objects],
                 ..ObjectReport::new(NodeName::new(node).unwrap(), at_us, Timestamp(at_us))
             };
-            let delivery = QueuedReport { kind: ReportKind::Detections, report: Arc::new(report) };
-            !queue.push(Delivery::local(delivery, Timestamp(at_us))).is_over_budget
+            let delivery = QueuedReport {
+                kind: ReportKind::Detections,
+                report: Arc::new(report),
+            };
+            !queue
+                .push(Delivery::local(delivery, Timestamp(at_us)))
+                .is_over_budget
         };
         let start = 1_000_000_000;
-        let of_parts = (0..100).filter(|part| push(&format!("mallory--{part}"), start + part, 1000)).count();
+        let of_parts = (0..100)
+            .filter(|part| push(&format!("mallory--{part}"), start + part, 1000))
+            .count();
         assert_eq!(of_parts, OBJECT_BURST as usize / 1000);
-        assert!(push("mallory", start + 200, 0), "a report without objects costs nothing");
+        assert!(
+            push("mallory", start + 200, 0),
+            "a report without objects costs nothing"
+        );
         assert!(push("euclid", start + 200, 1000));
         assert!(push("mallory", start + 100_000, 1000), "it earns new ones");
     }

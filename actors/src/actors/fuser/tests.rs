@@ -22,7 +22,9 @@ fn spans() -> Spans {
 
 fn map(epoch: &Epoch, round: u64, received_at: Timestamp) -> FollowerMessage {
     let map = Arc::new(GlobalMap::new(epoch, round, Timestamp(0)));
-    FollowerMessage::TakeMap { delivery: Delivery::local(map, received_at) }
+    FollowerMessage::TakeMap {
+        delivery: Delivery::local(map, received_at),
+    }
 }
 
 fn standby() -> FuserState {
@@ -50,7 +52,10 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         is_deserted: false,
         is_yielding: false,
     };
-    let seeking = Leadership { term: 7, ..Leadership::default() };
+    let seeking = Leadership {
+        term: 7,
+        ..Leadership::default()
+    };
     for leadership in [elected, seeking] {
         let ((fuser, mut told), newest) = (listening::slot().await, Newest::default());
         let arguments = FollowerArguments {
@@ -70,11 +75,17 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
         };
         let (follower, _) = Actor::spawn(None, Follower, arguments).await.unwrap();
         for round in 1..=3 {
-            follower.cast(map(&epoch(7, "edge"), round, Timestamp(round))).unwrap();
-            follower.cast(map(&epoch(u64::MAX, "gauss"), round, Timestamp(round))).unwrap();
+            follower
+                .cast(map(&epoch(7, "edge"), round, Timestamp(round)))
+                .unwrap();
+            follower
+                .cast(map(&epoch(u64::MAX, "gauss"), round, Timestamp(round)))
+                .unwrap();
         }
         // The filter believes who goes on publishing; a new leader does not go on from that.
-        follower.cast(map(&epoch(u64::MAX, "gauss"), 4, Timestamp(600_000))).unwrap();
+        follower
+            .cast(map(&epoch(u64::MAX, "gauss"), 4, Timestamp(600_000)))
+            .unwrap();
         follower.drain_and_wait(None).await.unwrap();
         fuser.get().unwrap().drain_and_wait(None).await.unwrap();
 
@@ -84,7 +95,10 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
             fuser.take_map(map, received_at);
             maps += 1;
         }
-        assert_eq!(newest.map.borrow().as_ref().map(|newest| newest.map.epoch), Some(u64::MAX));
+        assert_eq!(
+            newest.map.borrow().as_ref().map(|newest| newest.map.epoch),
+            Some(u64::MAX)
+        );
         let kept = fuser.last_map.map(|(map, _)| (map.epoch, map.round));
         assert_eq!((kept, maps), (Some((7, 3)), 3), "{leadership:?}");
     }
@@ -93,7 +107,9 @@ async fn a_forged_map_neither_keeps_the_leaders_out_nor_takes_their_place() {
 #[tokio::test]
 async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more() {
     let mut fuser = standby();
-    let FollowerMessage::TakeMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else { panic!("a map") };
+    let FollowerMessage::TakeMap { delivery } = map(&epoch(7, "edge"), 1, Timestamp(1)) else {
+        panic!("a map")
+    };
     fuser.take_map(Arc::clone(&delivery.message), Timestamp(1));
     fuser.forget_map(&NodeName::from_static("gauss"));
     assert!(fuser.last_map.is_some(), "another's");
@@ -104,12 +120,21 @@ async fn a_new_leader_goes_on_from_no_map_of_a_node_that_is_not_trusted_any_more
 /// The fuser's present troubles, as their subjects, kinds and causes.
 fn troubles(fuser: &FuserState) -> Vec<(Option<String>, String, String)> {
     let all = fuser.counters.troubles().present().into_iter();
-    all.map(|trouble| (trouble.about, trouble.kind, trouble.cause)).collect()
+    all.map(|trouble| (trouble.about, trouble.kind, trouble.cause))
+        .collect()
 }
 
-fn take(fuser: &mut FuserState, mut report: ObjectReport, received_at: Timestamp, location: Option<&str>) {
+fn take(
+    fuser: &mut FuserState,
+    mut report: ObjectReport,
+    received_at: Timestamp,
+    location: Option<&str>,
+) {
     report.seen = location.map(|id| vec![id.into()]);
-    let message = QueuedReport { kind: ReportKind::Detections, report: Arc::new(report) };
+    let message = QueuedReport {
+        kind: ReportKind::Detections,
+        report: Arc::new(report),
+    };
     fuser.take(&Delivery::local(message, received_at));
 }
 
@@ -122,7 +147,10 @@ fn a_clock_that_is_off_is_named() {
         let received_at = Timestamp(1_795_000_000_000_000 + n * 100_000);
         let report = ObjectReport::new(late.clone(), n, received_at + Duration::from_secs(5));
         take(&mut fuser, report, received_at, None);
-        let kinds: Vec<_> = troubles(&fuser).into_iter().map(|(_, kind, _)| kind).collect();
+        let kinds: Vec<_> = troubles(&fuser)
+            .into_iter()
+            .map(|(_, kind, _)| kind)
+            .collect();
         match n {
             ..=5 => assert!(kinds.is_empty(), "{n}: {kinds:?}"),
             7..=9 => assert_eq!(kinds, ["untimely"], "{n}"),
@@ -132,7 +160,11 @@ fn a_clock_that_is_off_is_named() {
     let told = troubles(&fuser);
     let about = Some("late".to_owned());
     let corrected = "its clock is 5.0 s ahead; its reports are put right by that";
-    assert_eq!(told, [(about, "clock_off".into(), corrected.into())], "refused no longer");
+    assert_eq!(
+        told,
+        [(about, "clock_off".into(), corrected.into())],
+        "refused no longer"
+    );
 }
 
 #[test]
@@ -140,11 +172,19 @@ fn a_time_in_seconds_is_told_from_a_clock_that_is_off() {
     let mut fuser = standby();
     for n in 1..=20 {
         let received_at = Timestamp(1_795_000_000_000_000 + n * 100_000);
-        let report = ObjectReport::new(NodeName::from_static("late"), n, Timestamp(received_at.micros() / 1_000_000));
+        let report = ObjectReport::new(
+            NodeName::from_static("late"),
+            n,
+            Timestamp(received_at.micros() / 1_000_000),
+        );
         take(&mut fuser, report, received_at, None);
     }
     let told = troubles(&fuser);
-    assert!(told.iter().any(|(_, _, cause)| cause.contains("`captured_at_us` looks like seconds")), "{told:?}");
+    assert!(
+        told.iter()
+            .any(|(_, _, cause)| cause.contains("`captured_at_us` looks like seconds")),
+        "{told:?}"
+    );
 }
 
 /// Where objects are tracked, they may be anywhere near the locations: three metres, but not three hundred.
@@ -163,7 +203,10 @@ fn a_vehicle_in_centimetres_is_named_where_objects_are_tracked() {
             take(&mut fuser, report, at, None);
         }
     }
-    let told: Vec<_> = troubles(&fuser).into_iter().map(|(about, kind, _)| (about.unwrap_or_default(), kind)).collect();
+    let told: Vec<_> = troubles(&fuser)
+        .into_iter()
+        .map(|(about, kind, _)| (about.unwrap_or_default(), kind))
+        .collect();
     assert_eq!(told, [("watson".to_owned(), "misplaced".to_owned())]);
 }
 
@@ -174,11 +217,24 @@ fn two_programs_that_report_under_one_name_are_told() {
         let mut fuser = standby();
         for n in 0..60 {
             let at = Timestamp(1_795_000_000_000_000 + n * 50_000);
-            let seq = if senders == 2 { n / 2 + 1000 * (n % 2) } else { 1000 + n % 30 };
-            take(&mut fuser, ObjectReport::new(NodeName::from_static("watson"), seq, at), at, None);
+            let seq = if senders == 2 {
+                n / 2 + 1000 * (n % 2)
+            } else {
+                1000 + n % 30
+            };
+            take(
+                &mut fuser,
+                ObjectReport::new(NodeName::from_static("watson"), seq, at),
+                at,
+                None,
+            );
         }
         let told = troubles(&fuser);
-        assert_eq!(told.iter().any(|(_, kind, _)| kind == "name_taken"), is_told, "{told:?}");
+        assert_eq!(
+            told.iter().any(|(_, kind, _)| kind == "name_taken"),
+            is_told,
+            "{told:?}"
+        );
     }
 }
 
@@ -187,7 +243,8 @@ fn two_programs_that_report_under_one_name_are_told() {
 fn a_vehicle_whose_objects_are_nowhere_is_named() {
     let mut fuser = standby();
     let slot = toml::from_str::<LandmarkConfig>("id = \"slot-0\"\nx_m = 3\ny_m = 0").unwrap();
-    fuser.aggregator = Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
+    fuser.aggregator =
+        Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
     let mut told = Vec::new();
     for n in 1..=120 {
         let at = Timestamp(1_795_000_000_000_000 + n * 100_000);
@@ -198,14 +255,32 @@ fn a_vehicle_whose_objects_are_nowhere_is_named() {
         }
         let mut gauss = ObjectReport::new(NodeName::from_static("gauss"), n, at);
         gauss.pose = Some(WirePose::new(0.0, 0.0, 0.0));
-        gauss.objects = vec![PerceivedObject::new("car", 0.9, 3.0, 0.0), PerceivedObject::new("car", 0.9, 800.0, 0.0)];
+        gauss.objects = vec![
+            PerceivedObject::new("car", 0.9, 3.0, 0.0),
+            PerceivedObject::new("car", 0.9, 800.0, 0.0),
+        ];
         take(&mut fuser, gauss, at, None);
         told = troubles(&fuser);
         assert_eq!(told.len(), if n <= 100 { 1 } else { 2 }, "{n}: {told:?}");
     }
-    let of = |name: &str, cause: &str| (Some(name.to_owned()), "misplaced".to_owned(), cause.to_owned());
+    let of = |name: &str, cause: &str| {
+        (
+            Some(name.to_owned()),
+            "misplaced".to_owned(),
+            cause.to_owned(),
+        )
+    };
     let far = of("gauss", "an object of its report is 800 m from its pose");
-    assert_eq!(told, [far, of("watson", "none of its objects is at a known location, or near one")]);
+    assert_eq!(
+        told,
+        [
+            far,
+            of(
+                "watson",
+                "none of its objects is at a known location, or near one"
+            )
+        ]
+    );
 }
 
 /// One that states the same and stands, as well as an estimate of its pose does, is not told.
@@ -214,16 +289,25 @@ fn a_vehicle_that_states_that_it_does_not_move_and_moves_is_named() {
     let mut fuser = standby();
     for n in 1..=60 {
         let at = Timestamp(1_795_000_000_000_000 + n * 100_000);
-        for (name, x_m, moving) in
-            [("watson", n as f64, false), ("euclid", (n % 3) as f64, false), ("gauss", n as f64, true)]
-        {
+        for (name, x_m, moving) in [
+            ("watson", n as f64, false),
+            ("euclid", (n % 3) as f64, false),
+            ("gauss", n as f64, true),
+        ] {
             let mut report = ObjectReport::new(NodeName::from_static(name), n, at);
             (report.pose, report.moving) = (Some(WirePose::new(x_m, 0.0, 0.0)), Some(moving));
             take(&mut fuser, report, at, None);
         }
     }
     let cause = "it states `moving` = false, and its pose has moved by more than 25 m";
-    assert_eq!(troubles(&fuser), [(Some("watson".to_owned()), "misplaced".to_owned(), cause.to_owned())]);
+    assert_eq!(
+        troubles(&fuser),
+        [(
+            Some("watson".to_owned()),
+            "misplaced".to_owned(),
+            cause.to_owned()
+        )]
+    );
 }
 
 #[test]
@@ -235,24 +319,35 @@ fn locations_that_only_one_side_knows_are_named() {
     assert_eq!(troubles(&without), []);
     take(&mut without, report(2), now, Some("slot-0"));
     let cause = "euclid names known locations, such as slot-0, and this node has none";
-    assert_eq!(troubles(&without), [(None, "no_locations".into(), cause.into())]);
+    assert_eq!(
+        troubles(&without),
+        [(None, "no_locations".into(), cause.into())]
+    );
 
     let mut with = standby();
     let slot = toml::from_str::<LandmarkConfig>("id = \"slot-0\"\nx_m = 0\ny_m = 0").unwrap();
-    with.aggregator = Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
+    with.aggregator =
+        Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
     take(&mut with, report(1), now, Some("slot-0"));
     assert_eq!(troubles(&with), []);
     take(&mut with, report(2), now, Some("slot-9"));
     let cause = "names the location slot-9, which this node does not know";
-    let unknown = [(Some("euclid".to_owned()), "unknown_location".to_owned(), cause.to_owned())];
+    let unknown = [(
+        Some("euclid".to_owned()),
+        "unknown_location".to_owned(),
+        cause.to_owned(),
+    )];
     assert_eq!(troubles(&with), unknown);
 
     // Votes for a location that no list has are ignored: that is told too.
     let mut votes = standby();
-    votes.aggregator = Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
+    votes.aggregator =
+        Aggregator::new_standby(FusionConfig::default(), vec![(&slot).into()], Timestamp(0));
     let seen = Some(vec!["slot-9".into()]);
-    let message =
-        QueuedReport { kind: ReportKind::VoteDetections, report: Arc::new(ObjectReport { seen, ..report(1) }) };
+    let message = QueuedReport {
+        kind: ReportKind::VoteDetections,
+        report: Arc::new(ObjectReport { seen, ..report(1) }),
+    };
     votes.take(&Delivery::local(message, now));
     assert_eq!(troubles(&votes), unknown);
 }

@@ -60,7 +60,10 @@ pub struct ElectionDriver {
 }
 
 impl ElectionDriver {
-    pub(super) fn new(arguments: LeaderElectionArguments, myself: ActorRef<LeaderElectionMessage>) -> Self {
+    pub(super) fn new(
+        arguments: LeaderElectionArguments,
+        myself: ActorRef<LeaderElectionMessage>,
+    ) -> Self {
         let LeaderElectionArguments {
             settings,
             term_file,
@@ -103,11 +106,16 @@ impl ElectionDriver {
 
     pub(super) async fn take_event(&mut self, event: MembershipEvent) {
         if let MembershipEvent::Alive { member } | MembershipEvent::Changed { member } = &event {
-            self.life_signs.meet(&member.name, member.certificate.as_ref());
+            self.life_signs
+                .meet(&member.name, member.certificate.as_ref());
         }
         let input = match event {
-            MembershipEvent::Alive { member } => Input::MemberAlive { member: as_seen(&member) },
-            MembershipEvent::Changed { member } => Input::MemberChanged { member: as_seen(&member) },
+            MembershipEvent::Alive { member } => Input::MemberAlive {
+                member: as_seen(&member),
+            },
+            MembershipEvent::Changed { member } => Input::MemberChanged {
+                member: as_seen(&member),
+            },
             MembershipEvent::Suspected { name } => Input::MemberSuspected { name },
             MembershipEvent::Expelled { name } => {
                 self.cell_time.forget(&name);
@@ -116,10 +124,16 @@ impl ElectionDriver {
                 return;
             }
             MembershipEvent::Down { name } => Input::MemberDown { name },
-            MembershipEvent::Received { from, rights, payload, .. } => match ElectionMessage::decode(&payload) {
+            MembershipEvent::Received {
+                from,
+                rights,
+                payload,
+                ..
+            } => match ElectionMessage::decode(&payload) {
                 Ok(message) => {
                     if !self.life_signs.is_proven(&message) {
-                        self.counters.reject(RejectReason::Unattested, from.as_str());
+                        self.counters
+                            .reject(RejectReason::Unattested, from.as_str());
                         return tracing::debug!(%from, "a sign of life without its leader's signature");
                     }
                     if message.from == from {
@@ -135,7 +149,11 @@ impl ElectionDriver {
                         }
                         self.cell_time.receive(&message, rights, clock::now());
                     }
-                    Input::Receive { from, rights, message }
+                    Input::Receive {
+                        from,
+                        rights,
+                        message,
+                    }
                 }
                 Err(reason) => {
                     self.counters.reject(reason, from.as_str());
@@ -155,14 +173,21 @@ impl ElectionDriver {
     pub(super) async fn take_status(&mut self, status: &NodeStatus) {
         if self.leadership.borrow().leader() == Some(&status.node) && status.node != self.name {
             let of_this = |trouble: &&Trouble| {
-                let about = trouble.about.as_ref().and_then(|about| NodeName::new(about).ok());
-                let refuses = TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::refuses_reports);
+                let about = trouble
+                    .about
+                    .as_ref()
+                    .and_then(|about| NodeName::new(about).ok());
+                let refuses =
+                    TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::refuses_reports);
                 refuses && about.is_some_and(|about| about.vehicle() == self.name)
             };
             let complaint = status.troubles.iter().find(of_this).cloned();
             self.complaint = complaint.map(|trouble| (status.node.clone(), trouble));
         }
-        self.handle(Input::StatusHeard { status: status.clone() }).await;
+        self.handle(Input::StatusHeard {
+            status: status.clone(),
+        })
+        .await;
     }
 
     /// Hands in what happened, and carries out what comes of it before anything else happens.
@@ -172,14 +197,17 @@ impl ElectionDriver {
         }
         let mut inputs = VecDeque::from([input]);
         if self.own_broker.has_changed().unwrap_or(false) {
-            inputs.push_front(Input::OwnBroker { address: *self.own_broker.borrow_and_update() });
+            inputs.push_front(Input::OwnBroker {
+                address: *self.own_broker.borrow_and_update(),
+            });
         }
         while let Some(input) = inputs.pop_front() {
             for effect in self.machine.handle(input, clock::now()) {
                 inputs.extend(self.carry_out(effect).await);
             }
         }
-        self.cell_time.follow(&self.leadership.borrow(), clock::now());
+        self.cell_time
+            .follow(&self.leadership.borrow(), clock::now());
         self.clock.show(self.cell_time.reading());
         self.set_timer();
     }
@@ -199,13 +227,23 @@ impl ElectionDriver {
                 self.life_signs.sign(&mut message);
                 message.clock = Some(Box::new(self.cell_time.stamps(&to, clock::now())));
                 let payload = message.encode(Encoding::Cbor).into();
-                self.parts.membership.send(MembershipMessage::Send { to, payload });
+                self.parts
+                    .membership
+                    .send(MembershipMessage::Send { to, payload });
             }
             Effect::TellLeadership { leadership } => self.tell(leadership),
-            Effect::Lead { epoch, first_round, first } => {
+            Effect::Lead {
+                epoch,
+                first_round,
+                first,
+            } => {
                 let term = self.terms.wait_for(epoch.term).await;
                 tracing::info!(%epoch, first_round, term_is_saved = term == TermState::Saved, "this node leads");
-                self.parts.fuser.send(FuserMessage::Lead { epoch, first_round, first });
+                self.parts.fuser.send(FuserMessage::Lead {
+                    epoch,
+                    first_round,
+                    first,
+                });
             }
             Effect::HoldRound => {
                 self.parts.fuser.send(FuserMessage::HoldRound);
@@ -215,20 +253,36 @@ impl ElectionDriver {
                 self.parts.fuser.send(FuserMessage::StopPublishing);
             }
             Effect::SetLinks { links } => {
-                self.parts.gateway.send(GatewayMessage::SetReportBrokers { addresses: links.report_brokers });
-                self.parts.gateway.send(GatewayMessage::SetBrokers { addresses: links.brokers });
+                self.parts.gateway.send(GatewayMessage::SetReportBrokers {
+                    addresses: links.report_brokers,
+                });
+                self.parts.gateway.send(GatewayMessage::SetBrokers {
+                    addresses: links.brokers,
+                });
             }
             Effect::PublishStatus { status } => {
                 self.parts.door.publish_status(&status);
-                self.parts.recording.send(clock::now(), LogItem::Status(Arc::new(status.clone())));
-                self.parts.uplink.send(UplinkMessage::SetStatus { status: status.clone() });
-                self.parts.gateway.send(GatewayMessage::PublishStatus { status });
+                self.parts
+                    .recording
+                    .send(clock::now(), LogItem::Status(Arc::new(status.clone())));
+                self.parts.uplink.send(UplinkMessage::SetStatus {
+                    status: status.clone(),
+                });
+                self.parts
+                    .gateway
+                    .send(GatewayMessage::PublishStatus { status });
             }
             Effect::SendSnapshot { to } => {
-                self.parts.keeper.send(ReputationKeeperMessage::SendSnapshot { to });
+                self.parts
+                    .keeper
+                    .send(ReputationKeeperMessage::SendSnapshot { to });
             }
             Effect::Look => {
-                let events = self.cell_time.look(clock::wall_offset_us(), &self.leadership.borrow(), clock::now());
+                let events = self.cell_time.look(
+                    clock::wall_offset_us(),
+                    &self.leadership.borrow(),
+                    clock::now(),
+                );
                 events.into_iter().for_each(log_clock);
                 self.note_troubles();
                 let looked = Input::Looked {
@@ -241,10 +295,21 @@ impl ElectionDriver {
                 return vec![looked, Input::Telling { troubles, page }];
             }
             Effect::AskParts => probe::ask_parts(&self.parts, self.myself.clone()),
-            Effect::CountImplausible { from } => self.counters.reject(RejectReason::OutOfRange, from.as_str()),
-            Effect::Log { notice: Notice::Overreached { from, role, priority, rights } } => {
+            Effect::CountImplausible { from } => self
+                .counters
+                .reject(RejectReason::OutOfRange, from.as_str()),
+            Effect::Log {
+                notice:
+                    Notice::Overreached {
+                        from,
+                        role,
+                        priority,
+                        rights,
+                    },
+            } => {
                 self.counters.count(Event::Overreached);
-                self.counters.reject(RejectReason::NotPermitted, from.as_str());
+                self.counters
+                    .reject(RejectReason::NotPermitted, from.as_str());
                 if self.overreached.insert(from.clone()) {
                     tracing::warn!(
                         %from, ?role, priority, ?rights,
@@ -253,7 +318,9 @@ impl ElectionDriver {
                     );
                 }
             }
-            Effect::Log { notice: Notice::NoLogin { at } } => {
+            Effect::Log {
+                notice: Notice::NoLogin { at },
+            } => {
                 if at.is_empty() {
                     tracing::info!("logged in at all brokers in use again");
                 }
@@ -270,14 +337,22 @@ impl ElectionDriver {
         for clock in self.cell_time.wrong_clocks(clock::now()) {
             if clock.node.is_none() || leadership.is_leading() {
                 let about = clock.node.map(NodeName::as_str);
-                troubles.note_with_remedy(about, TroubleKind::ClockOff, &clock_words(&clock), clock_remedy(&clock));
+                troubles.note_with_remedy(
+                    about,
+                    TroubleKind::ClockOff,
+                    &clock_words(&clock),
+                    clock_remedy(&clock),
+                );
             }
         }
         for name in &self.no_login {
             let cause = "it answers, and there is no login at its broker: this node or others may miss its maps";
             troubles.note_about(name.as_str(), TroubleKind::BrokerUnreachable, cause);
         }
-        let complaint = self.complaint.as_ref().filter(|(leader, _)| leadership.leader() == Some(leader));
+        let complaint = self
+            .complaint
+            .as_ref()
+            .filter(|(leader, _)| leadership.leader() == Some(leader));
         if let Some((leader, Trouble { cause, remedy, .. })) = complaint {
             let cause = format!("{leader} says of this node: {cause}");
             troubles.note_with_remedy(None, TroubleKind::ReportsRefused, &cause, remedy);
@@ -290,15 +365,26 @@ impl ElectionDriver {
 
     /// Shows the leadership; a change of the highest known term alone wakes nobody.
     fn tell(&self, leadership: Leadership) {
-        let Leadership { position, epoch, standby, .. } = leadership.clone();
+        let Leadership {
+            position,
+            epoch,
+            standby,
+            ..
+        } = leadership.clone();
         let has_moved = self.leadership.send_if_modified(|known| {
-            let has_moved = (known.position, &known.epoch, &known.standby) != (position, &epoch, &standby);
+            let has_moved =
+                (known.position, &known.epoch, &known.standby) != (position, &epoch, &standby);
             *known = leadership;
             has_moved
         });
         if has_moved {
             let (epoch, standby) = (epoch.as_ref().map(display), standby.as_ref().map(display));
-            tracing::info!(?position, leader = epoch, standby, "the leader or the standby has changed");
+            tracing::info!(
+                ?position,
+                leader = epoch,
+                standby,
+                "the leader or the standby has changed"
+            );
         }
     }
 
@@ -329,9 +415,16 @@ fn as_seen(member: &Member) -> node::SeenMember {
 /// The error of a clock in words.
 fn clock_words(clock: &WrongClock<'_>) -> String {
     let seconds = clock.error_us.unsigned_abs() as f64 / 1e6;
-    let side = if clock.error_us > 0 { "ahead of" } else { "behind" };
-    let others =
-        if clock.is_cell_wrong { "the clocks of the others, and the cell goes by it" } else { "the cell's time" };
+    let side = if clock.error_us > 0 {
+        "ahead of"
+    } else {
+        "behind"
+    };
+    let others = if clock.is_cell_wrong {
+        "the clocks of the others, and the cell goes by it"
+    } else {
+        "the cell's time"
+    };
     format!("its clock is {seconds:.1} s {side} {others}")
 }
 
@@ -347,29 +440,55 @@ fn clock_remedy(clock: &WrongClock<'_>) -> &'static str {
 fn log_clock(event: ClockEvent) {
     let seconds = |micros: i64| micros as f64 / 1e6;
     match event {
-        ClockEvent::WallStepped(step_us) => tracing::info!(step_s = seconds(step_us), "this machine's clock was set"),
-        ClockEvent::CellJumped(jump_us) => tracing::info!(jump_s = seconds(jump_us), "the cell's time jumps"),
+        ClockEvent::WallStepped(step_us) => {
+            tracing::info!(step_s = seconds(step_us), "this machine's clock was set")
+        }
+        ClockEvent::CellJumped(jump_us) => {
+            tracing::info!(jump_s = seconds(jump_us), "the cell's time jumps")
+        }
     };
 }
 
 fn log(notice: Notice) {
     match notice {
         Notice::Fit => tracing::info!("this node's parts work: it can lead"),
-        Notice::Unfit { health: Health { broker, fuser, gateway, reports, .. } } => {
-            tracing::warn!(broker, fuser, gateway, reports, "this node cannot lead: a part does not work");
+        Notice::Unfit {
+            health:
+                Health {
+                    broker,
+                    fuser,
+                    gateway,
+                    reports,
+                    ..
+                },
+        } => {
+            tracing::warn!(
+                broker,
+                fuser,
+                gateway,
+                reports,
+                "this node cannot lead: a part does not work"
+            );
         }
         Notice::OutOfReach { members } => tracing::warn!(
             ?members,
             "other machines do not reach this node's broker: it does not lead; give the nodes certificates in [tls], \
              or set broker.allow_plaintext, or an external mqtt.broker that is there"
         ),
-        Notice::ProcessGone { peer, broker } => tracing::info!(%peer, %broker, "the process of another node is gone"),
-        Notice::LeaderDisconnected { peer } => tracing::info!(%peer, "the leader's connection to this node broke"),
+        Notice::ProcessGone { peer, broker } => {
+            tracing::info!(%peer, %broker, "the process of another node is gone")
+        }
+        Notice::LeaderDisconnected { peer } => {
+            tracing::info!(%peer, "the leader's connection to this node broke")
+        }
         Notice::Preparing { leader } => tracing::info!(%leader, "preparing to take over"),
         Notice::NotServed { challenger } => {
             tracing::debug!(%challenger, "the lead is not handed over yet: no login at the challenger's broker");
         }
-        Notice::Deserted { without_login, followers } => tracing::warn!(
+        Notice::Deserted {
+            without_login,
+            followers,
+        } => tracing::warn!(
             without_login,
             followers,
             "followers cannot log in at this node's broker: check its certificate, `listen` and the firewall; if they \

@@ -30,14 +30,22 @@ pub(super) struct LifeSigns {
 impl LifeSigns {
     /// Without `credentials`, in a cell without certificates, nothing is signed, and all is believed.
     pub(super) fn new(cell: NodeName, credentials: Option<Arc<Credentials>>) -> Self {
-        Self { cell, credentials, certificates: BTreeMap::new(), signed: None }
+        Self {
+            cell,
+            credentials,
+            certificates: BTreeMap::new(),
+            signed: None,
+        }
     }
 
     /// Keeps the certificate of a node that has proven it.
     pub(super) fn meet(&mut self, name: &NodeName, certificate: Option<&Arc<[u8]>>) {
-        let Some(certificate) = certificate else { return };
+        let Some(certificate) = certificate else {
+            return;
+        };
         if self.certificates.len() < MAX_CERTIFICATES || self.certificates.contains_key(name) {
-            self.certificates.insert(name.clone(), Arc::clone(certificate));
+            self.certificates
+                .insert(name.clone(), Arc::clone(certificate));
         }
     }
 
@@ -48,29 +56,52 @@ impl LifeSigns {
 
     /// Signs the sign of life in a beat of this node.
     pub(super) fn sign(&mut self, message: &mut ElectionMessage) {
-        let (Some(credentials), Some(epoch)) = (&self.credentials, &message.epoch) else { return };
-        let Body::Beat { life, .. } = &mut message.body else { return };
-        let is_signed = |(of, signed): &&(Epoch, LifeSign)| of == epoch && signed.led_ms == life.led_ms;
+        let (Some(credentials), Some(epoch)) = (&self.credentials, &message.epoch) else {
+            return;
+        };
+        let Body::Beat { life, .. } = &mut message.body else {
+            return;
+        };
+        let is_signed =
+            |(of, signed): &&(Epoch, LifeSign)| of == epoch && signed.led_ms == life.led_ms;
         if let Some((_, signed)) = self.signed.as_ref().filter(is_signed) {
             *life = signed.clone();
             return;
         }
         // Without random numbers the system gives no signature, and others do not pass this on.
-        life.signature =
-            credentials.current().sign(&life.signed_bytes(&self.cell, epoch)).ok().map(|it| BASE64.encode(it).into());
+        life.signature = credentials
+            .current()
+            .sign(&life.signed_bytes(&self.cell, epoch))
+            .ok()
+            .map(|it| BASE64.encode(it).into());
         self.signed = Some((epoch.clone(), life.clone()));
     }
 
     /// True unless the message passes on a sign of life that its leader did not sign.
     pub(super) fn is_proven(&self, message: &ElectionMessage) -> bool {
-        let Body::LeaderEvidence { life, .. } = &message.body else { return true };
+        let Body::LeaderEvidence { life, .. } = &message.body else {
+            return true;
+        };
         if self.credentials.is_none() {
             return true;
         }
-        let Some(epoch) = &message.epoch else { return false };
-        let Some(certificate) = self.certificates.get(&epoch.leader) else { return false };
-        let signature = life.signature.as_ref().and_then(|text| BASE64.decode(text.as_bytes()).ok());
-        signature.is_some_and(|signature| is_signed_by(certificate, &life.signed_bytes(&self.cell, epoch), &signature))
+        let Some(epoch) = &message.epoch else {
+            return false;
+        };
+        let Some(certificate) = self.certificates.get(&epoch.leader) else {
+            return false;
+        };
+        let signature = life
+            .signature
+            .as_ref()
+            .and_then(|text| BASE64.decode(text.as_bytes()).ok());
+        signature.is_some_and(|signature| {
+            is_signed_by(
+                certificate,
+                &life.signed_bytes(&self.cell, epoch),
+                &signature,
+            )
+        })
     }
 }
 
@@ -91,7 +122,12 @@ mod tests {
             from: NodeName::from_static(from),
             run: 1,
             seq: 1,
-            candidacy: Candidacy { role: Role::Auto, priority: 100, load: 0, fit: true },
+            candidacy: Candidacy {
+                role: Role::Auto,
+                priority: 100,
+                load: 0,
+                fit: true,
+            },
             term: 4,
             epoch: Some(Epoch::new(4, NodeName::from_static("edge"))),
             hears_you: true,
@@ -108,32 +144,76 @@ mod tests {
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
         let mut credentials = |name: &'static str| {
             let name = NodeName::from_static(name);
-            authority.issue(&name, Role::Edge, Duration::from_secs(60), clock::now()).unwrap();
+            authority
+                .issue(&name, Role::Edge, Duration::from_secs(60), clock::now())
+                .unwrap();
             let (certificate, key) = authority.files_of(&name);
-            let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
+            let files = TlsConfig {
+                ca: authority.ca(),
+                certificate,
+                key,
+                revocation_list: None,
+                city: None,
+            };
             Arc::new(Credentials::load(&files, &name).unwrap())
         };
         let [edge, euclid] = ["edge", "euclid"].map(&mut credentials);
         let beat = |led_ms| {
-            let life = LifeSign { led_ms, signature: None };
-            Body::Beat { every_ms: 50, round: 1, followers: 1, after: None, successors: Vec::new(), life }
+            let life = LifeSign {
+                led_ms,
+                signature: None,
+            };
+            Body::Beat {
+                every_ms: 50,
+                round: 1,
+                followers: 1,
+                after: None,
+                successors: Vec::new(),
+                life,
+            }
         };
         let life_of = |credentials: &Arc<Credentials>, led_ms| {
             let mut signs = LifeSigns::new(cell.clone(), Some(Arc::clone(credentials)));
             let mut sent = message("edge", beat(led_ms));
             signs.sign(&mut sent);
-            let Body::Beat { life, .. } = sent.body else { panic!("a beat") };
+            let Body::Beat { life, .. } = sent.body else {
+                panic!("a beat")
+            };
             life
         };
         let mut seeker = LifeSigns::new(cell.clone(), Some(Arc::clone(&euclid)));
-        let evidence = |life| message("gauss", Body::LeaderEvidence { ask: 1, age_ms: 0, life });
-        assert!(!seeker.is_proven(&evidence(life_of(&edge, 500))), "a leader that was never met");
-        seeker.meet(&NodeName::from_static("edge"), Some(&edge.current().certificate().into()));
+        let evidence = |life| {
+            message(
+                "gauss",
+                Body::LeaderEvidence {
+                    ask: 1,
+                    age_ms: 0,
+                    life,
+                },
+            )
+        };
+        assert!(
+            !seeker.is_proven(&evidence(life_of(&edge, 500))),
+            "a leader that was never met"
+        );
+        seeker.meet(
+            &NodeName::from_static("edge"),
+            Some(&edge.current().certificate().into()),
+        );
         assert!(seeker.is_proven(&evidence(life_of(&edge, 500))));
-        assert!(!seeker.is_proven(&evidence(life_of(&euclid, 500))), "signed by another");
-        let later = LifeSign { led_ms: 9000, ..life_of(&edge, 500) };
+        assert!(
+            !seeker.is_proven(&evidence(life_of(&euclid, 500))),
+            "signed by another"
+        );
+        let later = LifeSign {
+            led_ms: 9000,
+            ..life_of(&edge, 500)
+        };
         assert!(!seeker.is_proven(&evidence(later)), "dated later");
-        assert!(!seeker.is_proven(&evidence(LifeSign::default())), "unsigned");
+        assert!(
+            !seeker.is_proven(&evidence(LifeSign::default())),
+            "unsigned"
+        );
         let of_later_term = ElectionMessage {
             epoch: Some(Epoch::new(5, NodeName::from_static("edge"))),
             term: 5,

@@ -14,8 +14,15 @@ use crate::transport::broker::BrokerHealth;
 
 /// Asks broker, gateway and fuser, and tells the election when they have answered.
 pub(super) fn ask_parts(parts: &Parts, election: ActorRef<LeaderElectionMessage>) {
-    let (broker, gateway, fuser) = (parts.broker.clone(), parts.gateway.clone(), parts.fuser.clone());
-    let fuser_runs = parts.fuser.get().is_some_and(|fuser| fuser.get_status() == ActorStatus::Running);
+    let (broker, gateway, fuser) = (
+        parts.broker.clone(),
+        parts.gateway.clone(),
+        parts.fuser.clone(),
+    );
+    let fuser_runs = parts
+        .fuser
+        .get()
+        .is_some_and(|fuser| fuser.get_status() == ActorStatus::Running);
     let contradicts = parts.shared.borrow().contradicts;
     tokio::spawn(async move {
         let (health, links, timeliness) = tokio::join!(
@@ -25,9 +32,18 @@ pub(super) fn ask_parts(parts: &Parts, election: ActorRef<LeaderElectionMessage>
         );
         let rejects_reports = timeliness.is_some_and(|timeliness| !timeliness.is_usable());
         let broker_serves = matches!(health, Some(BrokerHealth::Serving(_)));
-        let sample = HealthSample { broker_serves, links, fuser_runs, rejects_reports, contradicts };
+        let sample = HealthSample {
+            broker_serves,
+            links,
+            fuser_runs,
+            rejects_reports,
+            contradicts,
+        };
         let input = Input::PartsAnswered { sample };
-        if election.cast(LeaderElectionMessage::Note { input }).is_err() {
+        if election
+            .cast(LeaderElectionMessage::Note { input })
+            .is_err()
+        {
             tracing::debug!("the election ended before its parts answered");
         }
     });

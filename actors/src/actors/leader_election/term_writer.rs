@@ -63,7 +63,12 @@ impl TermWriter {
         if let Some(file) = file {
             tokio::spawn(write_all(file, terms, answers));
         }
-        Self { wanted, answer, has_disk, hung_at: None }
+        Self {
+            wanted,
+            answer,
+            has_disk,
+            hung_at: None,
+        }
     }
 
     /// Has a term written some time soon.
@@ -86,7 +91,10 @@ impl TermWriter {
             return TermState::Unanswered;
         }
         let answered = self.answer.wait_for(is_about);
-        let answered = tokio::time::timeout(DISK_TIMEOUT, answered).await.ok().and_then(Result::ok);
+        let answered = tokio::time::timeout(DISK_TIMEOUT, answered)
+            .await
+            .ok()
+            .and_then(Result::ok);
         match answered.map(|answer| answer.is_saved) {
             Some(true) => TermState::Saved,
             Some(false) => TermState::Refused,
@@ -99,7 +107,11 @@ impl TermWriter {
     }
 }
 
-async fn write_all(file: StateFile, mut terms: watch::Receiver<u64>, answers: watch::Sender<DiskAnswer>) {
+async fn write_all(
+    file: StateFile,
+    mut terms: watch::Receiver<u64>,
+    answers: watch::Sender<DiskAnswer>,
+) {
     let mut is_failing = false;
     while terms.changed().await.is_ok() {
         let term = *terms.borrow_and_update();
@@ -107,14 +119,19 @@ async fn write_all(file: StateFile, mut terms: watch::Receiver<u64>, answers: wa
         let written = tokio::task::spawn_blocking(move || writer.save(&term)).await;
         let written = written.map_err(std::io::Error::other).flatten();
         match &written {
-            Ok(()) if is_failing => tracing::info!(path = %file.path().display(), "term saved again"),
+            Ok(()) if is_failing => {
+                tracing::info!(path = %file.path().display(), "term saved again")
+            }
             Err(error) if !is_failing => {
                 tracing::warn!(path = %file.path().display(), %error, "term not saved");
             }
             Ok(()) | Err(_) => {}
         }
         is_failing = written.is_err();
-        answers.send_replace(DiskAnswer { term, is_saved: !is_failing });
+        answers.send_replace(DiskAnswer {
+            term,
+            is_saved: !is_failing,
+        });
     }
 }
 
@@ -127,7 +144,12 @@ mod tests {
     use super::*;
 
     fn file(directory: &Path) -> StateFile {
-        StateFile::new(directory, &NodeName::from_static("lot-1"), &NodeName::from_static("edge"), "term")
+        StateFile::new(
+            directory,
+            &NodeName::from_static("lot-1"),
+            &NodeName::from_static("edge"),
+            "term",
+        )
     }
 
     #[tokio::test]
@@ -145,7 +167,12 @@ mod tests {
     fn a_forged_term_on_disk_is_set_aside() {
         let directory = tempfile::tempdir().unwrap();
         let file = file(directory.path());
-        for (saved, read) in [(7, 7), (1_795_239_882, 1_795_239_882), ((1 << 53) - 1, 0), (u64::MAX, 0)] {
+        for (saved, read) in [
+            (7, 7),
+            (1_795_239_882, 1_795_239_882),
+            ((1 << 53) - 1, 0),
+            (u64::MAX, 0),
+        ] {
             file.save(&saved).unwrap();
             assert_eq!(saved_term(Some(&file)), read);
             assert_eq!(file.path().exists(), read > 0);
@@ -169,7 +196,12 @@ mod tests {
     async fn a_disk_that_hangs_is_waited_for_once() {
         let (wanted, _terms) = watch::channel(3);
         let (_answers, answer) = watch::channel(DiskAnswer::default());
-        let mut writer = TermWriter { wanted, answer, has_disk: true, hung_at: None };
+        let mut writer = TermWriter {
+            wanted,
+            answer,
+            has_disk: true,
+            hung_at: None,
+        };
         let begun = tokio::time::Instant::now();
         assert_eq!(writer.wait_for(3).await, TermState::Unanswered);
         assert!(begun.elapsed() >= DISK_TIMEOUT);

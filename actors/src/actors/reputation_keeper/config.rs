@@ -19,7 +19,10 @@ pub struct ReputationKeeperConfig {
 
 impl Default for ReputationKeeperConfig {
     fn default() -> Self {
-        Self { publish_period_s: 1.0, snapshot_period_s: 10.0 }
+        Self {
+            publish_period_s: 1.0,
+            snapshot_period_s: 10.0,
+        }
     }
 }
 
@@ -30,7 +33,12 @@ impl ReputationKeeperConfig {
     /// [`ConfigError`] naming the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("publish_period_s", self.publish_period_s, 0.05, 3600.0)?;
-        check_range("snapshot_period_s", self.snapshot_period_s, self.publish_period_s, 36_000.0)
+        check_range(
+            "snapshot_period_s",
+            self.snapshot_period_s,
+            self.publish_period_s,
+            36_000.0,
+        )
     }
 
     pub(super) fn publish_period(&self) -> Duration {

@@ -38,14 +38,27 @@ impl ReputationKeeperState {
             return;
         }
         let store = self.arguments.reputations.open();
-        let all = store.ledger.cell_counts(self.arguments.reputation.memory_votes);
+        let all = store
+            .ledger
+            .cell_counts(self.arguments.reputation.memory_votes);
         let lanes = store.ledger.latest_lanes();
         drop(store);
         let mut latest: Vec<_> = all.iter().collect();
         latest.sort_by_key(|(node, _)| Reverse(lanes.get(*node).copied()));
-        let counts = latest.into_iter().take(MAX_COMPARED).map(|(node, counts)| (node.clone(), *counts)).collect();
-        let is_lost = !self.arguments.uplink.send(UplinkMessage::TellCounts { counts });
-        self.told = ToldCounts { counts: all, is_due: false, is_lost };
+        let counts = latest
+            .into_iter()
+            .take(MAX_COMPARED)
+            .map(|(node, counts)| (node.clone(), *counts))
+            .collect();
+        let is_lost = !self
+            .arguments
+            .uplink
+            .send(UplinkMessage::TellCounts { counts });
+        self.told = ToldCounts {
+            counts: all,
+            is_due: false,
+            is_lost,
+        };
     }
 
     /// Tells the uplink what has changed, while this node leads.
@@ -58,15 +71,34 @@ impl ReputationKeeperState {
             return;
         }
         let store = self.arguments.reputations.open();
-        let now = store.ledger.cell_counts(self.arguments.reputation.memory_votes);
+        let now = store
+            .ledger
+            .cell_counts(self.arguments.reputation.memory_votes);
         // Of vehicles that it knew before a reset, nothing counts any more.
-        let nothing = CellCounts { reset_at: store.ledger.reset_at(), ..CellCounts::default() };
+        let nothing = CellCounts {
+            reset_at: store.ledger.reset_at(),
+            ..CellCounts::default()
+        };
         drop(store);
-        let has_changed = |(node, counts): &(&NodeName, &CellCounts)| self.told.counts.get(*node) != Some(*counts);
-        let changed = now.iter().filter(has_changed).map(|(node, counts)| (node.clone(), *counts));
-        let gone = self.told.counts.keys().filter(|node| !now.contains_key(*node)).map(|node| (node.clone(), nothing));
+        let has_changed = |(node, counts): &(&NodeName, &CellCounts)| {
+            self.told.counts.get(*node) != Some(*counts)
+        };
+        let changed = now
+            .iter()
+            .filter(has_changed)
+            .map(|(node, counts)| (node.clone(), *counts));
+        let gone = self
+            .told
+            .counts
+            .keys()
+            .filter(|node| !now.contains_key(*node))
+            .map(|node| (node.clone(), nothing));
         let counts: Vec<_> = changed.chain(gone).collect();
         self.told.counts = now;
-        self.told.is_lost = !counts.is_empty() && !self.arguments.uplink.send(UplinkMessage::TellCounts { counts });
+        self.told.is_lost = !counts.is_empty()
+            && !self
+                .arguments
+                .uplink
+                .send(UplinkMessage::TellCounts { counts });
     }
 }

@@ -11,7 +11,8 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::reputation::{ReputationConfig, ReputationLedger};
 use ecod::wire::{
-    ForeignVotes, InvalidEntry, LedgerEntry, LedgerMark, LedgerShare, Payload, Reputation, Reputations, SCHEMA_VERSION,
+    ForeignVotes, InvalidEntry, LedgerEntry, LedgerMark, LedgerShare, Payload, Reputation,
+    Reputations, SCHEMA_VERSION,
 };
 use serde::{Deserialize, Serialize};
 
@@ -35,13 +36,27 @@ pub struct ReputationStore {
 
 impl ReputationStore {
     pub(super) fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
-        if self.by_evidence { self.ledger.reputations_beside(config, &self.foreign) } else { self.standing.clone() }
+        if self.by_evidence {
+            self.ledger.reputations_beside(config, &self.foreign)
+        } else {
+            self.standing.clone()
+        }
     }
 
     /// Takes over what was saved, within the bounds of what others send. Where evidence is signed, `signer` verifies it.
     /// `date` is the present time; a clock that was never set judges no other.
     fn take(&mut self, saved: Saved, mut signer: Option<&mut EvidenceSigner>, date: Timestamp) {
-        let Saved { entries, marks, mut statements, standing, signed, certificate, reset_at_us, node, .. } = saved;
+        let Saved {
+            entries,
+            marks,
+            mut statements,
+            standing,
+            signed,
+            certificate,
+            reset_at_us,
+            node,
+            ..
+        } = saved;
         let is_own_valid = match (&mut signer, &certificate) {
             (Some(signer), Some(certificate)) => signed && signer.is_of_cell(certificate),
             (signer, _) => signer.is_none() || signed,
@@ -51,9 +66,18 @@ impl ReputationStore {
         } else if reset_at_us > self.ledger.reset_at() {
             self.ledger = ReputationLedger::reset(reset_at_us);
         }
-        let mut standing =
-            Reputations { schema: SCHEMA_VERSION, aggregator: None, epoch: 0, round: 0, reputations: standing };
-        for InvalidEntry { reason, contributors } in standing.remove_invalid() {
+        let mut standing = Reputations {
+            schema: SCHEMA_VERSION,
+            aggregator: None,
+            epoch: 0,
+            round: 0,
+            reputations: standing,
+        };
+        for InvalidEntry {
+            reason,
+            contributors,
+        } in standing.remove_invalid()
+        {
             tracing::warn!(%reason, vehicles = ?contributors, "a saved reputation is not used");
         }
         self.standing = standing.reputations;
@@ -66,11 +90,19 @@ impl ReputationStore {
             signed: None,
             reset_at_us: None,
         };
-        let counts = entries.into_iter().map(|entry| share(vec![entry], Vec::new()));
-        let mut counts: Vec<_> = counts.chain(marks.into_iter().map(|mark| share(Vec::new(), vec![mark]))).collect();
+        let counts = entries
+            .into_iter()
+            .map(|entry| share(vec![entry], Vec::new()));
+        let mut counts: Vec<_> = counts
+            .chain(marks.into_iter().map(|mark| share(Vec::new(), vec![mark])))
+            .collect();
         let read = counts.len() + statements.len();
         counts.retain(|share| is_own_valid && is_plausible(share));
-        let mut is_valid = |share: &_| signer.as_mut().is_none_or(|signer| signer.verify_again(share).is_ok());
+        let mut is_valid = |share: &_| {
+            signer
+                .as_mut()
+                .is_none_or(|signer| signer.verify_again(share).is_ok())
+        };
         statements.retain(|share| is_plausible(share) && is_valid(share));
         let dropped = read - counts.len() - statements.len();
         if dropped > 0 {
@@ -79,7 +111,9 @@ impl ReputationStore {
                 "saved evidence not used: not signed, of a revoked node, or more than there can be"
             );
         }
-        counts.iter().for_each(|share| _ = self.ledger.merge_share(share, None));
+        counts
+            .iter()
+            .for_each(|share| _ = self.ledger.merge_share(share, None));
         for share in statements {
             match signer {
                 Some(_) => self.ledger.merge_statement(&Arc::new(share), None),
@@ -150,15 +184,26 @@ impl Saved {
     ) -> Self {
         let (ledger, signed) = (&store.ledger, arguments.credentials.is_some());
         let is_kept = |term: u64, aggregator: &NodeName| {
-            !signed || (*aggregator == arguments.name && !ledger.is_stated(&Epoch::new(term, aggregator.clone())))
+            !signed
+                || (*aggregator == arguments.name
+                    && !ledger.is_stated(&Epoch::new(term, aggregator.clone())))
         };
         Self {
-            entries: ledger.entries().filter(|entry| is_kept(entry.epoch, &entry.aggregator)).collect(),
-            marks: ledger.marks().filter(|mark| is_kept(mark.epoch, &mark.aggregator)).collect(),
+            entries: ledger
+                .entries()
+                .filter(|entry| is_kept(entry.epoch, &entry.aggregator))
+                .collect(),
+            marks: ledger
+                .marks()
+                .filter(|mark| is_kept(mark.epoch, &mark.aggregator))
+                .collect(),
             standing: store.standing.clone(),
             signed,
             certificate: certificate.cloned(),
-            statements: ledger.statements().map(|share| LedgerShare::clone(share)).collect(),
+            statements: ledger
+                .statements()
+                .map(|share| LedgerShare::clone(share))
+                .collect(),
             reset_at_us: ledger.reset_at(),
             ..Self::reset(&arguments.cell, &arguments.name, Timestamp::default())
         }
@@ -189,7 +234,12 @@ impl Saved {
 ///
 /// # Errors
 /// When the disk refuses it.
-pub fn reset_saved(file: &StateFile, cell: &NodeName, node: &NodeName, reset_at: Timestamp) -> std::io::Result<()> {
+pub fn reset_saved(
+    file: &StateFile,
+    cell: &NodeName,
+    node: &NodeName,
+    reset_at: Timestamp,
+) -> std::io::Result<()> {
     file.save(&Saved::reset(cell, node, reset_at))
 }
 
@@ -200,7 +250,9 @@ pub(super) fn restore(arguments: &ReputationKeeperArguments, signer: Option<&mut
         return;
     }
     let Some(file) = &arguments.file else {
-        tracing::warn!("no `state_dir`: reputations, and the terms in which this node has led, end with it");
+        tracing::warn!(
+            "no `state_dir`: reputations, and the terms in which this node has led, end with it"
+        );
         return;
     };
     if let Some(saved) = file.load(|saved: &Saved| saved.is_of(arguments)) {

@@ -32,7 +32,14 @@ fn member(node: &str, role: Role) -> Member {
 
 fn counted(epoch: u64, aggregator: &str) -> LedgerEntry {
     let (aggregator, node, label) = (name(aggregator), name("gauss"), "cup".into());
-    LedgerEntry { epoch, aggregator, node, label, correct: 0, incorrect: 1 }
+    LedgerEntry {
+        epoch,
+        aggregator,
+        node,
+        label,
+        correct: 0,
+        incorrect: 1,
+    }
 }
 
 fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> Delivery<Arc<LedgerShare>> {
@@ -49,8 +56,15 @@ fn share(from: &str, leads: Option<u64>, entries: Vec<LedgerEntry>) -> Delivery<
 }
 
 /// Arguments of the keeper of `euclid`, which follows `edge` in term 7.
-fn arguments(gateway: &ActorSlot<GatewayMessage>, counters: &Arc<Counters>) -> ReputationKeeperArguments {
-    let roles = [("edge", Role::Edge), ("gauss", Role::Auto), ("mallory", Role::Cav)];
+fn arguments(
+    gateway: &ActorSlot<GatewayMessage>,
+    counters: &Arc<Counters>,
+) -> ReputationKeeperArguments {
+    let roles = [
+        ("edge", Role::Edge),
+        ("gauss", Role::Auto),
+        ("mallory", Role::Cav),
+    ];
     let members = roles.map(|(node, role)| member(node, role)).to_vec();
     let epoch = Some(Epoch::new(7, name("edge")));
     let leadership = Leadership {
@@ -86,27 +100,60 @@ async fn evidence_of_others_is_judged_counted_and_answered() {
     let (gateway, mut published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let directory = tempfile::tempdir().unwrap();
-    let file = StateFile::new(directory.path(), &name("lot"), &name("euclid"), "reputations");
-    let mut keeper =
-        ReputationKeeperState::new(ReputationKeeperArguments { file: Some(file), ..arguments(&gateway, &counters) });
-    let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
-    keeper.arguments.reputations.open().ledger.record(3, &name("euclid"), &own);
+    let file = StateFile::new(
+        directory.path(),
+        &name("lot"),
+        &name("euclid"),
+        "reputations",
+    );
+    let mut keeper = ReputationKeeperState::new(ReputationKeeperArguments {
+        file: Some(file),
+        ..arguments(&gateway, &counters)
+    });
+    let own = Evidence {
+        node: name("gauss"),
+        label: "cup".into(),
+        correct: true,
+    };
+    keeper
+        .arguments
+        .reputations
+        .open()
+        .ledger
+        .record(3, &name("euclid"), &own);
     keeper.save().await;
 
     keeper.merge(&share("mallory", None, vec![counted(7, "mallory")]));
-    keeper.merge(&share("edge", Some(7), vec![counted(7, "edge"), counted(8, "edge")]));
+    keeper.merge(&share(
+        "edge",
+        Some(7),
+        vec![counted(7, "edge"), counted(8, "edge")],
+    ));
     assert_eq!(counters.rejects(RejectReason::NotCandidate), 1);
     assert_eq!(counters.rejects(RejectReason::UnknownTerm), 1);
     assert_eq!(counters.events(Event::LedgerMerged), 1);
-    assert_eq!(keeper.arguments.reputations.open().ledger.totals()[&name("gauss")], (1, 1));
+    assert_eq!(
+        keeper.arguments.reputations.open().ledger.totals()[&name("gauss")],
+        (1, 1)
+    );
     assert!(keeper.unadopted);
     keeper.save().await;
     keeper.save().await;
-    assert_eq!(counters.events(Event::ReputationsSaved), 2, "saved when there is news, and not again");
+    assert_eq!(
+        counters.events(Event::ReputationsSaved),
+        2,
+        "saved when there is news, and not again"
+    );
 
     gateway.get().unwrap().drain_and_wait(None).await.unwrap();
-    let Ok(GatewayMessage::PublishShare { share }) = published.try_recv() else { panic!("the leader is told") };
-    assert_eq!(share.entries.len(), 1, "a node that has led tells a new leader what it counted before");
+    let Ok(GatewayMessage::PublishShare { share }) = published.try_recv() else {
+        panic!("the leader is told")
+    };
+    assert_eq!(
+        share.entries.len(),
+        1,
+        "a node that has led tells a new leader what it counted before"
+    );
 }
 
 /// A cell's CA, and the credentials that it issues.
@@ -119,20 +166,37 @@ impl Certificates {
     fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
         let authority = Authority::init(directory.path(), &name("lot"), clock::now()).unwrap();
-        Self { directory, authority }
+        Self {
+            directory,
+            authority,
+        }
     }
 
     fn of(&mut self, node: &str) -> Arc<Credentials> {
         let day = Duration::from_secs(86_400);
-        self.authority.issue(&name(node), Role::Auto, day, clock::now()).unwrap();
+        self.authority
+            .issue(&name(node), Role::Auto, day, clock::now())
+            .unwrap();
         let (certificate, key) = self.authority.files_of(&name(node));
         let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
-        let files = TlsConfig { ca, certificate, key, revocation_list: Some(list), city: None };
+        let files = TlsConfig {
+            ca,
+            certificate,
+            key,
+            revocation_list: Some(list),
+            city: None,
+        };
         Arc::new(Credentials::load(&files, &name(node)).unwrap())
     }
 
-    fn signed(&mut self, by: &str, share: &Delivery<Arc<LedgerShare>>) -> Delivery<Arc<LedgerShare>> {
-        let signed = EvidenceSigner::new(name("lot"), self.of(by)).sign(LedgerShare::clone(&share.message)).unwrap();
+    fn signed(
+        &mut self,
+        by: &str,
+        share: &Delivery<Arc<LedgerShare>>,
+    ) -> Delivery<Arc<LedgerShare>> {
+        let signed = EvidenceSigner::new(name("lot"), self.of(by))
+            .sign(LedgerShare::clone(&share.message))
+            .unwrap();
         Delivery::local(Arc::new(signed), share.received_at)
     }
 }
@@ -142,7 +206,12 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
     let (gateway, mut published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
-    let file = StateFile::new(certificates.directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let file = StateFile::new(
+        certificates.directory.path(),
+        &name("lot"),
+        &name("euclid"),
+        "reputations",
+    );
     let credentials = Some(certificates.of("euclid"));
     let with = || ReputationKeeperArguments {
         credentials: credentials.clone(),
@@ -151,9 +220,21 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
     };
     let mut keeper = ReputationKeeperState::new(with());
     let votes = |keeper: &ReputationKeeperState| {
-        keeper.arguments.reputations.open().ledger.totals().get(&name("gauss")).copied().unwrap_or_default()
+        keeper
+            .arguments
+            .reputations
+            .open()
+            .ledger
+            .totals()
+            .get(&name("gauss"))
+            .copied()
+            .unwrap_or_default()
     };
-    let own = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
+    let own = Evidence {
+        node: name("gauss"),
+        label: "cup".into(),
+        correct: true,
+    };
     keeper.record(&Epoch::new(3, name("euclid")), 1, &[own], None);
     keeper.resync.step_down();
 
@@ -161,10 +242,16 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
     keeper.merge(&said);
     let forged = certificates.signed("gauss", &said);
     keeper.merge(&forged);
-    assert_eq!((counters.rejects(RejectReason::BadSignature), votes(&keeper)), (2, (1, 0)));
+    assert_eq!(
+        (counters.rejects(RejectReason::BadSignature), votes(&keeper)),
+        (2, (1, 0))
+    );
     let own_word = certificates.signed("gauss", &share("gauss", None, vec![counted(6, "gauss")]));
     keeper.merge(&own_word);
-    assert_eq!((counters.rejects(RejectReason::Unattested), votes(&keeper)), (1, (1, 0)));
+    assert_eq!(
+        (counters.rejects(RejectReason::Unattested), votes(&keeper)),
+        (1, (1, 0))
+    );
     let said = certificates.signed("edge", &said);
     keeper.merge(&said);
     assert_eq!(votes(&keeper), (1, 1));
@@ -172,17 +259,28 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
     let mut early = ReputationKeeperState::new(with());
     store::restore(&early.arguments, early.signer.as_mut());
     assert_eq!(votes(&early), (1, 0), "its leader is on trial");
-    keeper.merge(&Delivery::local(Arc::clone(&said.message), said.received_at + EVIDENCE_TRIAL));
+    keeper.merge(&Delivery::local(
+        Arc::clone(&said.message),
+        said.received_at + EVIDENCE_TRIAL,
+    ));
     keeper.save().await;
 
     let mut again = ReputationKeeperState::new(with());
     store::restore(&again.arguments, again.signer.as_mut());
     assert_eq!(votes(&again), (1, 1), "after a restart");
     gateway.get().unwrap().drain_and_wait(None).await.unwrap();
-    let Ok(GatewayMessage::PublishShare { share }) = published.try_recv() else { panic!("a round's evidence") };
-    assert_eq!(EvidenceSigner::new(name("lot"), certificates.of("edge")).verify(&share), Ok(()));
+    let Ok(GatewayMessage::PublishShare { share }) = published.try_recv() else {
+        panic!("a round's evidence")
+    };
+    assert_eq!(
+        EvidenceSigner::new(name("lot"), certificates.of("edge")).verify(&share),
+        Ok(())
+    );
 
-    certificates.authority.revoke(&name("edge"), clock::now()).unwrap();
+    certificates
+        .authority
+        .revoke(&name("edge"), clock::now())
+        .unwrap();
     tokio::time::sleep(Duration::from_millis(1100)).await;
     assert!(again.signer.as_mut().unwrap().reload() && again.drop_revoked());
     assert_eq!(votes(&again), (1, 0), "and only that");
@@ -190,7 +288,10 @@ async fn signed_evidence_is_verified_saved_and_dropped_when_its_signatory_is_rev
     assert_eq!(votes(&again), (1, 0), "nor does it come back");
     again.save().await;
     let text = std::fs::read_to_string(file.path()).unwrap();
-    assert!(text.contains("euclid") && !text.contains("edge"), "it is gone from the disk: {text}");
+    assert!(
+        text.contains("euclid") && !text.contains("edge"),
+        "it is gone from the disk: {text}"
+    );
     let mut last = ReputationKeeperState::new(with());
     store::restore(&last.arguments, last.signer.as_mut());
     assert_eq!(votes(&last), (1, 0));
@@ -201,27 +302,51 @@ async fn what_a_node_counted_under_a_revoked_certificate_does_not_come_back_with
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
-    let file = StateFile::new(certificates.directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let file = StateFile::new(
+        certificates.directory.path(),
+        &name("lot"),
+        &name("euclid"),
+        "reputations",
+    );
     let with = |credentials: &Arc<Credentials>| ReputationKeeperArguments {
         credentials: Some(Arc::clone(credentials)),
         file: Some(file.clone()),
         ..arguments(&gateway, &counters)
     };
     let votes = |keeper: &ReputationKeeperState| {
-        keeper.arguments.reputations.open().ledger.totals().get(&name("gauss")).copied().unwrap_or_default()
+        keeper
+            .arguments
+            .reputations
+            .open()
+            .ledger
+            .totals()
+            .get(&name("gauss"))
+            .copied()
+            .unwrap_or_default()
     };
     let stolen = certificates.of("euclid");
     let mut running = ReputationKeeperState::new(with(&stolen));
-    let vote = Evidence { node: name("gauss"), label: "cup".into(), correct: true };
+    let vote = Evidence {
+        node: name("gauss"),
+        label: "cup".into(),
+        correct: true,
+    };
     running.record(&Epoch::new(3, name("euclid")), 1, &[vote], None);
     running.save().await;
 
     let renewed = certificates.of("euclid");
     let mut restarted = ReputationKeeperState::new(with(&renewed));
     restarted.restore();
-    assert_eq!(votes(&restarted), (1, 0), "a certificate that is renewed changes nothing");
+    assert_eq!(
+        votes(&restarted),
+        (1, 0),
+        "a certificate that is renewed changes nothing"
+    );
 
-    certificates.authority.revoke(&name("euclid"), clock::now()).unwrap();
+    certificates
+        .authority
+        .revoke(&name("euclid"), clock::now())
+        .unwrap();
     let new = certificates.of("euclid");
     tokio::time::sleep(Duration::from_millis(1100)).await;
     let mut restarted = ReputationKeeperState::new(with(&new));
@@ -237,8 +362,10 @@ async fn a_candidates_broker_passes_on_no_evidence_that_others_are_said_to_vouch
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
     let credentials = Some(certificates.of("euclid"));
-    let mut keeper =
-        ReputationKeeperState::new(ReputationKeeperArguments { credentials, ..arguments(&gateway, &counters) });
+    let mut keeper = ReputationKeeperState::new(ReputationKeeperArguments {
+        credentials,
+        ..arguments(&gateway, &counters)
+    });
     // `turing` signs counts of a leadership that never was, and lets anybody say anything at its own broker.
     let invented = share("gauss", None, vec![counted(6, "turing")]);
     let over = |broker: &str, mut share: Delivery<Arc<LedgerShare>>| {
@@ -246,19 +373,39 @@ async fn a_candidates_broker_passes_on_no_evidence_that_others_are_said_to_vouch
         share
     };
     keeper.merge(&over("turing", certificates.signed("turing", &invented)));
-    assert!(keeper.arguments.reputations.open().ledger.totals().is_empty(), "gauss did not say that");
+    assert!(
+        keeper
+            .arguments
+            .reputations
+            .open()
+            .ledger
+            .totals()
+            .is_empty(),
+        "gauss did not say that"
+    );
     assert_eq!(counters.rejects(RejectReason::Unattested), 1);
-    assert_eq!(counters.rejects_by_source()[0].source, "turing", "the broker's node is to blame");
+    assert_eq!(
+        counters.rejects_by_source()[0].source,
+        "turing",
+        "the broker's node is to blame"
+    );
 
     let honest = share("edge", Some(7), vec![counted(7, "edge")]);
     keeper.merge(&over("turing", certificates.signed("edge", &honest)));
-    assert_eq!(keeper.arguments.reputations.open().ledger.totals()[&name("gauss")], (0, 1), "signed by its sender");
+    assert_eq!(
+        keeper.arguments.reputations.open().ledger.totals()[&name("gauss")],
+        (0, 1),
+        "signed by its sender"
+    );
     for broker in ["edge", "gauss", "euclid"] {
         let term = 3 + u64::from(broker == "gauss") + 2 * u64::from(broker == "euclid");
         let passed_on = share("gauss", None, vec![counted(term, "old")]);
         keeper.merge(&over(broker, certificates.signed("old", &passed_on)));
     }
-    assert_eq!(keeper.arguments.reputations.open().ledger.totals()[&name("gauss")], (0, 4));
+    assert_eq!(
+        keeper.arguments.reputations.open().ledger.totals()[&name("gauss")],
+        (0, 4)
+    );
     assert_eq!(counters.rejects(RejectReason::Unattested), 1);
 }
 
@@ -267,31 +414,51 @@ async fn a_ledger_that_an_earlier_version_let_be_poisoned_is_not_used() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let mut certificates = Certificates::new();
-    let file = StateFile::new(certificates.directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let file = StateFile::new(
+        certificates.directory.path(),
+        &name("lot"),
+        &name("euclid"),
+        "reputations",
+    );
     let entry = |node: &str, incorrect: u64| {
         format!(
             r#"{{"epoch":1,"aggregator":"edge","node":"{node}","label":"cup","correct":0,"incorrect":{incorrect}}}"#
         )
     };
-    let saved =
-        |entries: &str| format!(r#"{{"schema":1,"cell":"lot","node":"euclid","entries":[{entries}],"standing":{{}}}}"#);
+    let saved = |entries: &str| {
+        format!(
+            r#"{{"schema":1,"cell":"lot","node":"euclid","entries":[{entries}],"standing":{{}}}}"#
+        )
+    };
     let text = saved(&[entry("honest", 1_000_000_000), entry("other", 7)].join(","));
     let vehicles = |credentials: Option<Arc<Credentials>>| {
         std::fs::write(file.path(), &text).unwrap();
-        let arguments =
-            ReputationKeeperArguments { credentials, file: Some(file.clone()), ..arguments(&gateway, &counters) };
+        let arguments = ReputationKeeperArguments {
+            credentials,
+            file: Some(file.clone()),
+            ..arguments(&gateway, &counters)
+        };
         let mut keeper = ReputationKeeperState::new(arguments);
         store::restore(&keeper.arguments, keeper.signer.as_mut());
         keeper.arguments.reputations.open().ledger.totals().len()
     };
     assert_eq!(vehicles(None), 1, "what can be is read");
-    assert_eq!(vehicles(Some(certificates.of("euclid"))), 0, "nobody signed it");
+    assert_eq!(
+        vehicles(Some(certificates.of("euclid"))),
+        0,
+        "nobody signed it"
+    );
 
     reset_saved(&file, &name("lot"), &name("euclid"), Timestamp(5)).unwrap();
-    let mut keeper =
-        ReputationKeeperState::new(ReputationKeeperArguments { file: Some(file), ..arguments(&gateway, &counters) });
+    let mut keeper = ReputationKeeperState::new(ReputationKeeperArguments {
+        file: Some(file),
+        ..arguments(&gateway, &counters)
+    });
     store::restore(&keeper.arguments, keeper.signer.as_mut());
-    assert_eq!(keeper.arguments.reputations.open().ledger.reset_at(), Timestamp(5));
+    assert_eq!(
+        keeper.arguments.reputations.open().ledger.reset_at(),
+        Timestamp(5)
+    );
 }
 
 #[tokio::test]
@@ -299,23 +466,38 @@ async fn a_file_is_held_to_the_bounds_of_the_wire() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let directory = tempfile::tempdir().unwrap();
-    let file = StateFile::new(directory.path(), &name("lot"), &name("euclid"), "reputations");
+    let file = StateFile::new(
+        directory.path(),
+        &name("lot"),
+        &name("euclid"),
+        "reputations",
+    );
     let restored = |fields: &str| {
         let text = format!(r#"{{"schema":1,"cell":"lot","node":"euclid",{fields}}}"#);
         std::fs::write(file.path(), text).unwrap();
-        let arguments = ReputationKeeperArguments { file: Some(file.clone()), ..arguments(&gateway, &counters) };
+        let arguments = ReputationKeeperArguments {
+            file: Some(file.clone()),
+            ..arguments(&gateway, &counters)
+        };
         store::restore(&arguments, None);
         let store = arguments.reputations.open();
-        (store.ledger.totals().len(), store.standing.len(), store.ledger.reset_at())
+        (
+            store.ledger.totals().len(),
+            store.standing.len(),
+            store.ledger.reset_at(),
+        )
     };
     let none = Timestamp::default();
     let entry = |term: u64, label: &str, incorrect: u64| {
         let counts = format!(r#""label":"{label}","correct":0,"incorrect":{incorrect}"#);
         format!(r#"{{"epoch":{term},"aggregator":"edge","node":"gauss",{counts}}}"#)
     };
-    for (term, label, incorrect, expected) in
-        [(1, "cup", 7, 1), (1, "cup", 1_000_000_000, 0), (1 << 52, "cup", 7, 0), (1, "c\\u202eup", 7, 0)]
-    {
+    for (term, label, incorrect, expected) in [
+        (1, "cup", 7, 1),
+        (1, "cup", 1_000_000_000, 0),
+        (1 << 52, "cup", 7, 0),
+        (1, "c\\u202eup", 7, 0),
+    ] {
         let entry = entry(term, label, incorrect);
         let own = format!(r#""entries":[{entry}],"standing":{{}}"#);
         assert_eq!(restored(&own), (expected, 0, none), "{own}");
@@ -324,19 +506,37 @@ async fn a_file_is_held_to_the_bounds_of_the_wire() {
         assert_eq!(restored(&told), (expected, 0, none), "{told}");
     }
     let mark = |correct| {
-        let mark =
-            format!(r#"{{"epoch":1,"aggregator":"edge","node":"gauss","number":2,"correct":{correct},"incorrect":0}}"#);
+        let mark = format!(
+            r#"{{"epoch":1,"aggregator":"edge","node":"gauss","number":2,"correct":{correct},"incorrect":0}}"#
+        );
         restored(&format!(r#""entries":[],"marks":[{mark}],"standing":{{}}"#)).0
     };
     assert_eq!((mark(64), mark(65)), (1, 0));
-    for (score, correct, expected) in [("0.9", 7, 1), ("1e300", 7, 0), ("-1.0", 7, 0), ("0.9", u64::MAX, 0)] {
-        let standing = format!(r#"{{"gauss":{{"score":{score},"correct":{correct},"incorrect":0}}}}"#);
-        assert_eq!(restored(&format!(r#""entries":[],"standing":{standing}"#)).1, expected, "{standing}");
+    for (score, correct, expected) in [
+        ("0.9", 7, 1),
+        ("1e300", 7, 0),
+        ("-1.0", 7, 0),
+        ("0.9", u64::MAX, 0),
+    ] {
+        let standing =
+            format!(r#"{{"gauss":{{"score":{score},"correct":{correct},"incorrect":0}}}}"#);
+        assert_eq!(
+            restored(&format!(r#""entries":[],"standing":{standing}"#)).1,
+            expected,
+            "{standing}"
+        );
     }
     let hours = |hours: u64| clock::now() + Duration::from_secs(hours * 3600);
     for (at, expected) in [(hours(23), hours(23)), (hours(25), none)] {
-        let reset_at = restored(&format!(r#""entries":[],"standing":{{}},"reset_at_us":{at}"#, at = at.micros())).2;
-        assert!(reset_at.micros().abs_diff(expected.micros()) < 60_000_000, "{reset_at:?}");
+        let reset_at = restored(&format!(
+            r#""entries":[],"standing":{{}},"reset_at_us":{at}"#,
+            at = at.micros()
+        ))
+        .2;
+        assert!(
+            reset_at.micros().abs_diff(expected.micros()) < 60_000_000,
+            "{reset_at:?}"
+        );
     }
 }
 
@@ -345,13 +545,23 @@ async fn a_node_that_booted_in_1970_judges_a_reset_by_the_cells_time() {
     let (gateway, _published) = listening::slot().await;
     let mut keeper = ReputationKeeperState::new(arguments(&gateway, &Arc::default()));
     let now = clock::now();
-    let reset =
-        LedgerShare { reset_at_us: Some(now), ..LedgerShare::clone(&share("edge", Some(7), Vec::new()).message) };
+    let reset = LedgerShare {
+        reset_at_us: Some(now),
+        ..LedgerShare::clone(&share("edge", Some(7), Vec::new()).message)
+    };
     let reset = Delivery::local(Arc::new(reset), Timestamp(60_000_000));
-    let reset_at = |keeper: &ReputationKeeperState| keeper.arguments.reputations.open().ledger.reset_at();
+    let reset_at =
+        |keeper: &ReputationKeeperState| keeper.arguments.reputations.open().ledger.reset_at();
     keeper.merge(&reset);
-    assert_eq!(reset_at(&keeper), Timestamp(0), "decades ahead, as far as it knows");
-    keeper.arguments.clock.show(ClockReading { offset_us: now.micros() as i64, error_us: Some(1000) });
+    assert_eq!(
+        reset_at(&keeper),
+        Timestamp(0),
+        "decades ahead, as far as it knows"
+    );
+    keeper.arguments.clock.show(ClockReading {
+        offset_us: now.micros() as i64,
+        error_us: Some(1000),
+    });
     keeper.merge(&reset);
     assert_eq!(reset_at(&keeper), now);
 }
@@ -361,8 +571,16 @@ async fn a_saved_ledger_with_any_byte_changed_is_set_aside() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let directory = tempfile::tempdir().unwrap();
-    let file = StateFile::new(directory.path(), &name("lot"), &name("euclid"), "reputations");
-    let with = || ReputationKeeperArguments { file: Some(file.clone()), ..arguments(&gateway, &counters) };
+    let file = StateFile::new(
+        directory.path(),
+        &name("lot"),
+        &name("euclid"),
+        "reputations",
+    );
+    let with = || ReputationKeeperArguments {
+        file: Some(file.clone()),
+        ..arguments(&gateway, &counters)
+    };
     let mut keeper = ReputationKeeperState::new(with());
     keeper.merge(&share("edge", Some(7), vec![counted(7, "edge")]));
     keeper.save().await;
@@ -390,10 +608,21 @@ async fn counts_leap_no_further_after_a_restart_than_before() {
     let (gateway, _published) = listening::slot().await;
     let counters = Arc::<Counters>::default();
     let directory = tempfile::tempdir().unwrap();
-    let file = StateFile::new(directory.path(), &name("lot"), &name("euclid"), "reputations");
-    let with = || ReputationKeeperArguments { file: Some(file.clone()), ..arguments(&gateway, &counters) };
+    let file = StateFile::new(
+        directory.path(),
+        &name("lot"),
+        &name("euclid"),
+        "reputations",
+    );
+    let with = || ReputationKeeperArguments {
+        file: Some(file.clone()),
+        ..arguments(&gateway, &counters)
+    };
     let said = |incorrect| {
-        let entries = vec![LedgerEntry { incorrect, ..counted(7, "edge") }];
+        let entries = vec![LedgerEntry {
+            incorrect,
+            ..counted(7, "edge")
+        }];
         let mut share = share("edge", Some(7), entries);
         share.received_at = clock::now();
         share
@@ -404,11 +633,20 @@ async fn counts_leap_no_further_after_a_restart_than_before() {
 
     let mut again = ReputationKeeperState::new(with());
     again.restore();
-    let votes = |keeper: &ReputationKeeperState| keeper.arguments.reputations.open().ledger.totals()[&name("gauss")];
+    let votes = |keeper: &ReputationKeeperState| {
+        keeper.arguments.reputations.open().ledger.totals()[&name("gauss")]
+    };
     again.merge(&said(90_000_000));
-    assert_eq!((votes(&again), counters.rejects(RejectReason::Implausible)), ((0, 10), 1));
+    assert_eq!(
+        (votes(&again), counters.rejects(RejectReason::Implausible)),
+        ((0, 10), 1)
+    );
     again.merge(&said(1000));
-    assert_eq!((votes(&again), counters.rejects(RejectReason::Implausible)), ((0, 1000), 1), "it was down for a while");
+    assert_eq!(
+        (votes(&again), counters.rejects(RejectReason::Implausible)),
+        ((0, 1000), 1),
+        "it was down for a while"
+    );
 }
 
 /// A standby that takes over waits for the leader's evidence, and for nothing that others say in its name.
@@ -438,22 +676,39 @@ async fn the_election_is_told_of_evidence_that_was_verified_and_of_no_other() {
     keeper.merge(&over("edge", share("edge", Some(7), Vec::new())));
     election.get().unwrap().drain_and_wait(None).await.unwrap();
     let mut senders = Vec::new();
-    while let Ok(LeaderElectionMessage::Note { input: Input::EvidenceReceived { from } }) = told.try_recv() {
+    while let Ok(LeaderElectionMessage::Note {
+        input: Input::EvidenceReceived { from },
+    }) = told.try_recv()
+    {
         senders.push(from.to_string());
     }
-    assert_eq!(senders, ["gauss", "edge"], "a signature alone may be an old one");
+    assert_eq!(
+        senders,
+        ["gauss", "edge"],
+        "a signature alone may be an old one"
+    );
 }
 
 /// The uplink is told all when this node leads, then what changes, and after a reset that nothing counts any more.
 #[tokio::test]
 async fn the_uplink_is_told_what_other_cells_are_to_know() {
-    let ((gateway, _published), (uplink, mut told)) = (listening::slot().await, listening::slot().await);
+    let ((gateway, _published), (uplink, mut told)) =
+        (listening::slot().await, listening::slot().await);
     let counters = Arc::<Counters>::default();
-    let mut keeper = ReputationKeeperState::new(ReputationKeeperArguments { uplink, ..arguments(&gateway, &counters) });
-    let vote = |node: &str| Evidence { node: name(node), label: "cup".into(), correct: false };
+    let mut keeper = ReputationKeeperState::new(ReputationKeeperArguments {
+        uplink,
+        ..arguments(&gateway, &counters)
+    });
+    let vote = |node: &str| Evidence {
+        node: name(node),
+        label: "cup".into(),
+        correct: false,
+    };
     let mut counts = async || match told.recv().await {
         Some(UplinkMessage::TellCounts { counts }) => {
-            let wrong = |(node, counts): (NodeName, CellCounts)| (node, counts.all.incorrect, counts.reset_at.micros());
+            let wrong = |(node, counts): (NodeName, CellCounts)| {
+                (node, counts.all.incorrect, counts.reset_at.micros())
+            };
             counts.into_iter().map(wrong).collect::<Vec<_>>()
         }
         message => panic!("{message:?}"),
@@ -465,19 +720,39 @@ async fn the_uplink_is_told_what_other_cells_are_to_know() {
     keeper.tell_uplink();
     assert_eq!(counts().await, [(name("hertz"), 1, 0)], "what has changed");
     keeper.tell_all();
-    assert_eq!(counts().await, [(name("gauss"), 1, 0), (name("hertz"), 1, 0)]);
+    assert_eq!(
+        counts().await,
+        [(name("gauss"), 1, 0), (name("hertz"), 1, 0)]
+    );
 
     let mut reset = share("gauss", None, Vec::new()).map(Arc::unwrap_or_clone);
     reset.message.reset_at_us = Some(Timestamp(7));
     keeper.merge(&reset.map(Arc::new));
     keeper.record(&Epoch::new(8, name("euclid")), 3, &[vote("hertz")], None);
     keeper.settle().await;
-    assert_eq!(counts().await, [(name("hertz"), 1, 7), (name("gauss"), 0, 7)]);
+    assert_eq!(
+        counts().await,
+        [(name("hertz"), 1, 7), (name("gauss"), 0, 7)]
+    );
     keeper.resync.step_down();
     keeper.record(&Epoch::new(8, name("euclid")), 4, &[], None);
-    let votes = [(name("gauss"), ForeignVotes { correct: 0.0, incorrect: 5.0 })].into();
+    let votes = [(
+        name("gauss"),
+        ForeignVotes {
+            correct: 0.0,
+            incorrect: 5.0,
+        },
+    )]
+    .into();
     keeper.set_foreign(9, votes);
-    let published = keeper.arguments.reputations.open().reputations(&ReputationConfig::default());
-    assert!((published[&name("gauss")].score - 1.0 / 3.0).abs() < 1e-9, "{published:?}");
+    let published = keeper
+        .arguments
+        .reputations
+        .open()
+        .reputations(&ReputationConfig::default());
+    assert!(
+        (published[&name("gauss")].score - 1.0 / 3.0).abs() < 1e-9,
+        "{published:?}"
+    );
     assert!(published[&name("hertz")].foreign.is_none());
 }

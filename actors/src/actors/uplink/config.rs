@@ -30,7 +30,13 @@ pub struct UplinkConfig {
 
 impl Default for UplinkConfig {
     fn default() -> Self {
-        Self { broker: None, ca: None, user: None, password: None, max_hz: 2.0 }
+        Self {
+            broker: None,
+            ca: None,
+            user: None,
+            password: None,
+            max_hz: 2.0,
+        }
     }
 }
 
@@ -82,7 +88,10 @@ mod tests {
             ("ca = \"region.pem\"", "ca"),
             ("broker = \"region:8883\"\nmax_hz = 0", "max_hz"),
         ] {
-            let error = toml::from_str::<UplinkConfig>(text).unwrap().validate().unwrap_err();
+            let error = toml::from_str::<UplinkConfig>(text)
+                .unwrap()
+                .validate()
+                .unwrap_err();
             assert_eq!(error.key, key);
             assert!(!error.to_string().contains("4711"), "{error}");
         }

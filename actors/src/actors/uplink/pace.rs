@@ -25,7 +25,12 @@ pub(super) struct MapPace {
 impl MapPace {
     /// With a map due at once.
     pub(super) fn new(max_hz: f64) -> Self {
-        Self { max_hz, due: Timestamp::default(), max_early: Duration::ZERO, neighbour_at: None }
+        Self {
+            max_hz,
+            due: Timestamp::default(),
+            max_early: Duration::ZERO,
+            neighbour_at: None,
+        }
     }
 
     /// Notes that a neighbour's map was accepted.
@@ -40,11 +45,17 @@ impl MapPace {
 
     /// Notes that the map that was due is dealt with.
     pub(super) fn advance(&mut self, now: Timestamp) {
-        let is_heard = self.neighbour_at.is_some_and(|at| now.since(at) < NEIGHBOUR_TIMEOUT);
+        let is_heard = self
+            .neighbour_at
+            .is_some_and(|at| now.since(at) < NEIGHBOUR_TIMEOUT);
         let factor = if is_heard { NEIGHBOUR_FACTOR } else { 1.0 };
         let interval = Duration::from_secs_f64(1.0 / (factor * self.max_hz));
         self.max_early = interval.mul_f64(MAX_EARLY_SHARE);
-        self.due = if now.since(self.due) < interval { self.due } else { now } + interval;
+        self.due = if now.since(self.due) < interval {
+            self.due
+        } else {
+            now
+        } + interval;
     }
 }
 
@@ -73,8 +84,14 @@ mod tests {
         assert_eq!(count(&mut pace, 15_000), 20);
         pace.note_neighbour(Timestamp(25_000_000));
         let beside = count(&mut pace, 25_000);
-        assert!((54..=60).contains(&beside), "{beside}: for five seconds all of ten a second, then two a second");
-        assert!((19..=21).contains(&count(&mut pace, 35_000)), "without it as before");
+        assert!(
+            (54..=60).contains(&beside),
+            "{beside}: for five seconds all of ten a second, then two a second"
+        );
+        assert!(
+            (19..=21).contains(&count(&mut pace, 35_000)),
+            "without it as before"
+        );
         assert_eq!(count(&mut MapPace::new(0.5), 5_000), 6);
     }
 }

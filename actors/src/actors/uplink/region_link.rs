@@ -11,7 +11,8 @@ use ecod::model::names::NodeName;
 use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, CellMap, CellReputation, NodeStatus, RegionTopic, RegionTopicKind, ReputationTopic, encode,
+    CellDescription, CellMap, CellReputation, NodeStatus, RegionTopic, RegionTopicKind,
+    ReputationTopic, encode,
 };
 use uuid::Uuid;
 
@@ -58,13 +59,33 @@ impl RegionLink {
         status: &NodeStatus,
         report: LinkSink,
     ) -> Self {
-        let RegionLinkSetup { cell, tile, config, security, sink, counters, seed } = setup;
-        let path = |kind| RegionTopic { tile, cell: cell.clone(), kind }.path();
+        let RegionLinkSetup {
+            cell,
+            tile,
+            config,
+            security,
+            sink,
+            counters,
+            seed,
+        } = setup;
+        let path = |kind| {
+            RegionTopic {
+                tile,
+                cell: cell.clone(),
+                kind,
+            }
+            .path()
+        };
         let status_topic = path(RegionTopicKind::Status);
         let tiles = tile.with_neighbours();
-        let around = tiles.iter().map(|tile| RegionTopic::filter(*tile, RegionTopicKind::Map));
+        let around = tiles
+            .iter()
+            .map(|tile| RegionTopic::filter(*tile, RegionTopicKind::Map));
         let filters = around.chain([status_topic.clone()]).collect();
-        let will = LastWill { topic: status_topic, payload: offline_payload(status, config.encoding).into() };
+        let will = LastWill {
+            topic: status_topic,
+            payload: offline_payload(status, config.encoding).into(),
+        };
         let setup = Arc::new(LinkSetup {
             // Known to nobody else: who takes over a client id ends its connection. The id of this run is in the status.
             client_id: format!("{cell}-{}-{}", status.node, Uuid::new_v4().simple()),
@@ -78,7 +99,14 @@ impl RegionLink {
             seed,
         });
         let link = Link::spawn(id, broker, Arc::clone(&setup), report);
-        Self { id, cell, tile, link, setup, unsent: Vec::new() }
+        Self {
+            id,
+            cell,
+            tile,
+            link,
+            setup,
+            unsent: Vec::new(),
+        }
     }
 
     pub(super) fn id(&self) -> LinkId {
@@ -96,7 +124,10 @@ impl RegionLink {
 
     /// Subscribes to these filters; false when there is no room.
     pub(super) fn subscribe(&self, filters: &[String]) -> bool {
-        self.link.client.as_ref().is_some_and(|client| client.subscribe(filters, MaxQos::AtMostOnce))
+        self.link
+            .client
+            .as_ref()
+            .is_some_and(|client| client.subscribe(filters, MaxQos::AtMostOnce))
     }
 
     /// Unsubscribes from these filters, as far as there is room: what comes nevertheless is not used.
@@ -110,9 +141,13 @@ impl RegionLink {
 
     /// Publishes what the cell says of a vehicle; false when there is no room.
     pub(super) fn publish_reputation(&self, message: &CellReputation) -> bool {
-        let topic = ReputationTopic { vehicle: message.vehicle.clone(), cell: message.cell.clone() };
+        let topic = ReputationTopic {
+            vehicle: message.vehicle.clone(),
+            cell: message.cell.clone(),
+        };
         let payload = Bytes::from(encode(message, self.setup.config.encoding));
-        self.link.publish(&topic.path(), &payload, Retention::Retained)
+        self.link
+            .publish(&topic.path(), &payload, Retention::Retained)
     }
 
     /// Takes in an event of the link; true when it has just been established and nothing is published yet.
@@ -130,7 +165,9 @@ impl RegionLink {
             }
             LinkChange::Answered if self.link.state == LinkState::Stalled => LinkState::Up,
             // Other runs and last wills come as statuses.
-            LinkChange::Answered | LinkChange::DeclaredOffline | LinkChange::Namesake(_) => return false,
+            LinkChange::Answered | LinkChange::DeclaredOffline | LinkChange::Namesake(_) => {
+                return false;
+            }
         };
         let before = std::mem::replace(&mut self.link.state, state);
         if before != state {
@@ -148,8 +185,16 @@ impl RegionLink {
         }
         self.send_unsent();
         let is_sent = self.link.state == LinkState::Up
-            && self.link.publish(&self.topic(RegionTopicKind::Map), &payload, Retention::Transient);
-        self.setup.counters.count(if is_sent { Event::RegionPublished } else { Event::RegionWithheld });
+            && self.link.publish(
+                &self.topic(RegionTopicKind::Map),
+                &payload,
+                Retention::Transient,
+            );
+        self.setup.counters.count(if is_sent {
+            Event::RegionPublished
+        } else {
+            Event::RegionWithheld
+        });
         // The own map comes back, as that of any cell around.
         if self.link.state == LinkState::Up && self.link.misses_echo(now) {
             self.link.state = LinkState::Stalled;
@@ -161,20 +206,31 @@ impl RegionLink {
     /// Publishes the node's status, now if there is a connection, and as the last will of later ones.
     pub(super) fn publish_status(&mut self, status: &NodeStatus) {
         let encoding = self.setup.config.encoding;
-        self.setup.will.lock().unwrap_or_else(PoisonError::into_inner).payload =
-            offline_payload(status, encoding).into();
+        self.setup
+            .will
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .payload = offline_payload(status, encoding).into();
         self.retain(RegionTopicKind::Status, encode(status, encoding).into());
     }
 
     /// Publishes the description of the cell, if there is a connection.
     pub(super) fn publish_description(&mut self, description: &CellDescription) {
-        self.retain(RegionTopicKind::Cell, encode(description, self.setup.config.encoding).into());
+        self.retain(
+            RegionTopicKind::Cell,
+            encode(description, self.setup.config.encoding).into(),
+        );
     }
 
     /// Ends the connection without last will, after what is to be said of vehicles, and after `last` as the retained status,
     /// if it is given.
-    pub(super) async fn close(mut self, last: Option<&NodeStatus>, reputations: Vec<CellReputation>) {
-        let is_said = tokio::time::timeout(LEAVE_TIMEOUT, self.publish_reputations(&reputations)).await;
+    pub(super) async fn close(
+        mut self,
+        last: Option<&NodeStatus>,
+        reputations: Vec<CellReputation>,
+    ) {
+        let is_said =
+            tokio::time::timeout(LEAVE_TIMEOUT, self.publish_reputations(&reputations)).await;
         if is_said.is_err() {
             tracing::debug!(broker = %self.link.broker, "broker did not take all that was to be said of vehicles");
         }
@@ -202,7 +258,12 @@ impl RegionLink {
     }
 
     fn topic(&self, kind: RegionTopicKind) -> String {
-        RegionTopic { tile: self.tile, cell: self.cell.clone(), kind }.path()
+        RegionTopic {
+            tile: self.tile,
+            cell: self.cell.clone(),
+            kind,
+        }
+        .path()
     }
 
     fn retain(&mut self, kind: RegionTopicKind, payload: Bytes) {
@@ -215,6 +276,7 @@ impl RegionLink {
 
     fn send_unsent(&mut self) {
         let link = &self.link;
-        self.unsent.retain(|(topic, payload)| !link.publish(topic, payload, Retention::Repeated));
+        self.unsent
+            .retain(|(topic, payload)| !link.publish(topic, payload, Retention::Repeated));
     }
 }

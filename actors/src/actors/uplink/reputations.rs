@@ -34,8 +34,13 @@ impl UplinkState {
     /// Takes what the cell's own evidence says.
     pub(super) fn count_vehicles(&mut self, counts: Vec<(NodeName, CellCounts)>) {
         let (before, now) = (self.exchange.dropped(), clock::now());
-        counts.into_iter().for_each(|(vehicle, counts)| self.exchange.count(&vehicle, counts, now));
-        self.setup.counters.add(Event::CellReputationDropped, self.exchange.dropped() - before);
+        counts
+            .into_iter()
+            .for_each(|(vehicle, counts)| self.exchange.count(&vehicle, counts, now));
+        self.setup.counters.add(
+            Event::CellReputationDropped,
+            self.exchange.dropped() - before,
+        );
     }
 
     /// Takes what a cell says of a vehicle; what does not count is counted by its reason and cell.
@@ -46,17 +51,30 @@ impl UplinkState {
         myself: &ActorRef<UplinkMessage>,
     ) {
         let now = self.setup.clock.date(received_at);
-        if message.reset_at_us.is_some_and(|at| at.since(now) >= MAX_RESET_AHEAD) {
+        if message
+            .reset_at_us
+            .is_some_and(|at| at.since(now) >= MAX_RESET_AHEAD)
+        {
             let reason = RejectReason::FromTheFuture;
-            return self.setup.counters.reject_message(reason, &source(&message.cell), || {
-                format!("what the cell {} says of {} not used: reset in the future", message.cell, message.vehicle)
-            });
+            return self
+                .setup
+                .counters
+                .reject_message(reason, &source(&message.cell), || {
+                    format!(
+                        "what the cell {} says of {} not used: reset in the future",
+                        message.cell, message.vehicle
+                    )
+                });
         }
         let before = self.exchange.news_at();
         if self.exchange.hear(message, received_at) {
             self.setup.counters.count(Event::CellReputationAccepted);
         }
-        if let Some(news_at) = self.exchange.news_at().filter(|news_at| before.is_none_or(|before| *news_at < before)) {
+        if let Some(news_at) = self
+            .exchange
+            .news_at()
+            .filter(|news_at| before.is_none_or(|before| *news_at < before))
+        {
             myself.send_after(news_at.since(clock::now()), || UplinkMessage::Exchange);
         }
     }
@@ -64,9 +82,13 @@ impl UplinkState {
     /// Tells the fuser what is new, and carries out the next steps on the link.
     pub(super) fn exchange_reputations(&mut self) {
         if let Some(reputations) = self.exchange.take_news(clock::now()) {
-            self.setup.fuser.send(FuserMessage::TakeForeign { reputations: reputations.into() });
+            self.setup.fuser.send(FuserMessage::TakeForeign {
+                reputations: reputations.into(),
+            });
         }
-        let Some(link) = self.link.as_mut().filter(|link| link.is_up()) else { return };
+        let Some(link) = self.link.as_mut().filter(|link| link.is_up()) else {
+            return;
+        };
         for step in self.exchange.next(clock::now(), MAX_MESSAGES) {
             match step {
                 ExchangeStep::Subscribe(filters) if !link.subscribe(&filters) => {

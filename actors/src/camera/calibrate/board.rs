@@ -28,7 +28,9 @@ pub enum GroundBoard {
 #[derive(Debug, thiserror::Error)]
 pub enum BoardError {
     /// No board was found.
-    #[error("no {0} was found: photograph all of it, sharp, with nothing on it, and as large as it fits")]
+    #[error(
+        "no {0} was found: photograph all of it, sharp, with nothing on it, and as large as it fits"
+    )]
     NotFound(&'static str),
     /// Several codes were found.
     #[error("{0} QR codes were found, and only one has the stated size: cover the others")]
@@ -48,34 +50,59 @@ pub enum BoardError {
 ///
 /// # Errors
 /// [`BoardError`] when the board is not found or fits no camera.
-pub fn fit_board(photograph: &Mat, board: &GroundBoard, lens: &Lens) -> Result<GroundFit, BoardError> {
+pub fn fit_board(
+    photograph: &Mat,
+    board: &GroundBoard,
+    lens: &Lens,
+) -> Result<GroundFit, BoardError> {
     let (pixels, places) = match board {
         GroundBoard::QrCode { side_mm } => {
             // A board on the ground is foreshortened along the columns.
             let passes = [(1.0, 1.0), (1.0, 2.0), (2.0, 4.0)];
-            let passes = passes.map(|(stretch_x, stretch_y)| Pass { stretch_x, stretch_y }).to_vec();
-            let mut codes = PlacardDetector::new(PlacardConfig { passes, ..PlacardConfig::default() })
-                .codes(&mut photograph.try_clone()?)?;
+            let passes = passes
+                .map(|(stretch_x, stretch_y)| Pass {
+                    stretch_x,
+                    stretch_y,
+                })
+                .to_vec();
+            let mut codes = PlacardDetector::new(PlacardConfig {
+                passes,
+                ..PlacardConfig::default()
+            })
+            .codes(&mut photograph.try_clone()?)?;
             let code = codes.pop().ok_or(BoardError::NotFound("QR code"))?;
             if !codes.is_empty() {
                 return Err(BoardError::SeveralCodes(codes.len() + 1));
             }
-            (finder_corners(photograph, &code)?, finder_places(code.modules, side_mm / 1000.0))
+            (
+                finder_corners(photograph, &code)?,
+                finder_places(code.modules, side_mm / 1000.0),
+            )
         }
         GroundBoard::Chessboard(board) => {
-            let corners = find_board(photograph, board)?.ok_or(BoardError::NotFound("whole chessboard"))?;
-            let pixels = corners.iter().map(|corner| Point2::new(f64::from(corner.x) + 0.5, f64::from(corner.y) + 0.5));
+            let corners =
+                find_board(photograph, board)?.ok_or(BoardError::NotFound("whole chessboard"))?;
+            let pixels = corners
+                .iter()
+                .map(|corner| Point2::new(f64::from(corner.x) + 0.5, f64::from(corner.y) + 0.5));
             (pixels.collect(), chessboard_places(board))
         }
     };
     let size = lens.intrinsics;
     let scale = f64::from(size.width) / f64::from(photograph.cols());
-    let scaled: Vec<_> = pixels.iter().map(|pixel| Point2::from(pixel.coords * scale)).collect();
+    let scaled: Vec<_> = pixels
+        .iter()
+        .map(|pixel| Point2::from(pixel.coords * scale))
+        .collect();
     fit(&lens.undistorted(&scaled)?, &places, &size)
 }
 
 /// The fit to a board, whose corners may count from either side of it.
-fn fit(pixels: &[Point2<f64>], places: &[Point2<f64>], intrinsics: &Intrinsics) -> Result<GroundFit, BoardError> {
+fn fit(
+    pixels: &[Point2<f64>],
+    places: &[Point2<f64>],
+    intrinsics: &Intrinsics,
+) -> Result<GroundFit, BoardError> {
     let points = |side: f64| -> Vec<GroundPoint> {
         let point = |(pixel, place): (&Point2<f64>, &Point2<f64>)| GroundPoint {
             pixel: *pixel,
@@ -91,8 +118,12 @@ fn fit(pixels: &[Point2<f64>], places: &[Point2<f64>], intrinsics: &Intrinsics) 
 
 fn chessboard_places(board: &Chessboard) -> Vec<Point2<f64>> {
     let square_m = board.square_mm / 1000.0;
-    let place = |row: u16, column: u16| Point2::new(f64::from(column) * square_m, -f64::from(row) * square_m);
-    (0..board.rows).flat_map(|row| (0..board.columns).map(move |column| place(row, column))).collect()
+    let place = |row: u16, column: u16| {
+        Point2::new(f64::from(column) * square_m, -f64::from(row) * square_m)
+    };
+    (0..board.rows)
+        .flat_map(|row| (0..board.columns).map(move |column| place(row, column)))
+        .collect()
 }
 
 /// Corners of a code's three finder patterns in modules: rows and columns count from the upper left corner. Each pattern is
@@ -103,7 +134,10 @@ fn finder_modules(modules: f64) -> Vec<Point2<f64>> {
     let squares = [0.0, 1.0, 2.0].map(|inset| (inset, 7.0 - inset));
     let corners = |(low, high): (f64, f64)| [(low, low), (high, low), (high, high), (low, high)];
     let all = patterns.into_iter().flat_map(|(column, row)| {
-        squares.into_iter().flat_map(corners).map(move |(x, y)| Point2::new(column + x, row + y))
+        squares
+            .into_iter()
+            .flat_map(corners)
+            .map(move |(x, y)| Point2::new(column + x, row + y))
     });
     all.collect()
 }
@@ -111,32 +145,63 @@ fn finder_modules(modules: f64) -> Vec<Point2<f64>> {
 /// The same on the ground, in metres.
 fn finder_places(modules: f64, side_m: f64) -> Vec<Point2<f64>> {
     let module_m = side_m / modules;
-    finder_modules(modules).into_iter().map(|corner| Point2::new(corner.x * module_m, -corner.y * module_m)).collect()
+    finder_modules(modules)
+        .into_iter()
+        .map(|corner| Point2::new(corner.x * module_m, -corner.y * module_m))
+        .collect()
 }
 
 /// The same in the photograph: as the corners of the code put them, and then where the edges are.
 fn finder_corners(photograph: &Mat, code: &Code) -> opencv::Result<Vec<Point2<f64>>> {
     let single = |point: &Point2<f64>| Point2f::new(point.x as f32, point.y as f32);
     let n = code.modules;
-    let outer: Vector<Point2f> =
-        [(0.0, 0.0), (n, 0.0), (n, n), (0.0, n)].iter().map(|&(x, y)| single(&Point2::new(x, y))).collect();
+    let outer: Vector<Point2f> = [(0.0, 0.0), (n, 0.0), (n, n), (0.0, n)]
+        .iter()
+        .map(|&(x, y)| single(&Point2::new(x, y)))
+        .collect();
     let seen: Vector<Point2f> = code.corners.iter().map(single).collect();
     let modules: Vector<Point2f> = finder_modules(n).iter().map(single).collect();
     let mut to_image = calib3d::find_homography_def(&outer, &seen, &mut Mat::default())?;
     let mut corners = Vector::<Point2f>::new();
     for _ in 0..REFINEMENTS {
         perspective_transform(&modules, &mut corners, &to_image)?;
-        let sides = corners.iter().zip(corners.iter().skip(1)).map(|(a, b)| f64::from((a.x - b.x).hypot(a.y - b.y)));
+        let sides = corners
+            .iter()
+            .zip(corners.iter().skip(1))
+            .map(|(a, b)| f64::from((a.x - b.x).hypot(a.y - b.y)));
         // Within a module of each corner is no other.
-        let reach = (sides.fold(f64::INFINITY, f64::min) / 3.0 * 0.7).floor().clamp(1.0, 10.0) as i32;
+        let reach = (sides.fold(f64::INFINITY, f64::min) / 3.0 * 0.7)
+            .floor()
+            .clamp(1.0, 10.0) as i32;
         // OpenCV's refinement has the middle of the first pixel at 0, everything else here at 0.5.
-        let mut middles: Vector<Point2f> = corners.iter().map(|c| Point2f::new(c.x - 0.5, c.y - 0.5)).collect();
+        let mut middles: Vector<Point2f> = corners
+            .iter()
+            .map(|c| Point2f::new(c.x - 0.5, c.y - 0.5))
+            .collect();
         let none = Size::new(-1, -1);
-        imgproc::corner_sub_pix(photograph, &mut middles, Size::new(reach, reach), none, stop_after(40, 1e-3)?)?;
-        corners = middles.iter().map(|c| Point2f::new(c.x + 0.5, c.y + 0.5)).collect();
-        to_image = calib3d::find_homography(&modules, &corners, &mut Mat::default(), calib3d::RANSAC, OFF_PX)?;
+        imgproc::corner_sub_pix(
+            photograph,
+            &mut middles,
+            Size::new(reach, reach),
+            none,
+            stop_after(40, 1e-3)?,
+        )?;
+        corners = middles
+            .iter()
+            .map(|c| Point2f::new(c.x + 0.5, c.y + 0.5))
+            .collect();
+        to_image = calib3d::find_homography(
+            &modules,
+            &corners,
+            &mut Mat::default(),
+            calib3d::RANSAC,
+            OFF_PX,
+        )?;
     }
-    Ok(corners.iter().map(|corner| Point2::new(f64::from(corner.x), f64::from(corner.y))).collect())
+    Ok(corners
+        .iter()
+        .map(|corner| Point2::new(f64::from(corner.x), f64::from(corner.y)))
+        .collect())
 }
 
 const REFINEMENTS: usize = 3;

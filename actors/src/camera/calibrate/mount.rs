@@ -87,19 +87,25 @@ const MAX_PITCH_SIGMA_DEG: f64 = 5.0;
 ///
 /// # Errors
 /// [`GroundFitError`] when no camera fits, or several do.
-pub fn fit_ground_points(points: &[GroundPoint], intrinsics: &Intrinsics) -> Result<GroundFit, GroundFitError> {
+pub fn fit_ground_points(
+    points: &[GroundPoint],
+    intrinsics: &Intrinsics,
+) -> Result<GroundFit, GroundFitError> {
     if points.len() < MIN_POINTS {
         return Err(GroundFitError::TooFewPoints(points.len()));
     }
     let threshold_px = OUTLIER_SHARE * f64::from(intrinsics.width);
-    let (pose, mount, inliers) = solve(points, intrinsics, threshold_px)?.ok_or(GroundFitError::NoCamera)?;
+    let (pose, mount, inliers) =
+        solve(points, intrinsics, threshold_px)?.ok_or(GroundFitError::NoCamera)?;
     let height_m = mount.height_m.unwrap_or(0.0);
     if height_m <= 0.0 {
         return Err(GroundFitError::BelowGround);
     }
     let camera = PosedCamera::new(pose, &mount, *intrinsics);
     let fit = |(index, point): (usize, &GroundPoint)| PointFit {
-        error_px: camera.pixel(&point.place).map_or(f64::INFINITY, |pixel| (pixel - point.pixel).norm()),
+        error_px: camera
+            .pixel(&point.place)
+            .map_or(f64::INFINITY, |pixel| (pixel - point.pixel).norm()),
         error_m: mount
             .ground_at(&point.pixel, intrinsics)
             .map(|ground| (pose.transform(ground.x, ground.y) - point.place).norm()),
@@ -107,14 +113,27 @@ pub fn fit_ground_points(points: &[GroundPoint], intrinsics: &Intrinsics) -> Res
     };
     let fits: Vec<PointFit> = points.iter().enumerate().map(fit).collect();
     let used: Vec<GroundPoint> = inliers.iter().map(|&index| points[index]).collect();
-    let squares = fits.iter().filter(|fit| !fit.is_outlier).map(|fit| fit.error_px * fit.error_px).sum::<f64>();
+    let squares = fits
+        .iter()
+        .filter(|fit| !fit.is_outlier)
+        .map(|fit| fit.error_px * fit.error_px)
+        .sum::<f64>();
     let freedom = (2 * used.len() - PARAMETERS) as f64;
     let sigma_px = (squares / freedom).sqrt().max(MIN_SIGMA_PX);
-    let sigmas = sigmas(&used, &pose, &mount, intrinsics).ok_or(GroundFitError::NoCamera)? * sigma_px;
-    let estimate =
-        MountEstimate { mount, height_sigma_m: sigmas[0], pitch_sigma_rad: sigmas[1], roll_sigma_rad: sigmas[2] };
+    let sigmas =
+        sigmas(&used, &pose, &mount, intrinsics).ok_or(GroundFitError::NoCamera)? * sigma_px;
+    let estimate = MountEstimate {
+        mount,
+        height_sigma_m: sigmas[0],
+        pitch_sigma_rad: sigmas[1],
+        roll_sigma_rad: sigmas[2],
+    };
     if sigmas[1].to_degrees() <= MAX_PITCH_SIGMA_DEG {
-        Ok(GroundFit { pose, estimate, points: fits })
+        Ok(GroundFit {
+            pose,
+            estimate,
+            points: fits,
+        })
     } else {
         Err(GroundFitError::Undetermined(sigmas[1].to_degrees()))
     }
@@ -129,10 +148,13 @@ fn solve(
 ) -> Result<Option<Solution>, opencv::Error> {
     let place = |point: &GroundPoint| Point3d::new(point.place.x, point.place.y, 0.0);
     let pixel = |point: &GroundPoint| Point2d::new(point.pixel.x, point.pixel.y);
-    let (places, pixels): (Vector<Point3d>, Vector<Point2d>) =
-        (points.iter().map(place).collect(), points.iter().map(pixel).collect());
+    let (places, pixels): (Vector<Point3d>, Vector<Point2d>) = (
+        points.iter().map(place).collect(),
+        points.iter().map(pixel).collect(),
+    );
     let (camera, undistorted) = (camera_matrix(intrinsics), Mat::default());
-    let (mut rotation, mut translation, mut inliers) = (Mat::default(), Mat::default(), Vector::<i32>::new());
+    let (mut rotation, mut translation, mut inliers) =
+        (Mat::default(), Mat::default(), Vector::<i32>::new());
     let is_solved = calib3d::solve_pnp_ransac(
         &places,
         &pixels,
@@ -147,15 +169,36 @@ fn solve(
         &mut inliers,
         SolvePnPMethod::SOLVEPNP_AP3P as i32,
     )?;
-    let inliers: Vec<usize> = inliers.iter().filter_map(|index| usize::try_from(index).ok()).collect();
+    let inliers: Vec<usize> = inliers
+        .iter()
+        .filter_map(|index| usize::try_from(index).ok())
+        .collect();
     if !is_solved || inliers.len() < MIN_POINTS {
         return Ok(None);
     }
-    let (places, pixels): (Vector<Point3d>, Vector<Point2d>) =
-        inliers.iter().map(|&index| (place(&points[index]), pixel(&points[index]))).unzip();
+    let (places, pixels): (Vector<Point3d>, Vector<Point2d>) = inliers
+        .iter()
+        .map(|&index| (place(&points[index]), pixel(&points[index])))
+        .unzip();
     let planar = SolvePnPMethod::SOLVEPNP_IPPE as i32;
-    calib3d::solve_pnp(&places, &pixels, &camera, &undistorted, &mut rotation, &mut translation, false, planar)?;
-    calib3d::solve_pnp_refine_lm_def(&places, &pixels, &camera, &undistorted, &mut rotation, &mut translation)?;
+    calib3d::solve_pnp(
+        &places,
+        &pixels,
+        &camera,
+        &undistorted,
+        &mut rotation,
+        &mut translation,
+        false,
+        planar,
+    )?;
+    calib3d::solve_pnp_refine_lm_def(
+        &places,
+        &pixels,
+        &camera,
+        &undistorted,
+        &mut rotation,
+        &mut translation,
+    )?;
     let mut matrix = Matx33d::default();
     calib3d::rodrigues_def(&rotation, &mut matrix)?;
     let from_ground = Matrix3::from_row_slice(&matrix.val);
@@ -184,7 +227,12 @@ fn from_extrinsics(from_ground: &Matrix3<f64>, origin: &Vector3<f64>) -> (Pose, 
 const PARAMETERS: usize = 6;
 
 /// Standard deviations of height (m), pitch and roll (rad) for pixels of deviation 1.
-fn sigmas(points: &[GroundPoint], pose: &Pose, mount: &Mount, intrinsics: &Intrinsics) -> Option<Vector3<f64>> {
+fn sigmas(
+    points: &[GroundPoint],
+    pose: &Pose,
+    mount: &Mount,
+    intrinsics: &Intrinsics,
+) -> Option<Vector3<f64>> {
     const STEP: f64 = 1e-6;
     let pixels = |change: SVector<f64, PARAMETERS>| {
         let mount = Mount {
@@ -194,21 +242,42 @@ fn sigmas(points: &[GroundPoint], pose: &Pose, mount: &Mount, intrinsics: &Intri
             ..*mount
         };
         let [x_m, y_m, turn_rad] = [change[3], change[4], change[5]];
-        let pose = Pose::new(pose.position.x + x_m, pose.position.y + y_m, pose.heading_rad + turn_rad);
+        let pose = Pose::new(
+            pose.position.x + x_m,
+            pose.position.y + y_m,
+            pose.heading_rad + turn_rad,
+        );
         let camera = PosedCamera::new(pose, &mount, *intrinsics);
-        points.iter().map(|point| camera.pixel(&point.place)).collect::<Option<Vec<_>>>()
+        points
+            .iter()
+            .map(|point| camera.pixel(&point.place))
+            .collect::<Option<Vec<_>>>()
     };
     let here = pixels(SVector::zeros())?;
     let mut columns = Vec::new();
     for axis in 0..PARAMETERS {
-        let moved = pixels(SVector::from_fn(|row, _| if row == axis { STEP } else { 0.0 }))?;
-        columns.push(moved.iter().zip(&here).map(|(moved, here)| (moved - here) / STEP).collect::<Vec<_>>());
+        let moved = pixels(SVector::from_fn(
+            |row, _| if row == axis { STEP } else { 0.0 },
+        ))?;
+        columns.push(
+            moved
+                .iter()
+                .zip(&here)
+                .map(|(moved, here)| (moved - here) / STEP)
+                .collect::<Vec<_>>(),
+        );
     }
     let information = SMatrix::<f64, PARAMETERS, PARAMETERS>::from_fn(|row, column| {
-        columns[row].iter().zip(&columns[column]).map(|(a, b)| a.dot(b)).sum()
+        columns[row]
+            .iter()
+            .zip(&columns[column])
+            .map(|(a, b)| a.dot(b))
+            .sum()
     });
     let covariance = information.try_inverse()?;
-    Some(Vector3::from_fn(|index, _| covariance[(index, index)].sqrt()))
+    Some(Vector3::from_fn(|index, _| {
+        covariance[(index, index)].sqrt()
+    }))
 }
 
 #[cfg(test)]

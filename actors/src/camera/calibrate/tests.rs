@@ -3,7 +3,11 @@ use opencv::core::{BORDER_CONSTANT, CV_8UC1, Matx33d, Point, Rect, Scalar};
 
 use super::*;
 
-const BOARD: Chessboard = Chessboard { columns: 8, rows: 5, square_mm: 25.0 };
+const BOARD: Chessboard = Chessboard {
+    columns: 8,
+    rows: 5,
+    square_mm: 25.0,
+};
 const FOCAL_PX: f64 = 530.0;
 /// Pixels of the drawn board to a square.
 const SQUARE_PX: i32 = 40;
@@ -12,13 +16,26 @@ const SQUARE_PX: i32 = 40;
 fn flat_board() -> Mat {
     let (columns, rows) = (i32::from(BOARD.columns) + 1, i32::from(BOARD.rows) + 1);
     let white = Scalar::all(255.0);
-    let mut image =
-        Mat::new_rows_cols_with_default((rows + 2) * SQUARE_PX, (columns + 2) * SQUARE_PX, CV_8UC1, white).unwrap();
+    let mut image = Mat::new_rows_cols_with_default(
+        (rows + 2) * SQUARE_PX,
+        (columns + 2) * SQUARE_PX,
+        CV_8UC1,
+        white,
+    )
+    .unwrap();
     for (row, column) in (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column))) {
         if (row + column) % 2 == 0 {
             let at = Point::new((column + 1) * SQUARE_PX, (row + 1) * SQUARE_PX);
             let square = Rect::from_point_size(at, Size::new(SQUARE_PX, SQUARE_PX));
-            imgproc::rectangle(&mut image, square, Scalar::all(0.0), imgproc::FILLED, imgproc::LINE_8, 0).unwrap();
+            imgproc::rectangle(
+                &mut image,
+                square,
+                Scalar::all(0.0),
+                imgproc::FILLED,
+                imgproc::LINE_8,
+                0,
+            )
+            .unwrap();
         }
     }
     image
@@ -80,7 +97,11 @@ fn take_photographs(directory: &Path) -> Vec<PathBuf> {
         ([0.1, 0.5, 0.3], [50.0, 0.0], 450.0),
     ];
     let photograph = |(index, (turn, shift, distance))| {
-        write(directory, &format!("board{index}.jpg"), &photograph(&flat, turn, shift, distance))
+        write(
+            directory,
+            &format!("board{index}.jpg"),
+            &photograph(&flat, turn, shift, distance),
+        )
     };
     (0..).zip(views).map(photograph).collect()
 }
@@ -96,7 +117,12 @@ fn a_known_camera_is_recovered_within_one_percent_and_survives_its_file() {
     let found = &report.calibration;
     assert!((found.fx / FOCAL_PX - 1.0).abs() < 0.01, "fx {}", found.fx);
     assert!((found.fy / FOCAL_PX - 1.0).abs() < 0.01, "fy {}", found.fy);
-    assert!((found.cx - 320.0).abs() < 5.0 && (found.cy - 240.0).abs() < 5.0, "{} {}", found.cx, found.cy);
+    assert!(
+        (found.cx - 320.0).abs() < 5.0 && (found.cy - 240.0).abs() < 5.0,
+        "{} {}",
+        found.cx,
+        found.cy
+    );
     assert!(found.rms_px < 0.5, "rms {}", found.rms_px);
     assert_eq!(report.without_board, [directory.path().join("blank.jpg")]);
     assert_eq!(found.images.len(), 7);
@@ -113,32 +139,51 @@ fn a_known_camera_is_recovered_within_one_percent_and_survives_its_file() {
 fn errors_name_the_image() {
     let directory = tempfile::tempdir().unwrap();
     let mut images = take_photographs(directory.path());
-    assert_eq!(photographs(&[directory.path().to_owned()]).unwrap(), images, "a directory means its images");
-    let few = calibrate(&images[..2], &BOARD).expect_err("two views").to_string();
+    assert_eq!(
+        photographs(&[directory.path().to_owned()]).unwrap(),
+        images,
+        "a directory means its images"
+    );
+    let few = calibrate(&images[..2], &BOARD)
+        .expect_err("two views")
+        .to_string();
     assert!(few.contains("found in 2 images"), "{few}");
 
     let text = directory.path().join("notes.png");
     std::fs::write(&text, "not an image").unwrap();
     for unreadable in [text, directory.path().join("missing.png")] {
         images[1] = unreadable.clone();
-        let error = calibrate(&images, &BOARD).expect_err("unreadable").to_string();
+        let error = calibrate(&images, &BOARD)
+            .expect_err("unreadable")
+            .to_string();
         assert!(error.contains(unreadable.to_str().unwrap()), "{error}");
     }
     let small = Mat::new_rows_cols_with_default(240, 320, CV_8UC1, Scalar::all(90.0)).unwrap();
     images[1] = write(directory.path(), "small.jpg", &small);
-    let error = calibrate(&images, &BOARD).expect_err("sizes differ").to_string();
-    assert!(error.contains("small.jpg") && error.contains("320x240"), "{error}");
+    let error = calibrate(&images, &BOARD)
+        .expect_err("sizes differ")
+        .to_string();
+    assert!(
+        error.contains("small.jpg") && error.contains("320x240"),
+        "{error}"
+    );
 }
 
 #[test]
 fn a_bad_calibration_file_is_refused_by_name() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("camera.toml");
-    assert!(matches!(Calibration::read(&file), Err(CalibrationError::File(..))));
+    assert!(matches!(
+        Calibration::read(&file),
+        Err(CalibrationError::File(..))
+    ));
     let good = "image_width=640\nimage_height=480\nfx=500.0\nfy=500.0\ncx=320.0\ncy=240.0\n\
                 distortion=[0.0,0.0,0.0,0.0,0.0]\nrms_px=0.1\nimages=[]\n";
-    for bad in [good.replace("fx=500.0", "fx=0.0"), good.replace("fx=500.0", "fx=nan"), good.replace("cx=320.0\n", "")]
-    {
+    for bad in [
+        good.replace("fx=500.0", "fx=0.0"),
+        good.replace("fx=500.0", "fx=nan"),
+        good.replace("cx=320.0\n", ""),
+    ] {
         std::fs::write(&file, bad).unwrap();
         let error = Calibration::read(&file).expect_err("malformed").to_string();
         assert!(error.contains("camera.toml"), "{error}");

@@ -25,13 +25,21 @@ impl ScoredBox {
     /// The detection of the box.
     pub(super) fn labelled(&self, label: Label) -> Detection {
         let confidence = f64::from(self.score).clamp(0.0, 1.0);
-        Detection { label, confidence, bounding_box: self.bounds, corners: None }
+        Detection {
+            label,
+            confidence,
+            bounding_box: self.bounds,
+            corners: None,
+        }
     }
 }
 
 /// The best boxes of each class: of two that overlap by more than `max_overlap`, intersection over union, the lower score
 /// goes.
-pub(super) fn suppress(mut candidates: Vec<ScoredBox>, max_overlap: f64) -> opencv::Result<Vec<ScoredBox>> {
+pub(super) fn suppress(
+    mut candidates: Vec<ScoredBox>,
+    max_overlap: f64,
+) -> opencv::Result<Vec<ScoredBox>> {
     candidates.sort_by_key(|candidate| candidate.class);
     let mut best = Vec::new();
     for of_class in candidates.chunk_by(|a, b| a.class == b.class) {
@@ -40,7 +48,11 @@ pub(super) fn suppress(mut candidates: Vec<ScoredBox>, max_overlap: f64) -> open
         let scores: Vector<f32> = of_class.iter().map(|c| c.score).collect();
         let mut kept = Vector::<i32>::new();
         dnn::nms_boxes_f64(&boxes, &scores, 0.0, max_overlap as f32, &mut kept, 1.0, 0)?;
-        best.extend(kept.iter().filter_map(|index| of_class.get(index as usize)).copied());
+        best.extend(
+            kept.iter()
+                .filter_map(|index| of_class.get(index as usize))
+                .copied(),
+        );
     }
     Ok(best)
 }

@@ -39,7 +39,12 @@ pub struct CocoConfig {
 
 impl Default for CocoConfig {
     fn default() -> Self {
-        Self { model: None, threshold: 0.4, max_overlap: 0.5, tiling: false }
+        Self {
+            model: None,
+            threshold: 0.4,
+            max_overlap: 0.5,
+            tiling: false,
+        }
     }
 }
 
@@ -85,8 +90,10 @@ pub enum ModelError {
 }
 
 #[cfg(feature = "coco-weights")]
-static BUILT_IN: Option<&[u8]> =
-    Some(include_bytes!(concat!(env!("CARGO_MANIFEST_DIR"), "/../models/ssdlite_mobilenet_v2_coco.onnx")));
+static BUILT_IN: Option<&[u8]> = Some(include_bytes!(concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../models/ssdlite_mobilenet_v2_coco.onnx"
+)));
 #[cfg(not(feature = "coco-weights"))]
 static BUILT_IN: Option<&[u8]> = None;
 
@@ -115,29 +122,50 @@ impl CocoDetector {
     pub fn new(config: CocoConfig) -> Result<Self, ModelError> {
         let packaged = || installed::path(PACKAGED).filter(|_| BUILT_IN.is_none());
         let file = config.model.clone().or_else(packaged);
-        let name = file.as_ref().map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
+        let name = file
+            .as_ref()
+            .map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
         // OpenCV tells more in further lines.
         let first_line = |reason: String| reason.lines().next().unwrap_or_default().to_owned();
-        let unusable = |reason: String| ModelError::Unusable { path: name.clone(), reason: first_line(reason) };
+        let unusable = |reason: String| ModelError::Unusable {
+            path: name.clone(),
+            reason: first_line(reason),
+        };
         // Through a buffer of ours the heap would stay larger by the whole file.
         let net = match file {
             Some(path) => match bounded_file::open(&path) {
                 Ok(_) => dnn::read_net_from_onnx(&path),
                 Err(source) => return Err(ModelError::Unreadable { path, source }),
             },
-            None => dnn::read_net_from_onnx_buffer(&Vector::from_slice(BUILT_IN.ok_or(ModelError::NoWeights)?)),
+            None => dnn::read_net_from_onnx_buffer(&Vector::from_slice(
+                BUILT_IN.ok_or(ModelError::NoWeights)?,
+            )),
         };
         let net = net.map_err(|e| unusable(e.message))?;
-        let mut detector = Self { config, net, anchors: anchors::all() };
+        let mut detector = Self {
+            config,
+            net,
+            anchors: anchors::all(),
+        };
         let black = Mat::new_rows_cols_with_default(INPUT_PX, INPUT_PX, CV_8UC3, Scalar::all(0.0));
-        black.and_then(|image| detector.run_network(&image)).map_err(|e| unusable(e.message))?;
+        black
+            .and_then(|image| detector.run_network(&image))
+            .map_err(|e| unusable(e.message))?;
         Ok(detector)
     }
 
     /// Runs the network on one image. Boxes are in shares of its sides.
     fn run_network(&mut self, image: &Mat) -> opencv::Result<Vec<ScoredBox>> {
         let (scale, middle) = (1.0 / 127.5, Scalar::all(127.5));
-        let blob = dnn::blob_from_image(image, scale, Size::new(INPUT_PX, INPUT_PX), middle, true, false, CV_32F)?;
+        let blob = dnn::blob_from_image(
+            image,
+            scale,
+            Size::new(INPUT_PX, INPUT_PX),
+            middle,
+            true,
+            false,
+            CV_32F,
+        )?;
         self.net.set_input_def(&blob)?;
         let mut outputs = Vector::<Mat>::new();
         let names: Vector<String> = ["boxes", "scores"].into_iter().collect();
@@ -149,12 +177,20 @@ impl CocoDetector {
             let message = format!("outputs of {} and {} numbers", boxes.len(), scores.len());
             return Err(opencv::Error::new(opencv::core::StsUnmatchedSizes, message));
         }
-        let anchors = self.anchors.iter().zip(boxes.chunks_exact(4)).zip(scores.chunks_exact(classes));
+        let anchors = self
+            .anchors
+            .iter()
+            .zip(boxes.chunks_exact(4))
+            .zip(scores.chunks_exact(classes));
         Ok(anchors
             .filter_map(|((anchor, offsets), scores)| {
                 let (class, score) = best_class(scores)?;
                 let bounds = anchor.decode(offsets);
-                (f64::from(score) >= self.config.threshold).then_some(ScoredBox { class, score, bounds })
+                (f64::from(score) >= self.config.threshold).then_some(ScoredBox {
+                    class,
+                    score,
+                    bounds,
+                })
             })
             .collect())
     }
@@ -167,17 +203,26 @@ impl CocoDetector {
         }
         if self.config.tiling {
             for (right, lower) in [(false, false), (true, false), (false, true), (true, true)] {
-                let (tile_width, tile_height) = ((width * TILE_SHARE).floor(), (height * TILE_SHARE).floor());
+                let (tile_width, tile_height) =
+                    ((width * TILE_SHARE).floor(), (height * TILE_SHARE).floor());
                 let x = if right { width - tile_width } else { 0.0 };
                 let y = if lower { height - tile_height } else { 0.0 };
                 let area = Rect::new(x as i32, y as i32, tile_width as i32, tile_height as i32);
                 let tile = Mat::roi(image, area)?.try_clone()?;
-                let whole = self.run_network(&tile)?.into_iter().filter(|c| !is_cut(&c.bounds, right, lower));
-                found
-                    .extend(whole.map(|c| ScoredBox { bounds: placed(&c.bounds, x, y, tile_width, tile_height), ..c }));
+                let whole = self
+                    .run_network(&tile)?
+                    .into_iter()
+                    .filter(|c| !is_cut(&c.bounds, right, lower));
+                found.extend(whole.map(|c| ScoredBox {
+                    bounds: placed(&c.bounds, x, y, tile_width, tile_height),
+                    ..c
+                }));
             }
         }
-        Ok(found.into_iter().filter_map(|candidate| candidate.inside(width, height)).collect())
+        Ok(found
+            .into_iter()
+            .filter_map(|candidate| candidate.inside(width, height))
+            .collect())
     }
 }
 
@@ -185,14 +230,25 @@ impl Detect for CocoDetector {
     fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError> {
         let failed = |step| move |source| DetectError::OpenCv { step, source };
         let image = bgr(frame)?;
-        let candidates = self.run_on_image(&image).map_err(failed("the coco network"))?;
-        let best = suppress(candidates, self.config.max_overlap).map_err(failed("non-maximum suppression"))?;
-        Ok(best.iter().filter_map(|found| Some(found.labelled(labels::name(found.class)?.into()))).collect())
+        let candidates = self
+            .run_on_image(&image)
+            .map_err(failed("the coco network"))?;
+        let best = suppress(candidates, self.config.max_overlap)
+            .map_err(failed("non-maximum suppression"))?;
+        Ok(best
+            .iter()
+            .filter_map(|found| Some(found.labelled(labels::name(found.class)?.into())))
+            .collect())
     }
 }
 
 fn best_class(scores: &[f32]) -> Option<(usize, f32)> {
-    scores.iter().copied().enumerate().skip(1).max_by(|a, b| a.1.total_cmp(&b.1))
+    scores
+        .iter()
+        .copied()
+        .enumerate()
+        .skip(1)
+        .max_by(|a, b| a.1.total_cmp(&b.1))
 }
 
 /// Converts a box from shares of a tile's sides to pixels of the image.
@@ -207,7 +263,13 @@ fn placed(b: &BoundingBox, x: f64, y: f64, width: f64, height: f64) -> BoundingB
 
 /// True if an inner edge of a tile cuts the box. A neighbouring tile or the image shows all of it.
 fn is_cut(b: &BoundingBox, right: bool, lower: bool) -> bool {
-    let cut = |low: f64, high: f64, second: bool| if second { low < CUT_SHARE } else { high > 1.0 - CUT_SHARE };
+    let cut = |low: f64, high: f64, second: bool| {
+        if second {
+            low < CUT_SHARE
+        } else {
+            high > 1.0 - CUT_SHARE
+        }
+    };
     cut(b.x_min, b.x_max, right) || cut(b.y_min, b.y_max, lower)
 }
 

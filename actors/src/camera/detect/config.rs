@@ -37,8 +37,12 @@ pub struct CustomDetector {
 
 impl CustomDetector {
     /// A factory. If it fails, as without a file, the node fails.
-    pub fn new(build: impl Fn() -> anyhow::Result<Box<dyn Detect>> + Send + Sync + 'static) -> Self {
-        Self { build: Arc::new(build) }
+    pub fn new(
+        build: impl Fn() -> anyhow::Result<Box<dyn Detect>> + Send + Sync + 'static,
+    ) -> Self {
+        Self {
+            build: Arc::new(build),
+        }
     }
 }
 

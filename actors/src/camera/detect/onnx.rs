@@ -110,7 +110,9 @@ pub enum OnnxError {
         source: std::io::Error,
     },
     /// The runtime refuses the file.
-    #[error("model {path:?} cannot be run: {reason}; export it to onnx with 32-bit weights and standard operators")]
+    #[error(
+        "model {path:?} cannot be run: {reason}; export it to onnx with 32-bit weights and standard operators"
+    )]
     NotRunnable {
         /// The model.
         path: PathBuf,
@@ -118,7 +120,9 @@ pub enum OnnxError {
         reason: String,
     },
     /// The network does not take one image.
-    #[error("model {path:?} takes {inputs}; export it for one image, such as images tensor(f32) [1, 3, 640, 640]")]
+    #[error(
+        "model {path:?} takes {inputs}; export it for one image, such as images tensor(f32) [1, 3, 640, 640]"
+    )]
     UnknownInputs {
         /// The model.
         path: PathBuf,
@@ -126,13 +130,17 @@ pub enum OnnxError {
         inputs: String,
     },
     /// The file says no size of the image.
-    #[error("model {path:?} takes images of any size: set `input_px` to the size of its training, such as [640, 640]")]
+    #[error(
+        "model {path:?} takes images of any size: set `input_px` to the size of its training, such as [640, 640]"
+    )]
     AnySize {
         /// The model.
         path: PathBuf,
     },
     /// The network takes another size than the configured one.
-    #[error("model {path:?} takes images of {taken}, not {told}: remove `input_px` or export it for that size")]
+    #[error(
+        "model {path:?} takes images of {taken}, not {told}: remove `input_px` or export it for that size"
+    )]
     OtherSize {
         /// The model.
         path: PathBuf,
@@ -142,7 +150,9 @@ pub enum OnnxError {
         told: ImageSize,
     },
     /// The network fails at the configured size.
-    #[error("model {path:?} fails with an image of {size}: {reason}; try sides that are multiples of 32 in `input_px`")]
+    #[error(
+        "model {path:?} fails with an image of {size}: {reason}; try sides that are multiples of 32 in `input_px`"
+    )]
     RefusedSize {
         /// The model.
         path: PathBuf,
@@ -167,13 +177,17 @@ pub enum OnnxError {
         family: String,
     },
     /// A YOLOX model with other outputs than its family's.
-    #[error("model {path:?} gives boxes of yolox in pixels: export it without `--decode_in_inference`")]
+    #[error(
+        "model {path:?} gives boxes of yolox in pixels: export it without `--decode_in_inference`"
+    )]
     InPixels {
         /// The model.
         path: PathBuf,
     },
     /// The count of labels is not that of the classes.
-    #[error("{labels} labels in {path:?}, but the model has {classes} classes: list one on each line, in its order")]
+    #[error(
+        "{labels} labels in {path:?}, but the model has {classes} classes: list one on each line, in its order"
+    )]
     LabelCount {
         /// The file of the labels or of the model.
         path: PathBuf,
@@ -191,7 +205,9 @@ pub enum OnnxError {
         label: String,
     },
     /// No labels are known.
-    #[error("model {path:?} has {classes} classes without names: set `labels` to a file with one on each line")]
+    #[error(
+        "model {path:?} has {classes} classes without names: set `labels` to a file with one on each line"
+    )]
     NoLabels {
         /// The model.
         path: PathBuf,
@@ -233,32 +249,65 @@ impl OnnxDetector {
     /// [`OnnxError`] with the file and the remedy.
     pub fn new(config: OnnxConfig) -> Result<Self, OnnxError> {
         let path = &config.model;
-        let told = config.input_px.map(|[width, height]| ImageSize { width: width.into(), height: height.into() });
+        let told = config.input_px.map(|[width, height]| ImageSize {
+            width: width.into(),
+            height: height.into(),
+        });
         let network = Network::load(path, told)?;
         let size = network.input_size();
-        let outputs =
-            network.run(vec![0.0; 3 * size.width as usize * size.height as usize]).map_err(|reason| match told {
-                Some(size) => OnnxError::RefusedSize { path: path.clone(), size, reason },
-                None => OnnxError::NotRunnable { path: path.clone(), reason },
+        let outputs = network
+            .run(vec![0.0; 3 * size.width as usize * size.height as usize])
+            .map_err(|reason| match told {
+                Some(size) => OnnxError::RefusedSize {
+                    path: path.clone(),
+                    size,
+                    reason,
+                },
+                None => OnnxError::NotRunnable {
+                    path: path.clone(),
+                    reason,
+                },
             })?;
         let (names, names_path) = names(&config, &network)?;
-        let description = ["description", "head"].map(|key| network.metadata(key).unwrap_or_default()).join(" ");
-        let clues =
-            Clues { told: config.family, description: &description, input: size, scales_boxes: network.scales_boxes() };
-        let head = Head::find(&clues, &outputs).ok_or_else(|| unknown_outputs(&config, size, &outputs))?;
+        let description = ["description", "head"]
+            .map(|key| network.metadata(key).unwrap_or_default())
+            .join(" ");
+        let clues = Clues {
+            told: config.family,
+            description: &description,
+            input: size,
+            scales_boxes: network.scales_boxes(),
+        };
+        let head =
+            Head::find(&clues, &outputs).ok_or_else(|| unknown_outputs(&config, size, &outputs))?;
         if head.is_in_pixels(&outputs, size) {
             return Err(OnnxError::InPixels { path: path.clone() });
         }
-        let labels = head.classes(&outputs).labels(names.as_deref()).map_err(|classes| {
-            let classes = classes.unwrap_or_default();
-            match &names {
-                Some(names) => OnnxError::LabelCount { path: names_path, labels: names.len(), classes },
-                None => OnnxError::NoLabels { path: path.clone(), classes },
-            }
-        })?;
+        let labels = head
+            .classes(&outputs)
+            .labels(names.as_deref())
+            .map_err(|classes| {
+                let classes = classes.unwrap_or_default();
+                match &names {
+                    Some(names) => OnnxError::LabelCount {
+                        path: names_path,
+                        labels: names.len(),
+                        classes,
+                    },
+                    None => OnnxError::NoLabels {
+                        path: path.clone(),
+                        classes,
+                    },
+                }
+            })?;
         let classes = classes(&config, labels)?;
         tracing::info!(model = %path.display(), family = %head.family, input = %size, "model loaded");
-        Ok(Self { head, classes, network, config })
+        Ok(Self {
+            head,
+            classes,
+            network,
+            config,
+        })
     }
 }
 
@@ -269,67 +318,136 @@ impl Detect for OnnxDetector {
         let size = ImageSize::of(&image);
         let input = self.network.input_size();
         let letterbox = Letterbox::new(self.head.fit(), size, input);
-        let factors = self.config.normalization.unwrap_or_else(|| self.head.normalization()).factors();
+        let factors = self
+            .config
+            .normalization
+            .unwrap_or_else(|| self.head.normalization())
+            .factors();
         let is_bgr = self.head.is_bgr();
         let convert = |[blue, green, red]: [u8; 3]| {
-            let channels = if is_bgr { [blue, green, red] } else { [red, green, blue] };
+            let channels = if is_bgr {
+                [blue, green, red]
+            } else {
+                [red, green, blue]
+            };
             std::array::from_fn(|c| f32::from(channels[c]) * factors[c].0 + factors[c].1)
         };
         let pixels = letterbox
             .fill(&image, self.network.has_channels_last(), convert)
             .map_err(failed("fitting a frame into the network"))?;
         let outputs = self.network.run(pixels).map_err(DetectError::Model)?;
-        let least = self.classes.iter().flatten().map(|class| class.threshold).fold(1.0, f32::min);
+        let least = self
+            .classes
+            .iter()
+            .flatten()
+            .map(|class| class.threshold)
+            .fold(1.0, f32::min);
         let mut found = Vec::new();
         for candidate in self.head.decode(&outputs, input, least) {
-            let class = self.classes.get(candidate.class).ok_or(DetectError::UnknownClass {
-                class: candidate.class,
-                labels: self.classes.iter().flatten().count(),
-            })?;
-            if class.as_ref().is_some_and(|class| candidate.score >= class.threshold) {
+            let class = self
+                .classes
+                .get(candidate.class)
+                .ok_or(DetectError::UnknownClass {
+                    class: candidate.class,
+                    labels: self.classes.iter().flatten().count(),
+                })?;
+            if class
+                .as_ref()
+                .is_some_and(|class| candidate.score >= class.threshold)
+            {
                 let bounds = letterbox.to_image(&candidate.bounds);
-                found.extend(ScoredBox { bounds, ..candidate }.inside(size.width.into(), size.height.into()));
+                found.extend(
+                    ScoredBox {
+                        bounds,
+                        ..candidate
+                    }
+                    .inside(size.width.into(), size.height.into()),
+                );
             }
         }
         if self.head.needs_suppression() {
-            found = suppress(found, self.config.max_overlap).map_err(failed("non-maximum suppression"))?;
+            found = suppress(found, self.config.max_overlap)
+                .map_err(failed("non-maximum suppression"))?;
         }
-        let labelled = |found: &ScoredBox| Some(found.labelled(self.classes[found.class].as_ref()?.label.clone()));
+        let labelled = |found: &ScoredBox| {
+            Some(found.labelled(self.classes[found.class].as_ref()?.label.clone()))
+        };
         Ok(found.iter().filter_map(labelled).collect())
     }
 }
 
 /// Names of the classes in their order, if they are known, and their file.
-fn names(config: &OnnxConfig, network: &Network) -> Result<(Option<Vec<String>>, PathBuf), OnnxError> {
+fn names(
+    config: &OnnxConfig,
+    network: &Network,
+) -> Result<(Option<Vec<String>>, PathBuf), OnnxError> {
     let (names, path) = match &config.labels {
         Some(path) => {
-            let text =
-                bounded_file::read_text(path).map_err(|source| OnnxError::Unreadable { path: path.clone(), source })?;
+            let text = bounded_file::read_text(path).map_err(|source| OnnxError::Unreadable {
+                path: path.clone(),
+                source,
+            })?;
             (Some(labels::read(&text)), path)
         }
         None => (network.metadata("names").map(labels::parse), &config.model),
     };
     let path = path.clone();
     match names.as_deref().and_then(labels::first_unusable) {
-        Some(label) => Err(OnnxError::BadLabel { label: label.to_owned(), path }),
+        Some(label) => Err(OnnxError::BadLabel {
+            label: label.to_owned(),
+            path,
+        }),
         None => Ok((names, path)),
     }
 }
 
 fn unknown_outputs(config: &OnnxConfig, size: ImageSize, outputs: &[NamedTensor]) -> OnnxError {
-    let outputs = outputs.iter().map(NamedTensor::to_string).collect::<Vec<_>>().join("; ");
-    let family = config.family.map_or_else(|| "any known family".to_owned(), |family| family.to_string());
-    OnnxError::UnknownOutputs { path: config.model.clone(), outputs, size, family }
+    let outputs = outputs
+        .iter()
+        .map(NamedTensor::to_string)
+        .collect::<Vec<_>>()
+        .join("; ");
+    let family = config.family.map_or_else(
+        || "any known family".to_owned(),
+        |family| family.to_string(),
+    );
+    OnnxError::UnknownOutputs {
+        path: config.model.clone(),
+        outputs,
+        size,
+        family,
+    }
 }
 
-fn classes(config: &OnnxConfig, labels: Vec<Option<Label>>) -> Result<Vec<Option<Class>>, OnnxError> {
+fn classes(
+    config: &OnnxConfig,
+    labels: Vec<Option<Label>>,
+) -> Result<Vec<Option<Class>>, OnnxError> {
     let is_known = |label: &str| labels.iter().flatten().any(|known| known == label);
     if let Some(label) = config.thresholds.keys().find(|label| !is_known(label)) {
-        let labels = labels.iter().flatten().map(Label::as_str).collect::<Vec<_>>().join(", ");
-        return Err(OnnxError::UnknownLabel { path: config.model.clone(), label: label.clone(), labels });
+        let labels = labels
+            .iter()
+            .flatten()
+            .map(Label::as_str)
+            .collect::<Vec<_>>()
+            .join(", ");
+        return Err(OnnxError::UnknownLabel {
+            path: config.model.clone(),
+            label: label.clone(),
+            labels,
+        });
     }
-    let threshold = |label: &Label| config.thresholds.get(label.as_str()).copied().unwrap_or(config.threshold) as f32;
-    let class = |label: Label| Class { threshold: threshold(&label), label };
+    let threshold = |label: &Label| {
+        config
+            .thresholds
+            .get(label.as_str())
+            .copied()
+            .unwrap_or(config.threshold) as f32
+    };
+    let class = |label: Label| Class {
+        threshold: threshold(&label),
+        label,
+    };
     Ok(labels.into_iter().map(|label| label.map(class)).collect())
 }
 

@@ -39,8 +39,14 @@ pub struct Pass {
 
 impl Default for PlacardConfig {
     fn default() -> Self {
-        let pass = |stretch_x, stretch_y| Pass { stretch_x, stretch_y };
-        Self { passes: vec![pass(1.0, 1.0), pass(2.0, 2.0), pass(4.0, 2.0)], max_codes: 32 }
+        let pass = |stretch_x, stretch_y| Pass {
+            stretch_x,
+            stretch_y,
+        };
+        Self {
+            passes: vec![pass(1.0, 1.0), pass(2.0, 2.0), pass(4.0, 2.0)],
+            max_codes: 32,
+        }
     }
 }
 
@@ -51,11 +57,25 @@ impl PlacardConfig {
     /// [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if !(1..=MAX_PASSES).contains(&self.passes.len()) {
-            return Err(ConfigError::new("passes", self.passes.len(), format!("1 to {MAX_PASSES} passes")));
+            return Err(ConfigError::new(
+                "passes",
+                self.passes.len(),
+                format!("1 to {MAX_PASSES} passes"),
+            ));
         }
         for (index, pass) in self.passes.iter().enumerate() {
-            check_range(&format!("passes.{index}.stretch_x"), pass.stretch_x, 1.0, 4.0)?;
-            check_range(&format!("passes.{index}.stretch_y"), pass.stretch_y, 1.0, 4.0)?;
+            check_range(
+                &format!("passes.{index}.stretch_x"),
+                pass.stretch_x,
+                1.0,
+                4.0,
+            )?;
+            check_range(
+                &format!("passes.{index}.stretch_y"),
+                pass.stretch_y,
+                1.0,
+                4.0,
+            )?;
         }
         check_range("max_codes", self.max_codes.into(), 1.0, 255.0)
     }
@@ -100,8 +120,10 @@ impl PlacardDetector {
         for &pass in &self.config.passes {
             let found = read(&reader, gray, pass)?;
             for code in &found {
-                paint_over(gray, code)
-                    .map_err(|source| DetectError::OpenCv { step: "painting over a code", source })?;
+                paint_over(gray, code).map_err(|source| DetectError::OpenCv {
+                    step: "painting over a code",
+                    source,
+                })?;
             }
             codes.extend(found);
             if codes.len() >= self.config.max_codes.into() {
@@ -122,13 +144,20 @@ impl Detect for PlacardDetector {
 
 /// Codes in one enlargement of the image, with corners in pixels of the original.
 fn read(reader: &BarcodeReader, image: &Mat, pass: Pass) -> Result<Vec<Code>, DetectError> {
-    let opencv_error = |source| DetectError::OpenCv { step: "enlarging a frame", source };
+    let opencv_error = |source| DetectError::OpenCv {
+        step: "enlarging a frame",
+        source,
+    };
     let enlarged = enlarge(image, pass).map_err(opencv_error)?;
     let pixels = enlarged.data_bytes().map_err(opencv_error)?;
     let view = ImageView::from_slice(pixels, enlarged.cols(), enlarged.rows(), ImageFormat::Lum);
     let codes = view.and_then(|view| reader.from(&view));
     let codes = codes.map_err(|error| DetectError::Decoder(error.to_string()))?;
-    Ok(codes.iter().filter(|code| code.is_valid()).map(|code| Code::of(code, pass)).collect())
+    Ok(codes
+        .iter()
+        .filter(|code| code.is_valid())
+        .map(|code| Code::of(code, pass))
+        .collect())
 }
 
 /// One decoded code.
@@ -145,17 +174,36 @@ impl Code {
     /// numbers; enlarging by OpenCV keeps the edges of the image in place, so both coordinates only scale.
     fn of(barcode: &Barcode, pass: Pass) -> Self {
         let position = barcode.position();
-        let corners = [position.top_left, position.top_right, position.bottom_right, position.bottom_left];
-        let corners = corners.map(|c| Point2::new(f64::from(c.x) / pass.stretch_x, f64::from(c.y) / pass.stretch_y));
+        let corners = [
+            position.top_left,
+            position.top_right,
+            position.bottom_right,
+            position.bottom_left,
+        ];
+        let corners = corners.map(|c| {
+            Point2::new(
+                f64::from(c.x) / pass.stretch_x,
+                f64::from(c.y) / pass.stretch_y,
+            )
+        });
         let version: u8 = barcode.extra_with_key("Version").parse().unwrap_or(1);
-        Self { text: barcode.bytes(), modules: 17.0 + 4.0 * f64::from(version), corners }
+        Self {
+            text: barcode.bytes(),
+            modules: 17.0 + 4.0 * f64::from(version),
+            corners,
+        }
     }
 
     fn into_detection(self) -> Option<Detection> {
         let label = label(self.text)?;
         let bounding_box = BoundingBox::around(&self.corners);
         let confidence = confidence(&self.corners, self.modules);
-        bounding_box.is_valid().then_some(Detection { label, confidence, bounding_box, corners: Some(self.corners) })
+        bounding_box.is_valid().then_some(Detection {
+            label,
+            confidence,
+            bounding_box,
+            corners: Some(self.corners),
+        })
     }
 }
 
@@ -166,7 +214,9 @@ fn label(text: Vec<u8>) -> Option<Label> {
 }
 
 fn confidence(corners: &[Point2<f64>; 4], modules: f64) -> f64 {
-    let side = (0..4).map(|i| nalgebra::distance(&corners[i], &corners[(i + 1) % 4])).fold(f64::INFINITY, f64::min);
+    let side = (0..4)
+        .map(|i| nalgebra::distance(&corners[i], &corners[(i + 1) % 4]))
+        .fold(f64::INFINITY, f64::min);
     let (small, large) = CONFIDENCE_MODULES_PX;
     let share = ((side / modules - small) / (large - small)).clamp(0.0, 1.0);
     CONFIDENCES.0 + share * (CONFIDENCES.1 - CONFIDENCES.0)
@@ -175,7 +225,10 @@ fn confidence(corners: &[Point2<f64>; 4], modules: f64) -> f64 {
 /// A continuous grayscale copy of the frame.
 fn gray(frame: &CameraFrame) -> Result<Mat, DetectError> {
     let image = &frame.image;
-    let unusable = |found: String| DetectError::UnusableImage { seq: frame.seq, found };
+    let unusable = |found: String| DetectError::UnusableImage {
+        seq: frame.seq,
+        found,
+    };
     if image.empty() || image.dims() != 2 {
         return Err(unusable("no pixels".into()));
     }
@@ -187,7 +240,10 @@ fn gray(frame: &CameraFrame) -> Result<Mat, DetectError> {
         }
         other => return Err(unusable(format!("opencv pixel type {other}"))),
     };
-    converted.map_err(|source| DetectError::OpenCv { step: "converting a frame to gray", source })
+    converted.map_err(|source| DetectError::OpenCv {
+        step: "converting a frame to gray",
+        source,
+    })
 }
 
 fn enlarge(image: &Mat, pass: Pass) -> opencv::Result<Mat> {
@@ -196,13 +252,23 @@ fn enlarge(image: &Mat, pass: Pass) -> opencv::Result<Mat> {
     }
     let mut enlarged = Mat::default();
     let (size, interpolation) = (Size::default(), imgproc::INTER_CUBIC);
-    imgproc::resize(image, &mut enlarged, size, pass.stretch_x, pass.stretch_y, interpolation)?;
+    imgproc::resize(
+        image,
+        &mut enlarged,
+        size,
+        pass.stretch_x,
+        pass.stretch_y,
+        interpolation,
+    )?;
     Ok(enlarged)
 }
 
 fn paint_over(image: &mut Mat, code: &Code) -> opencv::Result<()> {
-    let corners: Vector<Point> =
-        code.corners.iter().map(|c| Point::new(c.x.round() as i32, c.y.round() as i32)).collect();
+    let corners: Vector<Point> = code
+        .corners
+        .iter()
+        .map(|c| Point::new(c.x.round() as i32, c.y.round() as i32))
+        .collect();
     imgproc::fill_convex_poly_def(image, &corners, Scalar::all(255.0))
 }
 

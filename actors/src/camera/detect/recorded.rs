@@ -67,10 +67,19 @@ impl RecordedDetector {
     /// [`RecordingError`] naming the file and the first bad line.
     pub fn open(config: &RecordedConfig) -> Result<Self, RecordingError> {
         let path = &config.path;
-        let text = bounded_file::read_text(path)
-            .map_err(|source| RecordingError::Unreadable { path: path.clone(), source })?;
-        let frames = text.lines().enumerate().map(|(index, line)| read_line(path, index + 1, line));
-        Ok(Self { frames: frames.collect::<Result<_, _>>()?, looping: config.looping, next: 0 })
+        let text = bounded_file::read_text(path).map_err(|source| RecordingError::Unreadable {
+            path: path.clone(),
+            source,
+        })?;
+        let frames = text
+            .lines()
+            .enumerate()
+            .map(|(index, line)| read_line(path, index + 1, line));
+        Ok(Self {
+            frames: frames.collect::<Result<_, _>>()?,
+            looping: config.looping,
+            next: 0,
+        })
     }
 }
 
@@ -86,7 +95,11 @@ impl Detect for RecordedDetector {
 }
 
 fn read_line(path: &Path, line: usize, text: &str) -> Result<Vec<Detection>, RecordingError> {
-    parse_detections(text).map_err(|reason| RecordingError::Malformed { path: path.to_owned(), line, reason })
+    parse_detections(text).map_err(|reason| RecordingError::Malformed {
+        path: path.to_owned(),
+        line,
+        reason,
+    })
 }
 
 #[cfg(test)]
@@ -98,18 +111,26 @@ mod tests {
 
     use super::*;
 
-    const CUP: &str =
-        r#"[{"label":"cup","confidence":0.9,"bounding_box":{"x_min":1,"y_min":2,"x_max":30,"y_max":40}}]"#;
+    const CUP: &str = r#"[{"label":"cup","confidence":0.9,"bounding_box":{"x_min":1,"y_min":2,"x_max":30,"y_max":40}}]"#;
 
     fn open(text: &str, looping: bool) -> Result<RecordedDetector, RecordingError> {
         let mut file = tempfile::NamedTempFile::new().unwrap();
         file.write_all(text.as_bytes()).unwrap();
-        RecordedDetector::open(&RecordedConfig { path: file.path().to_owned(), looping })
+        RecordedDetector::open(&RecordedConfig {
+            path: file.path().to_owned(),
+            looping,
+        })
     }
 
     fn counts(mut detector: RecordedDetector, frames: usize) -> Vec<usize> {
-        let frame = CameraFrame { image: Mat::default(), captured_at: Timestamp(0), seq: 0 };
-        (0..frames).map(|_| detector.detect(&frame).unwrap().len()).collect()
+        let frame = CameraFrame {
+            image: Mat::default(),
+            captured_at: Timestamp(0),
+            seq: 0,
+        };
+        (0..frames)
+            .map(|_| detector.detect(&frame).unwrap().len())
+            .collect()
     }
 
     #[test]
@@ -122,13 +143,27 @@ mod tests {
 
     #[test]
     fn a_bad_recording_is_named_with_its_line() {
-        for bad in
-            ["{", r#"{"label":"cup"}"#, &CUP.replace("0.9", "1.9"), &CUP.replace("30", "0"), &CUP.replace("cup", "")]
-        {
-            let error = open(&format!("[]\n{bad}\n"), false).expect_err("malformed").to_string();
+        for bad in [
+            "{",
+            r#"{"label":"cup"}"#,
+            &CUP.replace("0.9", "1.9"),
+            &CUP.replace("30", "0"),
+            &CUP.replace("cup", ""),
+        ] {
+            let error = open(&format!("[]\n{bad}\n"), false)
+                .expect_err("malformed")
+                .to_string();
             assert!(error.contains("line 2: "), "{error}");
         }
-        let missing = RecordedConfig { path: "no/such/file.jsonl".into(), looping: false };
-        assert!(RecordedDetector::open(&missing).expect_err("missing").to_string().contains("no/such/file.jsonl"));
+        let missing = RecordedConfig {
+            path: "no/such/file.jsonl".into(),
+            looping: false,
+        };
+        assert!(
+            RecordedDetector::open(&missing)
+                .expect_err("missing")
+                .to_string()
+                .contains("no/such/file.jsonl")
+        );
     }
 }

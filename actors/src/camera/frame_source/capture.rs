@@ -35,7 +35,11 @@ pub struct CaptureConfig {
 
 impl Default for CaptureConfig {
     fn default() -> Self {
-        Self { stall_timeout_s: 5.0, retry_min_s: 0.5, retry_max_s: 30.0 }
+        Self {
+            stall_timeout_s: 5.0,
+            retry_min_s: 0.5,
+            retry_max_s: 30.0,
+        }
     }
 }
 
@@ -117,8 +121,17 @@ impl Capture {
         };
         let readers = capture.readers.clone();
         let (unusable, failures) = (Arc::clone(&capture.unusable), Arc::clone(&capture.failures));
-        thread::Builder::new().name("capture".into()).spawn(move || capture.run())?;
-        Ok(Self { slot, status, events, unusable, failures, readers })
+        thread::Builder::new()
+            .name("capture".into())
+            .spawn(move || capture.run())?;
+        Ok(Self {
+            slot,
+            status,
+            events,
+            unusable,
+            failures,
+            readers,
+        })
     }
 
     /// Waits for the latest frame; `None` once the source ended. Numbers continue when the source is reopened.
@@ -246,11 +259,19 @@ impl CaptureLoop {
                 }
                 Outcome::Failed(error) => error,
             };
-            failures = if self.captured > before { 1 } else { failures + 1 };
+            failures = if self.captured > before {
+                1
+            } else {
+                failures + 1
+            };
             let retry_after = self.config.retry_after(failures);
             self.failures.fetch_add(1, Ordering::Relaxed);
             tracing::info!(%error, failures, ?retry_after, "frame source failed");
-            self.status.send_replace(CaptureStatus::Failed { error, failures, retry_after });
+            self.status.send_replace(CaptureStatus::Failed {
+                error,
+                failures,
+                retry_after,
+            });
             if self.is_stopped_within(retry_after) {
                 break;
             }
@@ -267,7 +288,11 @@ impl CaptureLoop {
             return Outcome::Failed(FrameError::Stalled(stall_timeout));
         }
         let opening = self.opening.load(Ordering::SeqCst);
-        let reader = Reader { opening, current: Arc::clone(&self.opening), events: self.events.clone() };
+        let reader = Reader {
+            opening,
+            current: Arc::clone(&self.opening),
+            events: self.events.clone(),
+        };
         let open = Arc::clone(&self.open);
         let running = ReaderGuard::new(self.readers.clone());
         let read = move || {
@@ -276,15 +301,27 @@ impl CaptureLoop {
         };
         match thread::Builder::new().name("camera".into()).spawn(read) {
             Ok(reader) => self.abandoned.push(reader),
-            Err(e) => return Outcome::Failed(FrameError::Open { origin: "a thread".into(), reason: e.to_string() }),
+            Err(e) => {
+                return Outcome::Failed(FrameError::Open {
+                    origin: "a thread".into(),
+                    reason: e.to_string(),
+                });
+            }
         }
         let mut deadline = Instant::now() + stall_timeout;
         let mut last_unusable = None;
         loop {
-            match self.inbox.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
-                Ok(CaptureEvent::Stop) | Err(RecvTimeoutError::Disconnected) => return Outcome::Stopped,
+            match self
+                .inbox
+                .recv_timeout(deadline.saturating_duration_since(Instant::now()))
+            {
+                Ok(CaptureEvent::Stop) | Err(RecvTimeoutError::Disconnected) => {
+                    return Outcome::Stopped;
+                }
                 Err(RecvTimeoutError::Timeout) => {
-                    return Outcome::Failed(last_unusable.unwrap_or(FrameError::Stalled(stall_timeout)));
+                    return Outcome::Failed(
+                        last_unusable.unwrap_or(FrameError::Stalled(stall_timeout)),
+                    );
                 }
                 Ok(CaptureEvent::Read(from, _)) if from != opening => {}
                 Ok(CaptureEvent::Read(_, Err(error @ FrameError::Unusable { .. }))) => {
@@ -304,7 +341,10 @@ impl CaptureLoop {
                     self.status.send_if_modified(|status| {
                         std::mem::replace(status, CaptureStatus::Running) != CaptureStatus::Running
                     });
-                    self.slot.put(CameraFrame { seq: self.captured, ..frame });
+                    self.slot.put(CameraFrame {
+                        seq: self.captured,
+                        ..frame
+                    });
                     self.captured += 1;
                 }
             }
@@ -314,7 +354,10 @@ impl CaptureLoop {
     fn is_stopped_within(&self, time: Duration) -> bool {
         let deadline = Instant::now() + time;
         loop {
-            match self.inbox.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+            match self
+                .inbox
+                .recv_timeout(deadline.saturating_duration_since(Instant::now()))
+            {
                 Ok(CaptureEvent::Read(..)) => {}
                 Err(RecvTimeoutError::Timeout) => return false,
                 Ok(CaptureEvent::Stop) | Err(RecvTimeoutError::Disconnected) => return true,
@@ -338,7 +381,9 @@ impl Reader {
         };
         while self.current.load(Ordering::SeqCst) == self.opening {
             let read = source.next_frame();
-            let failed = read.as_ref().is_err_and(|error| !matches!(error, FrameError::Unusable { .. }));
+            let failed = read
+                .as_ref()
+                .is_err_and(|error| !matches!(error, FrameError::Unusable { .. }));
             self.send(read);
             if failed {
                 return;

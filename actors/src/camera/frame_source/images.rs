@@ -23,7 +23,10 @@ impl ImageSequence {
     /// Lists the images of a directory or a numbered pattern.
     pub(super) fn open(path: &Path, fps: f64, looping: bool) -> Result<Self, FrameError> {
         let origin = path.display().to_string();
-        let failed = |reason: String| FrameError::Open { origin: origin.clone(), reason };
+        let failed = |reason: String| FrameError::Open {
+            origin: origin.clone(),
+            reason,
+        };
         let files = if origin.contains('%') {
             numbered(&origin).ok_or_else(|| failed("need one %d or %0Nd in the pattern".into()))?
         } else {
@@ -32,7 +35,13 @@ impl ImageSequence {
         if files.is_empty() {
             return Err(failed("no images found".into()));
         }
-        Ok(Self { origin, files, looping, pace: FramePacer::new(fps), next: 0 })
+        Ok(Self {
+            origin,
+            files,
+            looping,
+            pace: FramePacer::new(fps),
+            next: 0,
+        })
     }
 }
 
@@ -40,15 +49,24 @@ impl FrameSource for ImageSequence {
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
         let count = self.files.len() as u64;
         if self.next >= count && !self.looping {
-            return Err(FrameError::Ended { origin: self.origin.clone() });
+            return Err(FrameError::Ended {
+                origin: self.origin.clone(),
+            });
         }
         let file = &self.files[(self.next % count) as usize];
         let seq = self.next;
         self.next += 1;
         self.pace.wait();
-        let unusable = |reason: String| FrameError::Unusable { origin: file.display().to_string(), reason };
+        let unusable = |reason: String| FrameError::Unusable {
+            origin: file.display().to_string(),
+            reason,
+        };
         let image = image_codec::read(file).map_err(|e| unusable(e.to_string()))?;
-        Ok(CameraFrame { image, captured_at: clock::now(), seq })
+        Ok(CameraFrame {
+            image,
+            captured_at: clock::now(),
+            seq,
+        })
     }
 }
 
@@ -57,7 +75,10 @@ pub(crate) fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
     let entries = std::fs::read_dir(directory)?.map(|entry| Ok(entry?.path()));
     let mut files = entries.collect::<std::io::Result<Vec<PathBuf>>>()?;
     let is_image = |path: &PathBuf| {
-        let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+        let extension = path
+            .extension()
+            .and_then(|e| e.to_str())
+            .map(str::to_ascii_lowercase);
         extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str()))
     };
     files.retain(is_image);
@@ -69,8 +90,17 @@ pub(crate) fn in_directory(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
 fn numbered(pattern: &str) -> Option<Vec<PathBuf>> {
     let (before, rest) = pattern.split_once('%')?;
     let (digits, after) = rest.split_once('d')?;
-    let width: usize = if digits.is_empty() { 0 } else { digits.parse().ok()? };
+    let width: usize = if digits.is_empty() {
+        0
+    } else {
+        digits.parse().ok()?
+    };
     let file = |number: u64| PathBuf::from(format!("{before}{number:0width$}{after}"));
     let first = if file(0).is_file() { 0 } else { 1 };
-    Some((first..).map(file).take_while(|path| path.is_file()).collect())
+    Some(
+        (first..)
+            .map(file)
+            .take_while(|path| path.is_file())
+            .collect(),
+    )
 }

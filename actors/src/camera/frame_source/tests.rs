@@ -11,7 +11,9 @@ fn brightness(frame: &CameraFrame) -> u8 {
 }
 
 fn open(toml: &str) -> Result<Box<dyn FrameSource>, FrameError> {
-    toml::from_str::<SourceConfig>(toml).unwrap().open(Duration::from_secs(5))
+    toml::from_str::<SourceConfig>(toml)
+        .unwrap()
+        .open(Duration::from_secs(5))
 }
 
 /// Brightness of all frames up to the error that ends them.
@@ -28,7 +30,14 @@ fn play(source: &mut dyn FrameSource) -> (Vec<u8>, FrameError) {
 fn write_images(directory: &Path) {
     for (number, value) in [50, 100, 150].into_iter().enumerate() {
         let file = directory.join(format!("f{number:03}.png"));
-        image::save_buffer(file, &[value; 64 * 48], 64, 48, image::ExtendedColorType::L8).unwrap();
+        image::save_buffer(
+            file,
+            &[value; 64 * 48],
+            64,
+            48,
+            image::ExtendedColorType::L8,
+        )
+        .unwrap();
     }
     std::fs::write(directory.join("notes.txt"), "not an image").unwrap();
 }
@@ -37,14 +46,27 @@ fn write_images(directory: &Path) {
 fn images_come_in_order_from_a_directory_and_from_a_pattern() {
     let directory = tempfile::tempdir().unwrap();
     write_images(directory.path());
-    for path in [directory.path().to_owned(), directory.path().join("f%03d.png")] {
+    for path in [
+        directory.path().to_owned(),
+        directory.path().join("f%03d.png"),
+    ] {
         let mut source = open(&format!("kind = 'images'\npath = {path:?}\nfps = 500.0")).unwrap();
         let (seen, end) = play(source.as_mut());
         assert_eq!(seen, [50, 100, 150], "{path:?}");
-        assert_eq!(end, FrameError::Ended { origin: path.display().to_string() });
+        assert_eq!(
+            end,
+            FrameError::Ended {
+                origin: path.display().to_string()
+            }
+        );
 
-        let mut source = open(&format!("kind = 'images'\npath = {path:?}\nfps = 500.0\nlooping = true")).unwrap();
-        let seen: Vec<u8> = (0..5).map(|_| brightness(&source.next_frame().unwrap())).collect();
+        let mut source = open(&format!(
+            "kind = 'images'\npath = {path:?}\nfps = 500.0\nlooping = true"
+        ))
+        .unwrap();
+        let seen: Vec<u8> = (0..5)
+            .map(|_| brightness(&source.next_frame().unwrap()))
+            .collect();
         assert_eq!(seen, [50, 100, 150, 50, 100]);
     }
 }
@@ -54,7 +76,11 @@ fn a_bad_image_is_passed_over_and_the_rest_is_played() {
     let directory = tempfile::tempdir().unwrap();
     write_images(directory.path());
     std::fs::write(directory.path().join("f001.png"), "half a fi").unwrap();
-    let mut source = open(&format!("kind = 'images'\npath = {:?}\nfps = 500.0", directory.path())).unwrap();
+    let mut source = open(&format!(
+        "kind = 'images'\npath = {:?}\nfps = 500.0",
+        directory.path()
+    ))
+    .unwrap();
     let mut played = Vec::new();
     loop {
         match source.next_frame() {
@@ -64,17 +90,28 @@ fn a_bad_image_is_passed_over_and_the_rest_is_played() {
         }
     }
     assert_eq!((&*played[0], &*played[2], played.len()), ("50", "150", 3));
-    assert!(played[1].contains("f001.png") && played[1].contains("not an image"), "{}", played[1]);
+    assert!(
+        played[1].contains("f001.png") && played[1].contains("not an image"),
+        "{}",
+        played[1]
+    );
 }
 
 #[test]
 fn images_keep_their_rate() {
     let directory = tempfile::tempdir().unwrap();
     write_images(directory.path());
-    let mut source = open(&format!("kind = 'images'\npath = {:?}\nfps = 20.0", directory.path())).unwrap();
+    let mut source = open(&format!(
+        "kind = 'images'\npath = {:?}\nfps = 20.0",
+        directory.path()
+    ))
+    .unwrap();
     let started = Instant::now();
     play(source.as_mut());
-    assert!(started.elapsed() >= Duration::from_millis(100), "three frames are two periods of 50 ms apart");
+    assert!(
+        started.elapsed() >= Duration::from_millis(100),
+        "three frames are two periods of 50 ms apart"
+    );
 }
 
 #[test]
@@ -83,21 +120,48 @@ fn what_cannot_be_opened_is_named_with_its_reason() {
     let text = empty.path().join("camera");
     std::fs::write(&text, "not a camera").unwrap();
     for (config, name, reason) in [
-        ("kind = 'v4l2'\ndevice = '/dev/video-none'".into(), "/dev/video-none", "No such file"),
-        ("kind = 'images'\npath = 'no/such/directory'".into(), "no/such/directory", "No such file"),
-        ("kind = 'images'\npath = 'frames/%s.png'".into(), "frames/%s.png", "%d"),
-        (format!("kind = 'images'\npath = {:?}", empty.path()), "", "no images"),
-        (format!("kind = 'v4l2'\ndevice = {text:?}"), "camera", "it is no camera"),
+        (
+            "kind = 'v4l2'\ndevice = '/dev/video-none'".into(),
+            "/dev/video-none",
+            "No such file",
+        ),
+        (
+            "kind = 'images'\npath = 'no/such/directory'".into(),
+            "no/such/directory",
+            "No such file",
+        ),
+        (
+            "kind = 'images'\npath = 'frames/%s.png'".into(),
+            "frames/%s.png",
+            "%d",
+        ),
+        (
+            format!("kind = 'images'\npath = {:?}", empty.path()),
+            "",
+            "no images",
+        ),
+        (
+            format!("kind = 'v4l2'\ndevice = {text:?}"),
+            "camera",
+            "it is no camera",
+        ),
     ] {
         let error = open(&config).err().expect("cannot be opened").to_string();
-        assert!(error.starts_with("cannot open ") && error.contains(name) && error.contains(reason), "{error}");
+        assert!(
+            error.starts_with("cannot open ") && error.contains(name) && error.contains(reason),
+            "{error}"
+        );
     }
 }
 
 #[test]
 fn bad_configuration_is_refused() {
-    assert!(toml::from_str::<SourceConfig>("kind = 'video'\npath = 'a'\nspeed = 2").is_err(), "unknown key");
-    let pipeline: SourceConfig = toml::from_str("kind = 'gstreamer'\npipeline = 'videotestsrc'").unwrap();
+    assert!(
+        toml::from_str::<SourceConfig>("kind = 'video'\npath = 'a'\nspeed = 2").is_err(),
+        "unknown key"
+    );
+    let pipeline: SourceConfig =
+        toml::from_str("kind = 'gstreamer'\npipeline = 'videotestsrc'").unwrap();
     assert_eq!(pipeline.validate().expect_err("no appsink").key, "pipeline");
     let camera: SourceConfig = toml::from_str("kind = 'v4l2'\nwidth = 0").unwrap();
     assert_eq!(camera.validate().expect_err("no width").key, "width");

@@ -39,21 +39,39 @@ impl V4l2Camera {
         timeout: Duration,
     ) -> Result<Self, FrameError> {
         let origin = device.display().to_string();
-        let failed = |reason: String| FrameError::Open { origin: origin.clone(), reason };
+        let failed = |reason: String| FrameError::Open {
+            origin: origin.clone(),
+            reason,
+        };
         let refused = |step: &'static str| {
             let origin = origin.clone();
-            move |error: io::Error| FrameError::Open { origin, reason: format!("{step}: {error}") }
+            move |error: io::Error| FrameError::Open {
+                origin,
+                reason: format!("{step}: {error}"),
+            }
         };
         std::fs::File::open(device).map_err(|error| failed(error.to_string()))?;
         let camera = Device::open(device).map_err(refused("it is no camera"))?;
-        let able = camera.capabilities().map_err(refused("it is no camera"))?.device_capabilities();
+        let able = camera
+            .capabilities()
+            .map_err(refused("it is no camera"))?
+            .device_capabilities();
         if !able.contains(CapabilityFlags::VIDEO_CAPTURE | CapabilityFlags::STREAMING) {
-            return Err(failed("it streams no pictures: a camera may have several devices, try the others".into()));
+            return Err(failed(
+                "it streams no pictures: a camera may have several devices, try the others".into(),
+            ));
         }
-        let offered = camera.formats(BufType::VIDEO_CAPTURE).map(|format| Ok(format?.pixel_format()));
-        let offered = offered.collect::<io::Result<Vec<_>>>().map_err(refused("its formats cannot be listed"))?;
+        let offered = camera
+            .formats(BufType::VIDEO_CAPTURE)
+            .map(|format| Ok(format?.pixel_format()));
+        let offered = offered
+            .collect::<io::Result<Vec<_>>>()
+            .map_err(refused("its formats cannot be listed"))?;
         let conversion = PixelConversion::choose(&offered).ok_or_else(|| {
-            failed(format!("its pictures have the formats {offered:?}, need one of {:?}", PixelConversion::formats()))
+            failed(format!(
+                "its pictures have the formats {offered:?}, need one of {:?}",
+                PixelConversion::formats()
+            ))
         })?;
         let [width, height] = [0, 1].map(|side| size[side].unwrap_or(DEFAULT_SIZE[side]));
         let camera = camera.video_capture(PixFormat::new(width, height, conversion.format()));
@@ -62,21 +80,36 @@ impl V4l2Camera {
         let fps = fps.unwrap_or(DEFAULT_FPS);
         match camera.set_frame_interval(Fract::new(1000, (fps * 1000.0).round().max(1.0) as u32)) {
             Ok(interval) => tracing::debug!(camera = origin, ?layout, %interval, "camera opened"),
-            Err(error) => tracing::debug!(camera = origin, ?layout, fps, %error, "camera rejects the rate"),
+            Err(error) => {
+                tracing::debug!(camera = origin, ?layout, fps, %error, "camera rejects the rate")
+            }
         }
         let stream = camera.into_stream().map_err(refused("it does not start"))?;
-        Ok(Self { origin, stream, layout, timeout, seq: 0 })
+        Ok(Self {
+            origin,
+            stream,
+            layout,
+            timeout,
+            seq: 0,
+        })
     }
 
     fn lost(&self, error: &io::Error) -> FrameError {
-        FrameError::Lost { origin: self.origin.clone(), reason: error.to_string() }
+        FrameError::Lost {
+            origin: self.origin.clone(),
+            reason: error.to_string(),
+        }
     }
 
     /// Waits until a buffer is filled, or the camera is gone.
     fn wait(&self) -> Result<(), FrameError> {
-        let timeout = Timespec::try_from(self.timeout).map_err(|e| self.lost(&io::Error::other(e)))?;
+        let timeout =
+            Timespec::try_from(self.timeout).map_err(|e| self.lost(&io::Error::other(e)))?;
         loop {
-            match poll(&mut [PollFd::new(&self.stream.as_fd(), PollFlags::IN)], Some(&timeout)) {
+            match poll(
+                &mut [PollFd::new(&self.stream.as_fd(), PollFlags::IN)],
+                Some(&timeout),
+            ) {
                 Ok(0) => return Err(FrameError::Stalled(self.timeout)),
                 Ok(_) => return Ok(()),
                 Err(rustix::io::Errno::INTR) => {}
@@ -92,12 +125,23 @@ impl FrameSource for V4l2Camera {
         let layout = self.layout;
         let taken = self.stream.dequeue(|buffer| {
             let captured_at = clock::now();
-            let image = if buffer.is_error() { Err("broken on its way".into()) } else { layout.to_bgr(&buffer) };
+            let image = if buffer.is_error() {
+                Err("broken on its way".into())
+            } else {
+                layout.to_bgr(&buffer)
+            };
             Ok((captured_at, image))
         });
         let (captured_at, image) = taken.map_err(|error| self.lost(&error))?;
-        let image = image.map_err(|reason| FrameError::Unusable { origin: self.origin.clone(), reason })?;
-        let frame = CameraFrame { image, captured_at, seq: self.seq };
+        let image = image.map_err(|reason| FrameError::Unusable {
+            origin: self.origin.clone(),
+            reason,
+        })?;
+        let frame = CameraFrame {
+            image,
+            captured_at,
+            seq: self.seq,
+        };
         self.seq += 1;
         Ok(frame)
     }

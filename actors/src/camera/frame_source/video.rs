@@ -61,25 +61,53 @@ impl VideoProcess {
     /// twice that time without a frame is an error.
     pub(super) fn open(source: &SourceConfig, timeout: Duration) -> Result<Self, FrameError> {
         let origin = source.origin();
-        let failed = |reason: String| FrameError::Open { origin: source.origin(), reason };
+        let failed = |reason: String| FrameError::Open {
+            origin: source.origin(),
+            reason,
+        };
         let program = installed::program(PROGRAM).ok_or_else(|| {
             let remedy = "install the package ecod-node, or build it by `cargo build --bin ecod-video` and keep it beside this program";
             failed(format!("the program {PROGRAM}, which reads such sources, is missing: {remedy}"))
         })?;
         let mut command = Command::new(&program);
-        let started = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
-        let child = started.map_err(|e| failed(format!("cannot start {}: {e}", program.display())))?;
+        let started = command
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn();
+        let child =
+            started.map_err(|e| failed(format!("cannot start {}: {e}", program.display())))?;
         let mut child = ProgramGuard(child);
-        let pipes = (&mut child.0.stdin, child.0.stdout.take(), child.0.stderr.take());
+        let pipes = (
+            &mut child.0.stdin,
+            child.0.stdout.take(),
+            child.0.stderr.take(),
+        );
         let (Some(stdin), Some(stdout), Some(stderr)) = pipes else {
             return Err(failed(format!("no pipes to {PROGRAM}")));
         };
         // If the program is gone already, its end says why.
-        let _ = protocol::write_line(stdin, &VideoRequest { source: source.clone(), timeout });
+        let _ = protocol::write_line(
+            stdin,
+            &VideoRequest {
+                source: source.clone(),
+                timeout,
+            },
+        );
         let last_words = LastWords::collect(&origin, stderr).map_err(|e| failed(e.to_string()))?;
         let frame_time = 2 * timeout;
-        let output = BufReader::new(DeadlineReader { stdout, deadline: Instant::now() });
-        let mut process = Self { origin, child, output, last_words, frame_time, seq: 0 };
+        let output = BufReader::new(DeadlineReader {
+            stdout,
+            deadline: Instant::now(),
+        });
+        let mut process = Self {
+            origin,
+            child,
+            output,
+            last_words,
+            frame_time,
+            seq: 0,
+        };
         match process.receive(MIN_OPEN_TIME.max(frame_time)) {
             Ok(VideoMessage::Opened) => Ok(process),
             Ok(VideoMessage::Failed(error)) => Err(error),
@@ -95,23 +123,33 @@ impl VideoProcess {
         let mut line = String::new();
         match (&mut self.output).take(MAX_LINE).read_line(&mut line) {
             Ok(0) => Err(self.end()),
-            Ok(_) => {
-                serde_json::from_str(&line).map_err(|e| self.lost(format!("{PROGRAM} is of another version: {e}")))
-            }
+            Ok(_) => serde_json::from_str(&line)
+                .map_err(|e| self.lost(format!("{PROGRAM} is of another version: {e}"))),
             Err(error) => Err(self.broken(&error, time)),
         }
     }
 
     fn receive_pixels(&mut self, header: &ImageHeader) -> Result<CameraFrame, FrameError> {
-        let ImageHeader { rows, columns, kind, since_boot } = *header;
+        let ImageHeader {
+            rows,
+            columns,
+            kind,
+            since_boot,
+        } = *header;
         if i64::from(rows) * i64::from(columns) > MAX_PIXELS {
             return Err(self.lost(format!("{columns} by {rows} pixels are too many")));
         }
         let image = Mat::new_rows_cols_with_default(rows, columns, kind, Scalar::all(0.0));
         let mut image = image.map_err(|e| self.lost(e.message))?;
         let pixels = image.data_bytes_mut().map_err(|e| self.lost(e.message))?;
-        self.output.read_exact(pixels).map_err(|e| self.broken(&e, self.frame_time))?;
-        let frame = CameraFrame { image, captured_at: clock::at(since_boot), seq: self.seq };
+        self.output
+            .read_exact(pixels)
+            .map_err(|e| self.broken(&e, self.frame_time))?;
+        let frame = CameraFrame {
+            image,
+            captured_at: clock::at(since_boot),
+            seq: self.seq,
+        };
         self.seq += 1;
         Ok(frame)
     }
@@ -128,14 +166,25 @@ impl VideoProcess {
     fn end(&mut self) -> FrameError {
         // It may have closed its output and go on; of a program that is gone, the status stays.
         let _ = self.child.0.kill();
-        let status = self.child.0.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
+        let status = self
+            .child
+            .0
+            .wait()
+            .map_or_else(|error| error.to_string(), |status| status.to_string());
         let words = self.last_words.wait();
-        let words = if words.is_empty() { words } else { format!(": {words}") };
+        let words = if words.is_empty() {
+            words
+        } else {
+            format!(": {words}")
+        };
         self.lost(format!("{PROGRAM} ended, {status}{words}"))
     }
 
     fn lost(&self, reason: String) -> FrameError {
-        FrameError::Lost { origin: self.origin.clone(), reason }
+        FrameError::Lost {
+            origin: self.origin.clone(),
+            reason,
+        }
     }
 }
 
@@ -187,7 +236,9 @@ impl LastWords {
     fn collect(origin: &str, stderr: ChildStderr) -> io::Result<Self> {
         let (line, (until, ended)) = (Arc::<Mutex<String>>::default(), mpsc::channel());
         let (camera, last) = (origin.to_owned(), Arc::clone(&line));
-        thread::Builder::new().name("video-log".into()).spawn(move || log(&camera, stderr, &last, &until))?;
+        thread::Builder::new()
+            .name("video-log".into())
+            .spawn(move || log(&camera, stderr, &last, &until))?;
         Ok(Self { line, ended })
     }
 
@@ -195,7 +246,10 @@ impl LastWords {
     fn wait(&self) -> String {
         // Nothing is ever sent.
         let _ = self.ended.recv_timeout(LAST_WORDS_TIME);
-        self.line.lock().map(|line| line.clone()).unwrap_or_default()
+        self.line
+            .lock()
+            .map(|line| line.clone())
+            .unwrap_or_default()
     }
 }
 
@@ -216,11 +270,16 @@ pub(super) fn without_credentials(text: &str) -> String {
         let login = r#"://[^/"'\s]*@"#;
         let query = r#"(://[^?"'\s]*)\?[^"'\s]*"#;
         let value = r#"(?:\([^)]*\))?(?:"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|(?:\\.|[^\s"'])+)"#;
-        let property = format!(r"(?i)((?:pw|pass|passwd|password|passphrase|secret|token|key)\s*=\s*){value}");
+        let property =
+            format!(r"(?i)((?:pw|pass|passwd|password|passphrase|secret|token|key)\s*=\s*){value}");
         [(login, "://"), (query, "$1"), (&property, "${1}…")]
             .map(|(secret, bare)| (Regex::new(secret).expect("a valid expression"), bare))
     });
-    SECRETS.iter().fold(text.to_owned(), |text, (secret, bare)| secret.replace_all(&text, *bare).into_owned())
+    SECRETS
+        .iter()
+        .fold(text.to_owned(), |text, (secret, bare)| {
+            secret.replace_all(&text, *bare).into_owned()
+        })
 }
 
 #[cfg(test)]
@@ -229,18 +288,36 @@ mod tests {
 
     #[test]
     fn secrets_of_addresses_are_not_shown() {
-        assert_eq!(without_credentials("rtsp://user:p@ss@camera:554/1"), "rtsp://camera:554/1");
-        assert_eq!(without_credentials("rtsp://user:p?ss@camera/1"), "rtsp://camera/1");
-        assert_eq!(without_credentials("http://camera/a@b"), "http://camera/a@b");
-        assert_eq!(without_credentials("http://camera/video?user=admin&pwd=hush"), "http://camera/video");
+        assert_eq!(
+            without_credentials("rtsp://user:p@ss@camera:554/1"),
+            "rtsp://camera:554/1"
+        );
+        assert_eq!(
+            without_credentials("rtsp://user:p?ss@camera/1"),
+            "rtsp://camera/1"
+        );
+        assert_eq!(
+            without_credentials("http://camera/a@b"),
+            "http://camera/a@b"
+        );
+        assert_eq!(
+            without_credentials("http://camera/video?user=admin&pwd=hush"),
+            "http://camera/video"
+        );
         assert_eq!(
             without_credentials(
                 "rtspsrc location=rtsp://camera user-id=me user-pw=\"hu sh\" ! x264enc key-int-max=30 ! appsink"
             ),
             "rtspsrc location=rtsp://camera user-id=me user-pw=… ! x264enc key-int-max=30 ! appsink"
         );
-        for secret in [r"!hush", r"Winter!hush", r#""hu\"hush hush""#, r"hu\ hush", r#"(string)"hu hush""#, "'hu hush'"]
-        {
+        for secret in [
+            r"!hush",
+            r"Winter!hush",
+            r#""hu\"hush hush""#,
+            r"hu\ hush",
+            r#"(string)"hu hush""#,
+            "'hu hush'",
+        ] {
             let shown = without_credentials(&format!("rtspsrc user-pw={secret} ! appsink"));
             assert_eq!(shown, "rtspsrc user-pw=… ! appsink", "{secret}");
         }

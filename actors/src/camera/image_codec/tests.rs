@@ -7,7 +7,9 @@ const BLUE: [u8; 3] = [255, 0, 0];
 
 /// 32 rows of 48 columns, blue with a red upper left quarter.
 fn flag() -> Mat {
-    let mut image = Mat::new_rows_cols_with_default(32, 48, CV_8UC3, Scalar::new(255.0, 0.0, 0.0, 0.0)).unwrap();
+    let mut image =
+        Mat::new_rows_cols_with_default(32, 48, CV_8UC3, Scalar::new(255.0, 0.0, 0.0, 0.0))
+            .unwrap();
     for (row, column) in (0..16).flat_map(|row| (0..24).map(move |column| (row, column))) {
         *image.at_2d_mut::<Vec3b>(row, column).unwrap() = RED.into();
     }
@@ -24,9 +26,19 @@ fn is_near(color: [u8; 3], expected: [u8; 3]) -> bool {
 
 /// An EXIF segment of a JPEG file that says only this orientation.
 fn exif(orientation: u8) -> Vec<u8> {
-    let tiff = [b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(), &[orientation, 0, 0, 0], &[0; 4]].concat();
+    let tiff = [
+        b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(),
+        &[orientation, 0, 0, 0],
+        &[0; 4],
+    ]
+    .concat();
     let body = [b"Exif\0\0".as_slice(), &tiff].concat();
-    [&[0xff, 0xe1], (body.len() as u16 + 2).to_be_bytes().as_slice(), &body].concat()
+    [
+        &[0xff, 0xe1],
+        (body.len() as u16 + 2).to_be_bytes().as_slice(),
+        &body,
+    ]
+    .concat()
 }
 
 #[test]
@@ -45,10 +57,20 @@ fn a_photograph_is_turned_upright_as_its_camera_says() {
     ] {
         let file = [&jpeg[..2], &exif(orientation), &jpeg[2..]].concat();
         let image = decode(&file).unwrap();
-        assert_eq!((image.rows(), image.cols()), size, "orientation {orientation}");
-        assert!(is_near(color_at(&image, row, column), RED), "orientation {orientation}");
+        assert_eq!(
+            (image.rows(), image.cols()),
+            size,
+            "orientation {orientation}"
+        );
+        assert!(
+            is_near(color_at(&image, row, column), RED),
+            "orientation {orientation}"
+        );
         let (opposite_row, opposite_column) = (size.0 - 1 - row, size.1 - 1 - column);
-        assert!(is_near(color_at(&image, opposite_row, opposite_column), BLUE), "orientation {orientation}");
+        assert!(
+            is_near(color_at(&image, opposite_row, opposite_column), BLUE),
+            "orientation {orientation}"
+        );
     }
 }
 
@@ -58,17 +80,37 @@ fn every_format_is_read_by_its_content_as_bgr() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("frame.png");
     let rgb = [200, 100, 50].repeat(6);
-    for format in [ImageFormat::Bmp, ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::Pnm, ImageFormat::WebP] {
+    for format in [
+        ImageFormat::Bmp,
+        ImageFormat::Jpeg,
+        ImageFormat::Png,
+        ImageFormat::Pnm,
+        ImageFormat::WebP,
+    ] {
         image::save_buffer_with_format(&path, &rgb, 3, 2, ExtendedColorType::Rgb8, format).unwrap();
         let image = read(&path).unwrap();
-        assert_eq!((image.rows(), image.cols(), image.typ()), (2, 3, CV_8UC3), "{format:?}");
-        assert!(is_near(color_at(&image, 1, 2), [50, 100, 200]), "{format:?}: {:?}", color_at(&image, 1, 2));
+        assert_eq!(
+            (image.rows(), image.cols(), image.typ()),
+            (2, 3, CV_8UC3),
+            "{format:?}"
+        );
+        assert!(
+            is_near(color_at(&image, 1, 2), [50, 100, 200]),
+            "{format:?}: {:?}",
+            color_at(&image, 1, 2)
+        );
     }
-    for (pixels, kind) in [(vec![90; 6], ExtendedColorType::L8), ([90, 90, 90, 0].repeat(6), ExtendedColorType::Rgba8)]
-    {
+    for (pixels, kind) in [
+        (vec![90; 6], ExtendedColorType::L8),
+        ([90, 90, 90, 0].repeat(6), ExtendedColorType::Rgba8),
+    ] {
         image::save_buffer_with_format(&path, &pixels, 3, 2, kind, ImageFormat::Png).unwrap();
         let image = read(&path).unwrap();
-        assert_eq!((image.typ(), color_at(&image, 0, 0)), (CV_8UC3, [90; 3]), "{kind:?}");
+        assert_eq!(
+            (image.typ(), color_at(&image, 0, 0)),
+            (CV_8UC3, [90; 3]),
+            "{kind:?}"
+        );
     }
 }
 
@@ -86,7 +128,12 @@ fn what_is_no_whole_image_is_refused() {
     )
     .unwrap();
     let png = png.into_inner();
-    for bytes in [b"".as_slice(), b"half a fi", &jpeg[..100], &png[..png.len() / 2]] {
+    for bytes in [
+        b"".as_slice(),
+        b"half a fi",
+        &jpeg[..100],
+        &png[..png.len() / 2],
+    ] {
         let error = decode(bytes).expect_err("refused").to_string();
         assert!(error.starts_with("not an image"), "{error}");
     }
@@ -94,18 +141,29 @@ fn what_is_no_whole_image_is_refused() {
 
 #[test]
 fn gray_and_color_pictures_survive_jpeg() {
-    assert!(is_near(color_at(&decode(&encode_jpeg(&flag(), 95).unwrap()).unwrap(), 8, 12), RED));
+    assert!(is_near(
+        color_at(&decode(&encode_jpeg(&flag(), 95).unwrap()).unwrap(), 8, 12),
+        RED
+    ));
     let gray = Mat::new_rows_cols_with_default(10, 20, CV_8UC1, Scalar::all(77.0)).unwrap();
     let shown = decode(&encode_jpeg(&gray, 95).unwrap()).unwrap();
     assert_eq!((shown.rows(), shown.cols()), (10, 20));
     assert!(is_near(color_at(&shown, 5, 5), [77; 3]));
 
     let long = Mat::new_rows_cols_with_default(1, 70_000, CV_8UC1, Scalar::all(0.0)).unwrap();
-    assert!(encode_jpeg(&long, 95).expect_err("too long").to_string().contains("70000x1"));
+    assert!(
+        encode_jpeg(&long, 95)
+            .expect_err("too long")
+            .to_string()
+            .contains("70000x1")
+    );
 }
 
 #[test]
 fn a_header_that_states_more_than_a_machine_has_is_an_error() {
     let error = decode(b"P6\n65000 65000\n255\n").unwrap_err();
-    assert!(matches!(error, ImageError::Malformed(image::ImageError::Limits(_))), "{error:?}");
+    assert!(
+        matches!(error, ImageError::Malformed(image::ImageError::Limits(_))),
+        "{error:?}"
+    );
 }

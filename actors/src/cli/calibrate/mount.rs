@@ -79,7 +79,12 @@ pub(super) struct GroundBoardArguments {
     #[command(flatten)]
     node: MountArguments,
     /// Side of the QR code without its white rim, in millimetres
-    #[arg(long, value_name = "MM", required_unless_present = "square_mm", conflicts_with = "square_mm")]
+    #[arg(
+        long,
+        value_name = "MM",
+        required_unless_present = "square_mm",
+        conflicts_with = "square_mm"
+    )]
     qr_side_mm: Option<f64>,
     /// Side of a square of the chessboard in millimetres
     #[arg(long, value_name = "MM")]
@@ -121,13 +126,20 @@ const KNOWN_HEIGHT_SIGMA: f64 = 0.02;
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 
 fn measured_point(text: &str) -> Result<MeasuredPoint, String> {
-    let words =
-        text.split(|c: char| c == ',' || c == '=' || c == ';' || c.is_whitespace()).filter(|word| !word.is_empty());
-    let numbers: Option<Vec<f64>> =
-        words.map(|word| word.parse().ok().filter(|number: &f64| number.is_finite())).collect();
+    let words = text
+        .split(|c: char| c == ',' || c == '=' || c == ';' || c.is_whitespace())
+        .filter(|word| !word.is_empty());
+    let numbers: Option<Vec<f64>> = words
+        .map(|word| word.parse().ok().filter(|number: &f64| number.is_finite()))
+        .collect();
     match numbers.as_deref() {
-        Some(&[column, row, x_m, y_m]) => Ok(MeasuredPoint { pixel: [column, row], position_m: [x_m, y_m] }),
-        _ => Err(format!("{text:?} is not four numbers: column and row in pixels, two distances in metres")),
+        Some(&[column, row, x_m, y_m]) => Ok(MeasuredPoint {
+            pixel: [column, row],
+            position_m: [x_m, y_m],
+        }),
+        _ => Err(format!(
+            "{text:?} is not four numbers: column and row in pixels, two distances in metres"
+        )),
     }
 }
 
@@ -141,17 +153,28 @@ pub(super) fn run(command: &MountCommand) -> Result<(), Failure> {
 
 impl MountArguments {
     fn load(&self) -> Result<(NodeConfig, CameraConfig, Lens), Failure> {
-        let config =
-            NodeConfig::load(Some(&self.config), &BTreeMap::<String, String>::new()).map_err(Failure::usage)?;
+        let config = NodeConfig::load(Some(&self.config), &BTreeMap::<String, String>::new())
+            .map_err(Failure::usage)?;
         let camera = match &self.camera {
             None => config.camera.as_ref(),
-            Some(name) => config.all_cameras().find(|camera| camera.name.as_ref() == Some(name)),
+            Some(name) => config
+                .all_cameras()
+                .find(|camera| camera.name.as_ref() == Some(name)),
         };
         let no_camera = || match &self.camera {
-            None => anyhow!("{:?} has no [camera]: `ecod-node try --save node.toml` writes one", self.config),
-            Some(name) => anyhow!("{:?} has no camera {name:?}: see `name` in its [[cameras]]", self.config),
+            None => anyhow!(
+                "{:?} has no [camera]: `ecod-node try --save node.toml` writes one",
+                self.config
+            ),
+            Some(name) => anyhow!(
+                "{:?} has no camera {name:?}: see `name` in its [[cameras]]",
+                self.config
+            ),
         };
-        let camera = camera.cloned().ok_or_else(no_camera).map_err(Failure::usage)?;
+        let camera = camera
+            .cloned()
+            .ok_or_else(no_camera)
+            .map_err(Failure::usage)?;
         let lens = node::camera::lens(&camera).map_err(Failure::usage)?;
         Ok((config, camera, lens))
     }
@@ -160,11 +183,16 @@ impl MountArguments {
     fn tell(&self, estimate: &MountEstimate, lens: &Lens) -> Result<(), Failure> {
         print(&mount_table(estimate, self.camera.is_some()).context("the mount as TOML")?)?;
         if let Some([near_m, far_m]) = estimate.mount.ground_in_view(&lens.intrinsics) {
-            let far = if far_m.is_finite() { format!("to {far_m:.1} m") } else { "to the horizon".to_owned() };
+            let far = if far_m.is_finite() {
+                format!("to {far_m:.1} m")
+            } else {
+                "to the horizon".to_owned()
+            };
             eprintln!("the middle of the image shows the ground from {near_m:.1} m {far}");
         }
         if self.write {
-            self.write_into(&MountConfig::rounded(&estimate.mount)).map_err(Failure::usage)?;
+            self.write_into(&MountConfig::rounded(&estimate.mount))
+                .map_err(Failure::usage)?;
             eprintln!("written to {}", self.config.display());
         }
         Ok(())
@@ -175,11 +203,20 @@ impl MountArguments {
         let place = || format!("cannot write the mount to {}", self.config.display());
         let text = bounded_file::read_text(&self.config).with_context(place)?;
         let mut document: DocumentMut = text.parse().with_context(place)?;
-        let camera = self.table(&mut document).context("its camera is written elsewhere: paste the lines");
-        let table = camera.with_context(place)?.entry("mount").or_insert_with(toml_edit::table).as_table_like_mut();
+        let camera = self
+            .table(&mut document)
+            .context("its camera is written elsewhere: paste the lines");
+        let table = camera
+            .with_context(place)?
+            .entry("mount")
+            .or_insert_with(toml_edit::table)
+            .as_table_like_mut();
         let table = table.context("`mount` is no table").with_context(place)?;
         let keys = toml::Table::try_from(mount).with_context(place)?;
-        for (key, number) in keys.iter().filter_map(|(key, value)| Some((key, value.as_float()?))) {
+        for (key, number) in keys
+            .iter()
+            .filter_map(|(key, value)| Some((key, value.as_float()?)))
+        {
             table.insert(key, toml_edit::value(number));
         }
         std::fs::write(&self.config, document.to_string()).with_context(place)
@@ -187,12 +224,24 @@ impl MountArguments {
 
     /// The table of the camera.
     fn table<'a>(&self, document: &'a mut DocumentMut) -> Option<&'a mut dyn TableLike> {
-        let is_named = |table: &dyn TableLike| table.get("name").and_then(Item::as_str) == self.camera.as_deref();
-        if self.camera.is_none() || document.get("camera").and_then(Item::as_table_like).is_some_and(is_named) {
+        let is_named = |table: &dyn TableLike| {
+            table.get("name").and_then(Item::as_str) == self.camera.as_deref()
+        };
+        if self.camera.is_none()
+            || document
+                .get("camera")
+                .and_then(Item::as_table_like)
+                .is_some_and(is_named)
+        {
             return document.get_mut("camera")?.as_table_like_mut();
         }
-        let mut cameras = document.get_mut("cameras")?.as_array_of_tables_mut()?.iter_mut();
-        cameras.find(|camera| is_named(*camera)).map(|camera| camera as &mut dyn TableLike)
+        let mut cameras = document
+            .get_mut("cameras")?
+            .as_array_of_tables_mut()?
+            .iter_mut();
+        cameras
+            .find(|camera| is_named(*camera))
+            .map(|camera| camera as &mut dyn TableLike)
     }
 }
 
@@ -205,28 +254,58 @@ impl PointsArguments {
             let text = text.with_context(|| format!("cannot read points from {}", file.display()));
             for (number, line) in text.map_err(Failure::usage)?.lines().enumerate() {
                 if !line.trim().is_empty() && !line.trim_start().starts_with('#') {
-                    let place = |problem| anyhow!("{}, line {}: {problem}", file.display(), number + 1);
-                    stated.push(measured_point(line).map_err(place).map_err(Failure::usage)?);
+                    let place =
+                        |problem| anyhow!("{}, line {}: {problem}", file.display(), number + 1);
+                    stated.push(
+                        measured_point(line)
+                            .map_err(place)
+                            .map_err(Failure::usage)?,
+                    );
                 }
             }
         }
         let (picture, vehicle) = (self.picture(&lens)?, self.vehicle(&config)?);
-        let fit = fit_mount_to_points(&stated, picture, &lens, &vehicle).context("the points give no mount")?;
-        for (PointFit { error_px, error_m, is_outlier }, MeasuredPoint { pixel: [column, row], .. }) in
-            fit.points.iter().zip(&stated)
+        let fit = fit_mount_to_points(&stated, picture, &lens, &vehicle)
+            .context("the points give no mount")?;
+        for (
+            PointFit {
+                error_px,
+                error_m,
+                is_outlier,
+            },
+            MeasuredPoint {
+                pixel: [column, row],
+                ..
+            },
+        ) in fit.points.iter().zip(&stated)
         {
-            let on_ground = error_m.map_or_else(|| "above the horizon".to_owned(), |metres| format!("{metres:.3} m"));
-            let outlier = if *is_outlier { "  OUTLIER, left out: measure it again" } else { "" };
+            let on_ground = error_m.map_or_else(
+                || "above the horizon".to_owned(),
+                |metres| format!("{metres:.3} m"),
+            );
+            let outlier = if *is_outlier {
+                "  OUTLIER, left out: measure it again"
+            } else {
+                ""
+            };
             eprintln!("point {column},{row}: off by {error_px:.1} px, {on_ground}{outlier}");
         }
-        self.node.tell(&fit.estimate, &lens.of_frames(picture).map_err(Failure::usage)?)
+        self.node.tell(
+            &fit.estimate,
+            &lens.of_frames(picture).map_err(Failure::usage)?,
+        )
     }
 
     /// The size of the picture in which the points were measured.
     fn picture(&self, lens: &Lens) -> Result<ImageSize, Failure> {
         let Some(path) = &self.image else {
-            let unknown = anyhow!("`camera.optics` says no size of the image: give the picture with --image");
-            return if lens.is_any_shape { Err(Failure::usage(unknown)) } else { Ok((&lens.intrinsics).into()) };
+            let unknown =
+                anyhow!("`camera.optics` says no size of the image: give the picture with --image");
+            return if lens.is_any_shape {
+                Err(Failure::usage(unknown))
+            } else {
+                Ok((&lens.intrinsics).into())
+            };
         };
         let size = ImageSize::of(&read_gray(path).map_err(Failure::usage)?);
         lens.of_frames(size).map(|_| size).map_err(Failure::usage)
@@ -250,18 +329,34 @@ impl GroundBoardArguments {
         let board = match (self.qr_side_mm, self.square_mm) {
             (Some(side_mm), _) => GroundBoard::QrCode { side_mm },
             (None, square_mm) => {
-                let (columns, rows, square_mm) = (self.columns, self.rows, square_mm.unwrap_or_default());
-                GroundBoard::Chessboard(Chessboard { columns, rows, square_mm })
+                let (columns, rows, square_mm) =
+                    (self.columns, self.rows, square_mm.unwrap_or_default());
+                GroundBoard::Chessboard(Chessboard {
+                    columns,
+                    rows,
+                    square_mm,
+                })
             }
         };
         let photograph = read_gray(&self.photograph).map_err(Failure::usage)?;
-        let lens = lens.of_frames(ImageSize::of(&photograph)).map_err(Failure::usage)?;
+        let lens = lens
+            .of_frames(ImageSize::of(&photograph))
+            .map_err(Failure::usage)?;
         let fit = fit_board(&photograph, &board, &lens);
         let fit = fit.with_context(|| format!("{} gives no mount", self.photograph.display()))?;
         let used = fit.points.iter().filter(|point| !point.is_outlier);
         let worst_px = used.clone().map(|point| point.error_px).fold(0.0, f64::max);
-        eprintln!("{} corners of the board, off by {worst_px:.2} px at most", used.count());
-        self.node.tell(&MountEstimate { mount: camera.mount.placed(&fit.estimate.mount), ..fit.estimate }, &lens)
+        eprintln!(
+            "{} corners of the board, off by {worst_px:.2} px at most",
+            used.count()
+        );
+        self.node.tell(
+            &MountEstimate {
+                mount: camera.mount.placed(&fit.estimate.mount),
+                ..fit.estimate
+            },
+            &lens,
+        )
     }
 }
 
@@ -269,25 +364,60 @@ impl PeopleArguments {
     fn run(&self) -> Result<(), Failure> {
         let (_, mut camera, lens) = self.node.load()?;
         if let Some(path) = &self.video {
-            camera.source = SourceConfig::Video { path: path.clone(), looping: false };
+            camera.source = SourceConfig::Video {
+                path: path.clone(),
+                looping: false,
+            };
         }
         let no_size = || anyhow!("no size of {:?}: set camera.projection.sizes", self.label);
-        let size = camera.projection.sizes.of(&self.label).copied().ok_or_else(no_size).map_err(Failure::usage)?;
+        let size = camera
+            .projection
+            .sizes
+            .of(&self.label)
+            .copied()
+            .ok_or_else(no_size)
+            .map_err(Failure::usage)?;
         let size = match self.height_m {
-            Some(height_m) if (0.5..=2.5).contains(&height_m) => {
-                ObjectSize { height_m, relative_sigma: KNOWN_HEIGHT_SIGMA, ..size }
+            Some(height_m) if (0.5..=2.5).contains(&height_m) => ObjectSize {
+                height_m,
+                relative_sigma: KNOWN_HEIGHT_SIGMA,
+                ..size
+            },
+            Some(height_m) => {
+                return Err(Failure::usage(anyhow!(
+                    "--height-m {height_m}: must be 0.5 to 2.5"
+                )));
             }
-            Some(height_m) => return Err(Failure::usage(anyhow!("--height-m {height_m}: must be 0.5 to 2.5"))),
             None => size,
         };
         let watched = self.watch(&camera, lens)?;
         let boxes: usize = watched.people.iter().map(Vec::len).sum();
-        eprintln!("{boxes} whole boxes of {:?} in {} frames", self.label, watched.people.len());
+        eprintln!(
+            "{boxes} whole boxes of {:?} in {} frames",
+            self.label,
+            watched.people.len()
+        );
         let (sigma_px, intrinsics) = (camera.projection.pixel_sigma_px, watched.lens.intrinsics);
-        let estimate = fit_mount(&watched.people, &size, sigma_px, &intrinsics, &camera.mount.into());
-        let others = watched.others.iter().map(Label::as_str).collect::<Vec<_>>().join(", ");
-        let seen = if others.is_empty() { String::new() } else { format!(" (also seen: {others})") };
-        let estimate = estimate.with_context(|| format!("{:?} gives no mount{seen}", self.label))?;
+        let estimate = fit_mount(
+            &watched.people,
+            &size,
+            sigma_px,
+            &intrinsics,
+            &camera.mount.into(),
+        );
+        let others = watched
+            .others
+            .iter()
+            .map(Label::as_str)
+            .collect::<Vec<_>>()
+            .join(", ");
+        let seen = if others.is_empty() {
+            String::new()
+        } else {
+            format!(" (also seen: {others})")
+        };
+        let estimate =
+            estimate.with_context(|| format!("{:?} gives no mount{seen}", self.label))?;
         self.node.tell(&estimate, &watched.lens)
     }
 
@@ -297,16 +427,27 @@ impl PeopleArguments {
         let (source, capture) = (camera.source.clone(), camera.capture.clone());
         let timeout = node::camera::open_timeout(camera);
         source.open(timeout).map(drop).map_err(Failure::usage)?;
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build().context("cannot start")?;
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_time()
+            .build()
+            .context("cannot start")?;
         let for_s = Duration::try_from_secs_f64(self.for_s).map_err(Failure::usage)?;
-        let capture =
-            Capture::start(Arc::new(move || source.open(timeout)), capture).context("cannot start the camera")?;
-        let mut watched = Watched { people: Vec::new(), others: BTreeSet::new(), lens };
+        let capture = Capture::start(Arc::new(move || source.open(timeout)), capture)
+            .context("cannot start the camera")?;
+        let mut watched = Watched {
+            people: Vec::new(),
+            others: BTreeSet::new(),
+            lens,
+        };
         let end = Instant::now() + for_s;
         eprintln!("watches for {} s, or until the frames end", self.for_s);
-        while let Ok(Some(frame)) = runtime.block_on(async { timeout_at(end, capture.next_frame()).await }) {
+        while let Ok(Some(frame)) =
+            runtime.block_on(async { timeout_at(end, capture.next_frame()).await })
+        {
             let detections = detector.detect(&frame).context("the detector failed")?;
-            watched.add(detections, &frame, &self.label, camera).map_err(Failure::usage)?;
+            watched
+                .add(detections, &frame, &self.label, camera)
+                .map_err(Failure::usage)?;
         }
         let readers = capture.readers();
         drop(capture);
@@ -335,11 +476,26 @@ impl Watched {
         let size = ImageSize::of(&frame.image);
         self.lens = self.lens.of_frames(size)?;
         ImageSize::from(&self.lens.intrinsics).fit(size, &mut detections)?;
-        let projection = Projection::new(camera.projection.clone(), self.lens.intrinsics, camera.mount.into());
-        self.others.extend(detections.iter().filter(|other| other.label != label).map(|other| other.label.clone()));
-        detections.retain(|person| person.label == label && projection.cut(person) == Cut::default());
+        let projection = Projection::new(
+            camera.projection.clone(),
+            self.lens.intrinsics,
+            camera.mount.into(),
+        );
+        self.others.extend(
+            detections
+                .iter()
+                .filter(|other| other.label != label)
+                .map(|other| other.label.clone()),
+        );
+        detections
+            .retain(|person| person.label == label && projection.cut(person) == Cut::default());
         self.lens.undistort(&mut detections)?;
-        self.people.push(detections.iter().map(|person| person.bounding_box).collect());
+        self.people.push(
+            detections
+                .iter()
+                .map(|person| person.bounding_box)
+                .collect(),
+        );
         Ok(())
     }
 }

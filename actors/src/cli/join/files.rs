@@ -58,9 +58,14 @@ impl NodeDirectory {
         let usual = if is_root { SERVICE_DIRECTORY } else { "ecod" };
         let path = given.unwrap_or(Path::new(usual));
         let made = DirBuilder::new().recursive(true).mode(0o750).create(path);
-        let path = made.and_then(|()| path.canonicalize()).with_context(|| format!("cannot use {}", path.display()))?;
+        let path = made
+            .and_then(|()| path.canonicalize())
+            .with_context(|| format!("cannot use {}", path.display()))?;
         let is_service = is_root && path == Path::new(SERVICE_DIRECTORY);
-        Ok(Self { path, state_of_service: is_service.then(|| STATE_DIRECTORY.into()) })
+        Ok(Self {
+            path,
+            state_of_service: is_service.then(|| STATE_DIRECTORY.into()),
+        })
     }
 
     /// Checks that no node has its files here.
@@ -88,7 +93,10 @@ impl NodeDirectory {
 
     /// The files of the city, which a cell that belongs to one has here; `None` if it stands alone.
     pub(super) fn city(&self, is_of_city: bool) -> anyhow::Result<Option<CityTlsConfig>> {
-        let missing = [CITY_CA, CITY_LIST].map(|name| self.path.join(name)).into_iter().find(|path| !path.exists());
+        let missing = [CITY_CA, CITY_LIST]
+            .map(|name| self.path.join(name))
+            .into_iter()
+            .find(|path| !path.exists());
         match missing.filter(|_| is_of_city) {
             Some(path) => bail!(
                 "{} is missing: a city has signed the cell's CA. Copy the city's ca.pem and revoked.pem to {CITY_CA} and {CITY_LIST} \
@@ -100,7 +108,10 @@ impl NodeDirectory {
     }
 
     fn city_files(&self) -> CityTlsConfig {
-        CityTlsConfig { ca: self.path.join(CITY_CA), revocation_list: Some(self.path.join(CITY_LIST)) }
+        CityTlsConfig {
+            ca: self.path.join(CITY_CA),
+            revocation_list: Some(self.path.join(CITY_LIST)),
+        }
     }
 
     pub(super) fn configuration(&self) -> PathBuf {
@@ -109,12 +120,18 @@ impl NodeDirectory {
 
     pub(super) fn cell_key(&self) -> anyhow::Result<String> {
         let path = self.path.join("cell.key");
-        bounded_file::read_text(&path).with_context(|| format!("cannot read the cell's key {}", path.display()))
+        bounded_file::read_text(&path)
+            .with_context(|| format!("cannot read the cell's key {}", path.display()))
     }
 
     /// Writes all files of a node, and checks that they fit together. A configuration that is there, such as that of
     /// the package, is kept as `node.toml.1`, or with the next free number.
-    pub(super) fn write(&self, node: &NodeName, welcome: &Welcome, key: &str) -> anyhow::Result<()> {
+    pub(super) fn write(
+        &self,
+        node: &NodeName,
+        welcome: &Welcome,
+        key: &str,
+    ) -> anyhow::Result<()> {
         let file = |name: &str| self.path.join(name);
         let tls = TlsConfig {
             ca: file("ca.pem"),
@@ -123,27 +140,44 @@ impl NodeDirectory {
             revocation_list: Some(file("revoked.pem")),
             city: welcome.city.as_ref().map(|_| self.city_files()),
         };
-        let state_dir = self.state_of_service.clone().unwrap_or_else(|| file("state"));
+        let state_dir = self
+            .state_of_service
+            .clone()
+            .unwrap_or_else(|| file("state"));
         let configuration = toml::to_string(&Configuration {
             name: node,
             cell: &welcome.cell,
             role: welcome.role,
             state_dir,
-            membership: MembershipSection { key_file: file("cell.key"), seeds: &welcome.seeds },
+            membership: MembershipSection {
+                key_file: file("cell.key"),
+                seeds: &welcome.seeds,
+            },
             tls: &tls,
         })?;
         let configuration = format!("{HEAD}{configuration}{END_OF_CONFIGURATION}\n");
         if self.configuration().exists() {
-            let mut free = (1..).map(|number| file(&format!("node.toml.{number}"))).filter(|path| !path.exists());
-            let kept = free.next().map(|path| fs::rename(self.configuration(), path));
-            kept.transpose().context("cannot keep the former node.toml")?;
+            let mut free = (1..)
+                .map(|number| file(&format!("node.toml.{number}")))
+                .filter(|path| !path.exists());
+            let kept = free
+                .next()
+                .map(|path| fs::rename(self.configuration(), path));
+            kept.transpose()
+                .context("cannot keep the former node.toml")?;
         }
         // Programs of the service's group speak for the node, and are no members.
-        let key_mode = if self.state_of_service.is_some() { 0o640 } else { 0o600 };
-        let of_city = welcome
-            .city
-            .iter()
-            .flat_map(|city| [(CITY_CA, city.ca.as_str(), 0o644), (CITY_LIST, city.revocation_list.as_str(), 0o644)]);
+        let key_mode = if self.state_of_service.is_some() {
+            0o640
+        } else {
+            0o600
+        };
+        let of_city = welcome.city.iter().flat_map(|city| {
+            [
+                (CITY_CA, city.ca.as_str(), 0o644),
+                (CITY_LIST, city.revocation_list.as_str(), 0o644),
+            ]
+        });
         // The cell's key last: it is what makes the directory a node's.
         let files = of_city.chain([
             ("ca.pem", welcome.ca.as_str(), 0o644),
@@ -153,7 +187,10 @@ impl NodeDirectory {
             ("node.key", key, key_mode),
             ("cell.key", welcome.cell_key.as_str(), 0o600),
         ]);
-        let owner = self.state_of_service.as_ref().and_then(|state| fs::metadata(state).ok());
+        let owner = self
+            .state_of_service
+            .as_ref()
+            .and_then(|state| fs::metadata(state).ok());
         for (name, text, mode) in files {
             let path = file(name);
             replace_file(&path, text.as_bytes(), mode)
@@ -170,14 +207,24 @@ impl NodeDirectory {
     /// Has the system run the node from now on, if it is the system's: true if so.
     pub(super) fn enable_service(&self) -> anyhow::Result<bool> {
         let units = ["/lib/systemd/system", "/etc/systemd/system"];
-        let has_unit = units.iter().any(|units| Path::new(units).join("ecod-node.service").exists());
-        if self.state_of_service.is_none() || !has_unit || !Path::new("/run/systemd/system").exists() {
+        let has_unit = units
+            .iter()
+            .any(|units| Path::new(units).join("ecod-node.service").exists());
+        if self.state_of_service.is_none()
+            || !has_unit
+            || !Path::new("/run/systemd/system").exists()
+        {
             return Ok(false);
         }
         // One that runs already has another configuration.
         for command in ["enable", "restart"] {
-            let done = Command::new("systemctl").args([command, "ecod-node"]).status();
-            ensure!(done.context("cannot run systemctl")?.success(), "`systemctl {command} ecod-node` failed");
+            let done = Command::new("systemctl")
+                .args([command, "ecod-node"])
+                .status();
+            ensure!(
+                done.context("cannot run systemctl")?.success(),
+                "`systemctl {command} ecod-node` failed"
+            );
         }
         Ok(true)
     }
@@ -219,9 +266,15 @@ mod tests {
     #[test]
     fn the_services_group_reads_the_nodes_certificate_and_key_and_not_the_cells_key() {
         let directory = tempfile::tempdir().unwrap();
-        let (cell, node) = (NodeName::from_static("lot-1"), NodeName::from_static("euclid"));
-        let mut authority = Authority::init(&directory.path().join("pki"), &cell, clock::now()).unwrap();
-        authority.issue(&node, Role::Cav, Duration::from_secs(86_400), clock::now()).unwrap();
+        let (cell, node) = (
+            NodeName::from_static("lot-1"),
+            NodeName::from_static("euclid"),
+        );
+        let mut authority =
+            Authority::init(&directory.path().join("pki"), &cell, clock::now()).unwrap();
+        authority
+            .issue(&node, Role::Cav, Duration::from_secs(86_400), clock::now())
+            .unwrap();
         let (certificate, key) = authority.files_of(&node);
         let read = |path: PathBuf| fs::read_to_string(path).unwrap();
         let welcome = Welcome {
@@ -235,11 +288,24 @@ mod tests {
             city: None,
         };
         let key = read(key);
-        for (state_of_service, expected) in [(Some(directory.path().into()), 0o640), (None, 0o600)] {
-            let files = NodeDirectory { path: directory.path().into(), state_of_service };
+        for (state_of_service, expected) in [(Some(directory.path().into()), 0o640), (None, 0o600)]
+        {
+            let files = NodeDirectory {
+                path: directory.path().into(),
+                state_of_service,
+            };
             files.write(&node, &welcome, &key).unwrap();
-            let mode = |name| fs::metadata(directory.path().join(name)).unwrap().permissions().mode() & 0o777;
-            assert_eq!([mode("node.pem"), mode("node.key"), mode("cell.key")], [0o644, expected, 0o600]);
+            let mode = |name| {
+                fs::metadata(directory.path().join(name))
+                    .unwrap()
+                    .permissions()
+                    .mode()
+                    & 0o777
+            };
+            assert_eq!(
+                [mode("node.pem"), mode("node.key"), mode("cell.key")],
+                [0o644, expected, 0o600]
+            );
         }
     }
 }

@@ -10,10 +10,16 @@ use ecod::replay::{FusedLine, JournalEntry, JournalReplay, Replay, ReplayConfig}
 use ecod::wire::{Limits, ObjectReport, RejectReason, ReportKind, decode};
 
 use super::{Failure, RoundWriter, Usable, print_summary};
-use crate::observe::recorder::{LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName};
+use crate::observe::recorder::{
+    LogError, LogEvent, LogIdentity, LogMessage, LogReader, SchemaName,
+};
 
 /// Bounds of memory only: the node checked its own limits when it recorded.
-const LIMITS: Limits = Limits { payload_bytes: 1 << 28, map_bytes: 1 << 28, objects: usize::MAX };
+const LIMITS: Limits = Limits {
+    payload_bytes: 1 << 28,
+    map_bytes: 1 << 28,
+    objects: usize::MAX,
+};
 
 /// Way of replaying a log.
 enum ReplayEngine {
@@ -38,12 +44,23 @@ pub(super) struct LogReplay<'a> {
 
 impl<'a> LogReplay<'a> {
     pub(super) fn new(cell: Option<&'a ReplayConfig>, passes: Option<u32>) -> Self {
-        Self { cell, passes, identity: None, engine: None, unreadable: BTreeMap::new(), usable: Usable::default() }
+        Self {
+            cell,
+            passes,
+            identity: None,
+            engine: None,
+            unreadable: BTreeMap::new(),
+            usable: Usable::default(),
+        }
     }
 
     /// Reads the files and writes their rounds. Unusable parts are reported and skipped. Gives nothing for a journal, and
     /// if the reader of the output closed it.
-    pub(super) fn run(mut self, files: &[PathBuf], mut rounds: RoundWriter) -> Result<Option<Usable>, Failure> {
+    pub(super) fn run(
+        mut self,
+        files: &[PathBuf],
+        mut rounds: RoundWriter,
+    ) -> Result<Option<Usable>, Failure> {
         for file in files {
             let mut log = LogReader::open(file).map_err(Failure::usage)?;
             for event in log.by_ref() {
@@ -60,7 +77,10 @@ impl<'a> LogReplay<'a> {
                 }
             }
             for (schema, messages) in log.unknown() {
-                eprintln!("{}: {messages} messages of {schema:?} are not known and skipped", file.display());
+                eprintln!(
+                    "{}: {messages} messages of {schema:?} are not known and skipped",
+                    file.display()
+                );
             }
         }
         self.finish(rounds)
@@ -79,22 +99,37 @@ impl<'a> LogReplay<'a> {
             && known.node != identity.node
         {
             let (one, other) = (&known.node, &identity.node);
-            let what = format!("{} is of node {other}, earlier files are of {one}", file.display());
-            return Err(Failure::usage(anyhow!("{what}: give the files of one node at a time")));
+            let what = format!(
+                "{} is of node {other}, earlier files are of {one}",
+                file.display()
+            );
+            return Err(Failure::usage(anyhow!(
+                "{what}: give the files of one node at a time"
+            )));
         }
         let (file, version) = (file.display(), &identity.version);
-        if version != env!("CARGO_PKG_VERSION") && known.as_ref().is_none_or(|known| known.version != *version) {
+        if version != env!("CARGO_PKG_VERSION")
+            && known.as_ref().is_none_or(|known| known.version != *version)
+        {
             eprintln!("{file} was written by version {version}: its rounds may differ");
         }
         let identity = self.identity.insert(identity);
-        let Some(known) = known.filter(|known| known.run != identity.run) else { return Ok(Vec::new()) };
-        let is_as_before = (&known.fusion, &known.landmarks) == (&identity.fusion, &identity.landmarks);
+        let Some(known) = known.filter(|known| known.run != identity.run) else {
+            return Ok(Vec::new());
+        };
+        let is_as_before =
+            (&known.fusion, &known.landmarks) == (&identity.fusion, &identity.landmarks);
         let config = self.config();
         match &mut self.engine {
             Some(ReplayEngine::Journal(rerun)) => rerun.restart(config.fusion, config.landmarks),
             Some(ReplayEngine::Reports(replay)) if self.cell.is_none() && !is_as_before => {
-                eprintln!("{file} is of a run under another configuration: fusion starts again there");
-                return Ok(end(std::mem::replace(&mut **replay, Replay::new(config)), &mut self.usable));
+                eprintln!(
+                    "{file} is of a run under another configuration: fusion starts again there"
+                );
+                return Ok(end(
+                    std::mem::replace(&mut **replay, Replay::new(config)),
+                    &mut self.usable,
+                ));
             }
             _ => {}
         }
@@ -114,7 +149,9 @@ impl<'a> LogReplay<'a> {
             }
             SchemaName::ObjectReport => match read_report(message) {
                 Ok((kind, report)) => match self.engine(SchemaName::ObjectReport) {
-                    ReplayEngine::Journal(rerun) => rerun.report(kind, &Arc::new(report), message.at),
+                    ReplayEngine::Journal(rerun) => {
+                        rerun.report(kind, &Arc::new(report), message.at)
+                    }
                     ReplayEngine::Reports(replay) => replay.report(kind, report, message.at),
                 },
                 Err(reason) => self.reject(reason),
@@ -124,7 +161,11 @@ impl<'a> LogReplay<'a> {
     }
 
     fn reject(&mut self, reason: RejectReason) -> Vec<FusedLine> {
-        self.usable = self.usable.plus(Usable { reports: 1, faulty: 1, ..Usable::default() });
+        self.usable = self.usable.plus(Usable {
+            reports: 1,
+            faulty: 1,
+            ..Usable::default()
+        });
         *self.unreadable.entry(reason).or_default() += 1;
         Vec::new()
     }
@@ -134,7 +175,9 @@ impl<'a> LogReplay<'a> {
         let engine = match (self.engine.take(), first) {
             (Some(engine), _) => engine,
             (None, SchemaName::JournalEntry) => {
-                let ReplayConfig { fusion, landmarks, .. } = self.config();
+                let ReplayConfig {
+                    fusion, landmarks, ..
+                } = self.config();
                 ReplayEngine::Journal(Box::new(JournalReplay::new(fusion, landmarks)))
             }
             (None, _) => ReplayEngine::Reports(Box::new(Replay::new(self.config()))),
@@ -154,7 +197,11 @@ impl<'a> LogReplay<'a> {
             },
             (None, None) => ReplayConfig::default(),
         };
-        ReplayConfig { passes: self.passes, limits: LIMITS, ..config }
+        ReplayConfig {
+            passes: self.passes,
+            limits: LIMITS,
+            ..config
+        }
     }
 
     fn finish(mut self, mut rounds: RoundWriter) -> Result<Option<Usable>, Failure> {
@@ -180,8 +227,14 @@ impl<'a> LogReplay<'a> {
 #[cfg(fuzzing)]
 pub fn rounds_of_log(file: &Path) -> Vec<FusedLine> {
     let mut replay = LogReplay::new(None, None);
-    let Ok(log) = LogReader::open(file) else { return Vec::new() };
-    let mut rounds: Vec<_> = log.flatten().map_while(|event| replay.event(event, file).ok()).flatten().collect();
+    let Ok(log) = LogReader::open(file) else {
+        return Vec::new();
+    };
+    let mut rounds: Vec<_> = log
+        .flatten()
+        .map_while(|event| replay.event(event, file).ok())
+        .flatten()
+        .collect();
     if let Some(ReplayEngine::Reports(engine)) = replay.engine {
         rounds.extend(engine.finish().0);
     }
@@ -200,15 +253,23 @@ fn end(replay: Replay, usable: &mut Usable) -> Vec<FusedLine> {
 fn print_rerun(rerun: &JournalReplay) {
     let summary = rerun.summary();
     let used = summary.reports - summary.rejected.values().sum::<u64>();
-    eprintln!("{} reports, {used} used, {} written", summary.reports, summary.written);
+    eprintln!(
+        "{} reports, {used} used, {} written",
+        summary.reports, summary.written
+    );
     for (reason, reports) in &summary.rejected {
         eprintln!("rejected {reason} {reports}");
     }
     if summary.continued {
-        eprintln!("the log begins in the middle of a run: its first rounds use less evidence than the live ones did");
+        eprintln!(
+            "the log begins in the middle of a run: its first rounds use less evidence than the live ones did"
+        );
     }
     if summary.missing > 0 {
-        eprintln!("{} entries are missing in the log: later rounds may differ from the live ones", summary.missing);
+        eprintln!(
+            "{} entries are missing in the log: later rounds may differ from the live ones",
+            summary.missing
+        );
     }
 }
 

@@ -47,7 +47,10 @@ impl NodeBuilder {
     pub(super) fn membership_arguments(&self) -> MembershipArguments {
         let election = self.slots.election.clone();
         let failed = self.failed.clone();
-        let taken = NodeError::NameTaken { name: self.name.clone(), cell: self.config.cell.clone() };
+        let taken = NodeError::NameTaken {
+            name: self.name.clone(),
+            cell: self.config.cell.clone(),
+        };
         let events: EventSink = Arc::new(move |event| {
             if event == MembershipEvent::Excluded {
                 failed.send_replace(Some(taken.clone()));
@@ -63,7 +66,10 @@ impl NodeBuilder {
             broker: *self.broker_address.borrow(),
             credentials: self.security.credentials.clone(),
             // Others look for it where it was.
-            config: MembershipConfig { bind: self.gossip_address.borrow().or(membership.bind), ..membership.clone() },
+            config: MembershipConfig {
+                bind: self.gossip_address.borrow().or(membership.bind),
+                ..membership.clone()
+            },
             events,
             members: self.members.clone(),
             counters: self.frames(),
@@ -88,7 +94,12 @@ impl NodeBuilder {
     fn gateway_part(&self) -> SubscriptionRole {
         if self.config.may_lead() {
             SubscriptionRole::Candidate
-        } else if self.config.record.as_ref().is_some_and(|record| record.reports) {
+        } else if self
+            .config
+            .record
+            .as_ref()
+            .is_some_and(|record| record.reports)
+        {
             SubscriptionRole::Observer
         } else {
             SubscriptionRole::Follower
@@ -97,10 +108,22 @@ impl NodeBuilder {
 
     /// The identity of the node's log; `record.name` stands for the node's name where it is set.
     fn log_identity(&self) -> LogIdentity {
-        let NodeConfig { cell, fusion, landmarks, record, .. } = &self.config;
+        let NodeConfig {
+            cell,
+            fusion,
+            landmarks,
+            record,
+            ..
+        } = &self.config;
         let named = record.as_ref().and_then(|record| record.name.clone());
         let node = named.unwrap_or_else(|| self.name.clone());
-        LogIdentity::new(node, self.run, cell.clone(), fusion.clone(), landmarks.clone())
+        LogIdentity::new(
+            node,
+            self.run,
+            cell.clone(),
+            fusion.clone(),
+            landmarks.clone(),
+        )
     }
 
     pub(super) fn recorder_arguments(&self) -> Option<RecorderArguments> {
@@ -116,10 +139,25 @@ impl NodeBuilder {
     /// Takes what comes in to the part that deals with it. Reports are recorded by the fuser where there is one: in the
     /// order in which they are fused.
     fn subscriber(&self) -> Subscriber {
-        let ActorSlots { fuser, follower, keeper, election, description, .. } = self.slots.clone();
-        let (name, live_state, leadership) = (self.name.clone(), Arc::clone(&self.live_state), self.leadership());
+        let ActorSlots {
+            fuser,
+            follower,
+            keeper,
+            election,
+            description,
+            ..
+        } = self.slots.clone();
+        let (name, live_state, leadership) = (
+            self.name.clone(),
+            Arc::clone(&self.live_state),
+            self.leadership(),
+        );
         let (recording, fuses) = (self.recording.clone(), self.config.may_lead());
-        let (report_queue, counters, door) = (self.report_queue.clone(), self.counters(), self.door.clone());
+        let (report_queue, counters, door) = (
+            self.report_queue.clone(),
+            self.counters(),
+            self.door.clone(),
+        );
         let recent_reports = Mutex::<RecentReports>::default();
         Arc::new(move |delivery| {
             let at = delivery.received_at;
@@ -131,7 +169,9 @@ impl NodeBuilder {
             }
             match &delivery.message {
                 Incoming::Report { kind, report } if !fuses => {
-                    let mut recent_reports = recent_reports.lock().unwrap_or_else(PoisonError::into_inner);
+                    let mut recent_reports = recent_reports
+                        .lock()
+                        .unwrap_or_else(PoisonError::into_inner);
                     if recent_reports.is_new(*kind, report) {
                         recording.send(at, LogItem::Report(*kind, Arc::clone(report)));
                     }
@@ -148,7 +188,8 @@ impl NodeBuilder {
                 Incoming::Report { kind, report } => {
                     let (kind, report) = (*kind, Arc::clone(report));
                     let node = report.node.clone();
-                    let outcome = report_queue.push(delivery.map(|_| QueuedReport { kind, report }));
+                    let outcome =
+                        report_queue.push(delivery.map(|_| QueuedReport { kind, report }));
                     if outcome.has_replaced {
                         counters.shed(ShedReason::ReportReplaced, node.as_str());
                     }
@@ -160,19 +201,27 @@ impl NodeBuilder {
                 }
                 Incoming::Map(map) => {
                     let map = Arc::clone(map);
-                    follower.send(FollowerMessage::TakeMap { delivery: delivery.map(|_| map) })
+                    follower.send(FollowerMessage::TakeMap {
+                        delivery: delivery.map(|_| map),
+                    })
                 }
                 Incoming::Verdicts(verdicts) => {
                     let verdicts = Arc::clone(verdicts);
-                    follower.send(FollowerMessage::TakeVerdicts { delivery: delivery.map(|_| verdicts) })
+                    follower.send(FollowerMessage::TakeVerdicts {
+                        delivery: delivery.map(|_| verdicts),
+                    })
                 }
                 Incoming::Reputations(reputations) => {
                     let reputations = Arc::clone(reputations);
-                    follower.send(FollowerMessage::TakeReputations { delivery: delivery.map(|_| reputations) })
+                    follower.send(FollowerMessage::TakeReputations {
+                        delivery: delivery.map(|_| reputations),
+                    })
                 }
                 Incoming::Description(body) => {
                     let body = Arc::clone(body);
-                    description.send(DescriptionKeeperMessage::Take { delivery: delivery.map(|_| body) })
+                    description.send(DescriptionKeeperMessage::Take {
+                        delivery: delivery.map(|_| body),
+                    })
                 }
                 Incoming::Ledger(share) if !fuses => {
                     recording.send(at, LogItem::Share(Arc::clone(share)));
@@ -181,7 +230,9 @@ impl NodeBuilder {
                 Incoming::Ledger(share) => {
                     recording.send(at, LogItem::Share(Arc::clone(share)));
                     let share = Arc::clone(share);
-                    keeper.send(ReputationKeeperMessage::Merge { delivery: delivery.map(|_| share) })
+                    keeper.send(ReputationKeeperMessage::Merge {
+                        delivery: delivery.map(|_| share),
+                    })
                 }
                 Incoming::Link { broker, state } => {
                     recording.send(at, LogItem::Link(broker.clone(), *state));
@@ -189,10 +240,16 @@ impl NodeBuilder {
                         description.send(DescriptionKeeperMessage::Connected);
                     }
                     if let Some(node) = delivery.broker.clone() {
-                        let input = Input::BrokerProven { broker: broker.clone(), node };
+                        let input = Input::BrokerProven {
+                            broker: broker.clone(),
+                            node,
+                        };
                         election.send(LeaderElectionMessage::Note { input });
                     }
-                    let input = Input::LinkChanged { broker: broker.clone(), state: *state };
+                    let input = Input::LinkChanged {
+                        broker: broker.clone(),
+                        state: *state,
+                    };
                     election.send(LeaderElectionMessage::Note { input })
                 }
                 // Pages alone go by it.
@@ -200,7 +257,9 @@ impl NodeBuilder {
                 Incoming::Status { status, .. } => {
                     recording.send(at, LogItem::Status(Arc::clone(status)));
                     let status = Arc::clone(status);
-                    election.send(LeaderElectionMessage::TakeStatus { delivery: delivery.map(|_| status) })
+                    election.send(LeaderElectionMessage::TakeStatus {
+                        delivery: delivery.map(|_| status),
+                    })
                 }
             };
         })
@@ -224,7 +283,10 @@ impl NodeBuilder {
         }
     }
 
-    pub(super) fn description_arguments(&self, supervisor: ActorCell) -> DescriptionKeeperArguments {
+    pub(super) fn description_arguments(
+        &self,
+        supervisor: ActorCell,
+    ) -> DescriptionKeeperArguments {
         let supervisor = ActorRef::<NodeMessage>::from(supervisor);
         DescriptionKeeperArguments {
             name: self.name.clone(),
@@ -233,7 +295,9 @@ impl NodeBuilder {
             file: self.state_file("description"),
             credentials: self.security.credentials.clone(),
             // A supervisor that has ended needs no settings.
-            apply: Arc::new(move |description| _ = supervisor.cast(NodeMessage::Describe { description })),
+            apply: Arc::new(move |description| {
+                _ = supervisor.cast(NodeMessage::Describe { description })
+            }),
             members: self.members(),
             leadership: self.leadership(),
             gateway: self.slots.gateway.clone(),
@@ -265,15 +329,24 @@ impl NodeBuilder {
     /// A fuser starts with the evidence that the keeper has, and goes on with the objects of the newest map.
     pub(super) fn fuser_arguments(&self) -> FuserArguments {
         let (fusion, landmarks) = (self.config.fusion.clone(), self.config.landmarks());
-        let (now, ledger) = (clock::now(), Arc::new(self.reputations.open().ledger.clone()));
+        let (now, ledger) = (
+            clock::now(),
+            Arc::new(self.reputations.open().ledger.clone()),
+        );
         let mut aggregator = Aggregator::new_standby(fusion, landmarks, now);
         aggregator.adopt(&ledger);
-        self.recording.send(now, LogItem::Journal(JournalEvent::Start { ledger }));
+        self.recording
+            .send(now, LogItem::Journal(JournalEvent::Start { ledger }));
         FuserArguments {
             aggregator,
             recording: self.recording.clone(),
             report_queue: self.report_queue.clone(),
-            newest: self.newest.map.borrow().as_ref().map(|newest| (Arc::clone(&newest.map), newest.received_at)),
+            newest: self
+                .newest
+                .map
+                .borrow()
+                .as_ref()
+                .map(|newest| (Arc::clone(&newest.map), newest.received_at)),
             clock: self.clock.clone(),
             gateway: self.slots.gateway.clone(),
             keeper: self.slots.keeper.clone(),
@@ -284,11 +357,22 @@ impl NodeBuilder {
     }
 
     pub(super) fn election_arguments(&self) -> LeaderElectionArguments {
-        let ActorSlots { membership, gateway, fuser, keeper, description, uplink, .. } = self.slots.clone();
+        let ActorSlots {
+            membership,
+            gateway,
+            fuser,
+            keeper,
+            description,
+            uplink,
+            ..
+        } = self.slots.clone();
         let (broker, door) = (self.cell_broker(), self.door.clone());
         LeaderElectionArguments {
             settings: NodeSettings {
-                election: ElectionConfig { role: self.config.role, ..self.config.election.clone() },
+                election: ElectionConfig {
+                    role: self.config.role,
+                    ..self.config.election.clone()
+                },
                 plane: self.config.data_plane(),
                 round_period: self.round_period(),
                 keeps_reputations: self.parts().contains(&ActorKind::ReputationKeeper),
@@ -324,7 +408,12 @@ impl NodeBuilder {
             cell: self.config.cell.clone(),
             role: self.config.role,
             camera: !self.vehicle.shown_cameras.is_empty(),
-            cameras: self.vehicle.shown_cameras.iter().map(|camera| camera.name.clone()).collect(),
+            cameras: self
+                .vehicle
+                .shown_cameras
+                .iter()
+                .map(|camera| camera.name.clone())
+                .collect(),
             floor_plan: self.floor_plan.as_ref().map(|plan| plan.facts.clone()),
             version: env!("CARGO_PKG_VERSION"),
             started_at_us: self.started_at,
@@ -365,7 +454,11 @@ impl NodeBuilder {
 
     /// The node's broker, if it may carry the cell's data.
     fn cell_broker(&self) -> ActorSlot<BrokerMessage> {
-        if self.config.serves_nodes() { self.slots.broker.clone() } else { ActorSlot::default() }
+        if self.config.serves_nodes() {
+            self.slots.broker.clone()
+        } else {
+            ActorSlot::default()
+        }
     }
 
     /// The way of programs beside the node into the cell.
@@ -377,8 +470,11 @@ impl NodeBuilder {
         let credentials = self.security.credentials.clone();
         let (own_config, description) = (self.own_config.clone(), self.slots.description.clone());
         let shared = self.shared.subscribe();
-        let (gateway, to_watch, live_state) =
-            (self.slots.gateway.clone(), self.slots.gateway.clone(), Arc::clone(&self.live_state));
+        let (gateway, to_watch, live_state) = (
+            self.slots.gateway.clone(),
+            self.slots.gateway.clone(),
+            Arc::clone(&self.live_state),
+        );
         Door::new(DoorSetup {
             node: self.name.clone(),
             gateway_id: format!("{}-{}", self.name, self.run.simple()),
@@ -392,7 +488,9 @@ impl NodeBuilder {
                 ReportKind::Detections => shared.borrow().algorithms.pace(),
                 ReportKind::VoteDetections => shared.borrow().algorithms.vote(),
             }),
-            is_member: Arc::new(move |name| members.borrow().iter().any(|member| member.name == *name)),
+            is_member: Arc::new(move |name| {
+                members.borrow().iter().any(|member| member.name == *name)
+            }),
             report: Arc::new(move |kind, report| {
                 gateway.send(GatewayMessage::PublishReport { kind, report });
             }),
@@ -400,21 +498,31 @@ impl NodeBuilder {
                 if !own_config.may_lead() {
                     return Err("this node never leads and only follows: set the description at one that may".into());
                 }
-                if credentials.as_ref().is_some_and(|credentials| !credentials.may_describe()) {
-                    let remedy =
-                        "set it at an operator's node, such as that of the machine where `ecod-node init` was run";
+                if credentials
+                    .as_ref()
+                    .is_some_and(|credentials| !credentials.may_describe())
+                {
+                    let remedy = "set it at an operator's node, such as that of the machine where `ecod-node init` was run";
                     return Err(format!(
                         "the certificate of this node does not let it describe the cell: {remedy}, or issue a certificate by \
                          `ecod-node pki issue --operator`"
                     ));
                 }
-                own_config.described(&text).map_err(|error| error.to_string())?;
+                own_config
+                    .described(&text)
+                    .map_err(|error| error.to_string())?;
                 let is_sent = description.send(DescriptionKeeperMessage::Set { text });
-                if is_sent { Ok(()) } else { Err("the node is just starting: try again".into()) }
+                if is_sent {
+                    Ok(())
+                } else {
+                    Err("the node is just starting: try again".into())
+                }
             }),
             watch_reports: Arc::new(move |wanted| {
                 live_state.set_programs_want_reports(wanted);
-                to_watch.send(GatewayMessage::WatchReports { wanted: live_state.wants_reports() });
+                to_watch.send(GatewayMessage::WatchReports {
+                    wanted: live_state.wants_reports(),
+                });
             }),
             counters: self.counters(),
         })
@@ -422,22 +530,42 @@ impl NodeBuilder {
 
     fn state_file(&self, what: &str) -> Option<StateFile> {
         let directory = self.config.state_dir.as_deref()?;
-        Some(StateFile::new(directory, &self.config.cell, &self.name, what))
+        Some(StateFile::new(
+            directory,
+            &self.config.cell,
+            &self.name,
+            what,
+        ))
     }
 
     /// The node's status when a part starts, also anew: it follows whom it followed before.
     pub(super) fn status(&self) -> NodeStatus {
         let newest = self.newest.map.borrow();
-        let taken = newest.as_ref().map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone()));
+        let taken = newest
+            .as_ref()
+            .map(|received| Epoch::new(received.map.epoch, received.map.aggregator.clone()));
         let leadership = self.leadership.borrow();
-        let epoch = leadership.epoch.clone().filter(|_| leadership.leader().is_some()).or(taken);
+        let epoch = leadership
+            .epoch
+            .clone()
+            .filter(|_| leadership.leader().is_some())
+            .or(taken);
         NodeStatus {
-            state: if leadership.is_leading() { NodeCondition::Aggregating } else { NodeCondition::Following },
+            state: if leadership.is_leading() {
+                NodeCondition::Aggregating
+            } else {
+                NodeCondition::Following
+            },
             epoch: epoch.as_ref().map_or(0, |epoch| epoch.term),
             aggregator: epoch.map(|epoch| epoch.leader),
             fit: self.config.may_lead().then_some(false),
             description: self.held.status(),
-            ..NodeStatus::starting(self.name.clone(), self.run, self.config.role, env!("CARGO_PKG_VERSION"))
+            ..NodeStatus::starting(
+                self.name.clone(),
+                self.run,
+                self.config.role,
+                env!("CARGO_PKG_VERSION"),
+            )
         }
     }
 }
@@ -458,8 +586,17 @@ mod tests {
     use crate::transport::mqtt::Security;
 
     fn builder(config: NodeConfig) -> NodeBuilder {
-        let (vehicle, held) = ((VehicleParts::new(&config), Presence::Whole), HeldDescription::default());
-        NodeBuilder::new(vehicle, config, Security::default(), held, watch::Sender::new(None))
+        let (vehicle, held) = (
+            (VehicleParts::new(&config), Presence::Whole),
+            HeldDescription::default(),
+        );
+        NodeBuilder::new(
+            vehicle,
+            config,
+            Security::default(),
+            held,
+            watch::Sender::new(None),
+        )
     }
 
     #[test]
@@ -473,23 +610,45 @@ mod tests {
             (Pace, On, vec![spot], true),
             (Pace, Off, vec![], false),
         ] {
-            let mut config = NodeConfig { role: Role::Edge, landmarks, ..NodeConfig::default() };
+            let mut config = NodeConfig {
+                role: Role::Edge,
+                landmarks,
+                ..NodeConfig::default()
+            };
             (config.fusion.algorithms, config.fusion.tracks.mode) = (algorithms, mode);
             let builder = builder(config);
-            let keeps = builder.parts().contains(&crate::node::slots::ActorKind::ReputationKeeper);
+            let keeps = builder
+                .parts()
+                .contains(&crate::node::slots::ActorKind::ReputationKeeper);
             assert_eq!(keeps, expected, "{algorithms:?} {mode:?}");
         }
     }
 
     #[test]
     fn a_part_started_anew_still_says_whom_the_node_follows() {
-        let config = NodeConfig { role: Role::Cav, ..NodeConfig::default() };
+        let config = NodeConfig {
+            role: Role::Cav,
+            ..NodeConfig::default()
+        };
         let builder = builder(config);
-        assert_eq!((builder.status().epoch, builder.status().aggregator), (0, None));
-        let map = GlobalMap::new(&Epoch::new(7, NodeName::from_static("edge")), 1, Timestamp(0));
-        builder.newest.map.send_replace(Some(ReceivedMap { received_at: Timestamp(0), map: Arc::new(map) }));
         assert_eq!(
-            (builder.status().epoch, builder.status().aggregator.as_ref().map(NodeName::as_str)),
+            (builder.status().epoch, builder.status().aggregator),
+            (0, None)
+        );
+        let map = GlobalMap::new(
+            &Epoch::new(7, NodeName::from_static("edge")),
+            1,
+            Timestamp(0),
+        );
+        builder.newest.map.send_replace(Some(ReceivedMap {
+            received_at: Timestamp(0),
+            map: Arc::new(map),
+        }));
+        assert_eq!(
+            (
+                builder.status().epoch,
+                builder.status().aggregator.as_ref().map(NodeName::as_str)
+            ),
             (7, Some("edge"))
         );
     }

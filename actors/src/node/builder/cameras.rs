@@ -46,7 +46,12 @@ impl NodeBuilder {
             capture: camera.capture.clone(),
             detect: camera.detector.build().context("key `camera.detector`")?,
             lens: camera::lens(camera)?,
-            projector: self.slots.projectors.get(place).cloned().unwrap_or_default(),
+            projector: self
+                .slots
+                .projectors
+                .get(place)
+                .cloned()
+                .unwrap_or_default(),
             images: ImageRecorder::new(record, &self.name, camera, log, self.clock.clone()),
             camera_feed: self.camera_feed(place),
             troubles: self.camera_troubles(camera),
@@ -66,21 +71,35 @@ impl NodeBuilder {
                 Ok(perception) => {
                     let perception = Box::new(perception);
                     let algorithms = camera::algorithms(&self.config, camera);
-                    projector.send(ProjectorMessage::Configure { perception, standing, origin, algorithms });
+                    projector.send(ProjectorMessage::Configure {
+                        perception,
+                        standing,
+                        origin,
+                        algorithms,
+                    });
                 }
                 Err(error) => {
-                    tracing::error!(error = format!("{error:#}"), "the camera goes on with the settings before");
+                    tracing::error!(
+                        error = format!("{error:#}"),
+                        "the camera goes on with the settings before"
+                    );
                 }
             }
         }
     }
 
     fn camera(&self, place: usize) -> anyhow::Result<&CameraConfig> {
-        self.config.all_cameras().nth(place).context("this node has no such camera")
+        self.config
+            .all_cameras()
+            .nth(place)
+            .context("this node has no such camera")
     }
 
     fn camera_feed(&self, place: usize) -> Option<Arc<CameraFeed>> {
-        self.vehicle.shown_cameras.get(place).map(|camera| Arc::clone(&camera.feed))
+        self.vehicle
+            .shown_cameras
+            .get(place)
+            .map(|camera| Arc::clone(&camera.feed))
     }
 
     fn camera_troubles(&self, camera: &CameraConfig) -> CameraTroubles {
@@ -91,7 +110,10 @@ impl NodeBuilder {
     /// The pose of a vehicle that stands still, if it has a place in the cell's frame. The log says why it has none.
     fn standing_pose(&self) -> Option<ecod::model::geometry::Pose> {
         camera::standing_pose(&self.config).unwrap_or_else(|error| {
-            tracing::error!(error = format!("{error:#}"), "the cameras' frames are not reported");
+            tracing::error!(
+                error = format!("{error:#}"),
+                "the cameras' frames are not reported"
+            );
             None
         })
     }

@@ -17,7 +17,10 @@ impl NodeBuilder {
     /// Uses a description from now on. One that contradicts the node's own configuration, or that this version cannot read,
     /// is kept and passed on, and the node goes on with the settings that it has.
     pub(in crate::node) fn describe(&mut self, description: &Arc<CellDescription>) {
-        self.held = HeldDescription { description: Some(Arc::clone(description)), problem: None };
+        self.held = HeldDescription {
+            description: Some(Arc::clone(description)),
+            problem: None,
+        };
         if let Some(config) = self.held.lay_over(&self.own_config) {
             let before = std::mem::replace(&mut self.config, config);
             self.configure_parts(&before);
@@ -26,13 +29,16 @@ impl NodeBuilder {
         }
         self.configure_uplink();
         self.door.publish_description(description);
-        self.shared.send_replace(shared_facts(&self.config, &self.held));
+        self.shared
+            .send_replace(shared_facts(&self.config, &self.held));
         let input = Input::Described {
             description: self.held.status(),
             round_period: self.round_period(),
             keeps_reputations: self.parts().contains(&ActorKind::ReputationKeeper),
         };
-        self.slots().election.send(LeaderElectionMessage::Note { input });
+        self.slots()
+            .election
+            .send(LeaderElectionMessage::Note { input });
     }
 
     /// Notes values that look as if they were in another unit.
@@ -52,11 +58,15 @@ impl NodeBuilder {
         self.reputations.set_by_evidence(rates_by_evidence(config));
         if before.fusion.reputation != config.fusion.reputation {
             let reputation = config.fusion.reputation.clone();
-            slots.keeper.send(ReputationKeeperMessage::Configure { reputation });
+            slots
+                .keeper
+                .send(ReputationKeeperMessage::Configure { reputation });
         }
         if (&before.fusion, &before.landmarks) != (&config.fusion, &config.landmarks) {
             let (fusion, landmarks) = (Box::new(config.fusion.clone()), config.landmarks.clone());
-            slots.fuser.send(FuserMessage::Configure { fusion, landmarks });
+            slots
+                .fuser
+                .send(FuserMessage::Configure { fusion, landmarks });
             // A part that was switched on starts with the evidence that there is.
             let ledger = Arc::new(self.reputations.open().ledger.clone());
             slots.fuser.send(FuserMessage::Adopt { ledger });

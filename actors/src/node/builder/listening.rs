@@ -25,9 +25,14 @@ const REBIND_WAIT: Duration = Duration::from_millis(50);
 impl NodeBuilder {
     /// The broker comes back at the address it had, so that the links find it; the run before may need a moment to
     /// leave it.
-    pub(super) async fn start_broker(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
+    pub(super) async fn start_broker(
+        &self,
+        supervisor: ActorCell,
+    ) -> Result<ActorId, ActorProcessingErr> {
         let (broker, _) =
-            Actor::spawn_linked(None, Broker, Box::new(self.embedded_broker()), supervisor).await.map_err(cause)?;
+            Actor::spawn_linked(None, Broker, Box::new(self.embedded_broker()), supervisor)
+                .await
+                .map_err(cause)?;
         let before = *self.vehicle.listens_at.borrow();
         let mut address = before.unwrap_or(self.config.broker_listen());
         let takes_any_port = before.is_none() && self.config.may_listen_at_any_port();
@@ -40,7 +45,9 @@ impl NodeBuilder {
                     address.set_port(0);
                     attempts += 1;
                 }
-                Err(BrokerError::Bind { .. }) if attempts > 0 => tokio::time::sleep(REBIND_WAIT).await,
+                Err(BrokerError::Bind { .. }) if attempts > 0 => {
+                    tokio::time::sleep(REBIND_WAIT).await
+                }
                 outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
             }
         };
@@ -59,30 +66,59 @@ impl NodeBuilder {
         let (config, listen) = (self.config.broker(), self.config.broker_listen());
         let credentials = self.security.credentials.clone();
         match (&credentials, listen.ip().is_loopback()) {
-            _ if !self.config.serves_nodes() => tracing::info!(%listen, "broker for programs of this node"),
+            _ if !self.config.serves_nodes() => {
+                tracing::info!(%listen, "broker for programs of this node")
+            }
             (None, true) if self.config.data_plane().external.is_some() => tracing::warn!(
                 "mqtt.fallback_to_embedded serves this machine only: without certificates in [tls] or \
                  broker.allow_plaintext other machines are without maps when the external broker is gone"
             ),
-            (None, true) => tracing::info!("broker for this machine only: no certificates are configured"),
-            (None, false) => tracing::warn!(%listen, "broker for anyone: no certificates are configured"),
-            (Some(_), _) => tracing::info!(%listen, "broker for whoever has a certificate of the cell"),
+            (None, true) => {
+                tracing::info!("broker for this machine only: no certificates are configured")
+            }
+            (None, false) => {
+                tracing::warn!(%listen, "broker for anyone: no certificates are configured")
+            }
+            (Some(_), _) => {
+                tracing::info!(%listen, "broker for whoever has a certificate of the cell")
+            }
         }
-        let (topics, elected) = (Topics::new(&self.config.cell), publish_rule(self.leadership()));
+        let (topics, elected) = (
+            Topics::new(&self.config.cell),
+            publish_rule(self.leadership()),
+        );
         let (limits, counters) = (self.config.mqtt.limits(), self.counters());
-        let policy = AccessPolicy { credentials, topics, limits, elected, counters };
+        let policy = AccessPolicy {
+            credentials,
+            topics,
+            limits,
+            elected,
+            counters,
+        };
         EmbeddedBroker::protected(config, policy).with_door(self.door.clone())
     }
 
     /// The membership comes back at the address it had, as the broker does.
-    pub(super) async fn start_membership(&self, supervisor: ActorCell) -> Result<ActorId, ActorProcessingErr> {
-        let mut attempts = if self.gossip_address.borrow().is_some() { REBIND_ATTEMPTS } else { 1 };
+    pub(super) async fn start_membership(
+        &self,
+        supervisor: ActorCell,
+    ) -> Result<ActorId, ActorProcessingErr> {
+        let mut attempts = if self.gossip_address.borrow().is_some() {
+            REBIND_ATTEMPTS
+        } else {
+            1
+        };
         let actor = loop {
             attempts -= 1;
             let arguments = self.membership_arguments();
-            match Actor::spawn_linked(None, Membership, arguments, supervisor.clone()).await.map_err(cause) {
+            match Actor::spawn_linked(None, Membership, arguments, supervisor.clone())
+                .await
+                .map_err(cause)
+            {
                 Ok((actor, _)) => break actor,
-                Err(error) if attempts > 0 && error.is::<BindError>() => tokio::time::sleep(REBIND_WAIT).await,
+                Err(error) if attempts > 0 && error.is::<BindError>() => {
+                    tokio::time::sleep(REBIND_WAIT).await
+                }
                 Err(error) => return Err(error),
             }
         };

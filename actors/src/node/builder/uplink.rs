@@ -9,7 +9,10 @@ use crate::messages::uplink::UplinkMessage;
 impl NodeBuilder {
     pub(super) fn uplink_arguments(&self) -> Result<UplinkArguments, ActorProcessingErr> {
         let config = self.config.uplink.clone();
-        let broker = config.broker.clone().ok_or("no `uplink.broker` is configured")?;
+        let broker = config
+            .broker
+            .clone()
+            .ok_or("no `uplink.broker` is configured")?;
         if config.ca.is_none() {
             tracing::warn!(%broker, "the uplink is in plaintext: set `uplink.ca` to have it encrypted");
         }
@@ -35,6 +38,9 @@ impl NodeBuilder {
     /// Tells the uplink of the place and description of the cell.
     pub(super) fn configure_uplink(&self) {
         let (origin, description) = (self.config.origin, self.held.description.clone());
-        self.slots().uplink.send(UplinkMessage::Configure { origin, description });
+        self.slots().uplink.send(UplinkMessage::Configure {
+            origin,
+            description,
+        });
     }
 }

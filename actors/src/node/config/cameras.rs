@@ -17,9 +17,13 @@ impl NodeConfig {
     /// Gives further cameras the defaults that depend on their detector, but for keys that are stated.
     #[cfg(feature = "camera")]
     pub(super) fn set_camera_defaults(&mut self, stated: &Figment) {
-        let stated = stated.extract_inner::<Vec<toml::Table>>("cameras").unwrap_or_default();
+        let stated = stated
+            .extract_inner::<Vec<toml::Table>>("cameras")
+            .unwrap_or_default();
         for (camera, keys) in self.cameras.iter_mut().zip(stated) {
-            let is_stated = keys.get("projection").is_some_and(|projection| projection.get("pixel_sigma_px").is_some());
+            let is_stated = keys
+                .get("projection")
+                .is_some_and(|projection| projection.get("pixel_sigma_px").is_some());
             if matches!(camera.detector, DetectorConfig::Coco(_)) && !is_stated {
                 camera.projection.pixel_sigma_px = super::COCO_PIXEL_SIGMA_PX;
             }
@@ -33,20 +37,35 @@ impl NodeConfig {
             camera.validate().map_err(|error| error.within("camera"))?;
         }
         if self.cameras.len() > MAX_PARTS {
-            return Err(ConfigError::new("cameras", self.cameras.len(), format!("at most {MAX_PARTS}")));
+            return Err(ConfigError::new(
+                "cameras",
+                self.cameras.len(),
+                format!("at most {MAX_PARTS}"),
+            ));
         }
         for (index, camera) in self.cameras.iter().enumerate() {
             let within = |error: ConfigError| error.within(&format!("cameras[{index}]"));
             camera.validate().map_err(within)?;
             let earlier = self.camera.iter().chain(self.cameras.iter().take(index));
-            let Some(name) = camera.name.as_ref().filter(|_| earlier.clone().all(|other| other.name != camera.name))
+            let Some(name) = camera
+                .name
+                .as_ref()
+                .filter(|_| earlier.clone().all(|other| other.name != camera.name))
             else {
                 let name = camera.name.as_deref().unwrap_or("nothing");
                 let allowed = "a name of its own, such as \"rear\": its reports are those of that part of the vehicle";
                 return Err(within(ConfigError::new("name", name, allowed)));
             };
-            if self.name.as_ref().is_some_and(|node| camera.reporter(node) == *node) {
-                return Err(within(ConfigError::new("name", name, "shorter, or `name` of the node")));
+            if self
+                .name
+                .as_ref()
+                .is_some_and(|node| camera.reporter(node) == *node)
+            {
+                return Err(within(ConfigError::new(
+                    "name",
+                    name,
+                    "shorter, or `name` of the node",
+                )));
             }
         }
         Ok(())

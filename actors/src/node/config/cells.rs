@@ -61,21 +61,38 @@ fn default_radius_m() -> f64 {
 
 impl CellEntry {
     fn origin(&self) -> GeographicOrigin {
-        let Self { latitude_deg, longitude_deg, .. } = *self;
-        GeographicOrigin { latitude_deg, longitude_deg, height_m: 0.0, rotation_deg: 0.0 }
+        let Self {
+            latitude_deg,
+            longitude_deg,
+            ..
+        } = *self;
+        GeographicOrigin {
+            latitude_deg,
+            longitude_deg,
+            height_m: 0.0,
+            rotation_deg: 0.0,
+        }
     }
 
     fn validate(&self) -> Result<(), ConfigError> {
         self.origin().validate()?;
         if self.revocation_list.is_some() && self.ca.is_none() {
-            return Err(ConfigError::new("revocation_list", "set", "set together with `ca`"));
+            return Err(ConfigError::new(
+                "revocation_list",
+                "set",
+                "set together with `ca`",
+            ));
         }
         check_range("radius_m", self.radius_m, 1.0, 1e5)
     }
 
     /// The cell's place.
     pub fn known(&self) -> KnownCell {
-        KnownCell { name: self.name.clone(), origin: self.origin(), radius_m: self.radius_m }
+        KnownCell {
+            name: self.name.clone(),
+            origin: self.origin(),
+            radius_m: self.radius_m,
+        }
     }
 }
 
@@ -85,25 +102,45 @@ impl NodeConfig {
     /// # Errors
     /// [`LoadError`] naming the file, and the entry and key in it.
     pub fn load_cells(&self) -> Result<Vec<CellEntry>, LoadError> {
-        let Some(path) = &self.cells else { return Ok(Vec::new()) };
+        let Some(path) = &self.cells else {
+            return Ok(Vec::new());
+        };
         let text = bounded_file::read_text(path);
-        let text = text.map_err(|source| LoadError::Unreadable { path: path.clone(), source })?;
-        let malformed = |error: &dyn std::fmt::Display| LoadError::Malformed(format!("{}: {error}", path.display()));
+        let text = text.map_err(|source| LoadError::Unreadable {
+            path: path.clone(),
+            source,
+        })?;
+        let malformed = |error: &dyn std::fmt::Display| {
+            LoadError::Malformed(format!("{}: {error}", path.display()))
+        };
         let CellsFile { mut cells } = toml::from_str(&text).map_err(|error| malformed(&error))?;
         for (place, cell) in cells.iter().enumerate() {
-            let checked = cell.validate().map_err(|error| error.within(&format!("cells[{place}]")));
+            let checked = cell
+                .validate()
+                .map_err(|error| error.within(&format!("cells[{place}]")));
             checked.map_err(|error| malformed(&error))?;
-            if cells.iter().take(place).any(|other| other.name == cell.name) {
-                let error = ConfigError::new("name", &cell.name, "unique").within(&format!("cells[{place}]"));
+            if cells
+                .iter()
+                .take(place)
+                .any(|other| other.name == cell.name)
+            {
+                let error = ConfigError::new("name", &cell.name, "unique")
+                    .within(&format!("cells[{place}]"));
                 return Err(malformed(&error));
             }
         }
         if !cells.iter().any(|cell| cell.name == self.cell) {
-            return Err(malformed(&format!("this vehicle's own `cell`, {}, is not among `cells`", self.cell)));
+            return Err(malformed(&format!(
+                "this vehicle's own `cell`, {}, is not among `cells`",
+                self.cell
+            )));
         }
         let directory = path.parent().unwrap_or(Path::new(""));
         for cell in &mut cells {
-            for file in [&mut cell.key_file, &mut cell.ca, &mut cell.revocation_list].into_iter().flatten() {
+            for file in [&mut cell.key_file, &mut cell.ca, &mut cell.revocation_list]
+                .into_iter()
+                .flatten()
+            {
                 *file = directory.join(&*file);
             }
         }
@@ -115,12 +152,17 @@ impl NodeConfig {
     /// # Errors
     /// The cell, and what cannot be used there.
     pub fn credentials_in(&self, cell: &CellEntry) -> Result<Option<Arc<Credentials>>, LoadError> {
-        let unusable = |error: &dyn std::fmt::Display| LoadError::Malformed(format!("cell {}: {error}", cell.name));
+        let unusable = |error: &dyn std::fmt::Display| {
+            LoadError::Malformed(format!("cell {}: {error}", cell.name))
+        };
         let config = self.in_cell(cell).map_err(|error| unusable(&error))?;
         if config.membership.has_key() {
             check_key(&config.membership, &config.cell).map_err(|error| unusable(&error))?;
         }
-        Ok(config.security().map_err(|error| unusable(&error))?.credentials)
+        Ok(config
+            .security()
+            .map_err(|error| unusable(&error))?
+            .credentials)
     }
 
     /// True if the node receives poses: its cameras, or its choice of the cell, need them.
@@ -137,7 +179,11 @@ impl NodeConfig {
         if cell.name == self.cell {
             return Ok(self.clone());
         }
-        let mut guest = Self { cell: cell.name.clone(), role: Role::Cav, ..self.clone() };
+        let mut guest = Self {
+            cell: cell.name.clone(),
+            role: Role::Cav,
+            ..self.clone()
+        };
         SharedConfig::default().put_into(&mut guest);
         (guest.stated, guest.description) = (StatedKeys::default(), None);
         guest.mqtt.broker.clone_from(&cell.broker);
@@ -169,9 +215,19 @@ mod tests {
     fn vehicle(directory: &Path, cells: &str, own: &str) -> Result<NodeConfig, LoadError> {
         std::fs::write(directory.join("cells.toml"), cells).unwrap();
         let file = directory.join("node.toml");
-        let listen = if own.contains("[pose]") { "" } else { "[pose]\nlisten = \"127.0.0.1:0\"\n" };
-        std::fs::write(&file, format!("cells = {:?}\ncell = \"lot-1\"\n{own}{listen}", directory.join("cells.toml")))
-            .unwrap();
+        let listen = if own.contains("[pose]") {
+            ""
+        } else {
+            "[pose]\nlisten = \"127.0.0.1:0\"\n"
+        };
+        std::fs::write(
+            &file,
+            format!(
+                "cells = {:?}\ncell = \"lot-1\"\n{own}{listen}",
+                directory.join("cells.toml")
+            ),
+        )
+        .unwrap();
         NodeConfig::load(Some(&file), &json!({ "name": "euclid" }))
     }
 
@@ -199,27 +255,66 @@ mod tests {
         let guest = config.in_cell(&cells[1]).unwrap();
         assert_eq!((guest.cell.as_str(), guest.role), ("lot-2", Role::Cav));
         assert_eq!((guest.origin, guest.fusion.pace.gate_m), (None, 0.5));
-        assert_eq!((guest.mqtt.user, guest.mqtt.password), (None, None), "no other cell's broker gets the password");
-        assert_eq!((guest.membership.seeds, guest.membership.bind.unwrap().port()), (vec!["10.0.2.1:17884".into()], 0));
-        assert_eq!(guest.membership.key_file, Some(directory.path().join("lot-2.key")));
+        assert_eq!(
+            (guest.mqtt.user, guest.mqtt.password),
+            (None, None),
+            "no other cell's broker gets the password"
+        );
+        assert_eq!(
+            (
+                guest.membership.seeds,
+                guest.membership.bind.unwrap().port()
+            ),
+            (vec!["10.0.2.1:17884".into()], 0)
+        );
+        assert_eq!(
+            guest.membership.key_file,
+            Some(directory.path().join("lot-2.key"))
+        );
         assert!(guest.membership.key.is_none());
     }
 
     #[test]
     fn errors_name_the_file_the_cell_and_the_key() {
         let directory = tempfile::tempdir().unwrap();
-        let error = |cells: &str| vehicle(directory.path(), cells, "").unwrap().load_cells().unwrap_err().to_string();
+        let error = |cells: &str| {
+            vehicle(directory.path(), cells, "")
+                .unwrap()
+                .load_cells()
+                .unwrap_err()
+                .to_string()
+        };
         for (cells, parts) in [
-            (CELLS.replace("lot-1", "lot-3"), ["cells.toml", "lot-1", "not among"]),
-            (CELLS.replace("lot-2\"", "lot-1\""), ["cells.toml", "`cells[1].name`", "unique"]),
-            (CELLS.replace("radius_m = 150", "radius_m = 0"), ["cells.toml", "`cells[1].radius_m`", "0"]),
-            (CELLS.replace("radius_m", "radius"), ["cells.toml", "unknown field", "radius_m"]),
-            (CELLS.replace("key_file", "revocation_list"), ["cells.toml", "`cells[1].revocation_list`", "`ca`"]),
+            (
+                CELLS.replace("lot-1", "lot-3"),
+                ["cells.toml", "lot-1", "not among"],
+            ),
+            (
+                CELLS.replace("lot-2\"", "lot-1\""),
+                ["cells.toml", "`cells[1].name`", "unique"],
+            ),
+            (
+                CELLS.replace("radius_m = 150", "radius_m = 0"),
+                ["cells.toml", "`cells[1].radius_m`", "0"],
+            ),
+            (
+                CELLS.replace("radius_m", "radius"),
+                ["cells.toml", "unknown field", "radius_m"],
+            ),
+            (
+                CELLS.replace("key_file", "revocation_list"),
+                ["cells.toml", "`cells[1].revocation_list`", "`ca`"],
+            ),
         ] {
             let error = error(&cells);
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
         }
-        let error = vehicle(directory.path(), CELLS, "[pose]\nx_m = 1\n").unwrap_err().to_string();
-        assert!(error.contains("`pose.listen`") && error.contains("cells"), "{error}");
+        let error = vehicle(directory.path(), CELLS, "[pose]\nx_m = 1\n")
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("`pose.listen`") && error.contains("cells"),
+            "{error}"
+        );
     }
 }

@@ -11,7 +11,9 @@ const ENVIRONMENT_PREFIX: &str = "ECOD_";
 /// `ECOD_…`, two underscores between the levels of a key. `ECOD_BROKER` is the clients': the address of a node, not
 /// the table of the same name.
 pub(super) fn environment() -> Env {
-    Env::prefixed(ENVIRONMENT_PREFIX).ignore(&["broker"]).split("__")
+    Env::prefixed(ENVIRONMENT_PREFIX)
+        .ignore(&["broker"])
+        .split("__")
 }
 
 /// Reads the configuration. Values from the environment are guessed to be numbers, lists and so on by their looks;
@@ -50,7 +52,10 @@ fn guessed_wrong(figment: &Figment, error: &figment::Error) -> Option<(String, S
 }
 
 fn from_environment(error: &figment::Error) -> bool {
-    error.metadata.as_ref().is_some_and(|metadata| metadata.name.contains("environment variable"))
+    error
+        .metadata
+        .as_ref()
+        .is_some_and(|metadata| metadata.name.contains("environment variable"))
 }
 
 /// Keys whose values are shown to nobody.
@@ -62,10 +67,16 @@ fn describe(errors: figment::Error) -> String {
         let key = error.path.join(".");
         let origin = match &error.metadata {
             Some(_) if from_environment(&error) => {
-                format!(" in the environment variable {ENVIRONMENT_PREFIX}{}", error.path.join("__").to_uppercase())
+                format!(
+                    " in the environment variable {ENVIRONMENT_PREFIX}{}",
+                    error.path.join("__").to_uppercase()
+                )
             }
             Some(metadata) => {
-                let place = metadata.source.as_ref().map_or_else(String::new, |source| format!(" {source}"));
+                let place = metadata
+                    .source
+                    .as_ref()
+                    .map_or_else(String::new, |source| format!(" {source}"));
                 format!(" in {}{place}", metadata.name)
             }
             None => String::new(),
@@ -88,7 +99,11 @@ fn describe(errors: figment::Error) -> String {
             format!("configuration key `{key}`{origin}: {reason}")
         }
     };
-    errors.into_iter().map(describe).collect::<Vec<_>>().join("\n")
+    errors
+        .into_iter()
+        .map(describe)
+        .collect::<Vec<_>>()
+        .join("\n")
 }
 
 /// The key that is wrong in a table that its `kind` tells apart: serde reads such a table from a buffer and forgets
@@ -97,16 +112,25 @@ fn key_in_table(error: &figment::Error, figment: &Figment) -> Option<String> {
     if matches!(error.kind, figment::error::Kind::MissingField(_)) {
         return None;
     }
-    let keys =
-        figment.find_value(&error.path.join(".")).ok()?.into_dict().filter(|table| table.contains_key("kind"))?;
+    let keys = figment
+        .find_value(&error.path.join("."))
+        .ok()?
+        .into_dict()
+        .filter(|table| table.contains_key("kind"))?;
     let error_without = |key: &String| {
         let mut root: Dict = figment.extract().ok()?;
-        let table = error.path.iter().try_fold(&mut root, |table, level| match table.get_mut(level) {
-            Some(Value::Dict(_, table)) => Some(table),
-            _ => None,
-        });
+        let table =
+            error
+                .path
+                .iter()
+                .try_fold(&mut root, |table, level| match table.get_mut(level) {
+                    Some(Value::Dict(_, table)) => Some(table),
+                    _ => None,
+                });
         table?.remove(key);
-        Figment::from(Serialized::defaults(root)).extract::<NodeConfig>().err()
+        Figment::from(Serialized::defaults(root))
+            .extract::<NodeConfig>()
+            .err()
     };
     let is_wrong = |key: &String| error_without(key).is_none_or(|other| other.kind != error.kind);
     keys.into_keys().filter(|key| key != "kind").find(is_wrong)
@@ -118,6 +142,10 @@ fn without_secrets(text: &str) -> String {
         Some((before, after)) if after.contains('=') => format!("{before}{secret} = ***"),
         _ => line.to_owned(),
     };
-    let lines = text.lines().map(|line| SECRETS.iter().fold(line.to_owned(), |line, secret| hide(&line, secret)));
+    let lines = text.lines().map(|line| {
+        SECRETS
+            .iter()
+            .fold(line.to_owned(), |line, secret| hide(&line, secret))
+    });
     lines.collect::<Vec<_>>().join("\n")
 }

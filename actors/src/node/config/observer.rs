@@ -14,9 +14,17 @@ impl NodeConfig {
     pub fn observing(self, purpose: &str) -> Result<Self, InvalidName> {
         let own = format!("{purpose}-{}", std::process::id());
         let holder = self.name.as_ref().filter(|_| self.tls.is_some());
-        let name = holder.map_or_else(|| own.clone(), |holder| format!("{holder}{OBSERVER_MARK}{own}"));
-        let observer =
-            Self { name: Some(NodeName::new(name)?), role: Role::Cav, record: None, description: None, ..self };
+        let name = holder.map_or_else(
+            || own.clone(),
+            |holder| format!("{holder}{OBSERVER_MARK}{own}"),
+        );
+        let observer = Self {
+            name: Some(NodeName::new(name)?),
+            role: Role::Cav,
+            record: None,
+            description: None,
+            ..self
+        };
         Ok(observer.without_own_addresses())
     }
 

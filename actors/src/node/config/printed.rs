@@ -32,22 +32,35 @@ impl NodeConfig {
         let mut shown = self.clone();
         let mut comment = String::new();
         if shown.mqtt.password.take().is_some() {
-            comment.push_str("# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n");
+            comment.push_str(
+                "# `mqtt.password` is set but not shown: add it, or set ECOD_MQTT__PASSWORD\n",
+            );
         }
         if shown.uplink.password.take().is_some() {
-            comment.push_str("# `uplink.password` is set but not shown: add it, or set ECOD_UPLINK__PASSWORD\n");
+            comment.push_str(
+                "# `uplink.password` is set but not shown: add it, or set ECOD_UPLINK__PASSWORD\n",
+            );
         }
         if shown.dashboard.token.take().is_some() {
-            comment.push_str("# `dashboard.token` is set but not shown: add it, or set ECOD_DASHBOARD__TOKEN\n");
+            comment.push_str(
+                "# `dashboard.token` is set but not shown: add it, or set ECOD_DASHBOARD__TOKEN\n",
+            );
         }
         if shown.membership.key.take().is_some() {
-            comment.push_str("# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n");
+            comment.push_str(
+                "# `membership.key` is set but not shown: add it, or set ECOD_MEMBERSHIP__KEY\n",
+            );
         }
         #[cfg(feature = "camera")]
         for camera in shown.camera.iter_mut().chain(&mut shown.cameras) {
             if camera.source.forget_credentials() {
-                let of = camera.name.as_ref().map_or_else(String::new, |name| format!(" of camera {name}"));
-                let line = format!("# user and password of `camera.source.url`{of} are set but not shown: add them\n");
+                let of = camera
+                    .name
+                    .as_ref()
+                    .map_or_else(String::new, |name| format!(" of camera {name}"));
+                let line = format!(
+                    "# user and password of `camera.source.url`{of} are set but not shown: add them\n"
+                );
                 comment.push_str(&line);
             }
         }
@@ -57,9 +70,14 @@ impl NodeConfig {
 
 /// Removes each key and table below `path` without which the configuration is still `config`.
 fn remove_defaults(keys: &mut Table, path: &mut Vec<String>, config: &NodeConfig) {
-    let names: Vec<String> = at(keys, path).into_iter().flat_map(|table| table.keys().cloned()).collect();
+    let names: Vec<String> = at(keys, path)
+        .into_iter()
+        .flat_map(|table| table.keys().cloned())
+        .collect();
     for name in names {
-        let Some(value) = at(keys, path).and_then(|table| table.remove(&name)) else { continue };
+        let Some(value) = at(keys, path).and_then(|table| table.remove(&name)) else {
+            continue;
+        };
         let rest = Figment::from(Serialized::defaults(&*keys));
         if NodeConfig::of_keys(&rest).is_ok_and(|rest| rest == *config) {
             continue;
@@ -78,5 +96,7 @@ fn remove_defaults(keys: &mut Table, path: &mut Vec<String>, config: &NodeConfig
 
 /// The table at a path of tables.
 fn at<'a>(keys: &'a mut Table, path: &[String]) -> Option<&'a mut Table> {
-    path.iter().try_fold(keys, |table, name| table.get_mut(name).and_then(Value::as_table_mut))
+    path.iter().try_fold(keys, |table, name| {
+        table.get_mut(name).and_then(Value::as_table_mut)
+    })
 }

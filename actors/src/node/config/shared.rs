@@ -117,7 +117,10 @@ impl StatedKeys {
             shared.extend(stated.get(key).map(|value| (key.to_owned(), value.clone())));
         }
         if let Some(sizes) = stated.pointer("/camera/projection/sizes") {
-            shared.insert("camera".into(), serde_json::json!({ "projection": { "sizes": sizes } }));
+            shared.insert(
+                "camera".into(),
+                serde_json::json!({ "projection": { "sizes": sizes } }),
+            );
         }
         Self(Value::Object(shared))
     }
@@ -129,13 +132,22 @@ impl SharedConfig {
     /// # Errors
     /// [`DescriptionError`] naming the line, or the key, the value and what is allowed.
     pub fn parse(text: &str) -> Result<Self, DescriptionError> {
-        let shared: Self = toml::from_str(text).map_err(|error| DescriptionError::Malformed(error.to_string()))?;
-        shared.fusion.validate().map_err(|error| error.within("fusion"))?;
+        let shared: Self =
+            toml::from_str(text).map_err(|error| DescriptionError::Malformed(error.to_string()))?;
+        shared
+            .fusion
+            .validate()
+            .map_err(|error| error.within("fusion"))?;
         LandmarkConfig::validate_all(&shared.landmarks)?;
         if let Some(origin) = &shared.origin {
             origin.validate().map_err(|error| error.within("origin"))?;
         }
-        shared.camera.projection.sizes.validate().map_err(|error| error.within("camera.projection.sizes"))?;
+        shared
+            .camera
+            .projection
+            .sizes
+            .validate()
+            .map_err(|error| error.within("camera.projection.sizes"))?;
         shared.check_cost()?;
         Ok(shared)
     }
@@ -154,9 +166,15 @@ impl SharedConfig {
             readings: Vec::new(),
         };
         let landmarks = self.landmarks.iter().map(occupied).collect();
-        let map = GlobalMap { landmarks, ..GlobalMap::new(&epoch, 1, Timestamp(0)) };
+        let map = GlobalMap {
+            landmarks,
+            ..GlobalMap::new(&epoch, 1, Timestamp(0))
+        };
         let map_bytes = encode(&map, Encoding::Json).len();
-        DescriptionCost { map_bytes, bytes_per_s: map_bytes as f64 / self.fusion.round.period_s }
+        DescriptionCost {
+            map_bytes,
+            bytes_per_s: map_bytes as f64 / self.fusion.round.period_s,
+        }
     }
 
     /// Checks that every link carries a map in the time of a round, and that rounds come often enough for followers to
@@ -164,15 +182,25 @@ impl SharedConfig {
     fn check_cost(&self) -> Result<(), DescriptionError> {
         let period_s = self.fusion.round.period_s;
         if !DESCRIBED_PERIODS_S.contains(&period_s) {
-            let allowed = format!("{} to {} in a description", DESCRIBED_PERIODS_S.start(), DESCRIBED_PERIODS_S.end());
+            let allowed = format!(
+                "{} to {} in a description",
+                DESCRIBED_PERIODS_S.start(),
+                DESCRIBED_PERIODS_S.end()
+            );
             return Err(ConfigError::new("fusion.round.period_s", period_s, allowed).into());
         }
-        let DescriptionCost { map_bytes, bytes_per_s } = self.cost();
+        let DescriptionCost {
+            map_bytes,
+            bytes_per_s,
+        } = self.cost();
         if map_bytes > MAX_DESCRIBED_MAP_BYTES || bytes_per_s > MAX_DESCRIBED_BYTES_PER_S {
-            let found =
-                format!("{} entries, maps of {map_bytes} bytes, {bytes_per_s:.0} bytes/s", self.landmarks.len());
-            let allowed =
-                format!("maps of {MAX_DESCRIBED_MAP_BYTES} bytes, and {MAX_DESCRIBED_BYTES_PER_S:.0} bytes/s at most");
+            let found = format!(
+                "{} entries, maps of {map_bytes} bytes, {bytes_per_s:.0} bytes/s",
+                self.landmarks.len()
+            );
+            let allowed = format!(
+                "maps of {MAX_DESCRIBED_MAP_BYTES} bytes, and {MAX_DESCRIBED_BYTES_PER_S:.0} bytes/s at most"
+            );
             return Err(ConfigError::new("landmarks", found, allowed).into());
         }
         Ok(())
@@ -181,22 +209,40 @@ impl SharedConfig {
     /// The shared settings of a node's configuration.
     fn of(config: &NodeConfig) -> Self {
         #[cfg(feature = "camera")]
-        let sizes = config.all_cameras().next().map(|camera| camera.projection.sizes.clone()).unwrap_or_default();
+        let sizes = config
+            .all_cameras()
+            .next()
+            .map(|camera| camera.projection.sizes.clone())
+            .unwrap_or_default();
         #[cfg(not(feature = "camera"))]
         let sizes = ObjectSizes::default();
         Self {
             fusion: config.fusion.clone(),
             landmarks: config.landmarks.clone(),
             origin: config.origin,
-            camera: SharedCamera { projection: SharedProjection { sizes } },
+            camera: SharedCamera {
+                projection: SharedProjection { sizes },
+            },
         }
     }
 
     pub(super) fn put_into(self, config: &mut NodeConfig) {
-        let Self { fusion, landmarks, origin, camera: SharedCamera { projection: SharedProjection { sizes } } } = self;
+        let Self {
+            fusion,
+            landmarks,
+            origin,
+            camera:
+                SharedCamera {
+                    projection: SharedProjection { sizes },
+                },
+        } = self;
         (config.fusion, config.landmarks, config.origin) = (fusion, landmarks, origin);
         #[cfg(feature = "camera")]
-        if config.all_cameras().next().is_some_and(|camera| camera.projection.sizes != sizes) {
+        if config
+            .all_cameras()
+            .next()
+            .is_some_and(|camera| camera.projection.sizes != sizes)
+        {
             for camera in config.camera.iter_mut().chain(&mut config.cameras) {
                 camera.projection.sizes = sizes.clone();
             }
@@ -212,21 +258,32 @@ impl NodeConfig {
     /// # Errors
     /// [`DescriptionError`], also where the node's own configuration states another value.
     pub fn described(&self, text: &str) -> Result<Self, DescriptionError> {
-        let malformed = |error: &dyn std::fmt::Display| DescriptionError::Malformed(error.to_string());
-        let described = serde_json::to_value(SharedConfig::parse(text)?).map_err(|error| malformed(&error))?;
+        let malformed =
+            |error: &dyn std::fmt::Display| DescriptionError::Malformed(error.to_string());
+        let described =
+            serde_json::to_value(SharedConfig::parse(text)?).map_err(|error| malformed(&error))?;
         let keys = toml::from_str::<toml::Table>(text).map_err(|error| malformed(&error))?;
         let keys = serde_json::to_value(keys).map_err(|error| malformed(&error))?;
-        let mut shared = serde_json::to_value(SharedConfig::of(self)).map_err(|error| malformed(&error))?;
+        let mut shared =
+            serde_json::to_value(SharedConfig::of(self)).map_err(|error| malformed(&error))?;
         for path in leaves(&keys) {
-            let Some(value) = at(&described, &path) else { continue };
+            let Some(value) = at(&described, &path) else {
+                continue;
+            };
             if at(&self.stated.0, &path).is_some()
-                && let Some((within, own, described)) = at(&shared, &path).and_then(|own| difference(own, value))
+                && let Some((within, own, described)) =
+                    at(&shared, &path).and_then(|own| difference(own, value))
             {
-                return Err(DescriptionError::Contradicts { key: path.join(".") + &within, own, described });
+                return Err(DescriptionError::Contradicts {
+                    key: path.join(".") + &within,
+                    own,
+                    described,
+                });
             }
             put(&mut shared, &path, value.clone());
         }
-        let shared: SharedConfig = serde_json::from_value(shared).map_err(|error| malformed(&error))?;
+        let shared: SharedConfig =
+            serde_json::from_value(shared).map_err(|error| malformed(&error))?;
         let mut config = self.clone();
         shared.put_into(&mut config);
         config.validate()?;
@@ -236,9 +293,14 @@ impl NodeConfig {
 
 /// Paths of all values that are no tables.
 fn leaves(value: &Value) -> Vec<Vec<String>> {
-    let Value::Object(table) = value else { return vec![Vec::new()] };
+    let Value::Object(table) = value else {
+        return vec![Vec::new()];
+    };
     let below = |(key, value): (&String, &Value)| {
-        leaves(value).into_iter().map(|path| [vec![key.clone()], path].concat()).collect::<Vec<_>>()
+        leaves(value)
+            .into_iter()
+            .map(|path| [vec![key.clone()], path].concat())
+            .collect::<Vec<_>>()
     };
     table.iter().flat_map(below).collect()
 }
@@ -248,7 +310,9 @@ fn at<'a>(value: &'a Value, path: &[String]) -> Option<&'a Value> {
 }
 
 fn put(value: &mut Value, path: &[String], leaf: Value) {
-    let Some((key, rest)) = path.split_first() else { return *value = leaf };
+    let Some((key, rest)) = path.split_first() else {
+        return *value = leaf;
+    };
     if !value.is_object() {
         *value = Value::Object(Map::new());
     }
@@ -268,13 +332,16 @@ fn difference(own: &Value, described: &Value) -> Option<(String, String, String)
                     .map(|(within, own, described)| (format!("[{index}]{within}"), own, described))
             })
         }
-        (Value::Array(own), Value::Array(described)) => {
-            Some((String::new(), format!("{} entries", own.len()), format!("{} entries", described.len())))
-        }
+        (Value::Array(own), Value::Array(described)) => Some((
+            String::new(),
+            format!("{} entries", own.len()),
+            format!("{} entries", described.len()),
+        )),
         (Value::Object(own_table), Value::Object(table)) => own_table
             .iter()
             .find_map(|(key, own)| {
-                let (within, own, described) = difference(own, table.get(key).unwrap_or(&Value::Null))?;
+                let (within, own, described) =
+                    difference(own, table.get(key).unwrap_or(&Value::Null))?;
                 Some((format!(".{key}{within}"), own, described))
             })
             .or_else(|| Some((String::new(), own.to_string(), described.to_string()))),
@@ -317,19 +384,31 @@ mod tests {
 
     #[test]
     fn a_description_fills_in_what_a_nodes_own_file_leaves_open() {
-        let config =
-            own("[fusion.round]\nperiod_s = 0.2\n[fusion.vote.synonyms]\nmug = \"cup\"").described(CELL).unwrap();
-        assert_eq!((config.fusion.pace.gate_m, config.fusion.round.period_s), (1.0, 0.2));
-        assert_eq!(config.landmarks.iter().map(|l| &*l.id).collect::<Vec<_>>(), ["slot-0", "slot-1"]);
+        let config = own("[fusion.round]\nperiod_s = 0.2\n[fusion.vote.synonyms]\nmug = \"cup\"")
+            .described(CELL)
+            .unwrap();
+        assert_eq!(
+            (config.fusion.pace.gate_m, config.fusion.round.period_s),
+            (1.0, 0.2)
+        );
+        assert_eq!(
+            config.landmarks.iter().map(|l| &*l.id).collect::<Vec<_>>(),
+            ["slot-0", "slot-1"]
+        );
         assert_eq!(config.fusion.vote.synonyms.len(), 2, "labels of both");
         let origin = config.origin.unwrap();
-        assert_eq!((origin.latitude_deg, origin.height_m, origin.rotation_deg), (52.2, 0.0, 12.0));
+        assert_eq!(
+            (origin.latitude_deg, origin.height_m, origin.rotation_deg),
+            (52.2, 0.0, 12.0)
+        );
     }
 
     #[test]
     fn equal_values_in_both_are_no_contradiction() {
-        let same = own("[fusion.pace]\ngate_m = 1.0\n[[landmarks]]\nid = \"slot-0\"\nx_m = 0.0\ny_m = 0.5\n\
-                        [[landmarks]]\nid = \"slot-1\"\nx_m = 2.5\ny_m = 0.0");
+        let same = own(
+            "[fusion.pace]\ngate_m = 1.0\n[[landmarks]]\nid = \"slot-0\"\nx_m = 0.0\ny_m = 0.5\n\
+                        [[landmarks]]\nid = \"slot-1\"\nx_m = 2.5\ny_m = 0.0",
+        );
         assert_eq!(same.described(CELL).unwrap().landmarks, same.landmarks);
     }
 
@@ -337,14 +416,26 @@ mod tests {
     fn a_contradiction_names_the_key_and_both_values() {
         for (toml, parts) in [
             // The default, and yet stated.
-            ("[fusion.pace]\ngate_m = 0.5", ["`fusion.pace.gate_m`", "0.5", "1.0"]),
-            ("[[landmarks]]\nid = \"slot-0\"\nx_m = 0\ny_m = 0", ["`landmarks`", "1 entries", "2 entries"]),
+            (
+                "[fusion.pace]\ngate_m = 0.5",
+                ["`fusion.pace.gate_m`", "0.5", "1.0"],
+            ),
+            (
+                "[[landmarks]]\nid = \"slot-0\"\nx_m = 0\ny_m = 0",
+                ["`landmarks`", "1 entries", "2 entries"],
+            ),
             (
                 "[[landmarks]]\nid = \"slot-0\"\nx_m = 0\ny_m = 0.5\n[[landmarks]]\nid = \"slot-1\"\nx_m = 2.6\ny_m = 0",
                 ["`landmarks[1].x_m`", "2.6", "2.5"],
             ),
-            ("[fusion.vote.synonyms]\nvase = \"cup\"", ["`fusion.vote.synonyms.vase`", "\"cup\"", "\"sports ball\""]),
-            ("[origin]\nlatitude_deg = 1\nlongitude_deg = 2", ["`origin.latitude_deg`", "1.0", "52.2"]),
+            (
+                "[fusion.vote.synonyms]\nvase = \"cup\"",
+                ["`fusion.vote.synonyms.vase`", "\"cup\"", "\"sports ball\""],
+            ),
+            (
+                "[origin]\nlatitude_deg = 1\nlongitude_deg = 2",
+                ["`origin.latitude_deg`", "1.0", "52.2"],
+            ),
         ] {
             let error = own(toml).described(CELL).unwrap_err().to_string();
             assert!(parts.iter().all(|part| error.contains(part)), "{error}");
@@ -355,10 +446,22 @@ mod tests {
     fn a_description_has_shared_keys_alone_and_values_within_their_ranges() {
         for (toml, parts) in [
             ("name = \"edge\"", ["line 1", "unknown field", "name"]),
-            ("[fusion.pace]\ngate = 1", ["line 2", "unknown field", "gate_m"]),
-            ("[fusion.pace]\ngate_m = -1", ["`fusion.pace.gate_m`", "-1", "0.001"]),
-            ("[origin]\nlatitude_deg = 91\nlongitude_deg = 0", ["`origin.latitude_deg`", "91", "-90 to 90"]),
-            ("[camera.projection]\npixel_sigma_px = 3", ["line 2", "unknown field", "sizes"]),
+            (
+                "[fusion.pace]\ngate = 1",
+                ["line 2", "unknown field", "gate_m"],
+            ),
+            (
+                "[fusion.pace]\ngate_m = -1",
+                ["`fusion.pace.gate_m`", "-1", "0.001"],
+            ),
+            (
+                "[origin]\nlatitude_deg = 91\nlongitude_deg = 0",
+                ["`origin.latitude_deg`", "91", "-90 to 90"],
+            ),
+            (
+                "[camera.projection]\npixel_sigma_px = 3",
+                ["line 2", "unknown field", "sizes"],
+            ),
             (
                 "[camera.projection.sizes.labels]\ncar = { width_m = 0, height_m = 1 }",
                 ["sizes.labels.car", "0", "0.0001"],
@@ -372,15 +475,27 @@ mod tests {
     #[test]
     fn a_description_that_the_cells_links_cannot_carry_is_refused_with_its_cost() {
         let locations = |count: usize| -> String {
-            (0..count).map(|n| format!("[[landmarks]]\nid = \"slot-{n}\"\nx_m = {n}\ny_m = 0\n")).collect()
+            (0..count)
+                .map(|n| format!("[[landmarks]]\nid = \"slot-{n}\"\nx_m = {n}\ny_m = 0\n"))
+                .collect()
         };
-        let error = SharedConfig::parse(&locations(5200)).unwrap_err().to_string();
-        assert!(error.contains("5200 entries") && error.contains("bytes/s") && error.contains("262144"), "{error}");
+        let error = SharedConfig::parse(&locations(5200))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("5200 entries") && error.contains("bytes/s") && error.contains("262144"),
+            "{error}"
+        );
         let cost = SharedConfig::parse(&locations(500)).unwrap().cost();
         assert!((50_000..150_000).contains(&cost.map_bytes), "{cost:?}");
         for period_s in ["0.005", "60"] {
-            let error = SharedConfig::parse(&format!("[fusion.round]\nperiod_s = {period_s}")).unwrap_err().to_string();
-            assert!(error.contains("`fusion.round.period_s`") && error.contains("0.02 to 2"), "{error}");
+            let error = SharedConfig::parse(&format!("[fusion.round]\nperiod_s = {period_s}"))
+                .unwrap_err()
+                .to_string();
+            assert!(
+                error.contains("`fusion.round.period_s`") && error.contains("0.02 to 2"),
+                "{error}"
+            );
         }
         SharedConfig::parse("[fusion.round]\nperiod_s = 2").unwrap();
     }
@@ -389,13 +504,31 @@ mod tests {
     #[test]
     fn sizes_of_labels_are_those_of_the_cell_where_there_is_a_camera() {
         let sizes = "[camera.projection.sizes.labels]\ncar = { width_m = 1.8, height_m = 1.5 }";
-        let camera =
-            "[camera.source]\nkind = \"v4l2\"\nwidth = 640\nheight = 480\n[camera.detector]\nkind = \"placard\"\n";
+        let camera = "[camera.source]\nkind = \"v4l2\"\nwidth = 640\nheight = 480\n[camera.detector]\nkind = \"placard\"\n";
         let described = own(camera).described(sizes).unwrap();
-        assert_eq!(described.camera.unwrap().projection.sizes.of("car").unwrap().width_m, 1.8);
-        assert_eq!(own("").described(sizes).unwrap(), own(""), "an edge has no camera");
-        let other = own(&format!("{camera}[camera.projection.sizes.labels]\ncar = {{ width_m = 2, height_m = 1.5 }}"));
+        assert_eq!(
+            described
+                .camera
+                .unwrap()
+                .projection
+                .sizes
+                .of("car")
+                .unwrap()
+                .width_m,
+            1.8
+        );
+        assert_eq!(
+            own("").described(sizes).unwrap(),
+            own(""),
+            "an edge has no camera"
+        );
+        let other = own(&format!(
+            "{camera}[camera.projection.sizes.labels]\ncar = {{ width_m = 2, height_m = 1.5 }}"
+        ));
         let error = other.described(sizes).unwrap_err().to_string();
-        assert!(error.contains("`camera.projection.sizes.labels.car.width_m`"), "{error}");
+        assert!(
+            error.contains("`camera.projection.sizes.labels.car.width_m`"),
+            "{error}"
+        );
     }
 }

@@ -38,13 +38,20 @@ impl NodeConfig {
         if let Ok(keys) = Value::try_from(self) {
             collect(&keys, "", &mut found);
         }
-        let (sizes, others): (Vec<_>, Vec<_>) =
-            found.into_iter().partition(|(path, _)| as_only_camera(path).starts_with(SIZES));
+        let (sizes, others): (Vec<_>, Vec<_>) = found
+            .into_iter()
+            .partition(|(path, _)| as_only_camera(path).starts_with(SIZES));
         let cause = |found: Vec<(String, String)>| {
-            let texts: Vec<String> = found.into_iter().map(|(path, text)| format!("`{path}` is {text}")).collect();
+            let texts: Vec<String> = found
+                .into_iter()
+                .map(|(path, text)| format!("`{path}` is {text}"))
+                .collect();
             (!texts.is_empty()).then(|| texts.join("; "))
         };
-        [(TroubleKind::ImplausibleSize, cause(sizes)), (TroubleKind::ImplausibleUnit, cause(others))]
+        [
+            (TroubleKind::ImplausibleSize, cause(sizes)),
+            (TroubleKind::ImplausibleUnit, cause(others)),
+        ]
     }
 }
 
@@ -53,10 +60,15 @@ fn collect(value: &Value, path: &str, found: &mut Vec<(String, String)>) {
     let number = match value {
         Value::Table(table) => {
             let dot = if path.is_empty() { "" } else { "." };
-            return table.iter().for_each(|(key, value)| collect(value, &format!("{path}{dot}{key}"), found));
+            return table
+                .iter()
+                .for_each(|(key, value)| collect(value, &format!("{path}{dot}{key}"), found));
         }
         Value::Array(list) => {
-            return list.iter().enumerate().for_each(|(n, value)| collect(value, &format!("{path}[{n}]"), found));
+            return list
+                .iter()
+                .enumerate()
+                .for_each(|(n, value)| collect(value, &format!("{path}[{n}]"), found));
         }
         Value::Float(number) => *number,
         Value::Integer(number) => *number as f64,
@@ -69,7 +81,10 @@ fn collect(value: &Value, path: &str, found: &mut Vec<(String, String)>) {
 
 /// The path of a key in `[[cameras]]` as it would be in `[camera]`.
 fn as_only_camera(path: &str) -> Cow<'_, str> {
-    let key = path.strip_prefix("cameras[").and_then(|rest| rest.split_once("].")).map(|(_, key)| key);
+    let key = path
+        .strip_prefix("cameras[")
+        .and_then(|rest| rest.split_once("]."))
+        .map(|(_, key)| key);
     key.map_or(path.into(), |key| format!("camera.{key}").into())
 }
 
@@ -77,10 +92,15 @@ fn as_only_camera(path: &str) -> Cow<'_, str> {
 fn missed_unit(path: &str, value: f64) -> Option<&'static str> {
     let (table, key) = path.rsplit_once('.').unwrap_or(("", path));
     let size = value.abs();
-    let is_place = ["pose", "origin", "landmarks"].iter().any(|place| table.starts_with(place));
+    let is_place = ["pose", "origin", "landmarks"]
+        .iter()
+        .any(|place| table.starts_with(place));
     let (is_doubtful, unit) = match key.rsplit_once('_')? {
         ("max_range", "m") => return None,
-        (_, "m") => (!is_place && (size > MAX_LENGTH_M || is_unusual(table, key, value)), "metres"),
+        (_, "m") => (
+            !is_place && (size > MAX_LENGTH_M || is_unusual(table, key, value)),
+            "metres",
+        ),
         ("period", "s") if table == "fusion.round" => (value > MAX_PERIOD_S, "seconds"),
         ("stall_timeout", "s") => (value > MAX_TIME_S, "seconds"),
         ("align_memory", "s") => return None,
@@ -88,7 +108,14 @@ fn missed_unit(path: &str, value: f64) -> Option<&'static str> {
         ("latitude" | "longitude", _) => return None,
         ("horizontal_fov" | "vertical_fov", "deg") => (value < MIN_FIELD_OF_VIEW_DEG, "degrees"),
         (_, "deg") => (is_multiple_of_45_deg_in_radians(value), "degrees"),
-        (name, "rad") => (size > if name.ends_with("sigma") { MAX_ANGLE_SIGMA_RAD } else { TAU }, "radians"),
+        (name, "rad") => (
+            size > if name.ends_with("sigma") {
+                MAX_ANGLE_SIGMA_RAD
+            } else {
+                TAU
+            },
+            "radians",
+        ),
         _ => return None,
     };
     is_doubtful.then_some(unit)
@@ -101,7 +128,12 @@ fn is_multiple_of_45_deg_in_radians(value: f64) -> bool {
 
 /// True if a listed size is far from the usual one of its label.
 fn is_unusual(table: &str, key: &str, value: f64) -> bool {
-    let Some(label) = table.strip_prefix(SIZES).and_then(|rest| rest.strip_prefix("labels.")) else { return false };
+    let Some(label) = table
+        .strip_prefix(SIZES)
+        .and_then(|rest| rest.strip_prefix("labels."))
+    else {
+        return false;
+    };
     let unlisted = ObjectSizes::default();
     let usual_m = unlisted.of(label).and_then(|usual| match key {
         "width_m" => Some(usual.width_m),
@@ -123,12 +155,15 @@ mod tests {
     fn sizes_in_centimetres_are_noticed_by_what_is_usual_and_by_what_no_road_bears() {
         let of = |sizes: &str| {
             let text = format!("[camera]\n{CAMERA}\n[camera.projection.sizes]\n{sizes}");
-            toml::from_str::<NodeConfig>(&text).unwrap().doubtful_units()
+            toml::from_str::<NodeConfig>(&text)
+                .unwrap()
+                .doubtful_units()
         };
         let usual = "labels.cup = { width_m = 0.09, height_m = 0.1 }\nlabels.lorry = { width_m = 2.5, height_m = 4 }";
         assert_eq!(of(usual).map(|(_, cause)| cause), [None, None]);
-        let [(kind, cause), _] =
-            of("default = { width_m = 180, height_m = 1 }\nlabels.cup = { width_m = 8, height_m = 0.1 }");
+        let [(kind, cause), _] = of(
+            "default = { width_m = 180, height_m = 1 }\nlabels.cup = { width_m = 8, height_m = 0.1 }",
+        );
         assert_eq!(kind, TroubleKind::ImplausibleSize);
         let expected = "`camera.projection.sizes.default.width_m` is 180, and should be in metres; \
                         `camera.projection.sizes.labels.cup.width_m` is 8, and should be in metres";
@@ -136,8 +171,12 @@ mod tests {
         let second = format!(
             "[[cameras]]\nname = \"rear\"\n{CAMERA}\nprojection.sizes.labels.cup = {{ width_m = 8, height_m = 0.1 }}"
         );
-        let [(_, cause), _] = toml::from_str::<NodeConfig>(&second).unwrap().doubtful_units();
-        assert!(cause.is_some_and(|cause| cause.starts_with("`cameras[0].projection.sizes.labels.cup.width_m` is 8")));
+        let [(_, cause), _] = toml::from_str::<NodeConfig>(&second)
+            .unwrap()
+            .doubtful_units();
+        assert!(cause.is_some_and(|cause| {
+            cause.starts_with("`cameras[0].projection.sizes.labels.cup.width_m` is 8")
+        }));
     }
 
     #[test]
@@ -168,6 +207,11 @@ mod tests {
         ] {
             assert_eq!(missed_unit(key, value), None, "{key}");
         }
-        assert_eq!(NodeConfig::default().doubtful_units().map(|(_, cause)| cause), [None, None]);
+        assert_eq!(
+            NodeConfig::default()
+                .doubtful_units()
+                .map(|(_, cause)| cause),
+            [None, None]
+        );
     }
 }

@@ -36,7 +36,11 @@ const ASSETS: [Asset; 19] = [
 ];
 
 const fn asset(path: &'static str, content_type: &'static str, content: &'static str) -> Asset {
-    Asset { path, content_type, content }
+    Asset {
+        path,
+        content_type,
+        content,
+    }
 }
 
 /// Paths of all files of the page, the page itself first.
@@ -54,8 +58,11 @@ pub(crate) const VIEW_STYLE: &str = include_str!("page/view.css");
 
 /// Map and timeline of the page in HTML, with the identities that the scripts know.
 pub(crate) fn view() -> &'static str {
-    let page = include_str!("page/index.html").split("<!-- map and timeline, also of reports -->").nth(1);
-    page.and_then(|rest| rest.split("<!-- end -->").next()).unwrap_or_default()
+    let page = include_str!("page/index.html")
+        .split("<!-- map and timeline, also of reports -->")
+        .nth(1);
+    page.and_then(|rest| rest.split("<!-- end -->").next())
+        .unwrap_or_default()
 }
 
 /// The scripts that draw map and timeline, as one script without imports. No two of them have a name of their own alike.
@@ -73,8 +80,12 @@ pub(crate) fn view_script() -> String {
         "/timeline.js",
     ];
     let scripts = PATHS.into_iter().filter_map(Asset::find);
-    let lines = scripts.flat_map(|script| script.content.lines()).filter(|line| !line.starts_with("import "));
-    lines.map(|line| line.strip_prefix("export ").unwrap_or(line).to_owned() + "\n").collect()
+    let lines = scripts
+        .flat_map(|script| script.content.lines())
+        .filter(|line| !line.starts_with("import "));
+    lines
+        .map(|line| line.strip_prefix("export ").unwrap_or(line).to_owned() + "\n")
+        .collect()
 }
 
 impl Asset {
@@ -91,12 +102,23 @@ mod tests {
     #[test]
     fn the_page_is_small_even_uncompressed_and_whole() {
         let bytes: usize = ASSETS.iter().map(|asset| asset.content.len()).sum();
-        println!("page: {bytes} bytes in {} files, uncompressed", ASSETS.len());
+        println!(
+            "page: {bytes} bytes in {} files, uncompressed",
+            ASSETS.len()
+        );
         assert!(bytes < 150_000);
         for asset in ASSETS {
-            let imports = asset.content.split("from \"./").skip(1).filter_map(|rest| rest.split('"').next());
+            let imports = asset
+                .content
+                .split("from \"./")
+                .skip(1)
+                .filter_map(|rest| rest.split('"').next());
             for import in imports {
-                assert!(Asset::find(&format!("/{import}")).is_some(), "{} imports {import}", asset.path);
+                assert!(
+                    Asset::find(&format!("/{import}")).is_some(),
+                    "{} imports {import}",
+                    asset.path
+                );
             }
         }
     }
@@ -104,17 +126,29 @@ mod tests {
     #[test]
     fn a_report_gets_map_and_timeline_as_one_script() {
         let (view, script) = (view(), view_script());
-        for id in ["map", "map-table", "timeline-bands", "timeline-cursor", "timeline-events"] {
+        for id in [
+            "map",
+            "map-table",
+            "timeline-bands",
+            "timeline-cursor",
+            "timeline-events",
+        ] {
             assert!(view.contains(&format!("id=\"{id}\"")), "{id}");
         }
         assert!(!script.contains("import ") && !script.contains("\nexport "));
         let declared = |line: &'static str| {
-            let rest = ["const ", "let ", "function ", "class "].iter().find_map(|word| line.strip_prefix(word))?;
-            rest.split(|letter: char| !letter.is_alphanumeric() && letter != '_').next()
+            let rest = ["const ", "let ", "function ", "class "]
+                .iter()
+                .find_map(|word| line.strip_prefix(word))?;
+            rest.split(|letter: char| !letter.is_alphanumeric() && letter != '_')
+                .next()
         };
         let mut names = std::collections::BTreeSet::new();
         for line in String::leak(script).lines() {
-            assert!(declared(line).is_none_or(|name| name.is_empty() || names.insert(name)), "{line}");
+            assert!(
+                declared(line).is_none_or(|name| name.is_empty() || names.insert(name)),
+                "{line}"
+            );
         }
     }
 
@@ -122,7 +156,11 @@ mod tests {
     fn nothing_is_inline_or_from_elsewhere() {
         for asset in ASSETS {
             for forbidden in ["https://", "style=", "onclick=", "innerHTML", "eval("] {
-                assert!(!asset.content.contains(forbidden), "{}: {forbidden}", asset.path);
+                assert!(
+                    !asset.content.contains(forbidden),
+                    "{}: {forbidden}",
+                    asset.path
+                );
             }
         }
     }

@@ -53,7 +53,9 @@ mod tests {
         let feed = CameraFeed::default();
         let taken = || {
             let frames = (0..30).map(|frame| Timestamp(1_000_000 + frame * 1_000_000 / 30));
-            frames.filter(|captured_at| feed.takes(*captured_at)).count()
+            frames
+                .filter(|captured_at| feed.takes(*captured_at))
+                .count()
         };
         assert_eq!(taken(), 0);
         let viewer = feed.pictures();

@@ -49,7 +49,12 @@ impl PictureBox {
         Self {
             label: detection.label.clone(),
             confidence: detection.confidence,
-            edges: [b.x_min / width, b.y_min / height, b.x_max / width, b.y_max / height],
+            edges: [
+                b.x_min / width,
+                b.y_min / height,
+                b.x_max / width,
+                b.y_max / height,
+            ],
             object: None,
         }
     }
@@ -61,9 +66,20 @@ impl PictureBox {
 /// [`ImageError`] of the JPEG.
 pub fn camera_event(frame: &CameraFrame, boxes: &[PictureBox]) -> Result<Bytes, ImageError> {
     let jpeg = BASE64_STANDARD.encode(jpeg(&frame.image)?);
-    let ImageSize { width: width_px, height: height_px } = ImageSize::of(&frame.image);
-    let picture = json(&CameraPicture { captured_at_us: frame.captured_at, width_px, height_px, jpeg, boxes });
-    Ok([b"event: camera\ndata: ", &*picture, b"\n\n"].concat().into())
+    let ImageSize {
+        width: width_px,
+        height: height_px,
+    } = ImageSize::of(&frame.image);
+    let picture = json(&CameraPicture {
+        captured_at_us: frame.captured_at,
+        width_px,
+        height_px,
+        jpeg,
+        boxes,
+    });
+    Ok([b"event: camera\ndata: ", &*picture, b"\n\n"]
+        .concat()
+        .into())
 }
 
 fn jpeg(image: &Mat) -> Result<Vec<u8>, ImageError> {
@@ -89,16 +105,46 @@ mod tests {
     fn boxes_are_shares_of_a_picture_that_is_no_wider_than_a_page_needs() {
         let size = Size::new(1920, 1080);
         let image = Mat::new_size_with_default(size, CV_8UC3, Scalar::all(90.0)).unwrap();
-        let bounding_box = BoundingBox { x_min: 480.0, y_min: 270.0, x_max: 960.0, y_max: 1080.0 };
-        let cat = Detection { label: "cat".into(), confidence: 0.5, bounding_box, corners: None };
+        let bounding_box = BoundingBox {
+            x_min: 480.0,
+            y_min: 270.0,
+            x_max: 960.0,
+            y_max: 1080.0,
+        };
+        let cat = Detection {
+            label: "cat".into(),
+            confidence: 0.5,
+            bounding_box,
+            corners: None,
+        };
         let boxes = [PictureBox::new(&cat, ImageSize::of(&image))];
-        let event = camera_event(&CameraFrame { image, captured_at: Timestamp(7), seq: 0 }, &boxes).unwrap();
-        let data = event.strip_prefix(b"event: camera\ndata: ").unwrap().strip_suffix(b"\n\n").unwrap();
+        let event = camera_event(
+            &CameraFrame {
+                image,
+                captured_at: Timestamp(7),
+                seq: 0,
+            },
+            &boxes,
+        )
+        .unwrap();
+        let data = event
+            .strip_prefix(b"event: camera\ndata: ")
+            .unwrap()
+            .strip_suffix(b"\n\n")
+            .unwrap();
         let picture: serde_json::Value = serde_json::from_slice(data).unwrap();
         assert_eq!(picture["captured_at_us"], 7);
-        assert_eq!((&picture["width_px"], &picture["height_px"]), (&1920.into(), &1080.into()));
-        assert_eq!(picture["boxes"][0]["edges"], serde_json::json!([0.25, 0.25, 0.5, 1.0]));
-        let jpeg = BASE64_STANDARD.decode(picture["jpeg"].as_str().unwrap()).unwrap();
+        assert_eq!(
+            (&picture["width_px"], &picture["height_px"]),
+            (&1920.into(), &1080.into())
+        );
+        assert_eq!(
+            picture["boxes"][0]["edges"],
+            serde_json::json!([0.25, 0.25, 0.5, 1.0])
+        );
+        let jpeg = BASE64_STANDARD
+            .decode(picture["jpeg"].as_str().unwrap())
+            .unwrap();
         let shown = image_codec::decode(&jpeg).unwrap();
         assert_eq!((shown.cols(), shown.rows()), (640, 360));
     }

@@ -33,7 +33,8 @@ pub struct DashboardConfig {
 }
 
 /// Default address of the page.
-pub const DEFAULT_ADDRESS: SocketAddr = SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::LOCALHOST, 8080));
+pub const DEFAULT_ADDRESS: SocketAddr =
+    SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::LOCALHOST, 8080));
 
 /// Minimum length of a token.
 const MIN_TOKEN_BYTES: usize = 12;
@@ -64,20 +65,35 @@ impl DashboardConfig {
         check_range("max_rate_hz", self.max_rate_hz, 0.1, 60.0)?;
         check_range("max_connections", self.max_connections as f64, 4.0, 4096.0)?;
         if let Some(plan) = &self.floor_plan {
-            plan.validate().map_err(|error| error.within("floor_plan"))?;
+            plan.validate()
+                .map_err(|error| error.within("floor_plan"))?;
         }
         match (&self.token, self.listen) {
-            (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => {
-                Err(ConfigError::new("token", "a shorter text", format!("at least {MIN_TOKEN_BYTES} characters")))
-            }
+            (Some(token), _) if token.reveal().len() < MIN_TOKEN_BYTES => Err(ConfigError::new(
+                "token",
+                "a shorter text",
+                format!("at least {MIN_TOKEN_BYTES} characters"),
+            )),
             (Some(token), _)
-                if !token.reveal().chars().all(|c| c.is_ascii_graphic() && !NOT_IN_TOKENS.contains(&c)) =>
+                if !token
+                    .reveal()
+                    .chars()
+                    .all(|c| c.is_ascii_graphic() && !NOT_IN_TOKENS.contains(&c)) =>
             {
-                let allowed = "visible ASCII without \" # % & ' < >, as it is also given in an address";
-                Err(ConfigError::new("token", "a text with other characters", allowed))
+                let allowed =
+                    "visible ASCII without \" # % & ' < >, as it is also given in an address";
+                Err(ConfigError::new(
+                    "token",
+                    "a text with other characters",
+                    allowed,
+                ))
             }
             (None, Some(address)) if self.enabled && !address.ip().is_loopback() => {
-                Err(ConfigError::new("token", "nothing", format!("a secret, as other machines reach {address}")))
+                Err(ConfigError::new(
+                    "token",
+                    "nothing",
+                    format!("a secret, as other machines reach {address}"),
+                ))
             }
             _ => Ok(()),
         }
@@ -89,7 +105,9 @@ impl DashboardConfig {
     /// [`ConfigError`] as of [`FloorPlanConfig::load`].
     pub fn load_floor_plan(&self) -> Result<Option<FloorPlan>, ConfigError> {
         let plan = self.floor_plan.as_ref().filter(|_| self.enabled);
-        plan.map(FloorPlanConfig::load).transpose().map_err(|error| error.within("dashboard.floor_plan"))
+        plan.map(FloorPlanConfig::load)
+            .transpose()
+            .map_err(|error| error.within("dashboard.floor_plan"))
     }
 }
 
@@ -99,7 +117,12 @@ mod tests {
 
     fn validate(listen: &str, token: Option<&str>) -> Result<(), ConfigError> {
         let (listen, token) = (listen.parse().ok(), token.map(Secret::new));
-        DashboardConfig { listen, token, ..DashboardConfig::default() }.validate()
+        DashboardConfig {
+            listen,
+            token,
+            ..DashboardConfig::default()
+        }
+        .validate()
     }
 
     #[test]
@@ -107,16 +130,35 @@ mod tests {
         validate("127.0.0.1:8080", None).unwrap();
         validate("[::1]:8080", None).unwrap();
         for address in ["0.0.0.0:8080", "10.0.0.2:8080", "[::]:8080"] {
-            assert_eq!(validate(address, None).unwrap_err().key, "token", "{address}");
+            assert_eq!(
+                validate(address, None).unwrap_err().key,
+                "token",
+                "{address}"
+            );
             validate(address, Some("a-long-enough-token")).unwrap();
         }
-        for token in
-            ["short", "with a space in it", "a&b&c&d&e&f&g", "100%-certain-token", "number#1-token", "zwölf-zeichen"]
-        {
-            assert_eq!(validate("127.0.0.1:8080", Some(token)).unwrap_err().key, "token", "{token}");
+        for token in [
+            "short",
+            "with a space in it",
+            "a&b&c&d&e&f&g",
+            "100%-certain-token",
+            "number#1-token",
+            "zwölf-zeichen",
+        ] {
+            assert_eq!(
+                validate("127.0.0.1:8080", Some(token)).unwrap_err().key,
+                "token",
+                "{token}"
+            );
         }
         validate("127.0.0.1:8080", Some("q0Zk/8+d=~Tx:1!")).unwrap();
         let listen = "0.0.0.0:8080".parse().ok();
-        DashboardConfig { enabled: false, listen, ..DashboardConfig::default() }.validate().unwrap();
+        DashboardConfig {
+            enabled: false,
+            listen,
+            ..DashboardConfig::default()
+        }
+        .validate()
+        .unwrap();
     }
 }

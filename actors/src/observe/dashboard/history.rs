@@ -100,15 +100,38 @@ impl Default for History {
 impl History {
     /// The whole history as JSON, with the samples and events after `time` only.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
-        let samples: Vec<_> = self.samples.iter().filter(|(at, _)| *at > time).map(|(_, sample)| &**sample).collect();
-        let (terms, samples, failovers) = (json(&self.terms), samples.join(&b','), json(&self.failovers));
+        let samples: Vec<_> = self
+            .samples
+            .iter()
+            .filter(|(at, _)| *at > time)
+            .map(|(_, sample)| &**sample)
+            .collect();
+        let (terms, samples, failovers) = (
+            json(&self.terms),
+            samples.join(&b','),
+            json(&self.failovers),
+        );
         let (head, timeline) = (&b"{\"reigns\":"[..], self.timeline.json_since(time));
-        [head, &terms, b",\"samples\":[", &samples, b"],\"failovers\":", &failovers, b",", &timeline, b"}"].concat()
+        [
+            head,
+            &terms,
+            b",\"samples\":[",
+            &samples,
+            b"],\"failovers\":",
+            &failovers,
+            b",",
+            &timeline,
+            b"}",
+        ]
+        .concat()
     }
 
     /// Takes the present leadership.
     pub(crate) fn add_leadership(&mut self, leadership: &Leadership, now: Timestamp) {
-        let present = leadership.epoch.as_ref().filter(|_| leadership.position != Position::Seeking);
+        let present = leadership
+            .epoch
+            .as_ref()
+            .filter(|_| leadership.position != Position::Seeking);
         if let Some(open) = self.terms.back_mut().filter(|term| term.until_us.is_none()) {
             if present.is_some_and(|epoch| *epoch == Epoch::new(open.epoch, open.leader.clone())) {
                 return;
@@ -116,22 +139,50 @@ impl History {
             open.until_us = Some(now);
         }
         let Some(epoch) = present else { return };
-        self.failovers += u64::from(self.terms.back().is_some_and(|last| last.leader != epoch.leader));
-        let gap_ms = self.last_gap.as_ref().filter(|(of, _)| of == epoch).map(|(_, gap)| *gap);
+        self.failovers += u64::from(
+            self.terms
+                .back()
+                .is_some_and(|last| last.leader != epoch.leader),
+        );
+        let gap_ms = self
+            .last_gap
+            .as_ref()
+            .filter(|(of, _)| of == epoch)
+            .map(|(_, gap)| *gap);
         let (leader, epoch) = (epoch.leader.clone(), epoch.term);
-        push(&mut self.terms, LeaderTerm { leader, epoch, from_us: now, until_us: None, gap_ms }, MAX_TERMS);
+        push(
+            &mut self.terms,
+            LeaderTerm {
+                leader,
+                epoch,
+                from_us: now,
+                until_us: None,
+                gap_ms,
+            },
+            MAX_TERMS,
+        );
     }
 
     /// Takes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
-    pub(crate) fn add_round(&mut self, epoch: &Epoch, captured_at: Option<Timestamp>, received_at: Timestamp) {
+    pub(crate) fn add_round(
+        &mut self,
+        epoch: &Epoch,
+        captured_at: Option<Timestamp>,
+        received_at: Timestamp,
+    ) {
         self.rounds = self.rounds.saturating_add(1);
         if self.latencies_ms.len() < MAX_LATENCIES {
-            self.latencies_ms.extend(captured_at.map(|captured_at| received_at.since(captured_at).as_secs_f64() * 1e3));
+            self.latencies_ms.extend(
+                captured_at.map(|captured_at| received_at.since(captured_at).as_secs_f64() * 1e3),
+            );
         }
         let before = self.last_round.replace((epoch.clone(), received_at));
-        let Some((last, last_at)) = before.filter(|(last, _)| last != epoch) else { return };
+        let Some((last, last_at)) = before.filter(|(last, _)| last != epoch) else {
+            return;
+        };
         let gap_ms = u64::try_from(received_at.since(last_at).as_millis()).unwrap_or(u64::MAX);
-        let of_epoch = |term: &&mut LeaderTerm| term.leader == epoch.leader && term.epoch == epoch.term;
+        let of_epoch =
+            |term: &&mut LeaderTerm| term.leader == epoch.leader && term.epoch == epoch.term;
         if let Some(term) = self.terms.iter_mut().rev().find(of_epoch) {
             term.gap_ms.get_or_insert(gap_ms);
         }
@@ -143,13 +194,18 @@ impl History {
     pub(crate) fn sample(&mut self, reputations: Option<&Reputations>, now: Timestamp) {
         let mut latencies = std::mem::take(&mut self.latencies_ms);
         latencies.sort_by(f64::total_cmp);
-        let reputations = reputations.into_iter().flat_map(|r| &r.reputations).take(MAX_VEHICLES);
+        let reputations = reputations
+            .into_iter()
+            .flat_map(|r| &r.reputations)
+            .take(MAX_VEHICLES);
         let sample = VitalsSample {
             at_us: now,
             rounds: std::mem::take(&mut self.rounds),
             latency_p50_ms: latencies.get(latencies.len() / 2).copied(),
             latency_max_ms: latencies.last().copied(),
-            reputations: reputations.map(|(name, reputation)| (name, reputation.score)).collect(),
+            reputations: reputations
+                .map(|(name, reputation)| (name, reputation.score))
+                .collect(),
         };
         push(&mut self.samples, (now, json(&sample)), MAX_SAMPLES);
     }
@@ -169,7 +225,14 @@ mod tests {
 
     fn led_by(leader: &'static str, term: u64) -> Leadership {
         let epoch = Some(Epoch::new(term, NodeName::from_static(leader)));
-        Leadership { position: Position::Following, epoch, standby: None, term, is_deserted: false, is_yielding: false }
+        Leadership {
+            position: Position::Following,
+            epoch,
+            standby: None,
+            term,
+            is_deserted: false,
+            is_yielding: false,
+        }
     }
 
     fn seconds(n: u64) -> Timestamp {
@@ -183,7 +246,10 @@ mod tests {
         history.add_leadership(&led_by("edge", 3), seconds(1));
         history.add_round(&epoch("edge", 3), None, seconds(9));
         history.add_leadership(&led_by("edge", 3), seconds(9));
-        let seeking = Leadership { position: Position::Seeking, ..led_by("edge", 3) };
+        let seeking = Leadership {
+            position: Position::Seeking,
+            ..led_by("edge", 3)
+        };
         history.add_leadership(&seeking, seconds(10));
         history.add_leadership(&led_by("euclid", 4), seconds(11));
         history.add_round(&epoch("euclid", 4), None, seconds(12));
@@ -192,10 +258,22 @@ mod tests {
         history.add_leadership(&led_by("gauss", 5), seconds(16));
         let term = |leader, epoch, from, until: Option<u64>, gap_ms| {
             let leader = NodeName::from_static(leader);
-            LeaderTerm { leader, epoch, from_us: seconds(from), until_us: until.map(seconds), gap_ms }
+            LeaderTerm {
+                leader,
+                epoch,
+                from_us: seconds(from),
+                until_us: until.map(seconds),
+                gap_ms,
+            }
         };
-        let (first, second) = (term("edge", 3, 1, Some(10), None), term("euclid", 4, 11, Some(16), Some(3000)));
-        assert_eq!(history.terms, [first, second, term("gauss", 5, 16, None, Some(1000))]);
+        let (first, second) = (
+            term("edge", 3, 1, Some(10), None),
+            term("euclid", 4, 11, Some(16), Some(3000)),
+        );
+        assert_eq!(
+            history.terms,
+            [first, second, term("gauss", 5, 16, None, Some(1000))]
+        );
         assert_eq!(history.failovers, 2);
     }
 
@@ -212,16 +290,30 @@ mod tests {
     fn a_long_run_is_kept_in_bounds() {
         let mut history = History::default();
         for n in 0..1000 {
-            history.add_leadership(&led_by(if n % 2 == 0 { "edge" } else { "euclid" }, n), seconds(n));
+            history.add_leadership(
+                &led_by(if n % 2 == 0 { "edge" } else { "euclid" }, n),
+                seconds(n),
+            );
             let epoch = Epoch::new(n, NodeName::from_static("edge"));
             (0..1000).for_each(|_| history.add_round(&epoch, Some(seconds(n)), seconds(n)));
             assert!(history.latencies_ms.len() <= MAX_LATENCIES);
             history.sample(None, seconds(n));
         }
-        assert_eq!((history.terms.len(), history.samples.len()), (MAX_TERMS, MAX_SAMPLES));
-        let told: serde_json::Value = serde_json::from_slice(&history.json_since(seconds(997))).unwrap();
+        assert_eq!(
+            (history.terms.len(), history.samples.len()),
+            (MAX_TERMS, MAX_SAMPLES)
+        );
+        let told: serde_json::Value =
+            serde_json::from_slice(&history.json_since(seconds(997))).unwrap();
         let told = told["samples"].as_array().unwrap();
-        assert_eq!(told.len(), 2, "samples that the browser has are not sent again");
-        assert_eq!((&told[1]["at_us"], &told[1]["rounds"]), (&999_000_000.into(), &1000.into()));
+        assert_eq!(
+            told.len(),
+            2,
+            "samples that the browser has are not sent again"
+        );
+        assert_eq!(
+            (&told[1]["at_us"], &told[1]["rounds"]),
+            (&999_000_000.into(), &1000.into())
+        );
     }
 }

@@ -75,28 +75,64 @@ impl LiveState {
         match message {
             Incoming::Report { kind, report } => {
                 self.reports[*kind as usize].fetch_add(1, Relaxed);
-                let entry = LatestReport { kind: *kind, received_at, report: Arc::clone(report) };
-                let is_beside = |(name, of): &(NodeName, ReportKind)| of == kind && are_parts(name, &report.node);
+                let entry = LatestReport {
+                    kind: *kind,
+                    received_at,
+                    report: Arc::clone(report),
+                };
+                let is_beside = |(name, of): &(NodeName, ReportKind)| {
+                    of == kind && are_parts(name, &report.node)
+                };
                 let rank = |entry: &LatestReport| entry.received_at;
-                let gives_way = |oldest: &LatestReport| received_at.since(oldest.received_at) > SILENCE;
-                insert(&mut latest.reports, ((report.node.clone(), *kind), entry), is_beside, rank, gives_way);
+                let gives_way =
+                    |oldest: &LatestReport| received_at.since(oldest.received_at) > SILENCE;
+                insert(
+                    &mut latest.reports,
+                    ((report.node.clone(), *kind), entry),
+                    is_beside,
+                    rank,
+                    gives_way,
+                );
             }
-            Incoming::Status { status, via: broker } => {
-                let mut via = latest.statuses.remove(&status.node).map(|before| before.via).unwrap_or_default();
+            Incoming::Status {
+                status,
+                via: broker,
+            } => {
+                let mut via = latest
+                    .statuses
+                    .remove(&status.node)
+                    .map(|before| before.via)
+                    .unwrap_or_default();
                 via.insert(broker.clone());
-                let entry = ReportedStatus { status: Arc::clone(status), via, at: received_at };
+                let entry = ReportedStatus {
+                    status: Arc::clone(status),
+                    via,
+                    at: received_at,
+                };
                 let is_beside = |name: &NodeName| are_parts(name, &status.node);
-                let rank = |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
-                insert(&mut latest.statuses, (status.node.clone(), entry), is_beside, rank, |_| true);
+                let rank =
+                    |entry: &ReportedStatus| (entry.status.state != NodeState::Offline, entry.at);
+                insert(
+                    &mut latest.statuses,
+                    (status.node.clone(), entry),
+                    is_beside,
+                    rank,
+                    |_| true,
+                );
             }
             Incoming::StatusWithdrawn { node, via } => {
-                let Some(entry) = latest.statuses.get_mut(node) else { return };
+                let Some(entry) = latest.statuses.get_mut(node) else {
+                    return;
+                };
                 entry.via.remove(via);
                 if entry.via.is_empty() && entry.status.state == NodeState::Offline {
                     latest.statuses.remove(node);
                 }
             }
-            Incoming::Link { broker, state: LinkState::Down | LinkState::Refused } => {
+            Incoming::Link {
+                broker,
+                state: LinkState::Down | LinkState::Refused,
+            } => {
                 for entry in latest.statuses.values_mut() {
                     entry.via.remove(broker);
                 }
@@ -135,7 +171,10 @@ impl LiveState {
     #[cfg(feature = "camera")]
     pub(crate) fn pose_since(&self, node: &NodeName, time: Timestamp) -> Option<WirePose> {
         let latest = self.latest();
-        let reports = latest.reports.values().filter(|entry| entry.report.node == *node && entry.received_at >= time);
+        let reports = latest
+            .reports
+            .values()
+            .filter(|entry| entry.report.node == *node && entry.received_at >= time);
         reports.max_by_key(|entry| entry.received_at)?.report.pose
     }
 
@@ -154,21 +193,34 @@ impl LiveState {
         leader: Option<&NodeName>,
         own: Vec<Trouble>,
     ) -> Vec<(Option<NodeName>, Trouble)> {
-        let subject = |trouble: &Trouble, by: &NodeName| trouble.about.clone().unwrap_or_else(|| by.to_string());
-        let mut known: BTreeSet<_> = own.iter().map(|trouble| (subject(trouble, name), trouble.kind.clone())).collect();
+        let subject = |trouble: &Trouble, by: &NodeName| {
+            trouble.about.clone().unwrap_or_else(|| by.to_string())
+        };
+        let mut known: BTreeSet<_> = own
+            .iter()
+            .map(|trouble| (subject(trouble, name), trouble.kind.clone()))
+            .collect();
         let mut all: Vec<_> = own.into_iter().map(|trouble| (None, trouble)).collect();
         let latest = self.latest();
         let living = || {
             let statuses = latest.statuses.values().map(|reported| &reported.status);
             let told = statuses.filter(|status| status.state != NodeState::Offline);
-            told.flat_map(|status| status.troubles.iter().map(|trouble| (&status.node, trouble)))
+            told.flat_map(|status| {
+                status
+                    .troubles
+                    .iter()
+                    .map(|trouble| (&status.node, trouble))
+            })
         };
         let is_of_itself = |by: &NodeName, trouble: &Trouble| match &trouble.about {
-            Some(part) => part.strip_prefix(by.as_str()).is_some_and(|rest| rest.starts_with(PART_MARK)),
+            Some(part) => part
+                .strip_prefix(by.as_str())
+                .is_some_and(|rest| rest.starts_with(PART_MARK)),
             None => true,
         };
-        let is_separating =
-            |trouble: &Trouble| TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating);
+        let is_separating = |trouble: &Trouble| {
+            TroubleKind::named(&trouble.kind).is_some_and(TroubleKind::is_separating)
+        };
         let of_leader = living().filter(|(by, _)| leader == Some(*by));
         for (by, trouble) in of_leader {
             if known.insert((subject(trouble, by), trouble.kind.clone())) {
@@ -176,8 +228,11 @@ impl LiveState {
             }
         }
         let of_members = living().filter(|(by, _)| leader != Some(*by));
-        let (of_itself, of_others): (Vec<_>, Vec<_>) = of_members.partition(|(by, trouble)| is_of_itself(by, trouble));
-        let separating = of_others.into_iter().filter(|(_, trouble)| is_separating(trouble));
+        let (of_itself, of_others): (Vec<_>, Vec<_>) =
+            of_members.partition(|(by, trouble)| is_of_itself(by, trouble));
+        let separating = of_others
+            .into_iter()
+            .filter(|(_, trouble)| is_separating(trouble));
         let mut room_of: BTreeMap<NodeName, usize> = BTreeMap::new();
         for (by, trouble) in of_itself.into_iter().chain(separating) {
             let room = room_of.entry(by.vehicle()).or_insert(MAX_TROUBLES_OF_ONE);
@@ -199,12 +254,17 @@ impl LiveState {
 
 /// A member's trouble in its own words, as a quotation, with this node's remedy for the kind.
 fn quoted(trouble: &Trouble) -> Trouble {
-    let remedy = TroubleKind::named(&trouble.kind).map_or("see the log of that node", TroubleKind::remedy);
+    let remedy =
+        TroubleKind::named(&trouble.kind).map_or("see the log of that node", TroubleKind::remedy);
     let mut words: String = trouble.cause.chars().take(MAX_QUOTED_CHARACTERS).collect();
     if words.len() < trouble.cause.len() {
         words.push('…');
     }
-    Trouble { cause: format!("“{words}”"), remedy: remedy.to_owned(), ..trouble.clone() }
+    Trouble {
+        cause: format!("“{words}”"),
+        remedy: remedy.to_owned(),
+        ..trouble.clone()
+    }
 }
 
 /// True if two names are of parts of one node.
@@ -227,7 +287,9 @@ fn insert<K: Ord + Clone, T, R: Ord>(
         let evicted = if beside.clone().count() >= MAX_PARTS {
             beside.min_by_key(|(_, entry)| rank(entry))
         } else if map.len() >= MAX_SHOWN {
-            map.iter().min_by_key(|(_, entry)| rank(entry)).filter(|(_, entry)| gives_way(entry))
+            map.iter()
+                .min_by_key(|(_, entry)| rank(entry))
+                .filter(|(_, entry)| gives_way(entry))
         } else {
             None
         };
@@ -258,7 +320,10 @@ mod tests {
 
     fn report(node: &str, seq: u64) -> Incoming {
         let report = ObjectReport::new(NodeName::new(node).unwrap(), seq, Timestamp(seq));
-        Incoming::Report { kind: ReportKind::Detections, report: Arc::new(report) }
+        Incoming::Report {
+            kind: ReportKind::Detections,
+            report: Arc::new(report),
+        }
     }
 
     fn broker(address: &str) -> BrokerAddress {
@@ -277,21 +342,46 @@ mod tests {
         live_state.update(&report("euclid", 4), Timestamp(4));
         assert_eq!(live_state.reports_since(Timestamp(0)).len(), MAX_SHOWN);
         let fresh = live_state.reports_since(Timestamp(4));
-        assert_eq!(fresh.iter().map(|s| (s.report.node.as_str(), s.report.seq)).collect::<Vec<_>>(), [("euclid", 4)]);
-        assert_eq!(live_state.reports(ReportKind::Detections), 4 + 2 * MAX_SHOWN as u64);
+        assert_eq!(
+            fresh
+                .iter()
+                .map(|s| (s.report.node.as_str(), s.report.seq))
+                .collect::<Vec<_>>(),
+            [("euclid", 4)]
+        );
+        assert_eq!(
+            live_state.reports(ReportKind::Detections),
+            4 + 2 * MAX_SHOWN as u64
+        );
         live_state.update(&report("gauss", 1), Timestamp(5));
-        assert_eq!(live_state.reports_since(Timestamp(5)).len(), 1, "there is room when old ones are forgotten");
+        assert_eq!(
+            live_state.reports_since(Timestamp(5)).len(),
+            1,
+            "there is room when old ones are forgotten"
+        );
     }
 
     #[test]
     fn nodes_that_left_and_vehicles_that_fell_silent_give_way() {
         let live_state = LiveState::default();
         let status = |node: String, state| {
-            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
-            Incoming::Status { status: Arc::new(NodeStatus { state, ..starting }), via: broker("10.0.0.2:1883") }
+            let starting = NodeStatus::starting(
+                NodeName::new(node).unwrap(),
+                Uuid::nil(),
+                Role::Cav,
+                "0.1.0",
+            );
+            Incoming::Status {
+                status: Arc::new(NodeStatus { state, ..starting }),
+                via: broker("10.0.0.2:1883"),
+            }
         };
         for n in 0..MAX_SHOWN {
-            let state = if n % 2 == 0 { NodeState::Following } else { NodeState::Offline };
+            let state = if n % 2 == 0 {
+                NodeState::Following
+            } else {
+                NodeState::Offline
+            };
             live_state.update(&status(format!("node-{n}"), state), Timestamp(n as u64));
             live_state.update(&report(&format!("node-{n}"), 1), Timestamp(n as u64));
         }
@@ -300,20 +390,45 @@ mod tests {
         live_state.update(&report("late", 1), later);
         let statuses = live_state.statuses();
         let shown = |name: &'static str| statuses.contains_key(&NodeName::from_static(name));
-        assert_eq!((shown("late"), shown("node-1"), shown("node-0"), shown("node-3")), (true, false, true, true));
-        assert_eq!((statuses.len(), live_state.reports_since(later).len()), (MAX_SHOWN, 1));
+        assert_eq!(
+            (
+                shown("late"),
+                shown("node-1"),
+                shown("node-0"),
+                shown("node-3")
+            ),
+            (true, false, true, true)
+        );
+        assert_eq!(
+            (statuses.len(), live_state.reports_since(later).len()),
+            (MAX_SHOWN, 1)
+        );
     }
 
     #[test]
     fn who_took_its_status_back_at_every_broker_is_not_there() {
         let live_state = LiveState::default();
         let say = |state, via: &str| {
-            let starting = NodeStatus::starting(NodeName::from_static("top-1"), Uuid::nil(), Role::Cav, "0.1.0");
+            let starting = NodeStatus::starting(
+                NodeName::from_static("top-1"),
+                Uuid::nil(),
+                Role::Cav,
+                "0.1.0",
+            );
             let status = Arc::new(NodeStatus { state, ..starting });
-            live_state.update(&Incoming::Status { status, via: broker(via) }, Timestamp(1));
+            live_state.update(
+                &Incoming::Status {
+                    status,
+                    via: broker(via),
+                },
+                Timestamp(1),
+            );
         };
         let withdraw = |via: &str| {
-            let message = Incoming::StatusWithdrawn { node: NodeName::from_static("top-1"), via: broker(via) };
+            let message = Incoming::StatusWithdrawn {
+                node: NodeName::from_static("top-1"),
+                via: broker(via),
+            };
             live_state.update(&message, Timestamp(2));
         };
         let (edge, standby) = ("10.0.0.2:1883", "10.0.0.3:1883");
@@ -339,24 +454,67 @@ mod tests {
             remedy: "mend it".into(),
         };
         let say = |node: &str, state, troubles| {
-            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
-            let status = Arc::new(NodeStatus { state, troubles, ..starting });
-            live_state.update(&Incoming::Status { status, via: broker("10.0.0.2:1883") }, Timestamp(1));
+            let starting = NodeStatus::starting(
+                NodeName::new(node).unwrap(),
+                Uuid::nil(),
+                Role::Cav,
+                "0.1.0",
+            );
+            let status = Arc::new(NodeStatus {
+                state,
+                troubles,
+                ..starting
+            });
+            live_state.update(
+                &Incoming::Status {
+                    status,
+                    via: broker("10.0.0.2:1883"),
+                },
+                Timestamp(1),
+            );
         };
         say(
             "edge",
             NodeState::Aggregating,
-            vec![trouble("clock_off", Some("late"), "by the edge"), trouble("untimely", Some("late"), "by the edge")],
+            vec![
+                trouble("clock_off", Some("late"), "by the edge"),
+                trouble("untimely", Some("late"), "by the edge"),
+            ],
         );
-        say("late", NodeState::Following, vec![trouble("clock_off", None, "by itself"), trouble("camera", None, "x")]);
-        say("gone", NodeState::Offline, vec![trouble("camera", None, "y")]);
-        let own = vec![trouble("malformed", Some("watson"), "z"), trouble("overload", None, "own")];
-        let lies = [("overload", Some("self")), ("malformed", Some("late")), ("wrong_key", Some("10.0.0.7"))];
-        say("aaa", NodeState::Following, lies.map(|(kind, about)| trouble(kind, about, "by aaa")).into());
+        say(
+            "late",
+            NodeState::Following,
+            vec![
+                trouble("clock_off", None, "by itself"),
+                trouble("camera", None, "x"),
+            ],
+        );
+        say(
+            "gone",
+            NodeState::Offline,
+            vec![trouble("camera", None, "y")],
+        );
+        let own = vec![
+            trouble("malformed", Some("watson"), "z"),
+            trouble("overload", None, "own"),
+        ];
+        let lies = [
+            ("overload", Some("self")),
+            ("malformed", Some("late")),
+            ("wrong_key", Some("10.0.0.7")),
+        ];
+        say(
+            "aaa",
+            NodeState::Following,
+            lies.map(|(kind, about)| trouble(kind, about, "by aaa"))
+                .into(),
+        );
         let (name, edge) = (NodeName::from_static("self"), NodeName::from_static("edge"));
         let told = live_state.troubles(&name, Some(&edge), own);
-        let told: Vec<_> =
-            told.iter().map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause)).collect();
+        let told: Vec<_> = told
+            .iter()
+            .map(|(by, trouble)| (by.as_ref().map(NodeName::as_str), &*trouble.cause))
+            .collect();
         assert_eq!(
             told,
             [
@@ -374,9 +532,23 @@ mod tests {
     fn the_words_of_one_member_displace_nothing_and_advise_nobody() {
         let live_state = LiveState::default();
         let say = |node: &str, troubles| {
-            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
-            let status = Arc::new(NodeStatus { troubles, ..starting });
-            live_state.update(&Incoming::Status { status, via: broker("10.0.0.2:1883") }, Timestamp(1));
+            let starting = NodeStatus::starting(
+                NodeName::new(node).unwrap(),
+                Uuid::nil(),
+                Role::Cav,
+                "0.1.0",
+            );
+            let status = Arc::new(NodeStatus {
+                troubles,
+                ..starting
+            });
+            live_state.update(
+                &Incoming::Status {
+                    status,
+                    via: broker("10.0.0.2:1883"),
+                },
+                Timestamp(1),
+            );
         };
         let advice = |kind: String| Trouble {
             kind,
@@ -386,27 +558,53 @@ mod tests {
         };
         for part in 0..MAX_PARTS {
             let kinds = TroubleKind::ALL.iter().map(|kind| kind.as_str().to_owned());
-            say(&format!("aaa--{part}"), kinds.chain(["invented".into()]).map(advice).collect());
+            say(
+                &format!("aaa--{part}"),
+                kinds.chain(["invented".into()]).map(advice).collect(),
+            );
         }
-        let camera = Trouble { cause: "no frame".into(), ..advice("camera".into()) };
+        let camera = Trouble {
+            cause: "no frame".into(),
+            ..advice("camera".into())
+        };
         say("zoe", vec![camera]);
-        let of_leader = Trouble { kind: "malformed".into(), about: Some("watson".into()), ..advice(String::new()) };
-        say("edge", vec![Trouble { cause: "x_m is NaN".into(), ..of_leader }]);
+        let of_leader = Trouble {
+            kind: "malformed".into(),
+            about: Some("watson".into()),
+            ..advice(String::new())
+        };
+        say(
+            "edge",
+            vec![Trouble {
+                cause: "x_m is NaN".into(),
+                ..of_leader
+            }],
+        );
         let (name, edge) = (NodeName::from_static("self"), NodeName::from_static("edge"));
         let shown = live_state.troubles(&name, Some(&edge), Vec::new());
         let causes_by = |by: &str| -> Vec<&str> {
-            let of_node = shown
-                .iter()
-                .filter(|(author, _)| author.as_ref().is_some_and(|author| author.vehicle().as_str() == by));
+            let of_node = shown.iter().filter(|(author, _)| {
+                author
+                    .as_ref()
+                    .is_some_and(|author| author.vehicle().as_str() == by)
+            });
             of_node.map(|(_, trouble)| &*trouble.cause).collect()
         };
         assert_eq!(causes_by("edge"), ["x_m is NaN"]);
         assert_eq!(causes_by("zoe"), ["“no frame”"]);
         let of_attacker = causes_by("aaa");
         assert_eq!(of_attacker.len(), MAX_TROUBLES_OF_ONE);
-        assert!(of_attacker.iter().all(|cause| cause.starts_with('“') && cause.chars().count() < 130));
+        assert!(
+            of_attacker
+                .iter()
+                .all(|cause| cause.starts_with('“') && cause.chars().count() < 130)
+        );
         let remedies = shown.iter().filter(|(by, _)| by.as_ref() != Some(&edge));
-        assert!(remedies.map(|(_, trouble)| &trouble.remedy).all(|remedy| !remedy.contains("curl")));
+        assert!(
+            remedies
+                .map(|(_, trouble)| &trouble.remedy)
+                .all(|remedy| !remedy.contains("curl"))
+        );
     }
 
     /// A stolen certificate may speak in the names of any number of parts.
@@ -414,8 +612,16 @@ mod tests {
     fn the_parts_of_one_node_leave_room_for_other_nodes() {
         let live_state = LiveState::default();
         let status = |node: &str, state| {
-            let starting = NodeStatus::starting(NodeName::new(node).unwrap(), Uuid::nil(), Role::Cav, "0.1.0");
-            Incoming::Status { status: Arc::new(NodeStatus { state, ..starting }), via: broker("10.0.0.2:1883") }
+            let starting = NodeStatus::starting(
+                NodeName::new(node).unwrap(),
+                Uuid::nil(),
+                Role::Cav,
+                "0.1.0",
+            );
+            Incoming::Status {
+                status: Arc::new(NodeStatus { state, ..starting }),
+                via: broker("10.0.0.2:1883"),
+            }
         };
         for honest in ["edge", "edge--lidar", "gauss"] {
             live_state.update(&status(honest, NodeState::Following), Timestamp(1));
@@ -429,12 +635,24 @@ mod tests {
         let (statuses, end) = (live_state.statuses(), Timestamp(2 + 4 * MAX_SHOWN as u64));
         live_state.update(&report("late", 1), end);
         let reports = live_state.reports_since(Timestamp(0));
-        let reported: BTreeSet<_> = reports.iter().map(|latest| latest.report.node.as_str()).collect();
+        let reported: BTreeSet<_> = reports
+            .iter()
+            .map(|latest| latest.report.node.as_str())
+            .collect();
         for honest in ["edge", "edge--lidar", "gauss", "late"] {
             assert!(reported.contains(honest), "{honest}: {reported:?}");
-            assert!(honest == "late" || statuses.contains_key(&NodeName::from_static(honest)), "{honest}");
+            assert!(
+                honest == "late" || statuses.contains_key(&NodeName::from_static(honest)),
+                "{honest}"
+            );
         }
-        assert!(reported.contains(format!("gauss--{}", 4 * MAX_SHOWN - 1).as_str()), "the latest parts are shown");
-        assert_eq!((statuses.len(), reported.len()), (2 + MAX_PARTS + 1, 3 + MAX_PARTS + 1));
+        assert!(
+            reported.contains(format!("gauss--{}", 4 * MAX_SHOWN - 1).as_str()),
+            "the latest parts are shown"
+        );
+        assert_eq!(
+            (statuses.len(), reported.len()),
+            (2 + MAX_PARTS + 1, 3 + MAX_PARTS + 1)
+        );
     }
 }

@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 use crate::camera::calibrate::mount::PointFit;
 use crate::camera::config::{MountConfig, OpticsConfig};
 use crate::camera::image_size::ImageSize;
-use crate::camera::mount_calibration::{MeasuredPoint, fit_mount_to_points, mount_table, vehicle_of};
+use crate::camera::mount_calibration::{
+    MeasuredPoint, fit_mount_to_points, mount_table, vehicle_of,
+};
 
 /// Settings of a camera that fitting its mount needs, beside points.
 #[derive(Debug, Clone)]
@@ -45,11 +47,22 @@ impl MountQuestion {
     /// # Errors
     /// The reason in a sentence, with the remedy.
     pub(crate) fn answer(&self, setup: &CameraSetup, camera: &Pose) -> Result<MountAnswer, String> {
-        let lens = setup.optics.lens().map_err(|error| format!("key `camera.optics.calibration`: {error}"))?;
-        let picture = ImageSize { width: self.width_px, height: self.height_px };
+        let lens = setup
+            .optics
+            .lens()
+            .map_err(|error| format!("key `camera.optics.calibration`: {error}"))?;
+        let picture = ImageSize {
+            width: self.width_px,
+            height: self.height_px,
+        };
         let vehicle = vehicle_of(camera, &setup.mount.into());
-        let fit = fit_mount_to_points(&self.points, picture, &lens, &vehicle).map_err(|error| error.to_string())?;
-        let toml = mount_table(&fit.estimate, setup.is_one_of_several).map_err(|error| error.to_string())?;
-        Ok(MountAnswer { toml, points: fit.points })
+        let fit = fit_mount_to_points(&self.points, picture, &lens, &vehicle)
+            .map_err(|error| error.to_string())?;
+        let toml = mount_table(&fit.estimate, setup.is_one_of_several)
+            .map_err(|error| error.to_string())?;
+        Ok(MountAnswer {
+            toml,
+            points: fit.points,
+        })
     }
 }

@@ -106,16 +106,31 @@ impl NodeMonitor {
     }
 
     fn cached_event(&self) -> CachedResponse<Bytes> {
-        self.event.get(|| [EVENT_HEAD, &json(&self.snapshot()), EVENT_END].concat().into())
+        self.event.get(|| {
+            [EVENT_HEAD, &json(&self.snapshot()), EVENT_END]
+                .concat()
+                .into()
+        })
     }
 
     fn snapshot(&self) -> Snapshot {
         let (sources, now, readiness) = (&self.sources, clock::now(), self.readiness());
         let newest = &sources.vitals.newest;
-        let (leadership, map) = (sources.vitals.leadership.borrow().clone(), newest.map.borrow().clone());
+        let (leadership, map) = (
+            sources.vitals.leadership.borrow().clone(),
+            newest.map.borrow().clone(),
+        );
         let observed = self.observed();
-        let Observed { history, probe, met } = &*observed;
-        let since = history.terms.back().filter(|term| term.until_us.is_none()).map(|term| term.from_us);
+        let Observed {
+            history,
+            probe,
+            met,
+        } = &*observed;
+        let since = history
+            .terms
+            .back()
+            .filter(|term| term.until_us.is_none())
+            .map(|term| term.from_us);
         let links = probe
             .links
             .iter()
@@ -134,7 +149,10 @@ impl NodeMonitor {
                 since_us: since.filter(|_| leadership.leader().is_some()),
                 failovers: history.failovers,
             },
-            map: map.map(|newest| Received { received_at: newest.received_at, message: newest.map }),
+            map: map.map(|newest| Received {
+                received_at: newest.received_at,
+                message: newest.map,
+            }),
             verdicts: newest.verdicts.borrow().clone(),
             reputations: newest.reputations.borrow().clone(),
             vehicles: sources.live_state.reports_since(now - MAX_REPORT_AGE),
@@ -146,10 +164,22 @@ impl NodeMonitor {
     }
 
     fn troubles(&self) -> Vec<TroubleEntry> {
-        let NodeSources { node, counters, live_state, vitals, .. } = &self.sources;
+        let NodeSources {
+            node,
+            counters,
+            live_state,
+            vitals,
+            ..
+        } = &self.sources;
         let leader = vitals.leadership.borrow().leader().cloned();
-        let all = live_state.troubles(&node.name, leader.as_ref(), counters.troubles().present()).into_iter();
-        all.map(|(by, trouble)| TroubleEntry { told_by: by.unwrap_or_else(|| node.name.clone()), trouble }).collect()
+        let all = live_state
+            .troubles(&node.name, leader.as_ref(), counters.troubles().present())
+            .into_iter();
+        all.map(|(by, trouble)| TroubleEntry {
+            told_by: by.unwrap_or_else(|| node.name.clone()),
+            trouble,
+        })
+        .collect()
     }
 
     async fn follow_changes(&self) {
@@ -162,7 +192,11 @@ impl NodeMonitor {
         self.take_leadership();
         self.take_members();
         loop {
-            let due = if changed { next_snapshot } else { (sent_at + HEARTBEAT).max(next_snapshot) };
+            let due = if changed {
+                next_snapshot
+            } else {
+                (sent_at + HEARTBEAT).max(next_snapshot)
+            };
             tokio::select! {
                 Ok(()) = leadership.changed() => {
                     self.take_leadership();
@@ -205,39 +239,69 @@ impl NodeMonitor {
 
     fn take_leadership(&self) {
         let leadership = self.sources.vitals.leadership.borrow().clone();
-        self.observed().history.add_leadership(&leadership, clock::now());
+        self.observed()
+            .history
+            .add_leadership(&leadership, clock::now());
     }
 
     fn take_members(&self) {
         let statuses = self.sources.live_state.statuses();
         let mut observed = self.observed();
         observed.met.retain(|name| statuses.contains_key(name));
-        observed.met.extend(self.sources.members.borrow().iter().map(|member| member.name.clone()));
+        observed.met.extend(
+            self.sources
+                .members
+                .borrow()
+                .iter()
+                .map(|member| member.name.clone()),
+        );
     }
 
     fn take_map(&self) {
-        let Some(newest) = self.sources.vitals.newest.map.borrow().clone() else { return };
+        let Some(newest) = self.sources.vitals.newest.map.borrow().clone() else {
+            return;
+        };
         let epoch = Epoch::new(newest.map.epoch, newest.map.aggregator.clone());
         let clock = &self.sources.vitals.clock;
         let oldest_capture = newest.map.oldest_capture_us;
-        self.map_latency.observe(oldest_capture, newest.map.fused_at_us, clock.date(newest.received_at));
+        self.map_latency.observe(
+            oldest_capture,
+            newest.map.fused_at_us,
+            clock.date(newest.received_at),
+        );
         let captured_at = oldest_capture.map(|date| clock.undate(date));
-        self.observed().history.add_round(&epoch, captured_at, newest.received_at);
+        self.observed()
+            .history
+            .add_round(&epoch, captured_at, newest.received_at);
     }
 
     /// In a cell without maps, verdicts count as the round.
     fn take_verdicts(&self) {
-        let Some(newest) = self.sources.vitals.newest.verdicts.borrow().clone() else { return };
-        let map_at = self.sources.vitals.newest.map.borrow().as_ref().map(|map| map.received_at);
+        let Some(newest) = self.sources.vitals.newest.verdicts.borrow().clone() else {
+            return;
+        };
+        let map_at = self
+            .sources
+            .vitals
+            .newest
+            .map
+            .borrow()
+            .as_ref()
+            .map(|map| map.received_at);
         if map_at.is_none_or(|map_at| newest.received_at.since(map_at) > HEARTBEAT) {
             let epoch = Epoch::new(newest.message.epoch, newest.message.aggregator.clone());
-            self.observed().history.add_round(&epoch, None, newest.received_at);
+            self.observed()
+                .history
+                .add_round(&epoch, None, newest.received_at);
         }
     }
 
     fn sample(&self) {
         let reputations = self.sources.vitals.newest.reputations.borrow().clone();
-        self.observed().history.sample(reputations.as_ref().map(|newest| &*newest.message), clock::now());
+        self.observed().history.sample(
+            reputations.as_ref().map(|newest| &*newest.message),
+            clock::now(),
+        );
     }
 
     /// Adds to the timeline what is news, and the newest map.
@@ -245,31 +309,61 @@ impl NodeMonitor {
         let (sources, now, troubles) = (&self.sources, clock::now(), self.troubles());
         let newest = &sources.vitals.newest;
         let map = newest.map.borrow().clone();
-        let map = map.map(|newest| Received { received_at: newest.received_at, message: newest.map });
+        let map = map.map(|newest| Received {
+            received_at: newest.received_at,
+            message: newest.map,
+        });
         let verdicts = newest.verdicts.borrow().clone();
-        let received = [map.as_ref().map(|map| map.received_at), verdicts.as_ref().map(|it| it.received_at)];
+        let received = [
+            map.as_ref().map(|map| map.received_at),
+            verdicts.as_ref().map(|it| it.received_at),
+        ];
         let mut observed = self.observed();
-        let Observed { history, probe, met } = &mut *observed;
-        let nodes = nodes(sources, met, probe.links.as_ref()).into_iter().filter(|node| node.alive);
-        history.timeline.nodes(nodes.map(|node| node.name).collect(), now);
-        history.timeline.troubles(troubles.iter().map(|entry| (&entry.told_by, &entry.trouble)), now);
+        let Observed {
+            history,
+            probe,
+            met,
+        } = &mut *observed;
+        let nodes = nodes(sources, met, probe.links.as_ref())
+            .into_iter()
+            .filter(|node| node.alive);
+        history
+            .timeline
+            .nodes(nodes.map(|node| node.name).collect(), now);
+        history.timeline.troubles(
+            troubles
+                .iter()
+                .map(|entry| (&entry.told_by, &entry.trouble)),
+            now,
+        );
         if let Some(reputations) = &*newest.reputations.borrow() {
             history.timeline.reputations(&reputations.message, now);
         }
         if let Some(now_us) = received.into_iter().flatten().max() {
             let vehicles = || sources.live_state.reports_since(now - MAX_REPORT_AGE);
-            let frame = || json(&TimelineFrame { now_us, map, verdicts, vehicles: vehicles() });
+            let frame = || {
+                json(&TimelineFrame {
+                    now_us,
+                    map,
+                    verdicts,
+                    vehicles: vehicles(),
+                })
+            };
             history.timeline.frames.push(now_us, frame);
         }
     }
 
     /// Has a node that only follows receive the vehicles' reports while a browser shows them.
     fn request_reports(&self) {
-        let wanted = self.viewers() > 0 && self.sources.vitals.leadership.borrow().position == Position::Following;
+        let wanted = self.viewers() > 0
+            && self.sources.vitals.leadership.borrow().position == Position::Following;
         if wanted || self.sources.live_state.wants_reports() {
             self.sources.live_state.set_wants_reports(wanted);
             let wanted = self.sources.live_state.wants_reports();
-            self.sources.vitals.gateway.send(GatewayMessage::WatchReports { wanted });
+            self.sources
+                .vitals
+                .gateway
+                .send(GatewayMessage::WatchReports { wanted });
         }
     }
 

@@ -80,17 +80,25 @@ pub struct NodeFacts {
 impl NodeSources {
     /// The node as it is now.
     pub(crate) fn node_facts(&self) -> NodeFacts {
-        NodeFacts { round_period_s: self.vitals.shared.borrow().round_period_s, ..self.node.clone() }
+        NodeFacts {
+            round_period_s: self.vitals.shared.borrow().round_period_s,
+            ..self.node.clone()
+        }
     }
 
     /// The camera with this name, or the first.
     pub(crate) fn camera(&self, name: Option<&str>) -> Option<&ShownCamera> {
-        self.cameras.iter().find(|camera| name.is_none() || camera.name.as_deref() == name)
+        self.cameras
+            .iter()
+            .find(|camera| name.is_none() || camera.name.as_deref() == name)
     }
 
     /// Number of browsers that show pictures of a camera.
     pub(crate) fn camera_viewers(&self) -> usize {
-        self.cameras.iter().map(|camera| camera.feed.viewers()).sum()
+        self.cameras
+            .iter()
+            .map(|camera| camera.feed.viewers())
+            .sum()
     }
 
     /// Known locations of the cell.

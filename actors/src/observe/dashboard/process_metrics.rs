@@ -15,19 +15,38 @@ use crate::telemetry::line_throttle::lines_left_out;
 pub fn register(registry: &mut Registry, started_at: Timestamp) {
     let started = Gauge::<f64, AtomicU64>::default();
     started.set(started_at.micros() as f64 / 1e6);
-    registry.register_with_unit("process_start_time", "Unix time at which the node started", Unit::Seconds, started);
+    registry.register_with_unit(
+        "process_start_time",
+        "Unix time at which the node started",
+        Unit::Seconds,
+        started,
+    );
     let left_out = Counter::<u64>::default();
     left_out.inc_by(lines_left_out());
-    registry.register("ecod_log_lines_left_out", "Log lines that the throttle of log lines left out", left_out);
+    registry.register(
+        "ecod_log_lines_left_out",
+        "Log lines that the throttle of log lines left out",
+        left_out,
+    );
     if let Ok(usage) = getrusage(UsageWho::RUSAGE_SELF) {
         let cpu = Counter::<f64, AtomicU64>::default();
         cpu.inc_by(seconds(usage.user_time()) + seconds(usage.system_time()));
-        registry.register_with_unit("process_cpu", "User and system time used", Unit::Seconds, cpu);
+        registry.register_with_unit(
+            "process_cpu",
+            "User and system time used",
+            Unit::Seconds,
+            cpu,
+        );
     }
     if let Some(bytes) = resident_bytes() {
         let memory = Gauge::<i64>::default();
         memory.set(bytes);
-        registry.register_with_unit("process_resident_memory", "Memory in use", Unit::Bytes, memory);
+        registry.register_with_unit(
+            "process_resident_memory",
+            "Memory in use",
+            Unit::Bytes,
+            memory,
+        );
     }
 }
 

@@ -24,14 +24,20 @@ const AGE_PER_COST: u32 = 20;
 
 impl<T: Clone> ResponseCache<T> {
     pub(crate) fn new(min_age: Duration) -> Self {
-        Self { min_age, cached: Mutex::default() }
+        Self {
+            min_age,
+            cached: Mutex::default(),
+        }
     }
 
     /// The cached response, or a new one where that has expired.
     pub(crate) fn get(&self, compute: impl FnOnce() -> T) -> CachedResponse<T> {
         let mut cached = self.cached.lock().unwrap_or_else(PoisonError::into_inner);
         let begun = Instant::now();
-        if let Some(response) = cached.as_ref().filter(|response| begun < response.expires_at) {
+        if let Some(response) = cached
+            .as_ref()
+            .filter(|response| begun < response.expires_at)
+        {
             return response.clone();
         }
         let value = compute();
@@ -56,8 +62,17 @@ mod tests {
             response_cache.get(make).value
         };
         let fresh = ResponseCache::new(Duration::from_secs(3600));
-        assert_eq!([ask(&fresh, Duration::ZERO), ask(&fresh, Duration::ZERO)], [1, 1]);
+        assert_eq!(
+            [ask(&fresh, Duration::ZERO), ask(&fresh, Duration::ZERO)],
+            [1, 1]
+        );
         let costly = ResponseCache::new(Duration::ZERO);
-        assert_eq!([ask(&costly, Duration::from_millis(200)), ask(&costly, Duration::ZERO)], [2, 2]);
+        assert_eq!(
+            [
+                ask(&costly, Duration::from_millis(200)),
+                ask(&costly, Duration::ZERO)
+            ],
+            [2, 2]
+        );
     }
 }

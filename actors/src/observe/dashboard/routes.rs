@@ -91,8 +91,10 @@ impl HttpApi {
             .route(floor_plan::PATH, get(show_floor_plan))
             .fallback(show_asset);
         #[cfg(feature = "camera")]
-        let guarded =
-            guarded.route("/api/camera/mount", post(answer_mount).layer(DefaultBodyLimit::max(MAX_POINTS_BYTES)));
+        let guarded = guarded.route(
+            "/api/camera/mount",
+            post(answer_mount).layer(DefaultBodyLimit::max(MAX_POINTS_BYTES)),
+        );
         let counted = Arc::clone(&api);
         let guard = PageGuard::new(access, move |refusal| {
             counted.count(match refusal {
@@ -120,10 +122,16 @@ impl HttpApi {
     fn camera(&self, uri: &Uri) -> Result<&ShownCamera, (StatusCode, String)> {
         let (sources, name) = (&self.monitor.sources, value_in(uri, "name="));
         sources.camera(name).ok_or_else(|| {
-            let names: Vec<_> = sources.cameras.iter().filter_map(|camera| camera.name.as_deref()).collect();
+            let names: Vec<_> = sources
+                .cameras
+                .iter()
+                .filter_map(|camera| camera.name.as_deref())
+                .collect();
             let reason = match name.filter(|_| !sources.cameras.is_empty()) {
                 None => "this node shows no camera\n".to_owned(),
-                Some(name) if names.is_empty() => format!("no camera {name:?}: the only one has no name\n"),
+                Some(name) if names.is_empty() => {
+                    format!("no camera {name:?}: the only one has no name\n")
+                }
                 Some(name) => format!("no camera {name:?}: there are {}\n", names.join(", ")),
             };
             (StatusCode::NOT_FOUND, reason)
@@ -140,12 +148,20 @@ type Api = State<Arc<HttpApi>>;
 
 async fn show_readiness(State(api): Api) -> Response {
     let readiness = api.monitor.readiness();
-    let status = if readiness.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
+    let status = if readiness.ready {
+        StatusCode::OK
+    } else {
+        StatusCode::SERVICE_UNAVAILABLE
+    };
     (status, Json(readiness)).into_response()
 }
 
 async fn show_metrics(State(api): Api) -> Response {
-    match api.metrics.get(|| metrics::metrics(&api.monitor).map(Bytes::from)).value {
+    match api
+        .metrics
+        .get(|| metrics::metrics(&api.monitor).map(Bytes::from))
+        .value
+    {
         Ok(text) => typed(metrics::CONTENT_TYPE, text),
         Err(error) => {
             tracing::warn!(%error, "cannot write metrics");
@@ -160,14 +176,30 @@ async fn show_snapshot(State(api): Api) -> Response {
 
 /// The history, with the samples and events after `?since=` only.
 async fn show_history(State(api): Api, uri: Uri) -> Response {
-    typed(JSON, api.monitor.observed().history.json_since(time_in(&uri, "since=").unwrap_or_default()))
+    typed(
+        JSON,
+        api.monitor
+            .observed()
+            .history
+            .json_since(time_in(&uri, "since=").unwrap_or_default()),
+    )
 }
 
 /// The map that was the newest at `?at=`.
 async fn show_frame(State(api): Api, uri: Uri) -> Response {
-    let frame =
-        time_in(&uri, "at=").and_then(|at| api.monitor.observed().history.timeline.frames.at(at).map(Vec::from));
-    frame.map_or_else(|| StatusCode::NOT_FOUND.into_response(), |frame| typed(JSON, frame))
+    let frame = time_in(&uri, "at=").and_then(|at| {
+        api.monitor
+            .observed()
+            .history
+            .timeline
+            .frames
+            .at(at)
+            .map(Vec::from)
+    });
+    frame.map_or_else(
+        || StatusCode::NOT_FOUND.into_response(),
+        |frame| typed(JSON, frame),
+    )
 }
 
 fn time_in(uri: &Uri, key: &str) -> Option<Timestamp> {
@@ -175,7 +207,9 @@ fn time_in(uri: &Uri, key: &str) -> Option<Timestamp> {
 }
 
 fn value_in<'a>(uri: &'a Uri, key: &str) -> Option<&'a str> {
-    uri.query()?.split('&').find_map(|pair| pair.strip_prefix(key))
+    uri.query()?
+        .split('&')
+        .find_map(|pair| pair.strip_prefix(key))
 }
 
 async fn show_landmarks(State(api): Api) -> Response {
@@ -207,14 +241,28 @@ async fn answer_mount(State(api): Api, request: Request) -> Response {
         Ok(camera) => camera.clone(),
         Err(refusal) => return refusal.into_response(),
     };
-    let question = match timeout(BODY_TIMEOUT, Json::<MountQuestion>::from_request(request, &())).await {
+    let question = match timeout(
+        BODY_TIMEOUT,
+        Json::<MountQuestion>::from_request(request, &()),
+    )
+    .await
+    {
         Ok(Ok(Json(question))) => question,
         Ok(Err(refusal)) => return refusal.into_response(),
-        Err(_) => return (StatusCode::REQUEST_TIMEOUT, "the points did not come\n").into_response(),
+        Err(_) => {
+            return (StatusCode::REQUEST_TIMEOUT, "the points did not come\n").into_response();
+        }
     };
-    let pose = api.monitor.sources.live_state.pose_since(&camera.reporter, clock::now() - MAX_POSE_AGE);
+    let pose = api
+        .monitor
+        .sources
+        .live_state
+        .pose_since(&camera.reporter, clock::now() - MAX_POSE_AGE);
     let Some(pose) = pose else {
-        let reason = format!("{} reports no pose at present: wait for it, or see its troubles\n", camera.reporter);
+        let reason = format!(
+            "{} reports no pose at present: wait for it, or see its troubles\n",
+            camera.reporter
+        );
         return (StatusCode::CONFLICT, reason).into_response();
     };
     let Ok(permit) = Arc::clone(&api.mounts).acquire_owned().await else {
@@ -226,7 +274,9 @@ async fn answer_mount(State(api): Api, request: Request) -> Response {
     });
     match answered.await {
         Ok(Ok(mount)) => typed(JSON, json(&mount)),
-        Ok(Err(reason)) => (StatusCode::UNPROCESSABLE_ENTITY, format!("{reason}\n")).into_response(),
+        Ok(Err(reason)) => {
+            (StatusCode::UNPROCESSABLE_ENTITY, format!("{reason}\n")).into_response()
+        }
         Err(error) => {
             tracing::warn!(%error, "cannot fit a mount for a browser");
             StatusCode::INTERNAL_SERVER_ERROR.into_response()

@@ -37,19 +37,26 @@ impl Server {
         bound: watch::Sender<Option<SocketAddr>>,
     ) -> io::Result<Self> {
         let (stop, stopped) = oneshot::channel();
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-        let thread = std::thread::Builder::new().name("dashboard".into()).spawn(move || {
-            runtime.block_on(async {
-                tokio::select! {
-                    () = monitor.run() => {}
-                    () = serve(&config, &monitor, &bound) => {}
-                    // Ends when the sender is dropped, too.
-                    _ = stopped => {}
-                }
-            });
-            runtime.shutdown_background();
-        })?;
-        Ok(Self { stop: Some(stop), thread: Some(thread) })
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()?;
+        let thread = std::thread::Builder::new()
+            .name("dashboard".into())
+            .spawn(move || {
+                runtime.block_on(async {
+                    tokio::select! {
+                        () = monitor.run() => {}
+                        () = serve(&config, &monitor, &bound) => {}
+                        // Ends when the sender is dropped, too.
+                        _ = stopped => {}
+                    }
+                });
+                runtime.shutdown_background();
+            })?;
+        Ok(Self {
+            stop: Some(stop),
+            thread: Some(thread),
+        })
     }
 
     /// True if the thread ended by itself.
@@ -61,26 +68,39 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         drop(self.stop.take());
-        if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
+        if self
+            .thread
+            .take()
+            .is_some_and(|thread| thread.join().is_err())
+        {
             tracing::warn!("dashboard thread panicked");
         }
     }
 }
 
-async fn serve(config: &DashboardConfig, monitor: &Arc<NodeMonitor>, bound: &watch::Sender<Option<SocketAddr>>) {
+async fn serve(
+    config: &DashboardConfig,
+    monitor: &Arc<NodeMonitor>,
+    bound: &watch::Sender<Option<SocketAddr>>,
+) {
     // Browsers may know the port of an earlier run.
     let wanted = bound.borrow().or(config.listen);
     let listener = match wanted {
         Some(address) => listen(address, monitor).await,
         None => listen_anywhere(monitor).await,
     };
-    let Ok(address) = listener.local_addr() else { return };
+    let Ok(address) = listener.local_addr() else {
+        return;
+    };
     let access = PageAccess::new(config.token.as_ref(), address, &monitor.sources.node.name);
     tracing::info!(url = %format_args!("http://{address}/"), token = config.token.is_some(), "dashboard serves");
     bound.send_replace(Some(address));
     let router = HttpApi::new(Arc::clone(monitor), config.max_connections).router(access);
     let limit = ConnectionLimit::new(config.max_connections);
-    accept(&listener, &limit, &router, || monitor.sources.counters.count(Event::BrowserRefused)).await;
+    accept(&listener, &limit, &router, || {
+        monitor.sources.counters.count(Event::BrowserRefused)
+    })
+    .await;
 }
 
 /// Listens at the default address or, if another node of the machine does, on a free port of loopback.

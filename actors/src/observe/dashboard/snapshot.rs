@@ -110,16 +110,29 @@ pub(crate) fn json(value: &impl Serialize) -> Vec<u8> {
 }
 
 /// This node and the others by name. `met` holds the nodes that have ever answered; `links` is absent if unknown.
-pub(crate) fn nodes(sources: &NodeSources, met: &BTreeSet<NodeName>, links: Option<&LinkStates>) -> Vec<NodeEntry> {
+pub(crate) fn nodes(
+    sources: &NodeSources,
+    met: &BTreeSet<NodeName>,
+    links: Option<&LinkStates>,
+) -> Vec<NodeEntry> {
     let own = &sources.node;
     let leading = sources.vitals.leadership.borrow().is_leading();
-    let mut nodes = others(&sources.members.borrow(), sources.live_state.statuses(), met, links);
+    let mut nodes = others(
+        &sources.members.borrow(),
+        sources.live_state.statuses(),
+        met,
+        links,
+    );
     nodes.retain(|node| node.name != own.name);
     nodes.push(NodeEntry {
         name: own.name.clone(),
         role: own.role,
         alive: true,
-        state: Some(if leading { NodeState::Aggregating } else { NodeState::Following }),
+        state: Some(if leading {
+            NodeState::Aggregating
+        } else {
+            NodeState::Following
+        }),
         fit: None,
         version: Some(own.version.to_owned()),
         page: None,
@@ -146,18 +159,27 @@ fn others(
     };
     let (shown, further) = members.split_at(members.len().min(MAX_SHOWN));
     let mut nodes = Vec::new();
-    for Member { name, role, gossip, .. } in shown {
+    for Member {
+        name, role, gossip, ..
+    } in shown
+    {
         let reported = statuses.remove(name);
         let status = reported.as_ref().map(|reported| &*reported.status);
         let page = status.and_then(|status| page(status, gossip.ip()));
-        nodes.push(NodeEntry { page, ..entry(name, *role, true, status) });
+        nodes.push(NodeEntry {
+            page,
+            ..entry(name, *role, true, status)
+        });
     }
     let is_linked = |broker: &BrokerAddress| {
-        links.is_none_or(|links| matches!(links.get(broker), Some(LinkState::Up | LinkState::Stalled)))
+        links.is_none_or(|links| {
+            matches!(links.get(broker), Some(LinkState::Up | LinkState::Stalled))
+        })
     };
     for ReportedStatus { status, via, .. } in statuses.values() {
         let name = &status.node;
-        let is_online = status.state != NodeState::Offline && !met.contains(name) && via.iter().any(is_linked);
+        let is_online =
+            status.state != NodeState::Offline && !met.contains(name) && via.iter().any(is_linked);
         let alive = is_online || further.iter().any(|member| member.name == *name);
         nodes.push(entry(name, status.role, alive, Some(status)));
     }
@@ -187,8 +209,10 @@ mod tests {
     #[test]
     fn who_no_longer_answers_or_is_only_known_from_a_lost_broker_is_gone() {
         let name = NodeName::from_static;
-        let (edge, euclid): (BrokerAddress, BrokerAddress) =
-            ("10.0.0.2:1883".parse().unwrap(), "10.0.0.3:1883".parse().unwrap());
+        let (edge, euclid): (BrokerAddress, BrokerAddress) = (
+            "10.0.0.2:1883".parse().unwrap(),
+            "10.0.0.3:1883".parse().unwrap(),
+        );
         let member = Member {
             name: name("euclid"),
             run: 0,
@@ -200,7 +224,13 @@ mod tests {
         let live_state = LiveState::default();
         let say = |node, via: &BrokerAddress| {
             let status = NodeStatus::starting(name(node), Uuid::nil(), Role::Cav, "0.1.0");
-            live_state.update(&Incoming::Status { status: Arc::new(status), via: via.clone() }, Timestamp(1));
+            live_state.update(
+                &Incoming::Status {
+                    status: Arc::new(status),
+                    via: via.clone(),
+                },
+                Timestamp(1),
+            );
         };
         for node in ["edge", "euclid", "plain"] {
             say(node, &edge);
@@ -210,13 +240,35 @@ mod tests {
         let alive = |members: &[Member], links: &LinkStates| {
             let met = [name("edge"), name("euclid")].into();
             let nodes = others(members, live_state.statuses(), &met, Some(links));
-            nodes.into_iter().filter(|node| node.alive).map(|node| node.name.to_string()).collect::<Vec<_>>()
+            nodes
+                .into_iter()
+                .filter(|node| node.alive)
+                .map(|node| node.name.to_string())
+                .collect::<Vec<_>>()
         };
-        let up = [(edge.clone(), LinkState::Up), (euclid.clone(), LinkState::Up)].into();
-        assert_eq!(alive(std::slice::from_ref(&member), &up), ["euclid", "both", "plain"], "the edge does not answer");
+        let up = [
+            (edge.clone(), LinkState::Up),
+            (euclid.clone(), LinkState::Up),
+        ]
+        .into();
+        assert_eq!(
+            alive(std::slice::from_ref(&member), &up),
+            ["euclid", "both", "plain"],
+            "the edge does not answer"
+        );
         let left = [(euclid.clone(), LinkState::Up)].into();
-        assert_eq!(alive(std::slice::from_ref(&member), &left), ["euclid", "both"], "the link was given up");
-        live_state.update(&Incoming::Link { broker: edge, state: LinkState::Refused }, Timestamp(2));
+        assert_eq!(
+            alive(std::slice::from_ref(&member), &left),
+            ["euclid", "both"],
+            "the link was given up"
+        );
+        live_state.update(
+            &Incoming::Link {
+                broker: edge,
+                state: LinkState::Refused,
+            },
+            Timestamp(2),
+        );
         assert_eq!(
             alive(&[member], &up),
             ["euclid", "both"],
@@ -227,13 +279,34 @@ mod tests {
     #[test]
     fn a_page_is_linked_where_a_browser_here_may_reach_it() {
         let link = |announced: &str, host: &str| {
-            let starting = NodeStatus::starting(NodeName::from_static("euclid"), Uuid::nil(), Role::Cav, "0.1.0");
-            let status = NodeStatus { page: Some(announced.into()), ..starting };
+            let starting = NodeStatus::starting(
+                NodeName::from_static("euclid"),
+                Uuid::nil(),
+                Role::Cav,
+                "0.1.0",
+            );
+            let status = NodeStatus {
+                page: Some(announced.into()),
+                ..starting
+            };
             page(&status, host.parse().unwrap()).map(|page| page.to_string())
         };
-        assert_eq!(link("0.0.0.0:8080", "10.0.0.3").as_deref(), Some("10.0.0.3:8080"));
-        assert_eq!(link("10.0.1.3:80", "10.0.0.3").as_deref(), Some("10.0.1.3:80"));
-        assert_eq!(link("127.0.0.1:8081", "127.0.0.1").as_deref(), Some("127.0.0.1:8081"));
-        assert_eq!(link("127.0.0.1:8081", "10.0.0.3"), None, "that would be this machine");
+        assert_eq!(
+            link("0.0.0.0:8080", "10.0.0.3").as_deref(),
+            Some("10.0.0.3:8080")
+        );
+        assert_eq!(
+            link("10.0.1.3:80", "10.0.0.3").as_deref(),
+            Some("10.0.1.3:80")
+        );
+        assert_eq!(
+            link("127.0.0.1:8081", "127.0.0.1").as_deref(),
+            Some("127.0.0.1:8081")
+        );
+        assert_eq!(
+            link("127.0.0.1:8081", "10.0.0.3"),
+            None,
+            "that would be this machine"
+        );
     }
 }

@@ -118,9 +118,22 @@ impl Timeline {
     }
 
     /// Takes all present troubles and who tells of each.
-    pub(crate) fn troubles<'a>(&mut self, present: impl Iterator<Item = (&'a NodeName, &'a Trouble)>, now: Timestamp) {
+    pub(crate) fn troubles<'a>(
+        &mut self,
+        present: impl Iterator<Item = (&'a NodeName, &'a Trouble)>,
+        now: Timestamp,
+    ) {
         let mut troubled = BTreeSet::new();
-        for (told_by, Trouble { kind, about, cause, remedy }) in present {
+        for (
+            told_by,
+            Trouble {
+                kind,
+                about,
+                cause,
+                remedy,
+            },
+        ) in present
+        {
             let subject = about.clone().unwrap_or_else(|| told_by.to_string());
             let text = format!("{subject}: {cause}. Remedy: {remedy}");
             let key = (subject, kind.clone());
@@ -140,12 +153,15 @@ impl Timeline {
                 && it.incorrect >= MIN_WRONG_VOTES
                 && self.distrusted.insert(name.clone())
             {
-                let text =
-                    format!("{name} is contradicted by the others: {} votes right, {} wrong", it.correct, it.incorrect);
+                let text = format!(
+                    "{name} is contradicted by the others: {} votes right, {} wrong",
+                    it.correct, it.incorrect
+                );
                 self.event(EventKind::Distrusted, text, now);
             }
         }
-        self.distrusted.retain(|name| newest.reputations.contains_key(name));
+        self.distrusted
+            .retain(|name| newest.reputations.contains_key(name));
     }
 
     /// Adds an event.
@@ -159,23 +175,42 @@ impl Timeline {
 
     /// The fields `events` and `frames` of a JSON object: events after `time`, and the times of all maps, in order.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
-        let mut events: Vec<_> = self.events.iter().filter(|event| event.at_us > time).collect();
+        let mut events: Vec<_> = self
+            .events
+            .iter()
+            .filter(|event| event.at_us > time)
+            .collect();
         events.sort_by_key(|event| event.at_us);
         let mut times: Vec<_> = self.frames.items.iter().map(|(at, _)| at).collect();
         times.sort();
-        [&b"\"events\":"[..], &json(&events), b",\"frames\":", &json(&times)].concat()
+        [
+            &b"\"events\":"[..],
+            &json(&events),
+            b",\"frames\":",
+            &json(&times),
+        ]
+        .concat()
     }
 }
 
 impl ThinnedSeries {
     /// An empty series of the last `span`, with an item in each `period` at most.
     pub(crate) fn new(span: Duration, period: Duration) -> Self {
-        Self { items: VecDeque::new(), bytes: 0, span, least_period: period, period }
+        Self {
+            items: VecDeque::new(),
+            bytes: 0,
+            span,
+            least_period: period,
+            period,
+        }
     }
 
     /// Adds an item if one is due. A clock that went back makes it due.
     pub(crate) fn push(&mut self, at: Timestamp, item: impl FnOnce() -> Vec<u8>) {
-        let age_us = self.items.back().map(|(last, _)| u128::from(at.micros().abs_diff(last.micros())));
+        let age_us = self
+            .items
+            .back()
+            .map(|(last, _)| u128::from(at.micros().abs_diff(last.micros())));
         if age_us.is_some_and(|age| age == 0 || age < self.period.as_micros()) {
             return;
         }
@@ -183,7 +218,11 @@ impl ThinnedSeries {
         item.shrink_to_fit();
         self.bytes += item.len();
         self.items.push_back((at, item));
-        while self.items.front().is_some_and(|(oldest, _)| at.since(*oldest) > self.span) {
+        while self
+            .items
+            .front()
+            .is_some_and(|(oldest, _)| at.since(*oldest) > self.span)
+        {
             self.bytes -= self.items.pop_front().map_or(0, |(_, item)| item.len());
         }
         if self.bytes < MAX_SERIES_BYTES / 4 {
@@ -203,7 +242,9 @@ impl ThinnedSeries {
     /// The latest item of this time or before, or else the first.
     pub(crate) fn at(&self, time: Timestamp) -> Option<&[u8]> {
         let after = self.items.partition_point(|(at, _)| *at <= time);
-        self.items.get(after.saturating_sub(1)).map(|(_, item)| &**item)
+        self.items
+            .get(after.saturating_sub(1))
+            .map(|(_, item)| &**item)
     }
 
     /// All items in order of time, as a JSON array.
@@ -246,20 +287,39 @@ mod tests {
         };
         let edge = NodeName::from_static("edge");
         let reputations = |score, round| {
-            let reputation = ecod::wire::Reputation { score, correct: 3, incorrect: 12, foreign: None };
+            let reputation = ecod::wire::Reputation {
+                score,
+                correct: 3,
+                incorrect: 12,
+                foreign: None,
+            };
             let reputations = [(NodeName::from_static("liar"), reputation)].into();
-            Reputations { schema: 1, aggregator: None, epoch: 1, round, reputations }
+            Reputations {
+                schema: 1,
+                aggregator: None,
+                epoch: 1,
+                round,
+                reputations,
+            }
         };
         for second in 1..5 {
             timeline.nodes(names(&["edge", "euclid"]), at(second));
-            timeline.troubles([(&edge, &trouble), (&edge, &trouble)].into_iter(), at(second));
+            timeline.troubles(
+                [(&edge, &trouble), (&edge, &trouble)].into_iter(),
+                at(second),
+            );
             timeline.reputations(&reputations(0.35, second), at(second));
         }
         timeline.nodes(names(&["euclid"]), at(5));
         timeline.reputations(&reputations(0.45, 5), at(5));
         timeline.reputations(&reputations(0.35, 6), at(6));
         let told = told(&timeline);
-        let told: Vec<_> = told["events"].as_array().unwrap().iter().map(|event| event["text"].as_str()).collect();
+        let told: Vec<_> = told["events"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|event| event["text"].as_str())
+            .collect();
         let expected = [
             "edge joined",
             "euclid joined",
@@ -284,22 +344,43 @@ mod tests {
         let mut most = 0;
         for second in 1..=3600 {
             timeline.frames.push(at(second), || vec![b'x'; 500_000]);
-            (0..100).for_each(|n| timeline.event(EventKind::Trouble, format!("{second} {n}"), at(second)));
+            (0..100).for_each(|n| {
+                timeline.event(EventKind::Trouble, format!("{second} {n}"), at(second))
+            });
             most = most.max(timeline.frames.bytes);
         }
         let held = &timeline.frames.items;
-        assert!(most <= MAX_SERIES_BYTES + 500_000 && timeline.frames.bytes <= MAX_SERIES_BYTES, "{most}");
+        assert!(
+            most <= MAX_SERIES_BYTES + 500_000 && timeline.frames.bytes <= MAX_SERIES_BYTES,
+            "{most}"
+        );
         assert!(held.len() >= 8, "{} maps of ten minutes", held.len());
-        let apart = held.iter().zip(held.iter().skip(1)).map(|(a, b)| b.0.since(a.0)).max().unwrap();
-        assert!(apart <= 128 * SECOND && at(3600).since(held[0].0) <= span, "{apart:?}");
+        let apart = held
+            .iter()
+            .zip(held.iter().skip(1))
+            .map(|(a, b)| b.0.since(a.0))
+            .max()
+            .unwrap();
+        assert!(
+            apart <= 128 * SECOND && at(3600).since(held[0].0) <= span,
+            "{apart:?}"
+        );
         assert_eq!(timeline.events.len(), MAX_EVENTS);
 
         for second in 3601..=4800 {
             timeline.frames.push(at(second), || vec![b'x'; 1000]);
         }
-        assert!(timeline.frames.items.len() > 590, "a cell that became small is held in full again");
-        timeline.frames.push(at(5000), || vec![b'x'; 2 * MAX_SERIES_BYTES]);
-        assert!(timeline.frames.bytes <= MAX_SERIES_BYTES, "also after a map that is larger than the bound");
+        assert!(
+            timeline.frames.items.len() > 590,
+            "a cell that became small is held in full again"
+        );
+        timeline
+            .frames
+            .push(at(5000), || vec![b'x'; 2 * MAX_SERIES_BYTES]);
+        assert!(
+            timeline.frames.bytes <= MAX_SERIES_BYTES,
+            "also after a map that is larger than the bound"
+        );
     }
 
     #[test]
@@ -319,12 +400,22 @@ mod tests {
         let mut timeline = Timeline::new(Duration::MAX, Duration::ZERO);
         for second in [100, 101, 50, 51] {
             timeline.event(EventKind::Gap, second.to_string(), at(second));
-            timeline.frames.push(at(second), || second.to_string().into_bytes());
+            timeline
+                .frames
+                .push(at(second), || second.to_string().into_bytes());
         }
         let told = told(&timeline);
-        let texts: Vec<_> = told["events"].as_array().unwrap().iter().map(|event| event["text"].as_str()).collect();
+        let texts: Vec<_> = told["events"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|event| event["text"].as_str())
+            .collect();
         assert_eq!(texts, ["50", "51", "100", "101"].map(Some));
-        assert_eq!(told["frames"], serde_json::json!([50_000_000, 51_000_000, 100_000_000, 101_000_000]));
+        assert_eq!(
+            told["frames"],
+            serde_json::json!([50_000_000, 51_000_000, 100_000_000, 101_000_000])
+        );
         assert_eq!(timeline.frames.json(), b"[50,51,100,101]");
     }
 }

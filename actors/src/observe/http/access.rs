@@ -49,9 +49,18 @@ pub(crate) const HEADERS: [(HeaderName, HeaderValue); 5] = [
              base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
         ),
     ),
-    (header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff")),
-    (header::REFERRER_POLICY, HeaderValue::from_static("no-referrer")),
-    (HeaderName::from_static("cross-origin-resource-policy"), HeaderValue::from_static("same-origin")),
+    (
+        header::X_CONTENT_TYPE_OPTIONS,
+        HeaderValue::from_static("nosniff"),
+    ),
+    (
+        header::REFERRER_POLICY,
+        HeaderValue::from_static("no-referrer"),
+    ),
+    (
+        HeaderName::from_static("cross-origin-resource-policy"),
+        HeaderValue::from_static("same-origin"),
+    ),
     (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
 ];
 
@@ -59,9 +68,14 @@ impl PageAccess {
     /// Access to the page of a node that listens on `address`.
     pub fn new(token: Option<&Secret>, address: SocketAddr, node: &NodeName) -> Self {
         // Cookies are shared between the ports of a host, but not between names.
-        let token =
-            token.map(|token| PageToken { key: key(token.reveal().as_bytes()), cookie_name: format!("ecod-{node}") });
-        Self { loopback: address.ip().is_loopback(), token }
+        let token = token.map(|token| PageToken {
+            key: key(token.reveal().as_bytes()),
+            cookie_name: format!("ecod-{node}"),
+        });
+        Self {
+            loopback: address.ip().is_loopback(),
+            token,
+        }
     }
 
     /// The decision about a request.
@@ -69,12 +83,18 @@ impl PageAccess {
         if self.loopback && !headers.get(HOST).is_some_and(is_this_machine) {
             return AccessDecision::ForeignHost;
         }
-        let Some(token) = &self.token else { return AccessDecision::Allowed };
+        let Some(token) = &self.token else {
+            return AccessDecision::Allowed;
+        };
         if token.is_in_headers(headers) {
             return AccessDecision::Allowed;
         }
         // The configuration allows no character in a token that an address would escape.
-        match uri.query().and_then(|query| query.split('&').find_map(|pair| pair.strip_prefix("token="))) {
+        match uri.query().and_then(|query| {
+            query
+                .split('&')
+                .find_map(|pair| pair.strip_prefix("token="))
+        }) {
             Some(given) if token.is(given.as_bytes()) => AccessDecision::SignIn,
             _ => AccessDecision::Unauthorized,
         }
@@ -84,23 +104,38 @@ impl PageAccess {
     pub(crate) fn cookie(&self) -> Option<HeaderValue> {
         let PageToken { key, cookie_name } = self.token.as_ref()?;
         let cookie = BASE64_URL_SAFE_NO_PAD.encode(hmac::sign(key, COOKIE_MESSAGE));
-        HeaderValue::from_str(&format!("{cookie_name}={cookie}; Path=/; HttpOnly; SameSite=Lax")).ok()
+        HeaderValue::from_str(&format!(
+            "{cookie_name}={cookie}; Path=/; HttpOnly; SameSite=Lax"
+        ))
+        .ok()
     }
 }
 
 impl PageToken {
     fn is_in_headers(&self, headers: &HeaderMap) -> bool {
-        let bearer = headers.get(AUTHORIZATION).and_then(|value| value.as_bytes().strip_prefix(b"Bearer "));
+        let bearer = headers
+            .get(AUTHORIZATION)
+            .and_then(|value| value.as_bytes().strip_prefix(b"Bearer "));
         if bearer.is_some_and(|given| self.is(given)) {
             return true;
         }
-        let cookies = headers.get_all(COOKIE).into_iter().filter_map(|value| value.to_str().ok());
-        let mut pairs = cookies.flat_map(|line| line.split(';')).filter_map(|pair| pair.trim().split_once('='));
+        let cookies = headers
+            .get_all(COOKIE)
+            .into_iter()
+            .filter_map(|value| value.to_str().ok());
+        let mut pairs = cookies
+            .flat_map(|line| line.split(';'))
+            .filter_map(|pair| pair.trim().split_once('='));
         pairs.any(|(name, value)| name == self.cookie_name && self.is_signature(value))
     }
 
     fn is(&self, given: &[u8]) -> bool {
-        hmac::verify(&self.key, COOKIE_MESSAGE, hmac::sign(&key(given), COOKIE_MESSAGE).as_ref()).is_ok()
+        hmac::verify(
+            &self.key,
+            COOKIE_MESSAGE,
+            hmac::sign(&key(given), COOKIE_MESSAGE).as_ref(),
+        )
+        .is_ok()
     }
 
     fn is_signature(&self, cookie: &str) -> bool {
@@ -115,13 +150,23 @@ fn key(token: &[u8]) -> hmac::Key {
 
 /// True if a `Host` header names loopback. Any port is allowed, since a tunnel may end on another.
 fn is_this_machine(host: &HeaderValue) -> bool {
-    let Ok(host) = host.to_str() else { return false };
+    let Ok(host) = host.to_str() else {
+        return false;
+    };
     let name = match host.rsplit_once(':') {
-        Some((name, port)) if !port.is_empty() && port.bytes().all(|byte| byte.is_ascii_digit()) => name,
+        Some((name, port))
+            if !port.is_empty() && port.bytes().all(|byte| byte.is_ascii_digit()) =>
+        {
+            name
+        }
         _ => host,
     };
-    let name = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
-    name.eq_ignore_ascii_case("localhost") || name.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
+    let name = name
+        .strip_prefix('[')
+        .and_then(|name| name.strip_suffix(']'))
+        .unwrap_or(name);
+    name.eq_ignore_ascii_case("localhost")
+        || name.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
 #[cfg(test)]
@@ -130,22 +175,50 @@ mod tests {
 
     fn access(listen: &str, token: Option<&str>) -> PageAccess {
         let token = token.map(Secret::new);
-        PageAccess::new(token.as_ref(), listen.parse().unwrap(), &NodeName::from_static("edge"))
+        PageAccess::new(
+            token.as_ref(),
+            listen.parse().unwrap(),
+            &NodeName::from_static("edge"),
+        )
     }
 
     fn decide(access: &PageAccess, uri: &str, headers: &[(HeaderName, &str)]) -> AccessDecision {
-        let headers = headers.iter().map(|(name, value)| (name.clone(), HeaderValue::from_str(value).unwrap()));
+        let headers = headers
+            .iter()
+            .map(|(name, value)| (name.clone(), HeaderValue::from_str(value).unwrap()));
         access.decide(&uri.parse().unwrap(), &headers.collect())
     }
 
     #[test]
     fn on_loopback_only_names_of_this_machine_are_answered() {
         let access = access("127.0.0.1:8080", None);
-        for host in ["localhost:8080", "LOCALHOST", "127.0.0.1:9", "127.1.2.3", "[::1]:8080", "[::1]"] {
-            assert_eq!(decide(&access, "/", &[(HOST, host)]), AccessDecision::Allowed, "{host}");
+        for host in [
+            "localhost:8080",
+            "LOCALHOST",
+            "127.0.0.1:9",
+            "127.1.2.3",
+            "[::1]:8080",
+            "[::1]",
+        ] {
+            assert_eq!(
+                decide(&access, "/", &[(HOST, host)]),
+                AccessDecision::Allowed,
+                "{host}"
+            );
         }
-        for host in ["evil.example:8080", "127.0.0.1.evil.example", "localhost.evil.example", "10.0.0.2", "", "::1:"] {
-            assert_eq!(decide(&access, "/", &[(HOST, host)]), AccessDecision::ForeignHost, "{host}");
+        for host in [
+            "evil.example:8080",
+            "127.0.0.1.evil.example",
+            "localhost.evil.example",
+            "10.0.0.2",
+            "",
+            "::1:",
+        ] {
+            assert_eq!(
+                decide(&access, "/", &[(HOST, host)]),
+                AccessDecision::ForeignHost,
+                "{host}"
+            );
         }
         assert_eq!(decide(&access, "/", &[]), AccessDecision::ForeignHost);
     }
@@ -153,20 +226,48 @@ mod tests {
     #[test]
     fn a_token_comes_by_header_cookie_or_once_by_address() {
         let access = access("0.0.0.0:8080", Some("correct-horse"));
-        let with = |uri: &str, header: Option<(HeaderName, &str)>| decide(&access, uri, header.as_slice());
+        let with =
+            |uri: &str, header: Option<(HeaderName, &str)>| decide(&access, uri, header.as_slice());
         assert_eq!(with("/", None), AccessDecision::Unauthorized);
         assert_eq!(with("/?token=correct-horse", None), AccessDecision::SignIn);
-        assert_eq!(with("/?a=b&token=correct-horse", None), AccessDecision::SignIn);
-        assert_eq!(with("/?token=correct-hors", None), AccessDecision::Unauthorized);
-        assert_eq!(with("/", Some((AUTHORIZATION, "Bearer correct-horse"))), AccessDecision::Allowed);
-        for wrong in ["Bearer wrong", "Bearer ", "correct-horse", "Basic correct-horse"] {
-            assert_eq!(with("/", Some((AUTHORIZATION, wrong))), AccessDecision::Unauthorized, "{wrong}");
+        assert_eq!(
+            with("/?a=b&token=correct-horse", None),
+            AccessDecision::SignIn
+        );
+        assert_eq!(
+            with("/?token=correct-hors", None),
+            AccessDecision::Unauthorized
+        );
+        assert_eq!(
+            with("/", Some((AUTHORIZATION, "Bearer correct-horse"))),
+            AccessDecision::Allowed
+        );
+        for wrong in [
+            "Bearer wrong",
+            "Bearer ",
+            "correct-horse",
+            "Basic correct-horse",
+        ] {
+            assert_eq!(
+                with("/", Some((AUTHORIZATION, wrong))),
+                AccessDecision::Unauthorized,
+                "{wrong}"
+            );
         }
         let cookie = access.cookie().unwrap();
         let cookie = cookie.to_str().unwrap();
-        assert!(cookie.contains("HttpOnly") && !cookie.contains("correct-horse"), "{cookie}");
+        assert!(
+            cookie.contains("HttpOnly") && !cookie.contains("correct-horse"),
+            "{cookie}"
+        );
         let pair = cookie.split(';').next().unwrap();
-        assert_eq!(with("/", Some((COOKIE, &format!("a=b; {pair}")))), AccessDecision::Allowed);
-        assert_eq!(with("/", Some((COOKIE, &pair[..pair.len() - 1]))), AccessDecision::Unauthorized);
+        assert_eq!(
+            with("/", Some((COOKIE, &format!("a=b; {pair}")))),
+            AccessDecision::Allowed
+        );
+        assert_eq!(
+            with("/", Some((COOKIE, &pair[..pair.len() - 1]))),
+            AccessDecision::Unauthorized
+        );
     }
 }

@@ -51,7 +51,10 @@ pub(crate) struct AdmittedConnection {
 impl ConnectionLimit {
     /// A limit of `max` connections.
     pub fn new(max: usize) -> Self {
-        Self { max, open: Arc::default() }
+        Self {
+            max,
+            open: Arc::default(),
+        }
     }
 
     /// A slot for a connection from an address; none while all connections are kept.
@@ -65,21 +68,41 @@ impl ConnectionLimit {
         let number = open.next;
         open.next += 1;
         let (displace, displaced) = oneshot::channel();
-        open.by_number
-            .insert(number, TrackedConnection { source: host_network(from), kept: false, _displace: displace });
-        Some(AdmittedConnection { slot: ConnectionSlot { open: Arc::clone(&self.open), number }, displaced, displaces })
+        open.by_number.insert(
+            number,
+            TrackedConnection {
+                source: host_network(from),
+                kept: false,
+                _displace: displace,
+            },
+        );
+        Some(AdmittedConnection {
+            slot: ConnectionSlot {
+                open: Arc::clone(&self.open),
+                number,
+            },
+            displaced,
+            displaces,
+        })
     }
 }
 
 impl OpenConnections {
     fn next_displaced(&self) -> Option<u64> {
-        let candidates = || self.by_number.iter().filter(|(_, connection)| !connection.kept);
+        let candidates = || {
+            self.by_number
+                .iter()
+                .filter(|(_, connection)| !connection.kept)
+        };
         let mut per_source = HashMap::<IpAddr, usize>::new();
         for (_, connection) in candidates() {
             *per_source.entry(connection.source).or_default() += 1;
         }
         // `max_by_key` returns the last of equals; reversed, this is the oldest.
-        candidates().rev().max_by_key(|(_, connection)| per_source[&connection.source]).map(|(number, _)| *number)
+        candidates()
+            .rev()
+            .max_by_key(|(_, connection)| per_source[&connection.source])
+            .map(|(number, _)| *number)
     }
 }
 
@@ -118,22 +141,39 @@ mod tests {
     fn an_address_that_takes_all_places_makes_room_for_another() {
         let connection_limit = ConnectionLimit::new(4);
         let [mut first, mut second, mut third, mut other] =
-            ["10.0.0.9", "10.0.0.9", "10.0.0.9", "10.0.0.2"].map(|from| admit(&connection_limit, from).unwrap());
+            ["10.0.0.9", "10.0.0.9", "10.0.0.9", "10.0.0.2"]
+                .map(|from| admit(&connection_limit, from).unwrap());
         assert!(!other.displaces);
-        let mut flood: Vec<_> = (0..100).map(|_| admit(&connection_limit, "10.0.0.9").unwrap()).collect();
+        let mut flood: Vec<_> = (0..100)
+            .map(|_| admit(&connection_limit, "10.0.0.9").unwrap())
+            .collect();
         assert!(flood.iter().all(|admitted| admitted.displaces));
-        assert!([&mut first, &mut second, &mut third].into_iter().all(is_displaced));
+        assert!(
+            [&mut first, &mut second, &mut third]
+                .into_iter()
+                .all(is_displaced)
+        );
         assert!(!is_displaced(&mut other), "it is not the one that has most");
-        assert_eq!(flood.iter_mut().map(is_displaced).filter(|displaced| !displaced).count(), 3);
+        assert_eq!(
+            flood
+                .iter_mut()
+                .map(is_displaced)
+                .filter(|displaced| !displaced)
+                .count(),
+            3
+        );
     }
 
     #[test]
     fn an_ipv6_network_counts_as_one_address_and_of_equals_the_oldest_leaves() {
         let connection_limit = ConnectionLimit::new(3);
-        let [mut a, mut b, mut c] =
-            ["2001:db8::1", "2001:db8:0:1::1", "2001:db8:0:1::2"].map(|from| admit(&connection_limit, from).unwrap());
+        let [mut a, mut b, mut c] = ["2001:db8::1", "2001:db8:0:1::1", "2001:db8:0:1::2"]
+            .map(|from| admit(&connection_limit, from).unwrap());
         let _d = admit(&connection_limit, "2001:db8:0:2::1").unwrap();
-        assert_eq!([&mut a, &mut b, &mut c].map(is_displaced), [false, true, false]);
+        assert_eq!(
+            [&mut a, &mut b, &mut c].map(is_displaced),
+            [false, true, false]
+        );
         let _e = admit(&connection_limit, "2001:db8:0:3::1").unwrap();
         assert_eq!([&mut a, &mut c].map(is_displaced), [true, false]);
     }

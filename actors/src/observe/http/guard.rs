@@ -43,7 +43,12 @@ impl PageGuard {
     /// A guard that tells `count` of each refusal.
     pub fn new(access: PageAccess, count: impl Fn(HttpRefusal) + Send + Sync + 'static) -> Self {
         let throttle = || Mutex::new(TokenBucket::new(BURST, REQUEST_INTERVAL, clock::now()));
-        Self { access, answers: throttle(), refusals: throttle(), count: Box::new(count) }
+        Self {
+            access,
+            answers: throttle(),
+            refusals: throttle(),
+            count: Box::new(count),
+        }
     }
 
     /// The routes behind the guard.
@@ -54,7 +59,9 @@ impl PageGuard {
 
 impl fmt::Debug for PageGuard {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("PageGuard").field("access", &self.access).finish_non_exhaustive()
+        f.debug_struct("PageGuard")
+            .field("access", &self.access)
+            .finish_non_exhaustive()
     }
 }
 
@@ -73,10 +80,23 @@ async fn add_headers(mut answer: Response) -> Response {
 async fn guard(State(guard): State<Arc<PageGuard>>, request: Request, next: Next) -> Response {
     let decision = guard.access.decide(request.uri(), request.headers());
     let is_allowed = matches!(decision, AccessDecision::Allowed | AccessDecision::SignIn);
-    let throttle = if is_allowed { &guard.answers } else { &guard.refusals };
-    if !throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(clock::now()) {
+    let throttle = if is_allowed {
+        &guard.answers
+    } else {
+        &guard.refusals
+    };
+    if !throttle
+        .lock()
+        .unwrap_or_else(PoisonError::into_inner)
+        .allow(clock::now())
+    {
         (guard.count)(HttpRefusal::Throttled);
-        return (StatusCode::TOO_MANY_REQUESTS, [(header::RETRY_AFTER, "1")], "too many requests\n").into_response();
+        return (
+            StatusCode::TOO_MANY_REQUESTS,
+            [(header::RETRY_AFTER, "1")],
+            "too many requests\n",
+        )
+            .into_response();
     }
     if !is_allowed {
         (guard.count)(HttpRefusal::Refused);
@@ -86,9 +106,16 @@ async fn guard(State(guard): State<Arc<PageGuard>>, request: Request, next: Next
     match decision {
         AccessDecision::Allowed => next.run(request).await,
         AccessDecision::SignIn => {
-            let location = HeaderValue::from_str(request.uri().path()).unwrap_or(HeaderValue::from_static("/"));
-            let mut answer = (StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response();
-            answer.headers_mut().extend(guard.access.cookie().map(|cookie| (header::SET_COOKIE, cookie)));
+            let location = HeaderValue::from_str(request.uri().path())
+                .unwrap_or(HeaderValue::from_static("/"));
+            let mut answer =
+                (StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response();
+            answer.headers_mut().extend(
+                guard
+                    .access
+                    .cookie()
+                    .map(|cookie| (header::SET_COOKIE, cookie)),
+            );
             answer
         }
         AccessDecision::Unauthorized => {
@@ -96,8 +123,10 @@ async fn guard(State(guard): State<Arc<PageGuard>>, request: Request, next: Next
             let text = "open this page with ?token=… or send Authorization: Bearer …\n";
             (StatusCode::UNAUTHORIZED, challenge, text).into_response()
         }
-        AccessDecision::ForeignHost => {
-            (StatusCode::MISDIRECTED_REQUEST, "this page is served on loopback only\n").into_response()
-        }
+        AccessDecision::ForeignHost => (
+            StatusCode::MISDIRECTED_REQUEST,
+            "this page is served on loopback only\n",
+        )
+            .into_response(),
     }
 }

@@ -34,7 +34,12 @@ const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 const MAX_BUFFER_BYTES: usize = 64 * 1024;
 
 /// Accepts connections within a limit, without end; `count_refused` is called for each that gets no place or loses it.
-pub async fn accept(listener: &TcpListener, limit: &ConnectionLimit, router: &Router, count_refused: impl Fn()) {
+pub async fn accept(
+    listener: &TcpListener,
+    limit: &ConnectionLimit,
+    router: &Router,
+    count_refused: impl Fn(),
+) {
     loop {
         let (stream, from) = match listener.accept().await {
             Ok(accepted) => accepted,
@@ -48,7 +53,12 @@ pub async fn accept(listener: &TcpListener, limit: &ConnectionLimit, router: &Ro
         if admitted.as_ref().is_none_or(|admitted| admitted.displaces) {
             count_refused();
         }
-        let Some(AdmittedConnection { slot, displaced, .. }) = admitted else { continue };
+        let Some(AdmittedConnection {
+            slot, displaced, ..
+        }) = admitted
+        else {
+            continue;
+        };
         let router = router.clone();
         tokio::spawn(async move {
             tokio::select! {
@@ -62,7 +72,12 @@ pub async fn accept(listener: &TcpListener, limit: &ConnectionLimit, router: &Ro
 }
 
 /// Answers one request and closes the connection: an idle one would occupy a slot.
-async fn answer(stream: TcpStream, host: BrowserHost, slot: Arc<ConnectionSlot>, router: Router) -> hyper::Result<()> {
+async fn answer(
+    stream: TcpStream,
+    host: BrowserHost,
+    slot: Arc<ConnectionSlot>,
+    router: Router,
+) -> hyper::Result<()> {
     if let Err(error) = stream.set_nodelay(true) {
         tracing::debug!(%error, "cannot set TCP_NODELAY, small packets may be delayed");
     }

@@ -112,7 +112,13 @@ impl LeadershipChange {
             Position::Leading => "leading",
         };
         let Leadership { epoch, standby, .. } = leadership.clone();
-        Self { node, at_us, position: position.into(), epoch, standby }
+        Self {
+            node,
+            at_us,
+            position: position.into(),
+            epoch,
+            standby,
+        }
     }
 
     /// The change as text.
@@ -160,20 +166,48 @@ mod tests {
             (SchemaName::SceneUpdate, &["deletions", "entities"][..]),
             (
                 SchemaName::FrameTransform,
-                &["timestamp", "parent_frame_id", "child_frame_id", "translation", "rotation"][..],
+                &[
+                    "timestamp",
+                    "parent_frame_id",
+                    "child_frame_id",
+                    "translation",
+                    "rotation",
+                ][..],
             ),
-            (SchemaName::Log, &["timestamp", "level", "message", "name", "file", "line"][..]),
-            (SchemaName::CompressedImage, &["timestamp", "frame_id", "data", "format"][..]),
+            (
+                SchemaName::Log,
+                &["timestamp", "level", "message", "name", "file", "line"][..],
+            ),
+            (
+                SchemaName::CompressedImage,
+                &["timestamp", "frame_id", "data", "format"][..],
+            ),
             (
                 SchemaName::CameraCalibration,
-                &["timestamp", "frame_id", "width", "height", "distortion_model", "D", "K", "R", "P"][..],
+                &[
+                    "timestamp",
+                    "frame_id",
+                    "width",
+                    "height",
+                    "distortion_model",
+                    "D",
+                    "K",
+                    "R",
+                    "P",
+                ][..],
             ),
-            (SchemaName::ImageAnnotations, &["circles", "points", "texts"][..]),
+            (
+                SchemaName::ImageAnnotations,
+                &["circles", "points", "texts"][..],
+            ),
         ] {
             let json = serde_json::to_value(schema.json_schema()).unwrap();
             let properties = json["properties"].as_object().unwrap();
             assert_eq!(properties.len(), fields.len(), "{schema:?}");
-            assert!(fields.iter().all(|field| properties.contains_key(*field)), "{properties:?}");
+            assert!(
+                fields.iter().all(|field| properties.contains_key(*field)),
+                "{properties:?}"
+            );
         }
     }
 }

@@ -65,7 +65,10 @@ impl Default for RecordConfig {
 impl RecordConfig {
     /// The defaults, in `dir`.
     pub fn new(dir: impl Into<PathBuf>) -> Self {
-        Self { dir: dir.into(), ..Self::default() }
+        Self {
+            dir: dir.into(),
+            ..Self::default()
+        }
     }
 
     /// Checks every value, but not whether the directory can be written.
@@ -78,7 +81,12 @@ impl RecordConfig {
         }
         check_range("max_file_mb", self.max_file_mb as f64, 1.0, 1e6)?;
         check_range("max_file_s", self.max_file_s as f64, 1.0, 1e7)?;
-        check_range("max_total_mb", self.max_total_mb as f64, self.max_file_mb as f64, 1e9)?;
+        check_range(
+            "max_total_mb",
+            self.max_total_mb as f64,
+            self.max_file_mb as f64,
+            1e9,
+        )?;
         check_range("min_free_mb", self.min_free_mb as f64, 0.0, 1e9)?;
         check_range("queue", self.queue as f64, 16.0, 1e6)?;
         check_range("camera_hz", self.camera_hz, 0.0, 60.0)
@@ -154,8 +162,15 @@ mod tests {
     fn a_directory_alone_or_a_table_will_do() {
         let defaults = RecordConfig::new("/log");
         assert_eq!(read("record = \"/log\""), Ok(defaults.clone()));
-        let expected = RecordConfig { max_file_mb: 5, camera_hz: 2.0, ..defaults };
-        assert_eq!(read("[record]\ndir = \"/log\"\nmax_file_mb = 5\ncamera_hz = 2.0"), Ok(expected.clone()));
+        let expected = RecordConfig {
+            max_file_mb: 5,
+            camera_hz: 2.0,
+            ..defaults
+        };
+        assert_eq!(
+            read("[record]\ndir = \"/log\"\nmax_file_mb = 5\ncamera_hz = 2.0"),
+            Ok(expected.clone())
+        );
         let shown = toml::to_string(&expected).unwrap();
         assert_eq!(toml::from_str::<RecordConfig>(&shown).unwrap(), expected);
     }

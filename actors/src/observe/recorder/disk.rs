@@ -19,10 +19,17 @@ const MAX_FILES_PER_SECOND: u32 = 1000;
 ///
 /// # Errors
 /// The operating system's, and when fewer than `min_free` bytes are free.
-pub(crate) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) -> io::Result<(PathBuf, File)> {
+pub(crate) fn create(
+    dir: &Path,
+    node: &NodeName,
+    at: Timestamp,
+    min_free: u64,
+) -> io::Result<(PathBuf, File)> {
     check_room(dir, min_free)?;
     let seconds = i64::try_from(at.micros() / 1_000_000).unwrap_or_default();
-    let time = DateTime::from_timestamp(seconds, 0).unwrap_or_default().format("%Y%m%dT%H%M%SZ");
+    let time = DateTime::from_timestamp(seconds, 0)
+        .unwrap_or_default()
+        .format("%Y%m%dT%H%M%SZ");
     for number in 0..MAX_FILES_PER_SECOND {
         let path = dir.join(format!("{node}-{time}-{number:03}.{EXTENSION}"));
         match File::create_new(&path) {
@@ -30,7 +37,10 @@ pub(crate) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) 
             created => return created.map(|file| (path, file)),
         }
     }
-    Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{MAX_FILES_PER_SECOND} files began in the same second")))
+    Err(io::Error::new(
+        io::ErrorKind::AlreadyExists,
+        format!("{MAX_FILES_PER_SECOND} files began in the same second"),
+    ))
 }
 
 /// Checks that the disk has room for a log.
@@ -40,7 +50,11 @@ pub(crate) fn create(dir: &Path, node: &NodeName, at: Timestamp, min_free: u64) 
 pub(crate) fn check_room(dir: &Path, min_free: u64) -> io::Result<()> {
     let free = free_bytes(dir)?;
     if free < min_free {
-        let message = format!("{} MB are free and `record.min_free_mb` is {}", free / 1_000_000, min_free / 1_000_000);
+        let message = format!(
+            "{} MB are free and `record.min_free_mb` is {}",
+            free / 1_000_000,
+            min_free / 1_000_000
+        );
         return Err(io::Error::new(io::ErrorKind::StorageFull, message));
     }
     Ok(())
@@ -60,8 +74,14 @@ pub fn free_bytes(dir: &Path) -> io::Result<u64> {
 /// # Errors
 /// The operating system's about the directory.
 pub fn files(dir: &Path) -> io::Result<Vec<PathBuf>> {
-    let is_log = |path: &PathBuf| path.extension().is_some_and(|extension| extension == EXTENSION);
-    let mut files: Vec<_> = fs::read_dir(dir)?.filter_map(|entry| Some(entry.ok()?.path())).filter(is_log).collect();
+    let is_log = |path: &PathBuf| {
+        path.extension()
+            .is_some_and(|extension| extension == EXTENSION)
+    };
+    let mut files: Vec<_> = fs::read_dir(dir)?
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(is_log)
+        .collect();
     files.sort();
     Ok(files)
 }
@@ -73,7 +93,11 @@ pub fn files(dir: &Path) -> io::Result<Vec<PathBuf>> {
 pub(crate) fn prune(dir: &Path, node: &NodeName, max_bytes: u64) -> io::Result<usize> {
     let mut kept = 0;
     let mut deleted = 0;
-    for path in files(dir)?.into_iter().rev().filter(|path| is_of(path, node)) {
+    for path in files(dir)?
+        .into_iter()
+        .rev()
+        .filter(|path| is_of(path, node))
+    {
         kept += path.metadata()?.len();
         if kept > max_bytes {
             fs::remove_file(&path)?;
@@ -87,9 +111,11 @@ pub(crate) fn prune(dir: &Path, node: &NodeName, max_bytes: u64) -> io::Result<u
 fn is_of(path: &Path, node: &NodeName) -> bool {
     let name = path.file_stem().and_then(|stem| stem.to_str());
     let rest = name.and_then(|name| name.strip_prefix(node.as_str())?.strip_prefix('-'));
-    rest.and_then(|rest| rest.split_once('-')).is_some_and(|(time, number)| {
-        time.len() == "20261121T100500Z".len() && number.bytes().all(|byte| byte.is_ascii_digit())
-    })
+    rest.and_then(|rest| rest.split_once('-'))
+        .is_some_and(|(time, number)| {
+            time.len() == "20261121T100500Z".len()
+                && number.bytes().all(|byte| byte.is_ascii_digit())
+        })
 }
 
 #[cfg(test)]
@@ -104,17 +130,30 @@ mod tests {
     fn the_oldest_files_of_the_node_give_way_and_no_others() {
         let dir = tempfile::tempdir().unwrap();
         let at = |s: u64| Timestamp(1_732_154_400_000_000 + s * 1_000_000);
-        for (node, second) in [("cav", 0), ("cav", 0), ("cav", 7), ("cav-2", 0), ("cav", 4000)] {
+        for (node, second) in [
+            ("cav", 0),
+            ("cav", 0),
+            ("cav", 7),
+            ("cav-2", 0),
+            ("cav", 4000),
+        ] {
             let (path, _) = create(dir.path(), &name(node), at(second), 0).unwrap();
             fs::write(path, [0; 100]).unwrap();
         }
         fs::write(dir.path().join("cav-notes.txt"), "mine").unwrap();
         assert_eq!(prune(dir.path(), &name("cav"), 250).unwrap(), 2);
         let left: Vec<_> = files(dir.path()).unwrap();
-        let left: Vec<_> = left.iter().map(|path| path.file_name().unwrap().to_str().unwrap()).collect();
+        let left: Vec<_> = left
+            .iter()
+            .map(|path| path.file_name().unwrap().to_str().unwrap())
+            .collect();
         assert_eq!(
             left,
-            ["cav-2-20241121T020000Z-000.mcap", "cav-20241121T020007Z-000.mcap", "cav-20241121T030640Z-000.mcap"]
+            [
+                "cav-2-20241121T020000Z-000.mcap",
+                "cav-20241121T020007Z-000.mcap",
+                "cav-20241121T030640Z-000.mcap"
+            ]
         );
         assert!(dir.path().join("cav-notes.txt").exists());
     }

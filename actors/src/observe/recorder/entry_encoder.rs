@@ -70,21 +70,43 @@ impl EntryEncoder {
     }
 
     /// Writes the messages of an entry.
-    pub(crate) fn write(&mut self, LogEntry { at, item }: &LogEntry, sink: &mut impl MessageSink) -> McapResult<()> {
+    pub(crate) fn write(
+        &mut self,
+        LogEntry { at, item }: &LogEntry,
+        sink: &mut impl MessageSink,
+    ) -> McapResult<()> {
         let (at, node) = (*at, self.node.clone());
-        let mut output = Output { encoder: self, at, sink };
+        let mut output = Output {
+            encoder: self,
+            at,
+            sink,
+        };
         match item {
             LogItem::Report(kind, report) => {
                 let (vehicle, captured_at) = (&report.node, report.captured_at_us);
-                output.put(SchemaName::ObjectReport, kind.topic(vehicle.clone()), captured_at, report)?;
+                output.put(
+                    SchemaName::ObjectReport,
+                    kind.topic(vehicle.clone()),
+                    captured_at,
+                    report,
+                )?;
                 if !output.encoder.is_to_be_drawn(*kind, vehicle, captured_at) {
                     return Ok(());
                 }
                 let topic = format_args!("scene/{vehicle}");
-                output.draw(SchemaName::SceneUpdate, topic, captured_at, |style| style.report(report))?;
-                let Some(pose) = report.pose else { return Ok(()) };
+                output.draw(SchemaName::SceneUpdate, topic, captured_at, |style| {
+                    style.report(report)
+                })?;
+                let Some(pose) = report.pose else {
+                    return Ok(());
+                };
                 if let Some(vehicles) = output.encoder.vehicles(at, vehicle, &pose, report) {
-                    output.draw(SchemaName::SceneUpdate, "scene/vehicles", captured_at, |_| vehicles)?;
+                    output.draw(
+                        SchemaName::SceneUpdate,
+                        "scene/vehicles",
+                        captured_at,
+                        |_| vehicles,
+                    )?;
                 }
                 let transform = |_: &SceneStyle| FrameTransform::of(vehicle, pose, captured_at);
                 output.draw(SchemaName::FrameTransform, "tf", captured_at, transform)
@@ -97,32 +119,68 @@ impl EntryEncoder {
             }
             LogItem::Round(_) => Ok(()),
             LogItem::Map(map) => {
-                output.put(SchemaName::GlobalMap, Topic::GlobalDetections, map.fused_at_us, map)?;
-                output.draw(SchemaName::SceneUpdate, "scene/map", map.fused_at_us, |style| style.map(map))
+                output.put(
+                    SchemaName::GlobalMap,
+                    Topic::GlobalDetections,
+                    map.fused_at_us,
+                    map,
+                )?;
+                output.draw(
+                    SchemaName::SceneUpdate,
+                    "scene/map",
+                    map.fused_at_us,
+                    |style| style.map(map),
+                )
             }
-            LogItem::Verdicts(verdicts) => {
-                output.put(SchemaName::Verdicts, Topic::GlobalVerdicts, verdicts.fused_at_us, verdicts)
-            }
+            LogItem::Verdicts(verdicts) => output.put(
+                SchemaName::Verdicts,
+                Topic::GlobalVerdicts,
+                verdicts.fused_at_us,
+                verdicts,
+            ),
             LogItem::Reputations(reputations) => {
                 output.put(SchemaName::Reputations, Topic::Reputations, at, reputations)
             }
-            LogItem::Share(share) => output.put(SchemaName::LedgerShare, Topic::Ledger(share.node.clone()), at, share),
-            LogItem::Status(status) => {
-                output.put(SchemaName::NodeStatus, Topic::Nodes(status.node.clone()), at, status)
-            }
+            LogItem::Share(share) => output.put(
+                SchemaName::LedgerShare,
+                Topic::Ledger(share.node.clone()),
+                at,
+                share,
+            ),
+            LogItem::Status(status) => output.put(
+                SchemaName::NodeStatus,
+                Topic::Nodes(status.node.clone()),
+                at,
+                status,
+            ),
             LogItem::Leadership(leadership) => {
                 let change = LeadershipChange::new(node, at, leadership);
                 output.put(SchemaName::Leadership, "node/leadership", at, &change)?;
                 output.log(Level::Info, || change.in_words())
             }
             LogItem::Link(broker, state) => {
-                let level = if *state == LinkState::Up { Level::Info } else { Level::Warning };
-                output.log(level, || format!("link to {broker} is {state:?}").to_lowercase())
+                let level = if *state == LinkState::Up {
+                    Level::Info
+                } else {
+                    Level::Warning
+                };
+                output.log(level, || {
+                    format!("link to {broker} is {state:?}").to_lowercase()
+                })
             }
             LogItem::Counters(snapshot) => {
-                let named = |counts: &BTreeMap<&str, u64>| counts.iter().map(|(k, v)| ((*k).to_owned(), *v)).collect();
-                let [events, rejects, shed] = [&snapshot.events, &snapshot.rejects, &snapshot.shed].map(named);
-                let reading = CounterReading { node, at_us: at, events, rejects, shed };
+                let named = |counts: &BTreeMap<&str, u64>| {
+                    counts.iter().map(|(k, v)| ((*k).to_owned(), *v)).collect()
+                };
+                let [events, rejects, shed] =
+                    [&snapshot.events, &snapshot.rejects, &snapshot.shed].map(named);
+                let reading = CounterReading {
+                    node,
+                    at_us: at,
+                    events,
+                    rejects,
+                    shed,
+                };
                 output.put(SchemaName::Counters, "node/counters", at, &reading)
             }
             LogItem::Picture(picture) => output.picture(picture),
@@ -137,9 +195,13 @@ impl EntryEncoder {
         pose: &WirePose,
         report: &ObjectReport,
     ) -> Option<SceneUpdate> {
-        self.vehicles.retain(|_, (drawn_at, _)| at.since(*drawn_at) < VEHICLE_SHOWN_FOR);
+        self.vehicles
+            .retain(|_, (drawn_at, _)| at.since(*drawn_at) < VEHICLE_SHOWN_FOR);
         if self.vehicles.len() < MAX_DRAWN {
-            self.vehicles.insert(vehicle.clone(), (at, self.style.vehicle(vehicle, pose, report)));
+            self.vehicles.insert(
+                vehicle.clone(),
+                (at, self.style.vehicle(vehicle, pose, report)),
+            );
         }
         if at.since(self.vehicles_drawn_at) < VEHICLES_PERIOD {
             return None;
@@ -151,7 +213,12 @@ impl EntryEncoder {
 
     /// True for the first report of a frame: of both kinds and by whatever broker, a vehicle is drawn once. Votes have not
     /// all objects; they are drawn where a vehicle sends nothing else.
-    fn is_to_be_drawn(&mut self, kind: ReportKind, vehicle: &NodeName, captured_at: Timestamp) -> bool {
+    fn is_to_be_drawn(
+        &mut self,
+        kind: ReportKind,
+        vehicle: &NodeName,
+        captured_at: Timestamp,
+    ) -> bool {
         if !self.drawable {
             return false;
         }
@@ -171,7 +238,12 @@ impl EntryEncoder {
         event: &JournalEvent,
         sink: &mut impl MessageSink,
     ) -> McapResult<()> {
-        Output { encoder: self, at, sink }.journal(event)
+        Output {
+            encoder: self,
+            at,
+            sink,
+        }
+        .journal(event)
     }
 }
 
@@ -191,29 +263,58 @@ struct Output<'a, S> {
 
 impl<S: MessageSink> Output<'_, S> {
     fn journal(&mut self, event: &JournalEvent) -> McapResult<()> {
-        let entry = JournalEntry { at_us: self.at, event: event.clone() };
+        let entry = JournalEntry {
+            at_us: self.at,
+            event: event.clone(),
+        };
         self.put(SchemaName::JournalEntry, "node/journal", self.at, &entry)
     }
 
     /// A picture with the optics and the boxes of its time.
     fn picture(&mut self, picture: &CapturedPicture) -> McapResult<()> {
         let made_at = picture.captured_at;
-        let topic =
-            |root: &str| picture.camera.as_ref().map_or_else(|| root.to_owned(), |name| format!("{root}/{name}"));
+        let topic = |root: &str| {
+            picture
+                .camera
+                .as_ref()
+                .map_or_else(|| root.to_owned(), |name| format!("{root}/{name}"))
+        };
         if let Some(calibration) = CameraCalibration::of(picture) {
-            self.put(SchemaName::CameraCalibration, topic("camera_calibration"), made_at, &calibration)?;
+            self.put(
+                SchemaName::CameraCalibration,
+                topic("camera_calibration"),
+                made_at,
+                &calibration,
+            )?;
         }
         let boxes = |_: &SceneStyle| ImageAnnotations::of(picture);
-        self.draw(SchemaName::ImageAnnotations, topic("camera_boxes"), made_at, boxes)?;
+        self.draw(
+            SchemaName::ImageAnnotations,
+            topic("camera_boxes"),
+            made_at,
+            boxes,
+        )?;
         let optical = |_: &SceneStyle| FrameTransform::optical(&picture.reporter, made_at);
         self.draw(SchemaName::FrameTransform, "tf", made_at, optical)?;
         // Viewers draw over a picture what they have when it comes.
-        self.put(SchemaName::CompressedImage, topic("camera"), made_at, &CompressedImage::of(picture))
+        self.put(
+            SchemaName::CompressedImage,
+            topic("camera"),
+            made_at,
+            &CompressedImage::of(picture),
+        )
     }
 
     fn log(&mut self, level: Level, message: impl FnOnce() -> String) -> McapResult<()> {
         let (timestamp, name) = (self.at.into(), self.encoder.node.to_string());
-        let log = |_: &SceneStyle| Log { timestamp, level, message: message(), name, file: String::new(), line: 0 };
+        let log = |_: &SceneStyle| Log {
+            timestamp,
+            level,
+            message: message(),
+            name,
+            file: String::new(),
+            line: 0,
+        };
         self.draw(SchemaName::Log, "log", self.at, log)
     }
 
@@ -241,7 +342,13 @@ impl<S: MessageSink> Output<'_, S> {
         let json = &mut self.encoder.json;
         json.clear();
         serde_json::to_writer(&mut *json, message).map_err(std::io::Error::from)?;
-        self.sink.put(EncodedMessage { schema, topic: &topic.to_string(), at: self.at, made_at, json })
+        self.sink.put(EncodedMessage {
+            schema,
+            topic: &topic.to_string(),
+            at: self.at,
+            made_at,
+            json,
+        })
     }
 }
 
@@ -259,18 +366,33 @@ mod tests {
 
     impl MessageSink for Messages {
         fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()> {
-            self.0.push((message.topic.to_owned(), serde_json::from_slice(message.json).unwrap()));
+            self.0.push((
+                message.topic.to_owned(),
+                serde_json::from_slice(message.json).unwrap(),
+            ));
             Ok(())
         }
     }
 
     fn report(node: &str, at: u64) -> ObjectReport {
         let pose = Some(Pose::new(0.0, 0.0, 0.0).into());
-        ObjectReport { pose, ..ObjectReport::new(NodeName::new(node).unwrap(), at, Timestamp(at)) }
+        ObjectReport {
+            pose,
+            ..ObjectReport::new(NodeName::new(node).unwrap(), at, Timestamp(at))
+        }
     }
 
-    fn write(encoder: &mut EntryEncoder, sink: &mut Messages, kind: ReportKind, node: &str, at: u64) {
-        let entry = LogEntry { at: Timestamp(at), item: LogItem::Report(kind, Arc::new(report(node, at))) };
+    fn write(
+        encoder: &mut EntryEncoder,
+        sink: &mut Messages,
+        kind: ReportKind,
+        node: &str,
+        at: u64,
+    ) {
+        let entry = LogEntry {
+            at: Timestamp(at),
+            item: LogItem::Report(kind, Arc::new(report(node, at))),
+        };
         encoder.write(&entry, sink).unwrap();
     }
 
@@ -278,7 +400,8 @@ mod tests {
     fn a_frame_is_drawn_once_however_many_reports_it_makes() {
         let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), &[], true);
         let mut messages = Messages::default();
-        let mut write = |kind, node: &str, at: u64| write(&mut encoder, &mut messages, kind, node, at);
+        let mut write =
+            |kind, node: &str, at: u64| write(&mut encoder, &mut messages, kind, node, at);
         for at in 1..=10 {
             for _ in 0..2 {
                 write(ReportKind::VoteDetections, "euclid", at);
@@ -286,9 +409,22 @@ mod tests {
             }
             write(ReportKind::VoteDetections, "voter", at);
         }
-        let count = |topic: &str| messages.0.iter().filter(|(known, _)| known == topic).count();
-        assert_eq!([count("scene/euclid"), count("scene/voter"), count("tf")], [10, 10, 20]);
-        assert_eq!([count("detections/euclid"), count("vote_detections/euclid")], [20, 20], "each report is kept");
+        let count = |topic: &str| {
+            messages
+                .0
+                .iter()
+                .filter(|(known, _)| known == topic)
+                .count()
+        };
+        assert_eq!(
+            [count("scene/euclid"), count("scene/voter"), count("tf")],
+            [10, 10, 20]
+        );
+        assert_eq!(
+            [count("detections/euclid"), count("vote_detections/euclid")],
+            [20, 20],
+            "each report is kept"
+        );
     }
 
     #[test]
@@ -296,9 +432,21 @@ mod tests {
         let mut encoder = EntryEncoder::new(NodeName::from_static("recorder"), &[], true);
         let mut messages = Messages::default();
         for round in 20..40 {
-            write(&mut encoder, &mut messages, ReportKind::Detections, "euclid", 100_000 * round);
+            write(
+                &mut encoder,
+                &mut messages,
+                ReportKind::Detections,
+                "euclid",
+                100_000 * round,
+            );
             if round < 25 {
-                write(&mut encoder, &mut messages, ReportKind::Detections, "gauss", 100_000 * round + 30_000);
+                write(
+                    &mut encoder,
+                    &mut messages,
+                    ReportKind::Detections,
+                    "gauss",
+                    100_000 * round + 30_000,
+                );
             }
         }
         let drawn = |(topic, update): &(String, Value)| {
@@ -306,6 +454,10 @@ mod tests {
         };
         let drawn: Vec<usize> = messages.0.iter().filter_map(drawn).collect();
         assert_eq!(drawn[..3], [1, 2, 2]);
-        assert_eq!((drawn.len(), drawn.last()), (20, Some(&1)), "{drawn:?}: one that left goes");
+        assert_eq!(
+            (drawn.len(), drawn.last()),
+            (20, Some(&1)),
+            "{drawn:?}: one that left goes"
+        );
     }
 }

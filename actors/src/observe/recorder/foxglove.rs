@@ -29,7 +29,10 @@ pub(crate) struct Time {
 
 impl From<Timestamp> for Time {
     fn from(at: Timestamp) -> Self {
-        Self { sec: at.micros() / 1_000_000, nsec: (at.micros() % 1_000_000) as u32 * 1000 }
+        Self {
+            sec: at.micros() / 1_000_000,
+            nsec: (at.micros() % 1_000_000) as u32 * 1000,
+        }
     }
 }
 
@@ -120,16 +123,36 @@ pub(crate) fn optical_frame(reporter: &NodeName) -> String {
 impl FrameTransform {
     /// A vehicle's pose.
     pub(crate) fn of(node: &NodeName, pose: WirePose, at: Timestamp) -> Self {
-        let FoxglovePose { position: translation, orientation: rotation } = camera_pose(&pose);
+        let FoxglovePose {
+            position: translation,
+            orientation: rotation,
+        } = camera_pose(&pose);
         let (parent_frame_id, child_frame_id) = (MAP.to_owned(), node.to_string());
-        Self { timestamp: at.into(), parent_frame_id, child_frame_id, translation, rotation }
+        Self {
+            timestamp: at.into(),
+            parent_frame_id,
+            child_frame_id,
+            translation,
+            rotation,
+        }
     }
 
     /// The frame of a camera's pictures within that of the camera.
     pub(crate) fn optical(reporter: &NodeName, at: Timestamp) -> Self {
-        let rotation = Quaternion { x: -0.5, y: 0.5, z: -0.5, w: 0.5 };
+        let rotation = Quaternion {
+            x: -0.5,
+            y: 0.5,
+            z: -0.5,
+            w: 0.5,
+        };
         let (parent_frame_id, child_frame_id) = (reporter.to_string(), optical_frame(reporter));
-        Self { timestamp: at.into(), parent_frame_id, child_frame_id, translation: Vector3::default(), rotation }
+        Self {
+            timestamp: at.into(),
+            parent_frame_id,
+            child_frame_id,
+            translation: Vector3::default(),
+            rotation,
+        }
     }
 }
 
@@ -143,7 +166,16 @@ fn camera_pose(pose: &WirePose) -> FoxglovePose {
     let (roll_rad, pitch_rad) = (pose.roll_rad.unwrap_or(0.0), pose.pitch_rad.unwrap_or(0.0));
     let turn = UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, pose.heading_rad);
     FoxglovePose {
-        position: Vector3 { x: pose.x_m, y: pose.y_m, z: pose.height_m.unwrap_or(0.0) },
-        orientation: Quaternion { x: turn.i, y: turn.j, z: turn.k, w: turn.w },
+        position: Vector3 {
+            x: pose.x_m,
+            y: pose.y_m,
+            z: pose.height_m.unwrap_or(0.0),
+        },
+        orientation: Quaternion {
+            x: turn.i,
+            y: turn.j,
+            z: turn.k,
+            w: turn.w,
+        },
     }
 }

@@ -39,7 +39,9 @@ impl ImageRecorder {
         log: watch::Receiver<LogSender>,
         clock: CellClock,
     ) -> Option<Self> {
-        let hz = config.map(|record| record.camera_hz).filter(|hz| *hz > 0.0)?;
+        let hz = config
+            .map(|record| record.camera_hz)
+            .filter(|hz| *hz > 0.0)?;
         let (camera, reporter) = (camera.name.clone(), camera.reporter(vehicle));
         Some(Self {
             log,
@@ -58,7 +60,11 @@ impl ImageRecorder {
         }
         // By whole periods, so that frames that come unevenly are not lost; anew after a pause.
         let next = self.due + self.period;
-        self.due = if next + self.period <= frame.captured_at { frame.captured_at + self.period } else { next };
+        self.due = if next + self.period <= frame.captured_at {
+            frame.captured_at + self.period
+        } else {
+            next
+        };
         match image_codec::encode_jpeg(&frame.image, JPEG_QUALITY) {
             Ok(jpeg) => {
                 let size = ImageSize::of(&frame.image);
@@ -68,10 +74,15 @@ impl ImageRecorder {
                     jpeg,
                     captured_at: self.clock.date(frame.captured_at),
                     height: size.height,
-                    optics: lens.in_pixels_of(size).ok().map(|lens| (lens.intrinsics, lens.distortion)),
+                    optics: lens
+                        .in_pixels_of(size)
+                        .ok()
+                        .map(|lens| (lens.intrinsics, lens.distortion)),
                     detections: detections.to_vec(),
                 };
-                self.log.borrow().send(frame.captured_at, LogItem::Picture(Box::new(picture)));
+                self.log
+                    .borrow()
+                    .send(frame.captured_at, LogItem::Picture(Box::new(picture)));
             }
             Err(error) => tracing::debug!(%error, "cannot encode frame as JPEG"),
         }
@@ -94,25 +105,51 @@ mod tests {
         let log = LogSender::default();
         log.connect(Some(sender));
         let (log, reporter) = (watch::channel(log).1, NodeName::from_static("euclid"));
-        (ImageRecorder { log, clock, camera: None, reporter, period, due: Timestamp::default() }, recorded)
+        (
+            ImageRecorder {
+                log,
+                clock,
+                camera: None,
+                reporter,
+                period,
+                due: Timestamp::default(),
+            },
+            recorded,
+        )
     }
 
     fn offer(recorder: &mut ImageRecorder, captured_at: Timestamp) {
         let image = Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::all(128.0)).unwrap();
         let lens = Lens::ideal(Intrinsics::with_square_pixels(64, 48, 1.0));
-        recorder.offer(&CameraFrame { image, captured_at, seq: 1 }, &lens, &[]);
+        recorder.offer(
+            &CameraFrame {
+                image,
+                captured_at,
+                seq: 1,
+            },
+            &lens,
+            &[],
+        );
     }
 
     /// A Pi without a clock of its own starts years ago: viewers look for the vehicle's pose at the picture's time.
     #[test]
     fn a_picture_is_dated_as_reports_are() {
         let clock = CellClock::default();
-        clock.show(ClockReading { offset_us: 5_000_000, error_us: Some(1_000) });
+        clock.show(ClockReading {
+            offset_us: 5_000_000,
+            error_us: Some(1_000),
+        });
         let (mut recorder, recorded) = recorder(clock, Duration::from_secs(1));
         offer(&mut recorder, Timestamp(1_000));
         let entry = recorded.try_recv().unwrap();
-        let LogItem::Picture(picture) = entry.item else { panic!("a picture") };
-        assert_eq!((entry.at, picture.captured_at), (Timestamp(1_000), Timestamp(5_001_000)));
+        let LogItem::Picture(picture) = entry.item else {
+            panic!("a picture")
+        };
+        assert_eq!(
+            (entry.at, picture.captured_at),
+            (Timestamp(1_000), Timestamp(5_001_000))
+        );
     }
 
     #[test]
@@ -124,6 +161,10 @@ mod tests {
         }
         assert!(recorded.try_iter().count() >= 19);
         (0..10).for_each(|frame| offer(&mut recorder, Timestamp(60_000_000 + 20_000 * frame)));
-        assert_eq!(recorded.try_iter().count(), 1, "and no more often, also after a pause");
+        assert_eq!(
+            recorded.try_iter().count(),
+            1,
+            "and no more often, also after a pause"
+        );
     }
 }

@@ -7,7 +7,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use foxglove::{
-    ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, Schema, WebSocketServer, WebSocketServerHandle,
+    ChannelBuilder, Context, FoxgloveError, PartialMetadata, RawChannel, Schema, WebSocketServer,
+    WebSocketServerHandle,
 };
 use mcap::McapResult;
 
@@ -42,7 +43,11 @@ struct Channels {
 
 impl LiveServer {
     pub(crate) fn new(port: u16, encoder: EntryEncoder) -> Self {
-        Self { port, encoder, state: State::Down { retry_at: None } }
+        Self {
+            port,
+            encoder,
+            state: State::Down { retry_at: None },
+        }
     }
 
     /// Sends an entry to all viewers. A busy port is tried again.
@@ -52,7 +57,9 @@ impl LiveServer {
         {
             self.state = self.start(retry_at.is_none());
         }
-        let State::Up(channels) = &mut self.state else { return };
+        let State::Up(channels) = &mut self.state else {
+            return;
+        };
         if let Err(error) = self.encoder.write(entry, channels) {
             tracing::debug!(%error, "entry not sent to viewers");
         }
@@ -66,7 +73,9 @@ impl LiveServer {
                     let port = self.port;
                     tracing::warn!(port, %error, "cannot serve the log live; trying again every {RETRY_AFTER:?}");
                 }
-                State::Down { retry_at: Some(Instant::now() + RETRY_AFTER) }
+                State::Down {
+                    retry_at: Some(Instant::now() + RETRY_AFTER),
+                }
             }
         }
     }
@@ -75,28 +84,50 @@ impl LiveServer {
 impl Channels {
     fn start(port: u16) -> Result<Self, FoxgloveError> {
         let context = Context::new();
-        let server = WebSocketServer::new().name("ecod-node").bind(LOOPBACK, port).context(&context);
+        let server = WebSocketServer::new()
+            .name("ecod-node")
+            .bind(LOOPBACK, port)
+            .context(&context);
         let server = server.start_blocking()?;
-        tracing::info!(port = server.port(), "log is served live for Foxglove and Lichtblick");
-        Ok(Self { _server: server, context, by_topic: HashMap::new() })
+        tracing::info!(
+            port = server.port(),
+            "log is served live for Foxglove and Lichtblick"
+        );
+        Ok(Self {
+            _server: server,
+            context,
+            by_topic: HashMap::new(),
+        })
     }
 }
 
 impl MessageSink for Channels {
     fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()> {
-        let EncodedMessage { schema, topic, at, json, .. } = message;
+        let EncodedMessage {
+            schema,
+            topic,
+            at,
+            json,
+            ..
+        } = message;
         let key = (schema, topic.to_owned());
         let channel = match self.by_topic.get(&key) {
             Some(channel) => channel,
             None => {
                 let text = schema.json_schema().to_value().to_string();
                 let schema = Schema::new(schema.as_str(), "jsonschema", text.into_bytes());
-                let channel = ChannelBuilder::new(topic).context(&self.context).schema(schema).message_encoding("json");
+                let channel = ChannelBuilder::new(topic)
+                    .context(&self.context)
+                    .schema(schema)
+                    .message_encoding("json");
                 let channel = channel.build_raw().map_err(std::io::Error::other)?;
                 self.by_topic.entry(key).or_insert(channel)
             }
         };
-        channel.log_with_meta(json, PartialMetadata::with_log_time(at.micros().saturating_mul(1000)));
+        channel.log_with_meta(
+            json,
+            PartialMetadata::with_log_time(at.micros().saturating_mul(1000)),
+        );
         Ok(())
     }
 }

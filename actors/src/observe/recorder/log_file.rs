@@ -43,9 +43,18 @@ impl LogFile {
             .compression_level(1)
             .compression_threads(0);
         let mut writer = options.create(BufWriter::with_capacity(1 << 16, file))?;
-        writer.write_metadata(&Metadata { name: LogIdentity::RECORD.into(), metadata: identity.to_map() })?;
+        writer.write_metadata(&Metadata {
+            name: LogIdentity::RECORD.into(),
+            metadata: identity.to_map(),
+        })?;
         writer.flush()?;
-        Ok(Self { writer, path, has_messages: false, opened: Instant::now(), channels: HashMap::new() })
+        Ok(Self {
+            writer,
+            path,
+            has_messages: false,
+            opened: Instant::now(),
+            channels: HashMap::new(),
+        })
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -87,15 +96,28 @@ fn remove(path: &Path) {
 
 impl MessageSink for LogFile {
     fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()> {
-        let EncodedMessage { schema, topic, at, made_at, json } = message;
+        let EncodedMessage {
+            schema,
+            topic,
+            at,
+            made_at,
+            json,
+        } = message;
         let key = (schema, topic.to_owned());
         if !self.channels.contains_key(&key) {
             let text = schema.json_schema().to_value().to_string();
-            let schema_id = self.writer.add_schema(schema.as_str(), "jsonschema", text.as_bytes())?;
-            let id = self.writer.add_channel(schema_id, topic, "json", &BTreeMap::new())?;
-            self.channels.insert(key.clone(), WrittenChannel { id, sequence: 0 });
+            let schema_id =
+                self.writer
+                    .add_schema(schema.as_str(), "jsonschema", text.as_bytes())?;
+            let id = self
+                .writer
+                .add_channel(schema_id, topic, "json", &BTreeMap::new())?;
+            self.channels
+                .insert(key.clone(), WrittenChannel { id, sequence: 0 });
         }
-        let Some(channel) = self.channels.get_mut(&key) else { return Ok(()) };
+        let Some(channel) = self.channels.get_mut(&key) else {
+            return Ok(());
+        };
         channel.sequence = channel.sequence.wrapping_add(1);
         let header = MessageHeader {
             channel_id: channel.id,
@@ -133,7 +155,13 @@ mod tests {
         );
         let json = br#"{"at_us":0,"event":{"missing":{"entries":1}}}"#;
         let (at, made_at) = (Timestamp(0), Timestamp(0));
-        let message = EncodedMessage { schema: SchemaName::JournalEntry, topic: "node/journal", at, made_at, json };
+        let message = EncodedMessage {
+            schema: SchemaName::JournalEntry,
+            topic: "node/journal",
+            at,
+            made_at,
+            json,
+        };
 
         File::create_new(&path).unwrap();
         let refusing = File::open(&path).unwrap();

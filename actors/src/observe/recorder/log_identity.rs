@@ -55,7 +55,15 @@ impl LogIdentity {
         landmarks: Vec<LandmarkConfig>,
     ) -> Self {
         let version = env!("CARGO_PKG_VERSION").into();
-        Self { log: Self::VERSION, node, cell, run, version, fusion, landmarks }
+        Self {
+            log: Self::VERSION,
+            node,
+            cell,
+            run,
+            version,
+            fusion,
+            landmarks,
+        }
     }
 
     /// The record's content.
@@ -90,14 +98,18 @@ impl LogIdentity {
     /// [`LogIdentityError`] naming the first key that cannot be used.
     pub(crate) fn from_map(map: &BTreeMap<String, String>) -> Result<Self, LogIdentityError> {
         let fusion: FusionConfig = json(map, "fusion")?;
-        fusion.validate().map_err(|error| unusable("fusion", &error))?;
+        fusion
+            .validate()
+            .map_err(|error| unusable("fusion", &error))?;
         let landmarks: Vec<LandmarkConfig> = json(map, "landmarks")?;
         LandmarkConfig::validate_all(&landmarks).map_err(|error| unusable("landmarks", &error))?;
         Ok(Self {
             log: Self::version_in(map).ok_or_else(|| unusable("log", &"not a number"))?,
             node: NodeName::new(text(map, "node")?).map_err(|error| unusable("node", &error))?,
             cell: NodeName::new(text(map, "cell")?).map_err(|error| unusable("cell", &error))?,
-            run: text(map, "run")?.parse().map_err(|error| unusable("run", &error))?,
+            run: text(map, "run")?
+                .parse()
+                .map_err(|error| unusable("run", &error))?,
             version: text(map, "version")?.to_owned(),
             fusion,
             landmarks,
@@ -105,8 +117,13 @@ impl LogIdentity {
     }
 }
 
-fn text<'a>(map: &'a BTreeMap<String, String>, key: &'static str) -> Result<&'a str, LogIdentityError> {
-    map.get(key).map(String::as_str).ok_or_else(|| unusable(key, &"missing"))
+fn text<'a>(
+    map: &'a BTreeMap<String, String>,
+    key: &'static str,
+) -> Result<&'a str, LogIdentityError> {
+    map.get(key)
+        .map(String::as_str)
+        .ok_or_else(|| unusable(key, &"missing"))
 }
 
 fn json<T: serde::de::DeserializeOwned>(
@@ -117,5 +134,8 @@ fn json<T: serde::de::DeserializeOwned>(
 }
 
 fn unusable(key: &'static str, reason: &dyn std::fmt::Display) -> LogIdentityError {
-    LogIdentityError::Key { key, reason: reason.to_string() }
+    LogIdentityError::Key {
+        key,
+        reason: reason.to_string(),
+    }
 }

@@ -12,7 +12,9 @@ use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::perception::camera::Intrinsics;
 use ecod::replay::JournalEvent;
-use ecod::wire::{GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts};
+use ecod::wire::{
+    GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts,
+};
 
 use crate::telemetry::counters::{CounterSnapshot, Counters, Event};
 use crate::transport::mqtt::{BrokerAddress, LinkState};
@@ -80,7 +82,10 @@ impl LogItem {
 
     /// True for a change of the aggregator's settings.
     fn is_change(&self) -> bool {
-        matches!(self, Self::Journal(JournalEvent::Command(Command::Configure { .. })))
+        matches!(
+            self,
+            Self::Journal(JournalEvent::Command(Command::Configure { .. }))
+        )
     }
 
     /// True if an exact rerun of the aggregator needs it.
@@ -115,18 +120,26 @@ pub(crate) struct AggregatorState {
 impl LogSender {
     /// A sender that counts losses in `counters`.
     pub fn new(counters: Arc<Counters>) -> Self {
-        Self(Arc::new(SharedQueue { counters, ..SharedQueue::default() }))
+        Self(Arc::new(SharedQueue {
+            counters,
+            ..SharedQueue::default()
+        }))
     }
 
     /// Queues an item. A full queue drops and counts it, but for the latest change of settings, which waits beside the queue.
     pub fn send(&self, at: Timestamp, item: LogItem) {
         let queue = self.0.queue.read().unwrap_or_else(PoisonError::into_inner);
         let Some(queue) = &*queue else { return };
-        let Err(TrySendError::Full(entry) | TrySendError::Disconnected(entry)) = queue.try_send(LogEntry { at, item })
+        let Err(TrySendError::Full(entry) | TrySendError::Disconnected(entry)) =
+            queue.try_send(LogEntry { at, item })
         else {
             return;
         };
-        let lost = if entry.item.is_change() { self.change().replace(entry) } else { Some(entry) };
+        let lost = if entry.item.is_change() {
+            self.change().replace(entry)
+        } else {
+            Some(entry)
+        };
         if let Some(lost) = lost {
             self.count_lost(1, u64::from(lost.item.is_of_journal()));
         }
@@ -153,7 +166,10 @@ impl LogSender {
     }
 
     pub(crate) fn aggregator_state(&self) -> MutexGuard<'_, AggregatorState> {
-        self.0.aggregator_state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.0
+            .aggregator_state
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
     pub(crate) fn counters(&self) -> &Counters {

@@ -115,8 +115,12 @@ impl LogReader {
     /// [`LogError::Unreadable`].
     pub fn recognises(path: &Path) -> Result<bool, LogError> {
         let mut beginning = Vec::new();
-        let read = bounded_file::open(path).and_then(|file| file.take(MAGIC.len() as u64).read_to_end(&mut beginning));
-        read.map_err(|source| LogError::Unreadable { path: path.into(), source })?;
+        let read = bounded_file::open(path)
+            .and_then(|file| file.take(MAGIC.len() as u64).read_to_end(&mut beginning));
+        read.map_err(|source| LogError::Unreadable {
+            path: path.into(),
+            source,
+        })?;
         Ok(beginning == MAGIC)
     }
 
@@ -125,7 +129,10 @@ impl LogReader {
     /// # Errors
     /// [`LogError::Unreadable`].
     pub fn open(path: &Path) -> Result<Self, LogError> {
-        let file = bounded_file::open(path).map_err(|source| LogError::Unreadable { path: path.into(), source })?;
+        let file = bounded_file::open(path).map_err(|source| LogError::Unreadable {
+            path: path.into(),
+            source,
+        })?;
         let options = LinearReaderOptions::default()
             .with_skip_end_magic(true)
             .with_prevalidate_chunk_crcs(true)
@@ -162,23 +169,33 @@ impl LogReader {
                 Some(Ok(event)) => event,
             };
             match event {
-                LinearReadEvent::ReadRequest(wanted) => match self.source.read(self.reader.insert(wanted)) {
-                    Ok(read) => self.reader.notify_read(read),
-                    Err(source) => {
-                        self.ended = true;
-                        return Some(Err(LogError::Unreadable { path: self.path.clone(), source }));
-                    }
-                },
-                LinearReadEvent::Record { opcode: op::DATA_END, .. } => self.complete = true,
-                LinearReadEvent::Record { opcode, data } => match mcap::parse_record(opcode, data) {
-                    Err(error) => return self.end(Some(error)),
-                    Ok(record) => {
-                        let record = record.into_owned();
-                        if let Some(event) = self.process(record) {
-                            return Some(event);
+                LinearReadEvent::ReadRequest(wanted) => {
+                    match self.source.read(self.reader.insert(wanted)) {
+                        Ok(read) => self.reader.notify_read(read),
+                        Err(source) => {
+                            self.ended = true;
+                            return Some(Err(LogError::Unreadable {
+                                path: self.path.clone(),
+                                source,
+                            }));
                         }
                     }
-                },
+                }
+                LinearReadEvent::Record {
+                    opcode: op::DATA_END,
+                    ..
+                } => self.complete = true,
+                LinearReadEvent::Record { opcode, data } => {
+                    match mcap::parse_record(opcode, data) {
+                        Err(error) => return self.end(Some(error)),
+                        Ok(record) => {
+                            let record = record.into_owned();
+                            if let Some(event) = self.process(record) {
+                                return Some(event);
+                            }
+                        }
+                    }
+                }
             }
         }
     }
@@ -193,9 +210,21 @@ impl LogReader {
                 None
             }
             Record::Channel(channel) => {
-                let schema_name = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-                let schema = SchemaName::from_name(&schema_name).filter(|_| channel.message_encoding == "json");
-                self.channels.insert(channel.id, ReadChannel { schema, schema_name, topic: channel.topic });
+                let schema_name = self
+                    .schemas
+                    .get(&channel.schema_id)
+                    .cloned()
+                    .unwrap_or_default();
+                let schema = SchemaName::from_name(&schema_name)
+                    .filter(|_| channel.message_encoding == "json");
+                self.channels.insert(
+                    channel.id,
+                    ReadChannel {
+                        schema,
+                        schema_name,
+                        topic: channel.topic,
+                    },
+                );
                 None
             }
             Record::Message { header, data } => {
@@ -205,7 +234,12 @@ impl LogReader {
                     return None;
                 };
                 let (topic, at) = (channel.topic.clone(), Timestamp(header.log_time / 1000));
-                Some(Ok(LogEvent::Message(LogMessage { schema, topic, at, json: data.into_owned() })))
+                Some(Ok(LogEvent::Message(LogMessage {
+                    schema,
+                    topic,
+                    at,
+                    json: data.into_owned(),
+                })))
             }
             _ => None,
         }
@@ -229,7 +263,9 @@ impl LogReader {
         }
         let path = self.path.clone();
         Some(Err(match error {
-            None | Some(McapError::UnexpectedEof | McapError::UnexpectedEoc) => LogError::Truncated { path },
+            None | Some(McapError::UnexpectedEof | McapError::UnexpectedEoc) => {
+                LogError::Truncated { path }
+            }
             Some(source) => LogError::Damaged { path, source },
         }))
     }

@@ -15,12 +15,17 @@ pub(crate) fn schema_of<T: JsonSchema>() -> Schema {
         settings.meta_schema = None;
         settings.inline_subschemas = true;
     });
-    settings.with_transform(simplify).into_generator().into_root_schema_for::<T>()
+    settings
+        .with_transform(simplify)
+        .into_generator()
+        .into_root_schema_for::<T>()
 }
 
 fn simplify(schema: &mut Schema) {
     transform_subschemas(&mut simplify, schema);
-    let Some(schema) = schema.as_object_mut() else { return };
+    let Some(schema) = schema.as_object_mut() else {
+        return;
+    };
     for key in ["anyOf", "oneOf"] {
         if let Some(Value::Array(alternatives)) = schema.remove(key) {
             merge_alternatives(schema, alternatives);
@@ -28,7 +33,11 @@ fn simplify(schema: &mut Schema) {
     }
     if let Some(Value::Array(types)) = schema.get_mut("type") {
         let (null, mut rest): (Vec<_>, Vec<_>) = types.drain(..).partition(|name| name == "null");
-        let single = if rest.len() == 1 { rest.remove(0) } else { rest.into() };
+        let single = if rest.len() == 1 {
+            rest.remove(0)
+        } else {
+            rest.into()
+        };
         schema.insert("type".into(), single);
         if !null.is_empty() {
             schema.insert("nullable".into(), true.into());
@@ -42,7 +51,10 @@ fn simplify(schema: &mut Schema) {
 
 /// Reduces the alternatives of a field to what they have in common.
 fn merge_alternatives(schema: &mut Map<String, Value>, mut alternatives: Vec<Value>) {
-    if alternatives.iter().all(|alternative| alternative["const"].is_number()) {
+    if alternatives
+        .iter()
+        .all(|alternative| alternative["const"].is_number())
+    {
         schema.insert("oneOf".into(), alternatives.into());
         return;
     }
@@ -59,7 +71,9 @@ fn merge_alternatives(schema: &mut Map<String, Value>, mut alternatives: Vec<Val
     }
     if let Some(common) = alternatives.first().map(|first| first["type"].clone())
         && common.is_string()
-        && alternatives.iter().all(|alternative| alternative["type"] == common)
+        && alternatives
+            .iter()
+            .all(|alternative| alternative["type"] == common)
     {
         schema.insert("type".into(), common);
     }
@@ -77,12 +91,19 @@ mod tests {
         for (name, field) in schema["properties"].as_object().into_iter().flatten() {
             let path = format!("{path}.{name}");
             if let Some(alternatives) = field["oneOf"].as_array() {
-                assert!(alternatives.iter().all(|alternative| alternative["const"].is_number()), "{path}: {field}");
+                assert!(
+                    alternatives
+                        .iter()
+                        .all(|alternative| alternative["const"].is_number()),
+                    "{path}: {field}"
+                );
                 continue;
             }
             match field["type"].as_str() {
                 Some("object") => check(&path, field),
-                Some("array") if field["items"]["type"] == "object" => check(&path, &field["items"]),
+                Some("array") if field["items"]["type"] == "object" => {
+                    check(&path, &field["items"])
+                }
                 Some("array") => assert!(is_plain(&field["items"]), "{path}: {field}"),
                 _ => assert!(is_plain(field), "{path}: {field}"),
             }
@@ -90,7 +111,9 @@ mod tests {
     }
 
     fn is_plain(field: &Value) -> bool {
-        field["type"].as_str().is_some_and(|name| ["boolean", "string", "number", "integer"].contains(&name))
+        field["type"]
+            .as_str()
+            .is_some_and(|name| ["boolean", "string", "number", "integer"].contains(&name))
     }
 
     #[test]
@@ -111,7 +134,11 @@ mod tests {
         assert_eq!(image["properties"]["data"]["contentEncoding"], "base64");
         let log = SchemaName::Log.json_schema().to_value();
         let levels = log["properties"]["level"]["oneOf"].as_array().unwrap();
-        let named = |name: &str, level: u8| levels.iter().any(|one| one["title"] == name && one["const"] == level);
+        let named = |name: &str, level: u8| {
+            levels
+                .iter()
+                .any(|one| one["title"] == name && one["const"] == level)
+        };
         assert!(named("INFO", 2) && named("WARNING", 3), "{levels:?}");
     }
 
@@ -119,7 +146,11 @@ mod tests {
     fn what_may_be_null_says_so() {
         let report = SchemaName::ObjectReport.json_schema().to_value();
         let pose = &report["properties"]["pose"];
-        assert_eq!((&pose["type"], &pose["nullable"]), (&json!("object"), &json!(true)), "{pose}");
+        assert_eq!(
+            (&pose["type"], &pose["nullable"]),
+            (&json!("object"), &json!(true)),
+            "{pose}"
+        );
         assert_eq!(pose["properties"]["x_m"]["type"], "number");
         assert!(report["properties"]["seq"].get("nullable").is_none());
     }

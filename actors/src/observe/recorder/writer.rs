@@ -51,9 +51,12 @@ struct Pending {
 impl LogWriter {
     pub(crate) fn new(config: RecordConfig, identity: LogIdentity, recording: LogSender) -> Self {
         let flush_due = Instant::now() + FLUSH_PERIOD;
-        let encoder = |drawable| EntryEncoder::new(identity.node.clone(), &identity.landmarks, drawable);
+        let encoder =
+            |drawable| EntryEncoder::new(identity.node.clone(), &identity.landmarks, drawable);
         #[cfg(feature = "foxglove")]
-        let live = config.live_port.map(|port| LiveServer::new(port, encoder(true)));
+        let live = config
+            .live_port
+            .map(|port| LiveServer::new(port, encoder(true)));
         let encoder = encoder(config.drawable);
         Self {
             config,
@@ -107,13 +110,17 @@ impl LogWriter {
         self.open(entry);
         self.track_aggregator(&entry.item);
         let of_journal = u64::from(entry.item.is_of_journal());
-        let Some(file) = &mut self.file else { return self.recording.count_lost(1, of_journal) };
+        let Some(file) = &mut self.file else {
+            return self.recording.count_lost(1, of_journal);
+        };
         let missing = self.recording.take_missing();
         self.pending.entries += 1;
         self.pending.of_journal += of_journal + missing;
         let noted = match missing {
             0 => Ok(()),
-            entries => self.encoder.journal(entry.at, &JournalEvent::Missing { entries }, file),
+            entries => self
+                .encoder
+                .journal(entry.at, &JournalEvent::Missing { entries }, file),
         };
         if let Err(error) = noted.and_then(|()| self.encoder.write(entry, file)) {
             self.failed(&error);
@@ -144,9 +151,17 @@ impl LogWriter {
         }
         let (path, file) = disk::create(dir, node, entry.at, self.config.min_free_bytes())?;
         let mut file = LogFile::begin(&path, file, &self.identity)?;
-        let AggregatorState { runs, leads, next_round } = self.recording.aggregator_state().clone();
+        let AggregatorState {
+            runs,
+            leads,
+            next_round,
+        } = self.recording.aggregator_state().clone();
         if runs && !matches!(entry.item, LogItem::Journal(JournalEvent::Start { .. })) {
-            self.encoder.journal(entry.at, &JournalEvent::Continue { leads, next_round }, &mut file)?;
+            self.encoder.journal(
+                entry.at,
+                &JournalEvent::Continue { leads, next_round },
+                &mut file,
+            )?;
         }
         Ok(file)
     }
@@ -156,15 +171,24 @@ impl LogWriter {
         let mut aggregator_state = self.recording.aggregator_state();
         match item {
             LogItem::Journal(JournalEvent::Start { .. }) => {
-                *aggregator_state = AggregatorState { runs: true, ..AggregatorState::default() }
+                *aggregator_state = AggregatorState {
+                    runs: true,
+                    ..AggregatorState::default()
+                }
             }
-            LogItem::Journal(JournalEvent::Command(Command::Lead { epoch, first_round, .. })) => {
-                (aggregator_state.leads, aggregator_state.next_round) = (Some(epoch.clone()), *first_round);
+            LogItem::Journal(JournalEvent::Command(Command::Lead {
+                epoch, first_round, ..
+            })) => {
+                (aggregator_state.leads, aggregator_state.next_round) =
+                    (Some(epoch.clone()), *first_round);
             }
             LogItem::Journal(JournalEvent::Command(Command::Configure { fusion, landmarks })) => {
-                (self.identity.fusion, self.identity.landmarks) = (FusionConfig::clone(fusion), landmarks.clone());
+                (self.identity.fusion, self.identity.landmarks) =
+                    (FusionConfig::clone(fusion), landmarks.clone());
             }
-            LogItem::Journal(JournalEvent::Command(Command::StepDown)) => aggregator_state.leads = None,
+            LogItem::Journal(JournalEvent::Command(Command::StepDown)) => {
+                aggregator_state.leads = None
+            }
             LogItem::Round(round) => aggregator_state.next_round = round.saturating_add(1),
             _ => {}
         }
@@ -173,10 +197,15 @@ impl LogWriter {
     fn flush(&mut self) {
         let Some(file) = &mut self.file else { return };
         let is_full = match file.flush() {
-            Ok(bytes) => bytes >= self.config.max_file_bytes() || file.opened().elapsed() >= self.config.max_file_age(),
+            Ok(bytes) => {
+                bytes >= self.config.max_file_bytes()
+                    || file.opened().elapsed() >= self.config.max_file_age()
+            }
             Err(error) => return self.failed(&error),
         };
-        self.recording.counters().add(Event::Recorded, std::mem::take(&mut self.pending).entries);
+        self.recording
+            .counters()
+            .add(Event::Recorded, std::mem::take(&mut self.pending).entries);
         self.failing = false;
         if let Err(error) = disk::check_room(&self.config.dir, self.config.min_free_bytes()) {
             // All entries are in the file, which only needs its end.
@@ -194,7 +223,10 @@ impl LogWriter {
         if let Some(file) = self.file.take() {
             file.abandon();
         }
-        let Pending { entries, of_journal } = std::mem::take(&mut self.pending);
+        let Pending {
+            entries,
+            of_journal,
+        } = std::mem::take(&mut self.pending);
         self.recording.count_lost(entries, of_journal);
         self.retry_at = Some(Instant::now() + RETRY_AFTER);
         if !std::mem::replace(&mut self.failing, true) {
@@ -229,29 +261,51 @@ mod tests {
     const NODE: NodeName = NodeName::from_static("cav");
 
     fn writer(config: RecordConfig, counters: &Arc<Counters>) -> LogWriter {
-        let identity =
-            LogIdentity::new(NODE, Uuid::nil(), NodeName::from_static("lot-1"), FusionConfig::default(), Vec::new());
+        let identity = LogIdentity::new(
+            NODE,
+            Uuid::nil(),
+            NodeName::from_static("lot-1"),
+            FusionConfig::default(),
+            Vec::new(),
+        );
         LogWriter::new(config, identity, LogSender::new(Arc::clone(counters)))
     }
 
     fn in_directory(directory: &Path) -> RecordConfig {
-        RecordConfig { min_free_mb: 0, ..RecordConfig::new(directory) }
+        RecordConfig {
+            min_free_mb: 0,
+            ..RecordConfig::new(directory)
+        }
     }
 
     fn second(seconds: u64, item: LogItem) -> LogEntry {
-        LogEntry { at: Timestamp(seconds * 1_000_000), item }
+        LogEntry {
+            at: Timestamp(seconds * 1_000_000),
+            item,
+        }
     }
 
     fn messages(path: &Path) -> Vec<LogMessage> {
-        let message = |event| if let Ok(LogEvent::Message(message)) = event { Some(message) } else { None };
+        let message = |event| {
+            if let Ok(LogEvent::Message(message)) = event {
+                Some(message)
+            } else {
+                None
+            }
+        };
         LogReader::open(path).unwrap().filter_map(message).collect()
     }
 
     /// When the log says that entries are missing, and how many.
     fn missing(messages: &[LogMessage]) -> Vec<(Timestamp, u64)> {
-        let journal = messages.iter().filter(|message| message.schema == SchemaName::JournalEntry);
+        let journal = messages
+            .iter()
+            .filter(|message| message.schema == SchemaName::JournalEntry);
         let missing = |message: &LogMessage| match serde_json::from_slice(&message.json).unwrap() {
-            JournalEntry { at_us, event: JournalEvent::Missing { entries } } => Some((at_us, entries)),
+            JournalEntry {
+                at_us,
+                event: JournalEvent::Missing { entries },
+            } => Some((at_us, entries)),
             JournalEntry { .. } => None,
         };
         journal.filter_map(missing).collect()
@@ -261,7 +315,8 @@ mod tests {
     fn the_limit_holds_for_nodes_that_never_fill_a_file_and_makes_room_on_a_full_disk() {
         let directory = tempfile::tempdir().unwrap();
         for second in 0..40 {
-            let (path, _) = disk::create(directory.path(), &NODE, Timestamp(second * 1_000_000), 0).unwrap();
+            let (path, _) =
+                disk::create(directory.path(), &NODE, Timestamp(second * 1_000_000), 0).unwrap();
             std::fs::write(path, vec![0; 100_000]).unwrap();
         }
         let kept = || files(directory.path()).unwrap();
@@ -276,13 +331,20 @@ mod tests {
         let all = kept();
         writer(config(1_000_000_000), &counters).write(&entry);
         assert_eq!(counters.events(Event::RecordFailed), 1);
-        assert_eq!(kept(), all[20..], "the oldest are gone, though there is still no room for another");
+        assert_eq!(
+            kept(),
+            all[20..],
+            "the oldest are gone, though there is still no room for another"
+        );
         for starts in 1..=3 {
             let mut writer = writer(config(0), &counters);
             writer.write(&entry);
             writer.flush();
             assert_eq!(counters.events(Event::Recorded), starts);
-            let bytes: u64 = kept().iter().map(|path| path.metadata().unwrap().len()).sum();
+            let bytes: u64 = kept()
+                .iter()
+                .map(|path| path.metadata().unwrap().len())
+                .sum();
             assert!(bytes <= 3_000_000, "{bytes} bytes after {starts} starts");
         }
     }
@@ -292,15 +354,23 @@ mod tests {
         let (directory, counters) = (tempfile::tempdir().unwrap(), Arc::new(Counters::default()));
         let mut writer = writer(in_directory(directory.path()), &counters);
         let landmarks = vec![LandmarkConfig::at("slot-0", 1.0, 2.0)];
-        let change = Command::Configure { fusion: Box::default(), landmarks: landmarks.clone() };
+        let change = Command::Configure {
+            fusion: Box::default(),
+            landmarks: landmarks.clone(),
+        };
         writer.write(&second(1, LogItem::Journal(JournalEvent::Command(change))));
         writer.flush();
         writer.file.take().map(LogFile::finish).unwrap().unwrap();
         writer.write(&second(2, LogItem::Counters(counters.snapshot())));
         writer.flush();
         let known = |path: &Path| {
-            let identity =
-                |event| if let Ok(LogEvent::Identity(identity)) = event { Some(identity.landmarks) } else { None };
+            let identity = |event| {
+                if let Ok(LogEvent::Identity(identity)) = event {
+                    Some(identity.landmarks)
+                } else {
+                    None
+                }
+            };
             LogReader::open(path).unwrap().find_map(identity).unwrap()
         };
         let files = files(directory.path()).unwrap();
@@ -315,10 +385,18 @@ mod tests {
         writer.recording.connect(Some(sender));
         let change = |id| {
             let landmarks = vec![LandmarkConfig::at(id, 1.0, 2.0)];
-            LogItem::Journal(JournalEvent::Command(Command::Configure { fusion: Box::default(), landmarks }))
+            LogItem::Journal(JournalEvent::Command(Command::Configure {
+                fusion: Box::default(),
+                landmarks,
+            }))
         };
         let tick = || LogItem::Journal(JournalEvent::Command(Command::Tick));
-        let items = [(1, tick()), (3, change("superseded")), (4, change("slot-0")), (4, tick())];
+        let items = [
+            (1, tick()),
+            (3, change("superseded")),
+            (4, change("slot-0")),
+            (4, tick()),
+        ];
         for (seconds, item) in items {
             writer.recording.send(Timestamp(seconds * 1_000_000), item);
         }
@@ -327,21 +405,42 @@ mod tests {
         writer.write(&second(5, tick()));
         writer.flush();
         let messages = messages(&files(directory.path()).unwrap()[0]);
-        let journal = messages.iter().filter(|message| message.schema == SchemaName::JournalEntry);
-        let events = journal.map(|message| serde_json::from_slice::<JournalEntry>(&message.json).unwrap());
+        let journal = messages
+            .iter()
+            .filter(|message| message.schema == SchemaName::JournalEntry);
+        let events =
+            journal.map(|message| serde_json::from_slice::<JournalEntry>(&message.json).unwrap());
         let told: Vec<_> = events
             .map(|JournalEntry { at_us, event }| match event {
                 JournalEvent::Command(Command::Configure { landmarks, .. }) => {
                     (at_us.0 / 1_000_000, landmarks[0].id.to_string())
                 }
-                JournalEvent::Missing { entries } => (at_us.0 / 1_000_000, format!("{entries} missing")),
+                JournalEvent::Missing { entries } => {
+                    (at_us.0 / 1_000_000, format!("{entries} missing"))
+                }
                 _ => (at_us.0 / 1_000_000, "tick".into()),
             })
             .collect();
-        let told: Vec<_> = told.iter().map(|(at, event)| (*at, event.as_str())).collect();
-        assert_eq!(told, [(1, "2 missing"), (1, "tick"), (2, "tick"), (4, "slot-0"), (5, "tick")]);
+        let told: Vec<_> = told
+            .iter()
+            .map(|(at, event)| (*at, event.as_str()))
+            .collect();
+        assert_eq!(
+            told,
+            [
+                (1, "2 missing"),
+                (1, "tick"),
+                (2, "tick"),
+                (4, "slot-0"),
+                (5, "tick")
+            ]
+        );
         assert_eq!(counters.events(Event::RecordDropped), 2);
-        assert_eq!(writer.identity.landmarks[0].id.as_str(), "slot-0", "later files have it, too");
+        assert_eq!(
+            writer.identity.landmarks[0].id.as_str(),
+            "slot-0",
+            "later files have it, too"
+        );
     }
 
     #[test]
@@ -356,11 +455,22 @@ mod tests {
         writer.write(&entry(2));
         writer.flush();
         writer.write(&entry(3));
-        let [recorded, failed, dropped] = [Event::Recorded, Event::RecordFailed, Event::RecordDropped];
-        assert_eq!([recorded, failed, dropped].map(|event| counters.events(event)), [2, 1, 1]);
+        let [recorded, failed, dropped] =
+            [Event::Recorded, Event::RecordFailed, Event::RecordDropped];
+        assert_eq!(
+            [recorded, failed, dropped].map(|event| counters.events(event)),
+            [2, 1, 1]
+        );
         let path = &files(directory.path()).unwrap()[0];
-        let read = LogReader::open(path).unwrap().collect::<Result<Vec<_>, _>>().unwrap();
-        assert!(read.len() >= 2, "what came before is there, and the file is whole: {}", read.len());
+        let read = LogReader::open(path)
+            .unwrap()
+            .collect::<Result<Vec<_>, _>>()
+            .unwrap();
+        assert!(
+            read.len() >= 2,
+            "what came before is there, and the file is whole: {}",
+            read.len()
+        );
     }
 
     #[test]
@@ -373,7 +483,12 @@ mod tests {
         let path = format!("/proc/self/fd/{}", memory.as_raw_fd());
         let disk = memory.try_clone().unwrap();
         writer.file = Some(LogFile::begin(Path::new(&path), memory, &writer.identity).unwrap());
-        let tick = |seconds| second(seconds, LogItem::Journal(JournalEvent::Command(Command::Tick)));
+        let tick = |seconds| {
+            second(
+                seconds,
+                LogItem::Journal(JournalEvent::Command(Command::Tick)),
+            )
+        };
         writer.write(&tick(1));
         assert_eq!(counts(), [0, 0], "it is not on the disk yet");
         writer.flush();
@@ -403,16 +518,24 @@ mod tests {
         let (sender, queue) = sync_channel(1);
         writer.recording.connect(Some(sender));
         writer.recording.count_lost(3, 3);
-        writer.recording.send(Timestamp(99_000_000), LogItem::Round(7));
+        writer
+            .recording
+            .send(Timestamp(99_000_000), LogItem::Round(7));
         let round = queue.recv().unwrap();
         assert_eq!(round.at, Timestamp(99_000_000));
         writer.write(&round);
         assert!(files(directory.path()).unwrap().is_empty());
-        writer.write(&second(100, LogItem::Journal(JournalEvent::Command(Command::Tick))));
+        writer.write(&second(
+            100,
+            LogItem::Journal(JournalEvent::Command(Command::Tick)),
+        ));
         writer.flush();
         let path = &files(directory.path()).unwrap()[0];
         assert_eq!(path.file_name().unwrap(), "cav-19700101T000140Z-000.mcap");
         assert_eq!(missing(&messages(path)), [(Timestamp(100_000_000), 3)]);
-        assert_eq!([Event::Recorded, Event::RecordDropped].map(|event| counters.events(event)), [1, 3]);
+        assert_eq!(
+            [Event::Recorded, Event::RecordDropped].map(|event| counters.events(event)),
+            [1, 3]
+        );
     }
 }

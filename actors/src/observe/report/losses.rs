@@ -53,13 +53,18 @@ impl Losses {
             let before: BTreeMap<_, _> = counts(before).filter(|_| *run_before == run).collect();
             for (name, times) in counts(&reading) {
                 // A lower value than before means that the counter was reset.
-                let base = before.get(name).copied().filter(|base| *base <= times).unwrap_or_default();
+                let base = before
+                    .get(name)
+                    .copied()
+                    .filter(|base| *base <= times)
+                    .unwrap_or_default();
                 if times > base {
                     *self.by_reason.entry(name.to_owned()).or_default() += times - base;
                 }
             }
         }
-        self.over_time.push(reading.at_us, self.by_reason.values().sum::<u64>() as f64);
+        self.over_time
+            .push(reading.at_us, self.by_reason.values().sum::<u64>() as f64);
         self.newest = Some((run, reading));
     }
 
@@ -83,8 +88,14 @@ impl Losses {
 fn counts(reading: &CounterReading) -> impl Iterator<Item = (&str, u64)> {
     let is_loss = |name: &str| EVENTS.iter().any(|event| event.as_str() == name);
     let events = reading.events.iter().filter(move |(name, _)| is_loss(name));
-    let rejects = reading.rejects.iter().filter(|(name, _)| *name != "out_of_order");
-    events.chain(rejects).chain(&reading.shed).map(|(name, times)| (name.as_str(), *times))
+    let rejects = reading
+        .rejects
+        .iter()
+        .filter(|(name, _)| *name != "out_of_order");
+    events
+        .chain(rejects)
+        .chain(&reading.shed)
+        .map(|(name, times)| (name.as_str(), *times))
 }
 
 #[cfg(test)]
@@ -96,9 +107,18 @@ mod tests {
 
     #[test]
     fn losses_of_all_runs_add_up() {
-        let (mut losses, runs) = (Losses::default(), [1, 2].map(|number| Some(Uuid::from_u128(number))));
+        let (mut losses, runs) = (
+            Losses::default(),
+            [1, 2].map(|number| Some(Uuid::from_u128(number))),
+        );
         assert!(!losses.are_known());
-        let readings = [(runs[0], 3, 7), (runs[0], 10, 7), (runs[1], 4, 0), (runs[1], 30, 1), (runs[1], 2, 1)];
+        let readings = [
+            (runs[0], 3, 7),
+            (runs[0], 10, 7),
+            (runs[1], 4, 0),
+            (runs[1], 30, 1),
+            (runs[1], 2, 1),
+        ];
         for (second, (run, inbox_full, stale)) in readings.into_iter().enumerate() {
             let counts = |name: &str, times| BTreeMap::from([(name.to_owned(), times)]);
             let mut events = counts("inbox_full", inbox_full);
@@ -107,11 +127,18 @@ mod tests {
             let at_us = Timestamp(second as u64 * 1_000_000);
             losses.add(
                 run,
-                CounterReading { node, at_us, events, rejects: counts("stale", stale), shed: BTreeMap::new() },
+                CounterReading {
+                    node,
+                    at_us,
+                    events,
+                    rejects: counts("stale", stale),
+                    shed: BTreeMap::new(),
+                },
             );
         }
         assert!(losses.are_known());
-        let sums = [("inbox_full", 7 + 4 + 26 + 2), ("stale", 1)].map(|(name, times)| (name.to_owned(), times));
+        let sums = [("inbox_full", 7 + 4 + 26 + 2), ("stale", 1)]
+            .map(|(name, times)| (name.to_owned(), times));
         assert_eq!(*losses.by_reason(), BTreeMap::from(sums));
         assert_eq!(losses.over_time().values(), [0.0, 7.0, 11.0, 38.0, 40.0]);
     }

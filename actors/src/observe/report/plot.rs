@@ -49,7 +49,11 @@ impl Plot<'_> {
     pub(super) fn draw(&self) -> String {
         let points = || self.curves.iter().flat_map(|curve| &curve.points);
         let scale = Scale::new(self.x, points().map(|point| point.0));
-        let y_max = points().filter(|point| scale.shows(point.0)).map(|point| point.1).fold(0.0, f64::max).max(1e-9);
+        let y_max = points()
+            .filter(|point| scale.shows(point.0))
+            .map(|point| point.1)
+            .fold(0.0, f64::max)
+            .max(1e-9);
         let y_step = step(y_max * 1.05);
         let y_max = (y_max / y_step).ceil() * y_step;
         let x = |value: f64| LEFT + (WIDTH - LEFT - RIGHT) * scale.share(value);
@@ -57,14 +61,36 @@ impl Plot<'_> {
         let mut picture = picture(self.title, HEIGHT);
         for value in ticks(y_step, y_max) {
             picture = picture.add(line("grid", (LEFT, y(value)), (WIDTH - RIGHT, y(value))));
-            picture = picture.add(text("tick", "end", LEFT - 6.0, y(value) + 4.0, &number(value)));
+            picture = picture.add(text(
+                "tick",
+                "end",
+                LEFT - 6.0,
+                y(value) + 4.0,
+                &number(value),
+            ));
         }
         for value in scale.ticks() {
-            picture = picture.add(text("tick", "middle", x(value), HEIGHT - BOTTOM + 16.0, &number(value)));
+            picture = picture.add(text(
+                "tick",
+                "middle",
+                x(value),
+                HEIGHT - BOTTOM + 16.0,
+                &number(value),
+            ));
         }
         picture = picture
-            .add(line("axis", (LEFT, HEIGHT - BOTTOM), (WIDTH - RIGHT, HEIGHT - BOTTOM)))
-            .add(text("label", "middle", (LEFT + WIDTH - RIGHT) / 2.0, HEIGHT - 6.0, self.x_label))
+            .add(line(
+                "axis",
+                (LEFT, HEIGHT - BOTTOM),
+                (WIDTH - RIGHT, HEIGHT - BOTTOM),
+            ))
+            .add(text(
+                "label",
+                "middle",
+                (LEFT + WIDTH - RIGHT) / 2.0,
+                HEIGHT - 6.0,
+                self.x_label,
+            ))
             .add(text("label", "start", 4.0, TOP - 12.0, self.y_label));
         for (at, what) in &self.marks {
             let mark = line("mark", (x(*at), TOP), (x(*at), HEIGHT - BOTTOM));
@@ -72,12 +98,17 @@ impl Plot<'_> {
         }
         for (index, curve) in self.curves.iter().enumerate() {
             let shown = curve.points.iter().filter(|point| scale.shows(point.0));
-            let points: Vec<_> = shown.map(|point| format!("{:.1},{:.1}", x(point.0), y(point.1))).collect();
+            let points: Vec<_> = shown
+                .map(|point| format!("{:.1},{:.1}", x(point.0), y(point.1)))
+                .collect();
             let title = Title::new(curve.name.as_str());
-            picture =
-                picture.add(Group::new().add(title).add(
-                    Polyline::new().set("class", format!("curve {}", class(index))).set("points", points.join(" ")),
-                ));
+            picture = picture.add(
+                Group::new().add(title).add(
+                    Polyline::new()
+                        .set("class", format!("curve {}", class(index)))
+                        .set("points", points.join(" ")),
+                ),
+            );
         }
         picture.to_string()
     }
@@ -100,10 +131,23 @@ impl Scale {
             Axis::Logarithmic => {
                 let (min, max) = values
                     .filter(|value| *value > 0.0)
-                    .fold((f64::INFINITY, 0.0), |(min, max): (f64, f64), value| (value.min(min), value.max(max)));
-                let max = if max > 0.0 { max.log10().ceil() as i32 } else { 0 };
-                let min = if min.is_finite() { min.log10().floor() as i32 } else { max };
-                Self::Logarithmic { min: min.clamp(max - DECADES, max - 1), max }
+                    .fold((f64::INFINITY, 0.0), |(min, max): (f64, f64), value| {
+                        (value.min(min), value.max(max))
+                    });
+                let max = if max > 0.0 {
+                    max.log10().ceil() as i32
+                } else {
+                    0
+                };
+                let min = if min.is_finite() {
+                    min.log10().floor() as i32
+                } else {
+                    max
+                };
+                Self::Logarithmic {
+                    min: min.clamp(max - DECADES, max - 1),
+                    max,
+                }
             }
         }
     }
@@ -138,10 +182,20 @@ pub fn bars(title: &str, shares: &[(String, f64)]) -> String {
     let mut picture = picture(title, height);
     for (index, (name, share)) in shares.iter().enumerate() {
         let y = 4.0 + BAR * index as f64;
-        let bar = Rectangle::new().set("class", "bar").set("x", left).set("y", y + 3.0).set("rx", 2);
+        let bar = Rectangle::new()
+            .set("class", "bar")
+            .set("x", left)
+            .set("y", y + 3.0)
+            .set("rx", 2);
         picture = picture
             .add(text("tick", "end", left - 8.0, y + BAR / 2.0 + 4.0, name))
-            .add(bar.set("width", format!("{:.1}", width * (share / 100.0).clamp(0.0, 1.0))).set("height", BAR - 6.0))
+            .add(
+                bar.set(
+                    "width",
+                    format!("{:.1}", width * (share / 100.0).clamp(0.0, 1.0)),
+                )
+                .set("height", BAR - 6.0),
+            )
             .add(text(
                 "tick",
                 "start",
@@ -155,23 +209,36 @@ pub fn bars(title: &str, shares: &[(String, f64)]) -> String {
 
 /// The class of a curve, for its colour.
 pub(super) fn class(index: usize) -> String {
-    let dashed = if index / COLOURS % 2 == 1 { " dashed" } else { "" };
+    let dashed = if index / COLOURS % 2 == 1 {
+        " dashed"
+    } else {
+        ""
+    };
     format!("c{}{dashed}", index % COLOURS)
 }
 
 fn picture(title: &str, height: f64) -> Document {
-    let document = Document::new().set("viewBox", (0.0, 0.0, WIDTH, height)).set("role", "img");
-    document.set("aria-label", title).set("preserveAspectRatio", "xMinYMin meet")
+    let document = Document::new()
+        .set("viewBox", (0.0, 0.0, WIDTH, height))
+        .set("role", "img");
+    document
+        .set("aria-label", title)
+        .set("preserveAspectRatio", "xMinYMin meet")
 }
 
 fn line(class: &str, from: (f64, f64), to: (f64, f64)) -> Line {
     let round = |value: f64| format!("{value:.1}");
-    let line = Line::new().set("class", class).set("x1", round(from.0)).set("y1", round(from.1));
+    let line = Line::new()
+        .set("class", class)
+        .set("x1", round(from.0))
+        .set("y1", round(from.1));
     line.set("x2", round(to.0)).set("y2", round(to.1))
 }
 
 fn text(class: &str, anchor: &str, x: f64, y: f64, content: &str) -> Text {
-    let text = Text::new(content).set("class", class).set("text-anchor", anchor);
+    let text = Text::new(content)
+        .set("class", class)
+        .set("text-anchor", anchor);
     text.set("x", format!("{x:.1}")).set("y", format!("{y:.1}"))
 }
 
@@ -179,7 +246,11 @@ fn text(class: &str, anchor: &str, x: f64, y: f64, content: &str) -> Text {
 fn step(max: f64) -> f64 {
     let rough = max / TICKS;
     let power = 10f64.powf(rough.log10().floor());
-    [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|step| *step >= rough).unwrap_or(10.0 * power)
+    [1.0, 2.0, 5.0, 10.0]
+        .map(|factor| factor * power)
+        .into_iter()
+        .find(|step| *step >= rough)
+        .unwrap_or(10.0 * power)
 }
 
 fn ticks(step: f64, max: f64) -> impl Iterator<Item = f64> {
@@ -190,7 +261,11 @@ fn ticks(step: f64, max: f64) -> impl Iterator<Item = f64> {
 pub(super) fn number(value: f64) -> String {
     let rounded = format!("{value:.4}");
     let short = rounded.trim_end_matches('0').trim_end_matches('.');
-    if short.is_empty() { "0".into() } else { short.into() }
+    if short.is_empty() {
+        "0".into()
+    } else {
+        short.into()
+    }
 }
 
 #[cfg(test)]
@@ -210,23 +285,49 @@ mod tests {
     fn a_logarithmic_axis_goes_from_power_to_power() {
         let scale = Scale::new(Axis::Logarithmic, [0.0, 0.3, 45.0, 941.0].into_iter());
         assert_eq!(scale.ticks(), [0.1, 1.0, 10.0, 100.0, 1000.0]);
-        assert_eq!([0.0, 0.1, 10.0, 1000.0].map(|value| scale.share(value)), [0.0, 0.0, 0.5, 1.0]);
-        assert_eq!(Scale::new(Axis::Logarithmic, [1e-9, 1.0].into_iter()).ticks().len(), 7);
+        assert_eq!(
+            [0.0, 0.1, 10.0, 1000.0].map(|value| scale.share(value)),
+            [0.0, 0.0, 0.5, 1.0]
+        );
+        assert_eq!(
+            Scale::new(Axis::Logarithmic, [1e-9, 1.0].into_iter())
+                .ticks()
+                .len(),
+            7
+        );
     }
 
     #[test]
     fn a_plot_is_well_formed_whatever_it_is_given() {
-        let curve = |points: Vec<(f64, f64)>| Curve { name: "<a & b>".into(), points };
+        let curve = |points: Vec<(f64, f64)>| Curve {
+            name: "<a & b>".into(),
+            points,
+        };
         for points in [vec![], vec![(0.0, 0.0)], vec![(0.0, 1.0), (5.0, 2.0)]] {
             let marks = vec![(1.0, "new \"leader\" <x>".into())];
             let curves = vec![curve(points)];
-            let mut plot = Plot { title: "t & u", x_label: "s", y_label: "ms", curves, marks, x: Axis::Linear(0.0) };
+            let mut plot = Plot {
+                title: "t & u",
+                x_label: "s",
+                y_label: "ms",
+                curves,
+                marks,
+                x: Axis::Linear(0.0),
+            };
             for x in [Axis::Linear(0.0), Axis::Linear(5.0), Axis::Logarithmic] {
                 plot.x = x;
                 let drawn = plot.draw();
-                let document = roxmltree::Document::parse(&drawn).unwrap_or_else(|error| panic!("{error}: {drawn}"));
-                assert!(["NaN", "inf"].iter().all(|text| !drawn.contains(text)), "{drawn}");
-                assert!(document.descendants().any(|node| node.has_tag_name("polyline")));
+                let document = roxmltree::Document::parse(&drawn)
+                    .unwrap_or_else(|error| panic!("{error}: {drawn}"));
+                assert!(
+                    ["NaN", "inf"].iter().all(|text| !drawn.contains(text)),
+                    "{drawn}"
+                );
+                assert!(
+                    document
+                        .descendants()
+                        .any(|node| node.has_tag_name("polyline"))
+                );
             }
         }
         assert!(roxmltree::Document::parse(&bars("b", &[("a<b".into(), 120.0)])).is_ok());

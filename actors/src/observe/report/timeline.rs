@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use ecod::wire::{GlobalMap, NodeState, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts};
+use ecod::wire::{
+    GlobalMap, NodeState, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts,
+};
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -82,12 +84,19 @@ impl Default for LogTimeline {
 /// [`LogError::Unreadable`].
 pub(super) fn cell_offset_us(path: &Path) -> Result<i64, LogError> {
     let mut offsets = LogReader::open(path)?.filter_map(|event| match event {
-        Ok(LogEvent::Message(it)) if matches!(it.schema, SchemaName::GlobalMap | SchemaName::Verdicts) => {
-            serde_json::from_slice::<Round>(&it.json).ok().map(|round| round.fused_at_us.micros_from(it.at))
+        Ok(LogEvent::Message(it))
+            if matches!(it.schema, SchemaName::GlobalMap | SchemaName::Verdicts) =>
+        {
+            serde_json::from_slice::<Round>(&it.json)
+                .ok()
+                .map(|round| round.fused_at_us.micros_from(it.at))
         }
         _ => None,
     });
-    Ok(offsets.next().filter(|offset| offset.unsigned_abs() >= MIN_OFFSET_US).unwrap_or_default())
+    Ok(offsets
+        .next()
+        .filter(|offset| offset.unsigned_abs() >= MIN_OFFSET_US)
+        .unwrap_or_default())
 }
 
 impl LogTimeline {
@@ -99,7 +108,10 @@ impl LogTimeline {
     /// Takes the time of the next message.
     pub(super) fn advance(&mut self, now: Timestamp) {
         let before = self.last_at.replace(now);
-        if let Some(silence) = before.map(|before| now.since(before)).filter(|silence| *silence >= GAP) {
+        if let Some(silence) = before
+            .map(|before| now.since(before))
+            .filter(|silence| *silence >= GAP)
+        {
             let text = format!("the log has nothing of the {} s before", silence.as_secs());
             self.timeline.event(EventKind::Gap, text, now);
         }
@@ -107,15 +119,31 @@ impl LogTimeline {
 
     /// Takes a vehicle's report.
     pub(super) fn report(&mut self, kind: ReportKind, report: &ObjectReport, now: Timestamp) {
-        self.vehicles.update(&Incoming::Report { kind, report: Arc::new(report.clone()) }, now);
+        self.vehicles.update(
+            &Incoming::Report {
+                kind,
+                report: Arc::new(report.clone()),
+            },
+            now,
+        );
     }
 
     /// Takes a node's status.
     pub(super) fn status(&mut self, status: NodeStatus, now: Timestamp) {
         self.statuses.insert(status.node.clone(), status);
-        let alive = || self.statuses.values().filter(|status| status.state != NodeState::Offline);
-        self.timeline.nodes(alive().map(|status| status.node.clone()).collect(), now);
-        let troubles = alive().flat_map(|status| status.troubles.iter().map(|trouble| (&status.node, trouble)));
+        let alive = || {
+            self.statuses
+                .values()
+                .filter(|status| status.state != NodeState::Offline)
+        };
+        self.timeline
+            .nodes(alive().map(|status| status.node.clone()).collect(), now);
+        let troubles = alive().flat_map(|status| {
+            status
+                .troubles
+                .iter()
+                .map(|trouble| (&status.node, trouble))
+        });
         self.timeline.troubles(troubles, now);
     }
 
@@ -131,7 +159,10 @@ impl LogTimeline {
 
     /// Takes verdicts; in a log without maps they are shown alone.
     pub(super) fn verdicts(&mut self, verdicts: &Verdicts, has_maps: bool, now: Timestamp) {
-        self.verdicts = Some(Received { received_at: now, message: Arc::new(verdicts.clone()) });
+        self.verdicts = Some(Received {
+            received_at: now,
+            message: Arc::new(verdicts.clone()),
+        });
         if !has_maps {
             self.frame(None, now);
         }
@@ -139,15 +170,29 @@ impl LogTimeline {
 
     /// Takes an image.
     pub(super) fn picture(&mut self, picture: RecordedPicture, at_us: Timestamp) {
-        self.pictures.push(at_us, || json(&RecordedPicture { at_us, ..picture }));
+        self.pictures
+            .push(at_us, || json(&RecordedPicture { at_us, ..picture }));
     }
 
     fn frame(&mut self, map: Option<&GlobalMap>, now_us: Timestamp) {
-        let Self { timeline, vehicles, verdicts, .. } = self;
+        let Self {
+            timeline,
+            vehicles,
+            verdicts,
+            ..
+        } = self;
         timeline.frames.push(now_us, || {
-            let map = map.map(|map| Received { received_at: now_us, message: Arc::new(map.clone()) });
+            let map = map.map(|map| Received {
+                received_at: now_us,
+                message: Arc::new(map.clone()),
+            });
             let vehicles = vehicles.reports_since(now_us - MAX_REPORT_AGE);
-            json(&TimelineFrame { now_us, map, verdicts: verdicts.clone(), vehicles })
+            json(&TimelineFrame {
+                now_us,
+                map,
+                verdicts: verdicts.clone(),
+                vehicles,
+            })
         });
     }
 
@@ -160,7 +205,9 @@ impl LogTimeline {
         leaders.sort_by_key(|run| run.first_at);
         let mut terms: Vec<LeaderTerm> = Vec::new();
         for run in leaders {
-            let gap = terms.last().and_then(|before| Some(run.first_at.since(before.until_us?)));
+            let gap = terms
+                .last()
+                .and_then(|before| Some(run.first_at.since(before.until_us?)));
             terms.push(LeaderTerm {
                 leader: run.epoch.leader.clone(),
                 epoch: run.epoch.term,
@@ -179,7 +226,10 @@ impl LogTimeline {
         let data = fields.map(|field| field.concat()).concat();
         // Names in the log must not end the element.
         let data = String::from_utf8_lossy(&data).replace('<', "\\u003c");
-        let (view, script) = (assets::view(), assets::view_script() + include_str!("report.js"));
+        let (view, script) = (
+            assets::view(),
+            assets::view_script() + include_str!("report.js"),
+        );
         format!(
             "<section class=\"map-card\">\n{view}<figure id=\"picture-frame\" hidden><img id=\"picture\" alt=\"Image of the camera\">\
              <figcaption id=\"picture-at\"></figcaption></figure>\n\

@@ -78,14 +78,20 @@ impl<R: Copy + Ord> CountsBySource<R> {
             return false;
         }
         let has_room = sources.len() < MAX_TRACKED_SOURCES;
-        *sources.entry(if has_room { source } else { OTHERS }.to_owned()).or_default() += 1;
+        *sources
+            .entry(if has_room { source } else { OTHERS }.to_owned())
+            .or_default() += 1;
         has_room
     }
 
     pub(super) fn snapshot(&self) -> Vec<SourceCount<R>> {
         let mut all = Vec::new();
         for (&reason, sources) in self.counts().iter() {
-            all.extend(sources.iter().map(|(source, &times)| SourceCount { reason, source: source.clone(), times }));
+            all.extend(sources.iter().map(|(source, &times)| SourceCount {
+                reason,
+                source: source.clone(),
+                times,
+            }));
         }
         all
     }
@@ -106,15 +112,28 @@ mod tests {
         for source in 0..2 * MAX_TRACKED_SOURCES {
             for time in 0..2 {
                 let is_first = shed.count(ShedReason::ReportThrottled, &format!("v{source:03}"));
-                assert_eq!(is_first, time == 0 && source < MAX_TRACKED_SOURCES, "source {source}");
+                assert_eq!(
+                    is_first,
+                    time == 0 && source < MAX_TRACKED_SOURCES,
+                    "source {source}"
+                );
             }
         }
-        assert!(shed.count(ShedReason::LedgerThrottled, "gauss"), "each reason has room of its own");
+        assert!(
+            shed.count(ShedReason::LedgerThrottled, "gauss"),
+            "each reason has room of its own"
+        );
         let mut snapshot = shed.snapshot();
         snapshot.retain(|count| count.reason == ShedReason::ReportThrottled);
         assert_eq!(snapshot.len(), MAX_TRACKED_SOURCES + 1);
-        assert_eq!(snapshot.iter().map(|count| count.times).sum::<u64>(), 4 * MAX_TRACKED_SOURCES as u64);
-        let others = snapshot.iter().find(|count| count.source == OTHERS).unwrap();
+        assert_eq!(
+            snapshot.iter().map(|count| count.times).sum::<u64>(),
+            4 * MAX_TRACKED_SOURCES as u64
+        );
+        let others = snapshot
+            .iter()
+            .find(|count| count.source == OTHERS)
+            .unwrap();
         assert_eq!(others.times, 2 * MAX_TRACKED_SOURCES as u64);
     }
 }

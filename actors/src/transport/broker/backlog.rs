@@ -68,9 +68,21 @@ impl Backlog {
         let number = table.next_number;
         table.next_number += 1;
         let (cut, is_cut) = oneshot::channel();
-        let holding = Holding { principal, unread: 0, unfinished: 0, since: None, cut: Some(cut) };
+        let holding = Holding {
+            principal,
+            unread: 0,
+            unfinished: 0,
+            since: None,
+            cut: Some(cut),
+        };
         table.connections.insert(number, holding);
-        (BacklogSlot { backlog: self.clone(), number }, is_cut)
+        (
+            BacklogSlot {
+                backlog: self.clone(),
+                number,
+            },
+            is_cut,
+        )
     }
 
     fn table(&self) -> MutexGuard<'_, BacklogTable> {
@@ -91,19 +103,28 @@ impl BacklogSlot {
 
     fn set(&self, change: impl FnOnce(&mut Holding), now: Timestamp) {
         let mut table = self.backlog.table();
-        let Some(holding) = table.connections.get_mut(&self.number) else { return };
+        let Some(holding) = table.connections.get_mut(&self.number) else {
+            return;
+        };
         let before = holding.bytes();
         change(holding);
         let (bytes, principal) = (holding.bytes(), holding.principal.clone());
         holding.since = holding.since.or(Some(now)).filter(|_| bytes > 0);
         table.bytes = (table.bytes + bytes).saturating_sub(before);
-        let Backlog { max_bytes_each, max_bytes, .. } = self.backlog;
+        let Backlog {
+            max_bytes_each,
+            max_bytes,
+            ..
+        } = self.backlog;
         if bytes <= before || table.bytes <= max_bytes_each {
             return;
         }
         match principal {
             Some(principal) => {
-                table.cut_oldest(|holding| holding.principal.as_ref() == Some(&principal), max_bytes_each);
+                table.cut_oldest(
+                    |holding| holding.principal.as_ref() == Some(&principal),
+                    max_bytes_each,
+                );
             }
             None if bytes > max_bytes_each => table.cut(self.number),
             None => {}
@@ -124,10 +145,18 @@ impl BacklogTable {
     /// Cuts connections, the oldest holding first, until the rest of a group hold no more than a bound.
     fn cut_oldest(&mut self, is_member: impl Fn(&Holding) -> bool, bound: usize) {
         loop {
-            let members = || self.connections.iter().filter(|(_, holding)| holding.bytes() > 0 && is_member(holding));
-            let oldest = members().min_by_key(|(_, holding)| holding.since).map(|(number, _)| *number);
+            let members = || {
+                self.connections
+                    .iter()
+                    .filter(|(_, holding)| holding.bytes() > 0 && is_member(holding))
+            };
+            let oldest = members()
+                .min_by_key(|(_, holding)| holding.since)
+                .map(|(number, _)| *number);
             match oldest {
-                Some(oldest) if members().map(|(_, holding)| holding.bytes()).sum::<usize>() > bound => {
+                Some(oldest)
+                    if members().map(|(_, holding)| holding.bytes()).sum::<usize>() > bound =>
+                {
                     self.cut(oldest);
                 }
                 _ => break,
@@ -146,7 +175,11 @@ impl BacklogTable {
 impl Holding {
     /// Held bytes; those of a connection that is being cut do not count.
     fn bytes(&self) -> usize {
-        if self.cut.is_some() { self.unread + self.unfinished } else { 0 }
+        if self.cut.is_some() {
+            self.unread + self.unfinished
+        } else {
+            0
+        }
     }
 }
 
@@ -165,12 +198,17 @@ mod tests {
         let backlog = Backlog::new(0);
         let (honest, mut honest_cut) = backlog.open(Some("euclid".into()));
         honest.set_unread(MIB, Timestamp(1));
-        let mut flood: Vec<_> = (0..10).map(|_| backlog.open(Some("gauss".into()))).collect();
+        let mut flood: Vec<_> = (0..10)
+            .map(|_| backlog.open(Some("gauss".into())))
+            .collect();
         for (n, (slot, _)) in flood.iter().enumerate() {
             slot.set_unread(MIB, Timestamp(10 + n as u64));
             slot.set_unfinished(MIB, Timestamp(50));
         }
-        let cut: Vec<_> = flood.iter_mut().map(|(_, receiver)| is_cut(receiver)).collect();
+        let cut: Vec<_> = flood
+            .iter_mut()
+            .map(|(_, receiver)| is_cut(receiver))
+            .collect();
         assert_eq!(cut, [vec![true; 5], vec![false; 5]].concat());
         assert!(!is_cut(&mut honest_cut));
         flood.clear();
@@ -180,14 +218,19 @@ mod tests {
     #[test]
     fn the_oldest_of_all_gives_way_beyond_the_ceiling() {
         let backlog = Backlog::new(0);
-        let mut slots: Vec<_> = (0..20).map(|n| backlog.open(Some(format!("v{n}").into()))).collect();
+        let mut slots: Vec<_> = (0..20)
+            .map(|n| backlog.open(Some(format!("v{n}").into())))
+            .collect();
         let (empty, mut empty_cut) = backlog.open(None);
         empty.set_unread(1, Timestamp(0));
         empty.set_unread(0, Timestamp(0));
         for (n, (slot, _)) in slots.iter().enumerate() {
             slot.set_unread(4 * MIB, Timestamp(100 - n as u64));
         }
-        let cut = slots.iter_mut().filter_map(|(_, receiver)| is_cut(receiver).then_some(())).count();
+        let cut = slots
+            .iter_mut()
+            .filter_map(|(_, receiver)| is_cut(receiver).then_some(()))
+            .count();
         assert_eq!(cut, 12);
         assert!(!is_cut(&mut slots[0].1), "it came last");
         assert!(!is_cut(&mut empty_cut), "it holds nothing");
@@ -206,7 +249,8 @@ mod tests {
     #[test]
     fn who_ends_packets_is_not_the_oldest_however_much_it_sends() {
         let backlog = Backlog::new(0);
-        let [(sender, mut sender_cut), (reader, mut reader_cut)] = [0, 1].map(|_| backlog.open(Some("gauss".into())));
+        let [(sender, mut sender_cut), (reader, mut reader_cut)] =
+            [0, 1].map(|_| backlog.open(Some("gauss".into())));
         sender.set_unfinished(MIB, Timestamp(1));
         reader.set_unread(MIB, Timestamp(2));
         sender.set_unfinished(0, Timestamp(3));

@@ -61,15 +61,23 @@ mod tests {
                 return sent;
             }
             sent += packet;
-            waits[0] = now + throttle.charge(&principal, large, (packet, 1), now) + Duration::from_micros(1);
+            waits[0] = now
+                + throttle.charge(&principal, large, (packet, 1), now)
+                + Duration::from_micros(1);
         }
     }
 
     #[test]
     fn connections_of_one_principal_share_a_rate() {
         let mib = |bytes: usize| bytes as f64 / f64::from(1 << 20);
-        let (long, short) = (mib(sent(false, 64 * 1024, 20)), mib(sent(false, 64 * 1024, 10)));
-        assert!((38.0..42.0).contains(&(long - short)), "4 MiB a second: {long} {short}");
+        let (long, short) = (
+            mib(sent(false, 64 * 1024, 20)),
+            mib(sent(false, 64 * 1024, 10)),
+        );
+        assert!(
+            (38.0..42.0).contains(&(long - short)),
+            "4 MiB a second: {long} {short}"
+        );
         assert!((54.0..58.0).contains(&short), "and a burst: {short}");
         assert!((420.0..460.0).contains(&mib(sent(true, 64 * 1024, 10))));
         assert!(sent(false, 2, 10) < 2 * 60_000, "empty packets are few");

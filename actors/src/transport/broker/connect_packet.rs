@@ -23,7 +23,10 @@ const CONNECT: u8 = 0x10;
 const MQTT_5: u8 = 5;
 
 /// Reads the rest of the first packet, which must be CONNECT. rmqtt itself would wait for its first bytes for ever.
-pub(super) async fn read(first: u8, stream: &mut (impl AsyncRead + Unpin)) -> Result<ConnectPacket, ClientRejection> {
+pub(super) async fn read(
+    first: u8,
+    stream: &mut (impl AsyncRead + Unpin),
+) -> Result<ConnectPacket, ClientRejection> {
     if first != CONNECT {
         return Err(ClientRejection::Malformed);
     }
@@ -46,7 +49,11 @@ pub(super) async fn read(first: u8, stream: &mut (impl AsyncRead + Unpin)) -> Re
     let has_generated_id = client_id.is_some_and(<[u8]>::is_empty);
     let client_id = String::from_utf8_lossy(client_id.unwrap_or_default()).into_owned();
     packet.append(&mut body);
-    Ok(ConnectPacket { packet, client_id, has_generated_id })
+    Ok(ConnectPacket {
+        packet,
+        client_id,
+        has_generated_id,
+    })
 }
 
 /// Length of the first packet in received bytes, if it is complete. Only built for the fuzz targets.
@@ -55,8 +62,14 @@ pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
     use futures_util::FutureExt;
 
     let (first, mut rest) = sent.split_first()?;
-    let login = read(*first, &mut rest).now_or_never().expect("bytes that are there are not waited for").ok()?;
-    assert!(sent.starts_with(&login.packet), "rmqtt gets what the client sent");
+    let login = read(*first, &mut rest)
+        .now_or_never()
+        .expect("bytes that are there are not waited for")
+        .ok()?;
+    assert!(
+        sent.starts_with(&login.packet),
+        "rmqtt gets what the client sent"
+    );
     Some(login.packet.len())
 }
 
@@ -92,21 +105,44 @@ mod tests {
 
     #[tokio::test]
     async fn clients_that_name_themselves_are_told_from_those_that_do_not() {
-        let v4 = |id: &str| [&b"\0\x04MQTT\x04\x02\0\x3c\0"[..], &[id.len() as u8], id.as_bytes()].concat();
+        let v4 = |id: &str| {
+            [
+                &b"\0\x04MQTT\x04\x02\0\x3c\0"[..],
+                &[id.len() as u8],
+                id.as_bytes(),
+            ]
+            .concat()
+        };
         // With a session expiry of an hour.
         let v5 = |id: &str| {
-            [&b"\0\x04MQTT\x05\x02\0\x3c\x05\x11\0\0\x0e\x10\0"[..], &[id.len() as u8], id.as_bytes()].concat()
+            [
+                &b"\0\x04MQTT\x05\x02\0\x3c\x05\x11\0\0\x0e\x10\0"[..],
+                &[id.len() as u8],
+                id.as_bytes(),
+            ]
+            .concat()
         };
         let drawn = "0123456789abcdef0123456789abcdef";
-        for (body, has_generated_id) in
-            [(v4(""), true), (v5(""), true), (v4("euclid"), false), (v5("euclid"), false), (v4(drawn), false)]
-        {
+        for (body, has_generated_id) in [
+            (v4(""), true),
+            (v5(""), true),
+            (v4("euclid"), false),
+            (v5("euclid"), false),
+            (v4(drawn), false),
+        ] {
             let packet = [&[CONNECT, body.len() as u8], &body[..]].concat();
             let login = read(packet[0], &mut &packet[1..]).await.unwrap();
-            assert_eq!((login.packet, login.has_generated_id), (packet, has_generated_id));
+            assert_eq!(
+                (login.packet, login.has_generated_id),
+                (packet, has_generated_id)
+            );
         }
-        for body in [&b""[..], b"\0\x04MQ", b"\0\x04MQTT\x05\x02\0\x3c\xff\xff\xff\xff", b"\0\x04MQTT\x04\x02\0\x3c\0"]
-        {
+        for body in [
+            &b""[..],
+            b"\0\x04MQ",
+            b"\0\x04MQTT\x05\x02\0\x3c\xff\xff\xff\xff",
+            b"\0\x04MQTT\x04\x02\0\x3c\0",
+        ] {
             assert_eq!(client_id(body), None);
         }
     }

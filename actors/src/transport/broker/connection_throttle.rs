@@ -105,7 +105,12 @@ impl ConnectionThrottle {
         };
         is_allowed.then(|| {
             let (number, evicted) = table.insert(source, limit);
-            LoginSlot { throttle: self.clone(), source, number, evicted }
+            LoginSlot {
+                throttle: self.clone(),
+                source,
+                number,
+                evicted,
+            }
         })
     }
 
@@ -117,10 +122,19 @@ impl ConnectionThrottle {
 impl AddressTable {
     /// Adds a waiting connection and evicts the oldest if there are too many, of its source or in total.
     fn insert(&mut self, source: IpAddr, limit: usize) -> (u64, oneshot::Receiver<()>) {
-        let mut of_source = self.pending.iter().filter(|(_, (other, _))| *other == source).map(|(number, _)| *number);
+        let mut of_source = self
+            .pending
+            .iter()
+            .filter(|(_, (other, _))| *other == source)
+            .map(|(number, _)| *number);
         let oldest = match of_source.clone().count() {
             count if count >= limit => of_source.next(),
-            _ => self.pending.keys().next().copied().filter(|_| self.pending.len() >= MAX_PENDING),
+            _ => self
+                .pending
+                .keys()
+                .next()
+                .copied()
+                .filter(|_| self.pending.len() >= MAX_PENDING),
         };
         oldest.map(|oldest| self.pending.remove(&oldest));
         let number = self.next_number;
@@ -135,21 +149,30 @@ impl AddressTable {
         if self.by_address.len() >= MAX_ADDRESSES && !self.by_address.contains_key(&source) {
             if now.since(self.pruned_at) >= PRUNE_INTERVAL {
                 self.pruned_at = now;
-                self.by_address.retain(|_, entry| now < entry.privileged_until || !entry.bucket.is_full(now));
+                self.by_address
+                    .retain(|_, entry| now < entry.privileged_until || !entry.bucket.is_full(now));
             }
             if self.by_address.len() >= MAX_ADDRESSES {
                 return None;
             }
         }
         let bucket = || TokenBucket::new(self.burst, self.interval, now);
-        let fresh = || AddressEntry { bucket: bucket(), privileged_until: Timestamp::default() };
+        let fresh = || AddressEntry {
+            bucket: bucket(),
+            privileged_until: Timestamp::default(),
+        };
         Some(self.by_address.entry(source).or_insert_with(fresh))
     }
 
     /// Raises the rate of an address from which a client is, or was until now, logged in.
     fn note_login(&mut self, source: IpAddr, now: Timestamp) {
-        let (burst, interval) = (self.burst.saturating_mul(PRIVILEGED_FACTOR), self.interval / PRIVILEGED_FACTOR);
-        let Some(entry) = self.entry(source, now) else { return };
+        let (burst, interval) = (
+            self.burst.saturating_mul(PRIVILEGED_FACTOR),
+            self.interval / PRIVILEGED_FACTOR,
+        );
+        let Some(entry) = self.entry(source, now) else {
+            return;
+        };
         if now >= entry.privileged_until {
             entry.bucket = TokenBucket::new(burst, interval, now);
         }
@@ -167,7 +190,10 @@ impl LoginSlot {
     /// Frees the place: the client has logged in.
     pub(super) fn log_in(self) -> LoggedInConnection {
         self.throttle.table().note_login(self.source, clock::now());
-        LoggedInConnection { throttle: self.throttle.clone(), source: self.source }
+        LoggedInConnection {
+            throttle: self.throttle.clone(),
+            source: self.source,
+        }
     }
 }
 
@@ -200,29 +226,63 @@ mod tests {
     }
 
     fn evicted(tickets: &mut [LoginSlot]) -> Vec<usize> {
-        let is_displaced = |slot: &mut LoginSlot| slot.evicted.try_recv() == Err(oneshot::error::TryRecvError::Closed);
-        tickets.iter_mut().enumerate().filter_map(|(n, slot)| is_displaced(slot).then_some(n)).collect()
+        let is_displaced = |slot: &mut LoginSlot| {
+            slot.evicted.try_recv() == Err(oneshot::error::TryRecvError::Closed)
+        };
+        tickets
+            .iter_mut()
+            .enumerate()
+            .filter_map(|(n, slot)| is_displaced(slot).then_some(n))
+            .collect()
     }
 
     #[test]
     fn one_address_uses_up_its_own_share_only() {
         let throttle = throttle(3, at(0));
-        let admitted = |address, ms| (0..9).filter(|_| throttle.admit(from(address), at(ms)).is_some()).count();
-        assert_eq!([admitted("10.0.0.1", 0), admitted("10.0.0.2", 0), admitted("10.0.0.1", 100)], [3, 3, 1]);
-        assert_eq!([admitted("fd00::1:1", 0), admitted("fd00::2:2", 0)], [3, 0], "one network");
-        assert_eq!(admitted("::ffff:10.0.0.2", 0), 0, "the same host by the other protocol");
+        let admitted = |address, ms| {
+            (0..9)
+                .filter(|_| throttle.admit(from(address), at(ms)).is_some())
+                .count()
+        };
+        assert_eq!(
+            [
+                admitted("10.0.0.1", 0),
+                admitted("10.0.0.2", 0),
+                admitted("10.0.0.1", 100)
+            ],
+            [3, 3, 1]
+        );
+        assert_eq!(
+            [admitted("fd00::1:1", 0), admitted("fd00::2:2", 0)],
+            [3, 0],
+            "one network"
+        );
+        assert_eq!(
+            admitted("::ffff:10.0.0.2", 0),
+            0,
+            "the same host by the other protocol"
+        );
     }
 
     #[test]
     fn where_too_many_wait_the_oldest_gives_way_to_the_newest() {
         let throttle = throttle(100, at(0));
         let other = throttle.admit(from("10.0.0.2"), at(0)).unwrap();
-        let mut held: Vec<_> = (0..40).filter_map(|_| throttle.admit(from("10.0.0.1"), at(0))).collect();
-        assert_eq!(evicted(&mut held), (0..40 - MAX_PENDING_PER_ADDRESS).collect::<Vec<_>>());
+        let mut held: Vec<_> = (0..40)
+            .filter_map(|_| throttle.admit(from("10.0.0.1"), at(0)))
+            .collect();
+        assert_eq!(
+            evicted(&mut held),
+            (0..40 - MAX_PENDING_PER_ADDRESS).collect::<Vec<_>>()
+        );
         assert!(evicted(&mut [other]).is_empty(), "of its own address only");
         drop(held.pop());
         held.extend(throttle.admit(from("10.0.0.1"), at(0)));
-        assert_eq!(evicted(&mut held).len(), 40 - MAX_PENDING_PER_ADDRESS, "an end makes room");
+        assert_eq!(
+            evicted(&mut held).len(),
+            40 - MAX_PENDING_PER_ADDRESS,
+            "an end makes room"
+        );
         drop(held);
         assert!(throttle.table().pending.is_empty());
     }
@@ -241,20 +301,33 @@ mod tests {
         let throttle = throttle(100, clock::now());
         let flood = |ms: u64| {
             let now = clock::now() + Duration::from_millis(ms);
-            (0..10_000).filter(|_| throttle.admit(from("10.0.0.1"), now).is_some()).count()
+            (0..10_000)
+                .filter(|_| throttle.admit(from("10.0.0.1"), now).is_some())
+                .count()
         };
         assert_eq!(flood(0), 100);
-        let visit = throttle.admit(from("10.0.0.1"), clock::now() + Duration::from_secs(1)).unwrap().log_in();
+        let visit = throttle
+            .admit(from("10.0.0.1"), clock::now() + Duration::from_secs(1))
+            .unwrap()
+            .log_in();
         assert!((1000..1100).contains(&flood(1000)), "at once");
         assert!((95..=105).contains(&flood(2000)), "and each second after");
         drop(visit);
-        assert!(throttle.table().by_address.values().all(|entry| entry.privileged_until > clock::now()));
+        assert!(
+            throttle
+                .table()
+                .by_address
+                .values()
+                .all(|entry| entry.privileged_until > clock::now())
+        );
     }
 
     #[test]
     fn this_machines_are_not_throttled_but_few_wait() {
         let throttle = throttle(100, at(0));
-        let mut held: Vec<_> = (0..MAX_PENDING).filter_map(|_| throttle.admit(ClientOrigin::Local, at(0))).collect();
+        let mut held: Vec<_> = (0..MAX_PENDING)
+            .filter_map(|_| throttle.admit(ClientOrigin::Local, at(0)))
+            .collect();
         assert_eq!(held.len(), MAX_PENDING);
         assert_eq!(evicted(&mut held).len(), MAX_PENDING - MAX_PENDING_LOCAL);
     }
@@ -267,7 +340,10 @@ mod tests {
         }
         assert_eq!(throttle.table().by_address.len(), MAX_ADDRESSES);
         let latest = ClientOrigin::Remote(IpAddr::V4(u32::MAX.into()));
-        assert!(throttle.admit(latest, at(60_000)).is_some(), "the old are forgotten");
+        assert!(
+            throttle.admit(latest, at(60_000)).is_some(),
+            "the old are forgotten"
+        );
         let sources = throttle.table();
         assert_eq!((sources.by_address.len(), sources.pending.len()), (1, 0));
     }

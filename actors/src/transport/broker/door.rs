@@ -23,8 +23,8 @@ use ecod::admission::recent_reports::RecentReports;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind, Reputations, Topic, Topics,
-    encode,
+    CellDescription, Encoding, Limits, NodeStatus, ObjectReport, Payload, ReportKind, Reputations,
+    Topic, Topics, encode,
 };
 use rmqtt::context::ServerContext;
 use rmqtt::session::SessionState;
@@ -129,8 +129,14 @@ impl Door {
         let interval = Duration::from_secs(1) / per_second;
         let now = clock::now();
         Self(Some(Arc::new(DoorState {
-            throttles: std::array::from_fn(|_| Mutex::new(TokenBucket::new(per_second, interval, now))),
-            descriptions: Mutex::new(TokenBucket::new(DESCRIPTION_BURST, DESCRIPTION_INTERVAL, now)),
+            throttles: std::array::from_fn(|_| {
+                Mutex::new(TokenBucket::new(per_second, interval, now))
+            }),
+            descriptions: Mutex::new(TokenBucket::new(
+                DESCRIPTION_BURST,
+                DESCRIPTION_INTERVAL,
+                now,
+            )),
             setup,
             queue: Mutex::default(),
             retained: Mutex::default(),
@@ -171,7 +177,13 @@ impl Door {
 
     /// Passes on a vehicle's report. Each passes once, although it may come over two links.
     pub fn publish_report(&self, kind: ReportKind, report: &ObjectReport) {
-        let Some(door) = self.0.as_ref().filter(|door| door.wants_reports.load(Ordering::Relaxed)) else { return };
+        let Some(door) = self
+            .0
+            .as_ref()
+            .filter(|door| door.wants_reports.load(Ordering::Relaxed))
+        else {
+            return;
+        };
         if lock(&door.recent_reports).is_new(kind, report) {
             door.send(door.publication(&kind.topic(report.node.clone()), report, false));
         }
@@ -195,21 +207,49 @@ impl Door {
 
     /// Publishes at the broker's present run, on the broker's thread; never ends.
     pub(super) async fn run(self, context: ServerContext) {
-        let Some(door) = self.0 else { return std::future::pending().await };
+        let Some(door) = self.0 else {
+            return std::future::pending().await;
+        };
         let (sender, mut queue) = mpsc::channel(MAX_WAITING);
         *lock(&door.queue) = Some(sender);
         let before: Vec<_> = lock(&door.retained).clone().into_iter().collect();
-        let from = From::from_system(Id::new(context.node.id(), 0, None, None, "door".into(), None));
-        let publish = async |Publication { topic, payload, retain }| {
+        let from = From::from_system(Id::new(
+            context.node.id(),
+            0,
+            None,
+            None,
+            "door".into(),
+            None,
+        ));
+        let publish = async |Publication {
+                                 topic,
+                                 payload,
+                                 retain,
+                             }| {
             let topic = TopicPlace::Door.topic(&topic).into();
             let (qos, properties) = (QoS::AtMostOnce, None);
-            let packet = CodecPublish { dup: false, retain, qos, topic, packet_id: None, payload, properties };
-            if let Err(error) = SessionState::forwards(&context, from.clone(), packet.into(), false, None).await {
+            let packet = CodecPublish {
+                dup: false,
+                retain,
+                qos,
+                topic,
+                packet_id: None,
+                payload,
+                properties,
+            };
+            if let Err(error) =
+                SessionState::forwards(&context, from.clone(), packet.into(), false, None).await
+            {
                 tracing::debug!(%error, "not published at the door");
             }
         };
         for (topic, payload) in before {
-            publish(Publication { topic, payload, retain: true }).await;
+            publish(Publication {
+                topic,
+                payload,
+                retain: true,
+            })
+            .await;
         }
         while let Some(publication) = queue.recv().await {
             publish(publication).await;
@@ -225,14 +265,20 @@ impl Door {
 
 impl fmt::Debug for Door {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("Door").field(&self.0.as_ref().map(|door| &door.setup.node)).finish()
+        f.debug_tuple("Door")
+            .field(&self.0.as_ref().map(|door| &door.setup.node))
+            .finish()
     }
 }
 
 impl DoorState {
     fn publication<T: Payload>(&self, topic: &Topic, payload: &T, retain: bool) -> Publication {
         let payload = encode(payload, self.setup.encoding).into();
-        Publication { topic: self.setup.topics.path(topic), payload, retain }
+        Publication {
+            topic: self.setup.topics.path(topic),
+            payload,
+            retain,
+        }
     }
 
     /// Publishes a state that differs from the last one. One vehicle may have any number of parts: these leave half of the
@@ -242,8 +288,14 @@ impl DoorState {
         let is_known = retained.contains_key(&publication.topic);
         let topic = self.setup.topics.parse(&publication.topic);
         let is_of_part = matches!(topic, Some(Topic::Nodes(name)) if name.vehicle() != name);
-        let room = if is_of_part { MAX_RETAINED / 2 } else { MAX_RETAINED };
-        if retained.get(&publication.topic) == Some(&publication.payload) || (!is_known && retained.len() >= room) {
+        let room = if is_of_part {
+            MAX_RETAINED / 2
+        } else {
+            MAX_RETAINED
+        };
+        if retained.get(&publication.topic) == Some(&publication.payload)
+            || (!is_known && retained.len() >= room)
+        {
             return;
         }
         let topic = publication.topic.clone();
@@ -256,13 +308,19 @@ impl DoorState {
     fn next_unsent(&self) -> Option<Publication> {
         let topic = lock(&self.unsent).pop_first()?;
         let payload = lock(&self.retained).get(&topic)?.clone();
-        Some(Publication { topic, payload, retain: true })
+        Some(Publication {
+            topic,
+            payload,
+            retain: true,
+        })
     }
 
     /// Hands a message to the broker's present run, if there is one; false if it has no room.
     fn send(&self, publication: Publication) -> bool {
         let queue = lock(&self.queue);
-        let has_room = queue.as_ref().is_none_or(|queue| queue.try_send(publication).is_ok());
+        let has_room = queue
+            .as_ref()
+            .is_none_or(|queue| queue.try_send(publication).is_ok());
         if !has_room {
             self.setup.counters.count(Event::PublishRefused);
         }
@@ -273,7 +331,8 @@ impl DoorState {
     fn change_filters(&self, change: impl FnOnce(&mut BTreeMap<(ClientId, TopicFilter), bool>)) {
         let mut filters = lock(&self.filters);
         change(&mut filters);
-        self.has_readers.store(!filters.is_empty(), Ordering::Relaxed);
+        self.has_readers
+            .store(!filters.is_empty(), Ordering::Relaxed);
         let wants_reports = filters.values().any(|of_reports| *of_reports);
         if self.wants_reports.swap(wants_reports, Ordering::Relaxed) && !wants_reports {
             *lock(&self.recent_reports) = RecentReports::default();

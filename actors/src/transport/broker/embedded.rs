@@ -157,8 +157,18 @@ impl BrokerConfig {
         check_range("max_clients_each", self.max_clients_each as f64, 1.0, 1e6)?;
         check_range("max_waiting", self.max_waiting as f64, 1.0, 1e6)?;
         check_range("max_retained", self.max_retained as f64, 1.0, 1e6)?;
-        check_range("max_retained_bytes", self.max_retained_bytes as f64, 1024.0, 1e12)?;
-        check_range("handshake_timeout_ms", self.handshake_timeout_ms as f64, 100.0, 60_000.0)?;
+        check_range(
+            "max_retained_bytes",
+            self.max_retained_bytes as f64,
+            1024.0,
+            1e12,
+        )?;
+        check_range(
+            "handshake_timeout_ms",
+            self.handshake_timeout_ms as f64,
+            100.0,
+            60_000.0,
+        )?;
         check_range("connect_burst", f64::from(self.connect_burst), 1.0, 1e6)?;
         check_range("connects_per_s", f64::from(self.connects_per_s), 1.0, 1e4)?;
         check_range("max_messages_hz", f64::from(self.max_messages_hz), 1.0, 1e6)
@@ -200,12 +210,22 @@ const END_TIMEOUT: Duration = Duration::from_millis(1500);
 impl EmbeddedBroker {
     /// A broker without a frontend, not started: every client may log in.
     pub fn new(config: BrokerConfig) -> Self {
-        Self { config, policy: None, door: Door::default(), running: None }
+        Self {
+            config,
+            policy: None,
+            door: Door::default(),
+            running: None,
+        }
     }
 
     /// A broker behind a frontend with an access policy, not started.
     pub fn protected(config: BrokerConfig, policy: AccessPolicy) -> Self {
-        Self { config, policy: Some(policy), door: Door::default(), running: None }
+        Self {
+            config,
+            policy: Some(policy),
+            door: Door::default(),
+            running: None,
+        }
     }
 
     /// The same with a door for the node's programs.
@@ -235,7 +255,9 @@ impl MqttBroker for EmbeddedBroker {
                 drop::<mpsc::Sender<()>>(ending);
             })
             .map_err(thread_error)?;
-        let outcome = started.recv().unwrap_or_else(|_| Err(thread_error(io::Error::other("it ended at once"))));
+        let outcome = started
+            .recv()
+            .unwrap_or_else(|_| Err(thread_error(io::Error::other("it ended at once"))));
         let bound = match outcome {
             Ok(bound) => bound,
             Err(error) => {
@@ -245,12 +267,27 @@ impl MqttBroker for EmbeddedBroker {
                 return Err(error);
             }
         };
-        self.running = Some(RunningBroker { address: bound, stop, thread, ended, heartbeat: Mutex::new(heartbeat) });
+        self.running = Some(RunningBroker {
+            address: bound,
+            stop,
+            thread,
+            ended,
+            heartbeat: Mutex::new(heartbeat),
+        });
         Ok(bound)
     }
 
     fn stop(&mut self) {
-        let Some(RunningBroker { address, stop, thread, ended, .. }) = self.running.take() else { return };
+        let Some(RunningBroker {
+            address,
+            stop,
+            thread,
+            ended,
+            ..
+        }) = self.running.take()
+        else {
+            return;
+        };
         let told = stop.send(()).is_ok();
         if ended.recv_timeout(END_TIMEOUT) == Err(mpsc::RecvTimeoutError::Timeout) {
             tracing::error!(%address, "broker hangs and is left to itself");
@@ -262,7 +299,9 @@ impl MqttBroker for EmbeddedBroker {
     fn health(&self) -> BrokerHealth {
         match &self.running {
             None => BrokerHealth::Stopped,
-            Some(running) if running.thread.is_finished() || running.has_stopped() => BrokerHealth::Dead,
+            Some(running) if running.thread.is_finished() || running.has_stopped() => {
+                BrokerHealth::Dead
+            }
             Some(running) => BrokerHealth::Serving(running.address),
         }
     }
@@ -270,7 +309,10 @@ impl MqttBroker for EmbeddedBroker {
 
 impl RunningBroker {
     fn has_stopped(&self) -> bool {
-        self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).has_stopped(clock::now())
+        self.heartbeat
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .has_stopped(clock::now())
     }
 }
 
@@ -292,18 +334,23 @@ fn serve(
     let runtime = match runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => runtime,
         Err(source) => {
-            ready.send(Err(BrokerError::Thread { address, source })).unwrap_or_default();
+            ready
+                .send(Err(BrokerError::Thread { address, source }))
+                .unwrap_or_default();
             return;
         }
     };
     runtime.block_on(async {
-        let (server, frontend, bound, context) = match prepare(address, config, policy, door.clone()).await {
-            Ok(prepared) => prepared,
-            Err(error) => {
-                let reason = error.root_cause().to_string();
-                return ready.send(Err(BrokerError::Bind { address, reason })).unwrap_or_default();
-            }
-        };
+        let (server, frontend, bound, context) =
+            match prepare(address, config, policy, door.clone()).await {
+                Ok(prepared) => prepared,
+                Err(error) => {
+                    let reason = error.root_cause().to_string();
+                    return ready
+                        .send(Err(BrokerError::Bind { address, reason }))
+                        .unwrap_or_default();
+                }
+            };
         ready.send(Ok(bound)).unwrap_or_default();
         let admitting = async {
             match frontend {
@@ -335,7 +382,12 @@ async fn prepare(
     config: &BrokerConfig,
     policy: Option<AccessPolicy>,
     door: Door,
-) -> rmqtt::Result<(MqttServer, Option<BrokerFrontend>, SocketAddr, ServerContext)> {
+) -> rmqtt::Result<(
+    MqttServer,
+    Option<BrokerFrontend>,
+    SocketAddr,
+    ServerContext,
+)> {
     let listener = Builder::new()
         .name("ecod")
         // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
@@ -350,8 +402,14 @@ async fn prepare(
     let listener = match &policy {
         // Without anonymous clients, rmqtt asks the hooks about each login.
         // Subscriptions are limited by `SubscriptionQuota`: rmqtt would write a line of the log for each one that it refuses.
-        Some(_) => listener.laddr((Ipv4Addr::LOCALHOST, 0).into()).allow_anonymous(false).max_subscriptions(0),
-        None => listener.laddr(address).max_topic_levels(MAX_TOPIC_LEVELS).max_subscriptions(MAX_SUBSCRIPTIONS),
+        Some(_) => listener
+            .laddr((Ipv4Addr::LOCALHOST, 0).into())
+            .allow_anonymous(false)
+            .max_subscriptions(0),
+        None => listener
+            .laddr(address)
+            .max_topic_levels(MAX_TOPIC_LEVELS)
+            .max_subscriptions(MAX_SUBSCRIPTIONS),
     };
     let listener = listener.bind().and_then(Listener::tcp)?;
     let own = listener.local_addr()?;
@@ -364,17 +422,42 @@ async fn prepare(
             let bound = public.local_addr()?;
             let frontend = BrokerFrontend::new(public, own, (policy, door.clone()), config);
             let principals = frontend.principals();
-            SubscriptionQuota::new(principals.clone(), Arc::clone(&policy.counters)).install(&context).await;
-            InFlightMeter { in_flight: frontend.in_flight(), principals: principals.clone() }.install(&context).await;
-            DoorHooks { principals: principals.clone(), door: door.clone() }.install(&context).await;
-            Permissions { principals, policy: policy.clone(), door }.install(&context).await;
+            SubscriptionQuota::new(principals.clone(), Arc::clone(&policy.counters))
+                .install(&context)
+                .await;
+            InFlightMeter {
+                in_flight: frontend.in_flight(),
+                principals: principals.clone(),
+            }
+            .install(&context)
+            .await;
+            DoorHooks {
+                principals: principals.clone(),
+                door: door.clone(),
+            }
+            .install(&context)
+            .await;
+            Permissions {
+                principals,
+                policy: policy.clone(),
+                door,
+            }
+            .install(&context)
+            .await;
             (Some(frontend), bound)
         }
         None => (None, own),
     };
-    let principals = frontend.as_ref().map(BrokerFrontend::principals).unwrap_or_default();
+    let principals = frontend
+        .as_ref()
+        .map(BrokerFrontend::principals)
+        .unwrap_or_default();
     let counters = policy.map(|policy| policy.counters).unwrap_or_default();
-    PublishThrottle::new(config.max_messages_hz, principals, counters).install(&context).await;
-    let server = MqttServer::new(context.clone()).listener_by_id(listener, 1).build();
+    PublishThrottle::new(config.max_messages_hz, principals, counters)
+        .install(&context)
+        .await;
+    let server = MqttServer::new(context.clone())
+        .listener_by_id(listener, 1)
+        .build();
     Ok((server, frontend, bound, context))
 }

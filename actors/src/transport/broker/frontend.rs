@@ -75,7 +75,10 @@ impl BrokerFrontend {
         config: &BrokerConfig,
     ) -> Self {
         let interval = Duration::from_secs(1) / config.connects_per_s;
-        let current = policy.credentials.as_ref().map(|credentials| watch::Sender::new(credentials.current()));
+        let current = policy
+            .credentials
+            .as_ref()
+            .map(|credentials| watch::Sender::new(credentials.current()));
         let shared = FrontendState {
             credentials: policy.credentials.clone(),
             door,
@@ -133,15 +136,25 @@ impl BrokerFrontend {
     fn admit(&self, stream: TcpStream, from: SocketAddr) {
         // With certificates even local clients are told apart.
         let is_local = self.current.is_none() && from.ip().to_canonical().is_loopback();
-        let origin = if is_local { ClientOrigin::Local } else { ClientOrigin::Remote(from.ip()) };
+        let origin = if is_local {
+            ClientOrigin::Local
+        } else {
+            ClientOrigin::Remote(from.ip())
+        };
         let Some(slot) = self.throttle.admit(origin, clock::now()) else {
             self.shared.counters.count(Event::ClientThrottled);
             return;
         };
-        let (shared, current) = (Arc::clone(&self.shared), self.current.as_ref().map(watch::Sender::subscribe));
+        let (shared, current) = (
+            Arc::clone(&self.shared),
+            self.current.as_ref().map(watch::Sender::subscribe),
+        );
         tokio::spawn(async move {
             if let Err(turned_away) = shared.serve(stream, from, current, slot).await {
-                turned_away.event().into_iter().for_each(|event| shared.counters.count(event));
+                turned_away
+                    .event()
+                    .into_iter()
+                    .for_each(|event| shared.counters.count(event));
                 tracing::debug!(%from, %turned_away, "client turned away");
             }
         });
@@ -181,7 +194,9 @@ impl FrontendState {
     ) -> Result<(), ClientRejection> {
         stream.set_nodelay(true)?;
         let mut stream = Box::pin(TimeoutStream::new(stream));
-        stream.as_mut().set_write_timeout_pinned(Some(WRITE_TIMEOUT));
+        stream
+            .as_mut()
+            .set_write_timeout_pinned(Some(WRITE_TIMEOUT));
         let wire_bytes = Arc::<AtomicUsize>::default();
         let login = async {
             if !matches!(stream.get_ref().peek(&mut [0]).await, Ok(1)) {
@@ -208,18 +223,31 @@ impl FrontendState {
         };
         let (stream, certificates, connect) = login?;
         let own = current.as_ref().zip(certificates.first());
-        let identity = own.map(|(current, own)| current.borrow().subject_of(own)).transpose();
+        let identity = own
+            .map(|(current, own)| current.borrow().subject_of(own))
+            .transpose();
         let identity = identity.map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
         let principal = Principal::new(identity, from.ip(), connect.has_generated_id);
         let is_program = self.door.is_program(&principal, &connect.client_id);
-        let principal = if is_program { principal.programs() } else { principal };
-        let _part = self.quota.take(&principal).ok_or(ClientRejection::Crowded)?;
-        let _place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| ClientRejection::Full)?;
+        let principal = if is_program {
+            principal.programs()
+        } else {
+            principal
+        };
+        let _part = self
+            .quota
+            .take(&principal)
+            .ok_or(ClientRejection::Crowded)?;
+        let _place = Arc::clone(&self.places)
+            .try_acquire_owned()
+            .map_err(|_| ClientRejection::Full)?;
 
         let socket = TcpSocket::new_v4()?;
         socket.bind((Ipv4Addr::LOCALHOST, 0).into())?;
         // Registered before rmqtt can ask for it, and until the port may be reused.
-        let _pass = self.principals.register(socket.local_addr()?, principal.clone());
+        let _pass = self
+            .principals
+            .register(socket.local_addr()?, principal.clone());
         let mut backend = socket.connect(self.backend).await?;
         backend.set_nodelay(true)?;
         backend.write_all(&connect.packet).await?;
@@ -238,8 +266,13 @@ async fn secure(
 ) -> Result<(DuplexStream, Vec<CertificateDer<'static>>), ClientRejection> {
     let accepted = TlsAcceptor::from(server).accept(stream).await;
     let stream = accepted.map_err(|error| ClientRejection::Untrusted(error.to_string()))?;
-    let certificates = stream.get_ref().1.peer_certificates().map(|chain| chain.to_vec());
-    let certificates = certificates.ok_or_else(|| ClientRejection::Untrusted("no certificate".into()))?;
+    let certificates = stream
+        .get_ref()
+        .1
+        .peer_certificates()
+        .map(|chain| chain.to_vec());
+    let certificates =
+        certificates.ok_or_else(|| ClientRejection::Untrusted("no certificate".into()))?;
     Ok((Box::pin(stream), certificates))
 }
 

@@ -50,11 +50,21 @@ mod tests {
         let beats = heartbeat.beats();
         let mut lost_at = |from_ms: u64, step_ms: u64| {
             beats.fetch_add(1, Ordering::Relaxed);
-            (1..200).map(|n| from_ms + n * step_ms).find(|ms| heartbeat.has_stopped(Timestamp(ms * 1000)))
+            (1..200)
+                .map(|n| from_ms + n * step_ms)
+                .find(|ms| heartbeat.has_stopped(Timestamp(ms * 1000)))
         };
         let after = |from: u64, at: Option<u64>| at.map(|at| at - from);
         assert_eq!(after(10_000, lost_at(10_000, 250)), Some(26 * 250));
-        assert_eq!(after(100_000, lost_at(100_000, 10)), None, "many looks at once are few");
-        assert_eq!(after(200_000, lost_at(200_000, 60_000)), Some(26 * 60_000), "a stopped process looks at nothing");
+        assert_eq!(
+            after(100_000, lost_at(100_000, 10)),
+            None,
+            "many looks at once are few"
+        );
+        assert_eq!(
+            after(200_000, lost_at(200_000, 60_000)),
+            Some(26 * 60_000),
+            "a stopped process looks at nothing"
+        );
     }
 }

@@ -33,8 +33,16 @@ impl InFlight {
     /// True if a principal has to wait.
     pub(super) fn is_full(&self, principal: &Arc<str>, has_large_share: bool) -> bool {
         let charges = self.charges();
-        let bound = if has_large_share { MAX_BYTES_LARGE } else { MAX_BYTES_EACH };
-        charges.total >= MAX_BYTES || charges.by_principal.get(principal).is_some_and(|bytes| *bytes >= bound)
+        let bound = if has_large_share {
+            MAX_BYTES_LARGE
+        } else {
+            MAX_BYTES_EACH
+        };
+        charges.total >= MAX_BYTES
+            || charges
+                .by_principal
+                .get(principal)
+                .is_some_and(|bytes| *bytes >= bound)
     }
 
     /// A payload that is charged to a principal while any part of it lives.
@@ -42,9 +50,17 @@ impl InFlight {
         let bytes = payload.len() + clients * COPY_BYTES;
         let mut charges = self.charges();
         charges.total += bytes;
-        *charges.by_principal.entry(Arc::clone(&principal)).or_default() += bytes;
+        *charges
+            .by_principal
+            .entry(Arc::clone(&principal))
+            .or_default() += bytes;
         drop(charges);
-        Bytes::from_owner(ChargedPayload { payload, principal, bytes, in_flight: self.clone() })
+        Bytes::from_owner(ChargedPayload {
+            payload,
+            principal,
+            bytes,
+            in_flight: self.clone(),
+        })
     }
 
     fn charges(&self) -> MutexGuard<'_, Charges> {
@@ -88,7 +104,9 @@ impl InFlightMeter {
     /// Registers the hook for every message, before the door's.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
-        register.add_priority(Type::MessagePublish, 1, Box::new(self)).await;
+        register
+            .add_priority(Type::MessagePublish, 1, Box::new(self))
+            .await;
         register.start().await;
     }
 }
@@ -96,10 +114,16 @@ impl InFlightMeter {
 #[async_trait]
 impl Handler for InFlightMeter {
     async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
-        let Parameter::MessagePublish(Some(session), _, publish) = parameter else { return (true, before) };
-        let Some(principal) = self.principals.source(session.id.remote_addr) else { return (true, before) };
+        let Parameter::MessagePublish(Some(session), _, publish) = parameter else {
+            return (true, before);
+        };
+        let Some(principal) = self.principals.source(session.id.remote_addr) else {
+            return (true, before);
+        };
         let mut charged = (*publish).clone();
-        charged.payload = self.in_flight.charge(principal, publish.payload.clone(), self.principals.len());
+        charged.payload =
+            self.in_flight
+                .charge(principal, publish.payload.clone(), self.principals.len());
         (true, Some(HookResult::Publish(charged)))
     }
 }
@@ -110,12 +134,25 @@ mod tests {
 
     #[test]
     fn a_payload_counts_until_its_last_copy_is_gone() {
-        let (in_flight, gauss, euclid) = (InFlight::default(), Arc::<str>::from("gauss"), Arc::<str>::from("euclid"));
+        let (in_flight, gauss, euclid) = (
+            InFlight::default(),
+            Arc::<str>::from("gauss"),
+            Arc::<str>::from("euclid"),
+        );
         let held: Vec<_> = (0..3)
-            .map(|_| in_flight.charge(Arc::clone(&gauss), Bytes::from(vec![0; MAX_BYTES_EACH / 2]), 10))
+            .map(|_| {
+                in_flight.charge(
+                    Arc::clone(&gauss),
+                    Bytes::from(vec![0; MAX_BYTES_EACH / 2]),
+                    10,
+                )
+            })
             .collect();
         assert!(in_flight.is_full(&gauss, false) && !in_flight.is_full(&gauss, true));
-        assert!(!in_flight.is_full(&euclid, false), "another's room is its own");
+        assert!(
+            !in_flight.is_full(&euclid, false),
+            "another's room is its own"
+        );
         let part = held[0].slice(5..6);
         drop(held);
         assert!(!in_flight.is_full(&gauss, false) && in_flight.charges().total > 0);
@@ -128,7 +165,9 @@ mod tests {
     fn all_wait_while_many_send_too_much() {
         let in_flight = InFlight::default();
         let names = (0..40).map(|n| Arc::<str>::from(format!("v{n}")));
-        let _held: Vec<_> = names.map(|name| in_flight.charge(name, Bytes::from(vec![0; MAX_BYTES_EACH]), 0)).collect();
+        let _held: Vec<_> = names
+            .map(|name| in_flight.charge(name, Bytes::from(vec![0; MAX_BYTES_EACH]), 0))
+            .collect();
         assert!(in_flight.is_full(&"euclid".into(), true));
     }
 }

@@ -41,7 +41,12 @@ pub(super) struct QueueFull;
 impl OutboundQueue {
     /// An empty queue of at most so many messages.
     pub(super) fn new(max_packets: usize) -> Self {
-        Self { bytes: VecDeque::new(), packets: VecDeque::new(), scanner: PacketScanner::default(), max_packets }
+        Self {
+            bytes: VecDeque::new(),
+            packets: VecDeque::new(),
+            scanner: PacketScanner::default(),
+            max_packets,
+        }
     }
 
     /// Adds bytes; the result is the number of messages dropped for them.
@@ -50,15 +55,23 @@ impl OutboundQueue {
         while let Some(piece) = self.scanner.next(&mut bytes) {
             match piece {
                 Piece::Head(header, _) => {
-                    let is_droppable = header.first().is_some_and(|first| first & !RETAIN == PUBLISH);
-                    self.packets.push_back(QueuedPacket { bytes: header.len(), is_droppable });
+                    let is_droppable = header
+                        .first()
+                        .is_some_and(|first| first & !RETAIN == PUBLISH);
+                    self.packets.push_back(QueuedPacket {
+                        bytes: header.len(),
+                        is_droppable,
+                    });
                     self.append(&header);
                 }
                 Piece::Body(body) => {
                     // The packet may have been sent as far as it had come.
                     match self.packets.back_mut() {
                         Some(last) => last.bytes += body.len(),
-                        None => self.packets.push_back(QueuedPacket { bytes: body.len(), is_droppable: false }),
+                        None => self.packets.push_back(QueuedPacket {
+                            bytes: body.len(),
+                            is_droppable: false,
+                        }),
                     }
                     self.append(body);
                 }
@@ -88,7 +101,10 @@ impl OutboundQueue {
     /// Drops the oldest message that may be dropped; never the newest packet, whose end may be still to come.
     fn drop_oldest(&mut self) -> bool {
         let mut before = 0;
-        let older = self.packets.iter().take(self.packets.len().saturating_sub(1));
+        let older = self
+            .packets
+            .iter()
+            .take(self.packets.len().saturating_sub(1));
         for (index, packet) in older.enumerate() {
             if packet.is_droppable {
                 self.bytes.drain(before..before + packet.bytes);
@@ -138,7 +154,17 @@ mod tests {
 
     fn packet(first: u8, mark: u8, length: usize) -> Vec<u8> {
         let digits = [0, 7, 14, 21].map(|shift| (length >> shift & 0x7f) as u8);
-        [&[first, digits[0] | 0x80, digits[1] | 0x80, digits[2] | 0x80, digits[3]][..], &vec![mark; length]].concat()
+        [
+            &[
+                first,
+                digits[0] | 0x80,
+                digits[1] | 0x80,
+                digits[2] | 0x80,
+                digits[3],
+            ][..],
+            &vec![mark; length],
+        ]
+        .concat()
     }
 
     fn message(mark: u8, length: usize) -> Vec<u8> {
@@ -168,7 +194,11 @@ mod tests {
             }
         }
         let expected = [&message(1, 100)[10..], &answer, &message(5, 100)].concat();
-        assert_eq!(all(&mut queue), expected, "a begun packet, an answer, and the newest message");
+        assert_eq!(
+            all(&mut queue),
+            expected,
+            "a begun packet, an answer, and the newest message"
+        );
     }
 
     #[test]
@@ -190,9 +220,19 @@ mod tests {
         let mut queue = OutboundQueue::new(100);
         queue.push(&message(0, 10)).unwrap();
         queue.advance(1);
-        let dropped: usize = (1..60).map(|mark| queue.push(&message(mark, 255_000)).unwrap()).sum();
-        assert!(queue.len() <= MAX_BYTES + 255_010 && dropped >= 40, "{} {dropped}", queue.len());
-        assert!(queue.bytes.capacity() <= (MAX_BYTES + 255_010) * 9 / 8, "{}", queue.bytes.capacity());
+        let dropped: usize = (1..60)
+            .map(|mark| queue.push(&message(mark, 255_000)).unwrap())
+            .sum();
+        assert!(
+            queue.len() <= MAX_BYTES + 255_010 && dropped >= 40,
+            "{} {dropped}",
+            queue.len()
+        );
+        assert!(
+            queue.bytes.capacity() <= (MAX_BYTES + 255_010) * 9 / 8,
+            "{}",
+            queue.bytes.capacity()
+        );
         queue.push(&message(60, 8_000_000)).unwrap();
         assert_eq!(queue.packets.len(), 2, "what is begun and what is newest");
     }
@@ -200,7 +240,9 @@ mod tests {
     #[test]
     fn answers_that_nobody_reads_fill_the_queue() {
         let mut queue = OutboundQueue::new(10);
-        let pushed = (0..100).take_while(|_| queue.push(&[0xd0, 0]).is_ok()).count();
+        let pushed = (0..100)
+            .take_while(|_| queue.push(&[0xd0, 0]).is_ok())
+            .count();
         assert_eq!(pushed, 10 + MAX_ANSWERS);
     }
 
@@ -209,7 +251,15 @@ mod tests {
         let mut queue = OutboundQueue::new(1);
         queue.push(&message(1, 100)).unwrap();
         queue.advance(1);
-        assert_eq!((2..5).map(|mark| queue.push(&message(mark, 100)).unwrap()).sum::<usize>(), 2);
-        assert_eq!(all(&mut queue), [&message(1, 100)[1..], &message(4, 100)].concat());
+        assert_eq!(
+            (2..5)
+                .map(|mark| queue.push(&message(mark, 100)).unwrap())
+                .sum::<usize>(),
+            2
+        );
+        assert_eq!(
+            all(&mut queue),
+            [&message(1, 100)[1..], &message(4, 100)].concat()
+        );
     }
 }

@@ -38,7 +38,9 @@ impl PacketScanner {
             if self.header.len() > 1 && is_last {
                 let header = std::mem::take(&mut self.header);
                 let digits = header.iter().skip(1).zip([0, 7, 14, 21]);
-                self.rest = digits.map(|(byte, shift)| usize::from(byte & 0x7f) << shift).sum();
+                self.rest = digits
+                    .map(|(byte, shift)| usize::from(byte & 0x7f) << shift)
+                    .sum();
                 return Some(Piece::Head(header, self.rest));
             }
         }
@@ -69,7 +71,10 @@ mod tests {
                     }
                 }
             }
-            assert_eq!((heads, bodies), (vec![(0xd0, 0), (0x30, 200), (0x40, 2)], 202));
+            assert_eq!(
+                (heads, bodies),
+                (vec![(0xd0, 0), (0x30, 200), (0x40, 2)], 202)
+            );
             assert!(scanner.is_between_packets());
         }
     }

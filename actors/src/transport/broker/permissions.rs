@@ -22,7 +22,8 @@ use rmqtt::context::ServerContext;
 use rmqtt::hook::{Handler, HookResult, Parameter, ReturnType, Type};
 use rmqtt::session::Session;
 use rmqtt::types::{
-    AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, QoS, SubscribeAclResult, TopicFilter,
+    AuthResult, ConnectInfo, LastWill, Publish, PublishAclResult, QoS, SubscribeAclResult,
+    TopicFilter,
 };
 
 use super::door::{Door, DoorRefusal, TopicPlace};
@@ -58,8 +59,15 @@ impl Permissions {
     /// Registers the hooks.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
-        use Type::{ClientAuthenticate, ClientSubscribeCheckAcl, ClientUnsubscribe, MessagePublishCheckAcl};
-        for hook in [ClientAuthenticate, MessagePublishCheckAcl, ClientSubscribeCheckAcl, ClientUnsubscribe] {
+        use Type::{
+            ClientAuthenticate, ClientSubscribeCheckAcl, ClientUnsubscribe, MessagePublishCheckAcl,
+        };
+        for hook in [
+            ClientAuthenticate,
+            MessagePublishCheckAcl,
+            ClientSubscribeCheckAcl,
+            ClientUnsubscribe,
+        ] {
             register.add(hook, Box::new(self.clone())).await;
         }
         register.start().await;
@@ -68,14 +76,19 @@ impl Permissions {
     /// True if the connection may log in under this client id with this last will.
     fn allows_login(&self, info: &ConnectInfo) -> bool {
         // Unregistered: a local process that connected past the frontend.
-        let Some(principal) = self.principals.principal(info.id().remote_addr) else { return false };
+        let Some(principal) = self.principals.principal(info.id().remote_addr) else {
+            return false;
+        };
         let may_say = |will: LastWill<'_>| {
             let (topic, retain, bytes) = match will {
                 LastWill::V3(will) => (&will.topic, will.retain, will.message.len()),
                 LastWill::V5(will) => (&will.topic, will.retain, will.message.len()),
             };
             match self.door.is_program(&principal, info.client_id()) {
-                true => self.is_within_limits(topic, retain, bytes) && self.door.allows_will(&principal, topic),
+                true => {
+                    self.is_within_limits(topic, retain, bytes)
+                        && self.door.allows_will(&principal, topic)
+                }
                 false => self.allows(&principal, topic, retain, bytes),
             }
         };
@@ -88,11 +101,16 @@ impl Permissions {
     /// Takes a message, or says why not.
     fn check_publish(&self, session: &Session, publish: &Publish) -> Result<(), DoorRefusal> {
         let (place, topic) = TopicPlace::of(&publish.topic);
-        let refused = || DoorRefusal::not_permitted(format!("no permission to publish {topic} here"));
-        let principal = self.principals.principal(session.id.remote_addr).ok_or_else(refused)?;
+        let refused =
+            || DoorRefusal::not_permitted(format!("no permission to publish {topic} here"));
+        let principal = self
+            .principals
+            .principal(session.id.remote_addr)
+            .ok_or_else(refused)?;
         let (retain, bytes) = (publish.retain, publish.payload.len());
         if self.door.is_program(&principal, &session.id.client_id) {
-            self.check_limits(topic, retain, bytes).map_err(DoorRefusal::not_permitted)?;
+            self.check_limits(topic, retain, bytes)
+                .map_err(DoorRefusal::not_permitted)?;
             return self.door.take(&principal, (place, topic), publish);
         }
         let is_allowed = place == TopicPlace::Cell && self.allows(&principal, topic, retain, bytes);
@@ -106,7 +124,8 @@ impl Permissions {
             let topic = self.policy.topics.parse(topic);
             topic.is_some_and(|topic| may_publish(identity, &topic, &self.policy.elected))
         };
-        self.is_within_limits(topic, retain, bytes) && principal.identity.as_ref().is_none_or(may_publish)
+        self.is_within_limits(topic, retain, bytes)
+            && principal.identity.as_ref().is_none_or(may_publish)
     }
 
     /// True if a message is within its topic's limits of size and retention.
@@ -119,11 +138,15 @@ impl Permissions {
         if !is_topic_bounded(topic) {
             let (length, levels) = (topic.len(), topic.split('/').count());
             let most = format!("at most {MAX_TOPIC_BYTES} and {MAX_TOPIC_LEVELS}");
-            return Err(format!("the topic has {length} bytes and {levels} levels, {most}"));
+            return Err(format!(
+                "the topic has {length} bytes and {levels} levels, {most}"
+            ));
         }
         let parsed = self.policy.topics.parse(topic);
         let limits = &self.policy.limits;
-        let limit = parsed.as_ref().map_or(limits.payload_bytes, |topic| max_bytes(topic, limits));
+        let limit = parsed
+            .as_ref()
+            .map_or(limits.payload_bytes, |topic| max_bytes(topic, limits));
         if bytes > limit + ENVELOPE_BYTES {
             return Err(format!("{bytes} bytes on {topic}, at most {limit}"));
         }
@@ -151,7 +174,9 @@ impl Permissions {
     /// The filter as it is inside the broker.
     fn inner_filter(&self, session: &Session, filter: &TopicFilter) -> Option<TopicFilter> {
         let principal = self.principals.principal(session.id.remote_addr)?;
-        self.door.is_program(&principal, &session.id.client_id).then(|| TopicPlace::Door.topic(filter).into())
+        self.door
+            .is_program(&principal, &session.id.client_id)
+            .then(|| TopicPlace::Door.topic(filter).into())
     }
 }
 
@@ -173,13 +198,15 @@ pub(super) fn is_topic_bounded(topic: &str) -> bool {
 impl Handler for Permissions {
     async fn hook(&self, parameter: &Parameter, _earlier: Option<HookResult>) -> ReturnType {
         let answer = match parameter {
-            Parameter::ClientAuthenticate(info) => HookResult::AuthResult(if self.allows_login(info) {
-                AuthResult::Allow(false, None)
-            } else {
-                self.count_denied(info.id().remote_addr);
-                tracing::debug!(client = %info.client_id(), "login refused");
-                AuthResult::NotAuthorized
-            }),
+            Parameter::ClientAuthenticate(info) => {
+                HookResult::AuthResult(if self.allows_login(info) {
+                    AuthResult::Allow(false, None)
+                } else {
+                    self.count_denied(info.id().remote_addr);
+                    tracing::debug!(client = %info.client_id(), "login refused");
+                    AuthResult::NotAuthorized
+                })
+            }
             Parameter::MessagePublishCheckAcl(session, publish) => {
                 HookResult::PublishAclResult(match self.check_publish(session, publish) {
                     Ok(()) => PublishAclResult::allow(),
@@ -189,16 +216,22 @@ impl Handler for Permissions {
                     }
                 })
             }
-            Parameter::ClientSubscribeCheckAcl(session, subscribe) if !is_topic_bounded(&subscribe.topic_filter) => {
+            Parameter::ClientSubscribeCheckAcl(session, subscribe)
+                if !is_topic_bounded(&subscribe.topic_filter) =>
+            {
                 self.count_denied(session.id.remote_addr);
-                HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(SubscribeAckReason::TopicFilterInvalid))
+                HookResult::SubscribeAclResult(SubscribeAclResult::new_failure(
+                    SubscribeAckReason::TopicFilterInvalid,
+                ))
             }
             // QoS 0: an acknowledgement that never comes would hold messages in memory.
-            Parameter::ClientSubscribeCheckAcl(..) => {
-                HookResult::SubscribeAclResult(SubscribeAclResult::new_success(QoS::AtMostOnce, None))
-            }
+            Parameter::ClientSubscribeCheckAcl(..) => HookResult::SubscribeAclResult(
+                SubscribeAclResult::new_success(QoS::AtMostOnce, None),
+            ),
             // An UNSUBACK cannot refuse. Such a filter is never subscribed, so that there is nothing to end.
-            Parameter::ClientUnsubscribe(session, unsubscribe) if !is_topic_bounded(&unsubscribe.topic_filter) => {
+            Parameter::ClientUnsubscribe(session, unsubscribe)
+                if !is_topic_bounded(&unsubscribe.topic_filter) =>
+            {
                 self.count_denied(session.id.remote_addr);
                 HookResult::TopicFilter(Some(TopicFilter::default()))
             }
@@ -242,7 +275,9 @@ fn may_publish(identity: &CertificateSubject, topic: &Topic, elected: &LeaderChe
 /// True if a client id is the name and run of this node or of its observer. A connection ends an earlier one with the
 /// same client id, so that foreign ids are refused.
 fn may_use_client_id(identity: &CertificateSubject, client_id: &str) -> bool {
-    client_id.rsplit_once('-').is_some_and(|(name, run)| is_run(run) && identity.may_act_as(name))
+    client_id
+        .rsplit_once('-')
+        .is_some_and(|(name, run)| is_run(run) && identity.may_act_as(name))
 }
 
 #[cfg(test)]
@@ -258,8 +293,15 @@ mod tests {
 
     fn identity(name: &'static str, role: Role) -> CertificateSubject {
         let (directory, name) = (tempfile::tempdir().unwrap(), NodeName::from_static(name));
-        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
-        authority.issue(&name, role, Duration::from_secs(60), clock::now()).unwrap();
+        let mut authority = Authority::init(
+            directory.path(),
+            &NodeName::from_static("lot"),
+            clock::now(),
+        )
+        .unwrap();
+        authority
+            .issue(&name, role, Duration::from_secs(60), clock::now())
+            .unwrap();
         let pem = std::fs::read(authority.files_of(&name).0).unwrap();
         CertificateSubject::of(&x509_parser::pem::parse_x509_pem(&pem).unwrap().1.contents).unwrap()
     }
@@ -276,11 +318,19 @@ mod tests {
         let policy = AccessPolicy {
             credentials: None,
             topics: Topics::new(&NodeName::from_static("lot")),
-            limits: Limits { payload_bytes: 1000, map_bytes: 5000, ..Limits::default() },
+            limits: Limits {
+                payload_bytes: 1000,
+                map_bytes: 5000,
+                ..Limits::default()
+            },
             elected: Arc::new(|name| name.as_str() == "edge"),
             counters: Arc::default(),
         };
-        Permissions { principals: PrincipalRegistry::default(), policy, door: Door::default() }
+        Permissions {
+            principals: PrincipalRegistry::default(),
+            policy,
+            door: Door::default(),
+        }
     }
 
     #[test]
@@ -301,7 +351,10 @@ mod tests {
         ] {
             assert!(allows(&euclid, topic) && !allows(&edge, topic), "{topic}");
         }
-        assert!(!allows(&euclid, "ledger/euclid--2"), "parts see, and lead nothing");
+        assert!(
+            !allows(&euclid, "ledger/euclid--2"),
+            "parts see, and lead nothing"
+        );
         let vehicle = identity("euclid", Role::Cav);
         assert!(
             allows(&vehicle, "vote_detections/euclid") && !allows(&vehicle, "ledger/euclid"),
@@ -309,7 +362,10 @@ mod tests {
         );
         for topic in ["global_detections", "global_verdicts", "reputations"] {
             assert!(allows(&edge, topic) && !allows(&euclid, topic), "{topic}");
-            assert!(!allows(&identity("edge", Role::Cav), topic), "a vehicle that cannot lead");
+            assert!(
+                !allows(&identity("edge", Role::Cav), topic),
+                "a vehicle that cannot lead"
+            );
         }
         assert!(allows(&edge, "cell") && allows(&euclid, "cell") && !allows(&vehicle, "cell"));
         assert!(!allows(&euclid, "nodes/euclid-2") && !allows(&euclid, "nodes/euclid/x"));
@@ -321,18 +377,27 @@ mod tests {
     fn only_statuses_and_reputations_are_retained_whoever_asks() {
         let permissions = permissions();
         let edge = with(&identity("edge", Role::Edge));
-        let streams =
-            ["detections/edge", "vote_detections/edge", "ledger/edge", "global_detections", "global_verdicts"];
+        let streams = [
+            "detections/edge",
+            "vote_detections/edge",
+            "ledger/edge",
+            "global_detections",
+            "global_verdicts",
+        ];
         for principal in [edge, anyone()] {
-            let allows =
-                |topic: &str, retain| permissions.allows(&principal, &format!("ecod/v1/lot/{topic}"), retain, 0);
+            let allows = |topic: &str, retain| {
+                permissions.allows(&principal, &format!("ecod/v1/lot/{topic}"), retain, 0)
+            };
             for topic in streams {
                 assert!(allows(topic, false) && !allows(topic, true), "{topic}");
             }
             assert!(allows("nodes/edge", true) && allows("reputations", true));
             assert!(!permissions.allows(&principal, "elsewhere", true, 0));
         }
-        assert!(permissions.allows(&anyone(), "elsewhere", false, 0), "without certificates anybody may say anything");
+        assert!(
+            permissions.allows(&anyone(), "elsewhere", false, 0),
+            "without certificates anybody may say anything"
+        );
     }
 
     #[test]
@@ -340,9 +405,19 @@ mod tests {
         let permissions = permissions();
         for principal in [with(&identity("edge", Role::Edge)), anyone()] {
             let allows = |topic: &str, bytes| {
-                permissions.allows(&principal, &format!("ecod/v1/lot/{topic}"), false, bytes + ENVELOPE_BYTES)
+                permissions.allows(
+                    &principal,
+                    &format!("ecod/v1/lot/{topic}"),
+                    false,
+                    bytes + ENVELOPE_BYTES,
+                )
             };
-            for topic in ["detections/edge", "vote_detections/edge", "ledger/edge", "nodes/edge"] {
+            for topic in [
+                "detections/edge",
+                "vote_detections/edge",
+                "ledger/edge",
+                "nodes/edge",
+            ] {
                 assert!(allows(topic, 1000) && !allows(topic, 1001), "{topic}");
             }
             for topic in ["global_detections", "global_verdicts", "reputations"] {
@@ -357,9 +432,16 @@ mod tests {
         let mut permissions = permissions();
         permissions.policy.limits = Limits::default();
         let allows = |topic: &str, bytes| {
-            permissions.allows(&anyone(), &format!("ecod/v1/lot/{topic}"), true, bytes + ENVELOPE_BYTES)
+            permissions.allows(
+                &anyone(),
+                &format!("ecod/v1/lot/{topic}"),
+                true,
+                bytes + ENVELOPE_BYTES,
+            )
         };
-        assert!(allows("nodes/edge", MAX_STATUS_BYTES) && !allows("nodes/edge", MAX_STATUS_BYTES + 1));
+        assert!(
+            allows("nodes/edge", MAX_STATUS_BYTES) && !allows("nodes/edge", MAX_STATUS_BYTES + 1)
+        );
         assert!(allows("reputations", MAX_STATUS_BYTES + 1));
     }
 
@@ -370,7 +452,13 @@ mod tests {
         for good in [format!("euclid-{run}"), format!("euclid--top-7-{run}")] {
             assert!(may_use_client_id(&euclid, &good), "{good}");
         }
-        let others = [format!("edge-{run}"), format!("euclid-2-{run}"), "euclid".into(), "edge".into(), String::new()];
+        let others = [
+            format!("edge-{run}"),
+            format!("euclid-2-{run}"),
+            "euclid".into(),
+            "edge".into(),
+            String::new(),
+        ];
         for bad in others.into_iter().chain([run.to_owned()]) {
             assert!(!may_use_client_id(&euclid, &bad), "{bad}");
         }

@@ -34,26 +34,43 @@ pub(super) struct Principal {
 }
 
 impl Principal {
-    pub(super) fn new(identity: Option<CertificateSubject>, from: IpAddr, has_generated_id: bool) -> Self {
+    pub(super) fn new(
+        identity: Option<CertificateSubject>,
+        from: IpAddr,
+        has_generated_id: bool,
+    ) -> Self {
         let quota_key: Option<Arc<str>> = match &identity {
             Some(identity) => Some(identity.name().as_str().into()),
             None if from.to_canonical().is_loopback() => None,
             None => Some(host_network(from).to_string().into()),
         };
         let source = quota_key.clone().unwrap_or_else(|| THIS_MACHINE.into());
-        Self { identity: identity.map(Arc::new), quota_key, source, has_generated_id, are_programs: false }
+        Self {
+            identity: identity.map(Arc::new),
+            quota_key,
+            source,
+            has_generated_id,
+            are_programs: false,
+        }
     }
 
     /// The programs of this party, whose connections, messages and bytes count apart.
     pub(super) fn programs(self) -> Self {
         let apart = |key: &Arc<str>| Arc::from(format!("{key}, programs"));
         let (quota_key, source) = (self.quota_key.as_ref().map(apart), apart(&self.source));
-        Self { quota_key, source, are_programs: true, ..self }
+        Self {
+            quota_key,
+            source,
+            are_programs: true,
+            ..self
+        }
     }
 
     /// True if it is the node itself by its certificate; without certificates, a client of this machine.
     pub(super) fn is_of(&self, node: &NodeName) -> bool {
-        self.identity.as_ref().map_or(self.quota_key.is_none(), |identity| identity.name() == node)
+        self.identity
+            .as_ref()
+            .map_or(self.quota_key.is_none(), |identity| identity.name() == node)
     }
 
     /// Name under which its bytes count together.
@@ -69,7 +86,9 @@ impl Principal {
     /// True if it sends maps, or may be a whole cell.
     pub(super) fn has_large_share(&self, elected: &LeaderCheck) -> bool {
         match &self.identity {
-            Some(identity) => !self.are_programs && identity.may_serve() && elected(identity.name()),
+            Some(identity) => {
+                !self.are_programs && identity.may_serve() && elected(identity.name())
+            }
             None => self.quota_key.is_none(),
         }
     }
@@ -119,8 +138,17 @@ pub(super) struct ClientRegistration {
 
 impl PrincipalRegistry {
     pub(super) fn register(&self, address: SocketAddr, principal: Principal) -> ClientRegistration {
-        self.connections_mut().insert(address, Registered { principal, subscriptions: HashSet::new() });
-        ClientRegistration { principals: self.clone(), address }
+        self.connections_mut().insert(
+            address,
+            Registered {
+                principal,
+                subscriptions: HashSet::new(),
+            },
+        );
+        ClientRegistration {
+            principals: self.clone(),
+            address,
+        }
     }
 
     pub(super) fn principal(&self, address: Option<SocketAddr>) -> Option<Principal> {
@@ -134,19 +162,31 @@ impl PrincipalRegistry {
 
     /// Name under which the bytes of a connection count.
     pub(super) fn source(&self, address: Option<SocketAddr>) -> Option<Arc<str>> {
-        Some(Arc::clone(&self.connections().get(&address?)?.principal.source))
+        Some(Arc::clone(
+            &self.connections().get(&address?)?.principal.source,
+        ))
     }
 
     /// Counts a refusal, also by the principal of the connection.
     pub(super) fn count_denied(&self, address: Option<SocketAddr>, counters: &Counters) {
         counters.count(Event::ClientDenied);
-        counters.reject(RejectReason::NotPermitted, self.source(address).as_deref().unwrap_or(OTHERS));
+        counters.reject(
+            RejectReason::NotPermitted,
+            self.source(address).as_deref().unwrap_or(OTHERS),
+        );
     }
 
     /// Notes that a connection has begun or ended a subscription. One that is made again counts once.
-    pub(super) fn note_subscription(&self, address: Option<SocketAddr>, filter: &TopicFilter, is_begun: bool) {
+    pub(super) fn note_subscription(
+        &self,
+        address: Option<SocketAddr>,
+        filter: &TopicFilter,
+        is_begun: bool,
+    ) {
         let mut connections = self.connections_mut();
-        let Some(connection) = address.and_then(|address| connections.get_mut(&address)) else { return };
+        let Some(connection) = address.and_then(|address| connections.get_mut(&address)) else {
+            return;
+        };
         if !is_begun {
             connection.subscriptions.remove(filter);
         } else if !connection.subscriptions.contains(filter) {
@@ -157,9 +197,15 @@ impl PrincipalRegistry {
     /// Subscriptions of all connections of the same principal, or of this connection where each counts alone.
     pub(super) fn subscriptions(&self, address: Option<SocketAddr>) -> usize {
         let connections = self.connections();
-        let Some(connection) = address.and_then(|address| connections.get(&address)) else { return 0 };
-        let Some(key) = &connection.principal.quota_key else { return connection.subscriptions.len() };
-        let own = connections.values().filter(|other| other.principal.quota_key.as_ref() == Some(key));
+        let Some(connection) = address.and_then(|address| connections.get(&address)) else {
+            return 0;
+        };
+        let Some(key) = &connection.principal.quota_key else {
+            return connection.subscriptions.len();
+        };
+        let own = connections
+            .values()
+            .filter(|other| other.principal.quota_key.as_ref() == Some(key));
         own.map(|connection| connection.subscriptions.len()).sum()
     }
 
@@ -174,7 +220,8 @@ impl PrincipalRegistry {
     /// Key under which the messages of a client count.
     pub(super) fn quota_key(&self, address: Option<SocketAddr>, client: &ClientId) -> QuotaKey {
         let connections = self.connections();
-        let quota_key = address.and_then(|address| connections.get(&address)?.principal.quota_key.clone());
+        let quota_key =
+            address.and_then(|address| connections.get(&address)?.principal.quota_key.clone());
         quota_key.map_or_else(|| QuotaKey::Client(client.clone()), QuotaKey::Principal)
     }
 }
@@ -197,15 +244,25 @@ pub(super) type ConnectionPermit = Option<OwnedSemaphorePermit>;
 
 impl ConnectionQuota {
     pub(super) fn new(limit: usize) -> Self {
-        Self { limit, connections: Mutex::default() }
+        Self {
+            limit,
+            connections: Mutex::default(),
+        }
     }
 
     /// A place for one more connection of the principal, if there is one left.
     pub(super) fn take(&self, principal: &Principal) -> Option<ConnectionPermit> {
-        let Some(quota_key) = &principal.quota_key else { return Some(None) };
-        let mut connections = self.connections.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(quota_key) = &principal.quota_key else {
+            return Some(None);
+        };
+        let mut connections = self
+            .connections
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         connections.retain(|_, places| places.available_permits() < self.limit);
-        let places = connections.entry(Arc::clone(quota_key)).or_insert_with(|| Arc::new(Semaphore::new(self.limit)));
+        let places = connections
+            .entry(Arc::clone(quota_key))
+            .or_insert_with(|| Arc::new(Semaphore::new(self.limit)));
         Arc::clone(places).try_acquire_owned().ok().map(Some)
     }
 }
@@ -229,7 +286,11 @@ mod tests {
         assert_eq!(here.len(), 100);
         drop(held);
         assert!(take("10.0.0.1").is_some() && take("10.0.0.3").is_some());
-        assert_eq!(quota.connections.lock().unwrap().len(), 1, "who has left is forgotten");
+        assert_eq!(
+            quota.connections.lock().unwrap().len(),
+            1,
+            "who has left is forgotten"
+        );
     }
 
     #[test]
@@ -240,7 +301,10 @@ mod tests {
         assert!(held.is_some() && quota.take(&programs).is_none());
         assert!(quota.take(&node).is_some());
         assert_ne!(node.source(), programs.source());
-        assert!(at("127.0.0.1").programs().quota_key().is_none(), "this machine's connections each count alone");
+        assert!(
+            at("127.0.0.1").programs().quota_key().is_none(),
+            "this machine's connections each count alone"
+        );
     }
 
     #[test]
@@ -248,12 +312,23 @@ mod tests {
         let principals = PrincipalRegistry::default();
         let port = |port| SocketAddr::from(([127, 0, 0, 1], port));
         let holders = ["10.0.0.1", "10.0.0.1", "10.0.0.2", "127.0.0.1", "127.0.0.1"].map(at);
-        let _issued: Vec<_> =
-            (1..).zip(holders).map(|(n, principal)| principals.register(port(n), principal)).collect();
-        let quota_key = |n: u16| principals.quota_key(Some(port(n)), &ClientId::from(format!("client-{n}")));
+        let _issued: Vec<_> = (1..)
+            .zip(holders)
+            .map(|(n, principal)| principals.register(port(n), principal))
+            .collect();
+        let quota_key =
+            |n: u16| principals.quota_key(Some(port(n)), &ClientId::from(format!("client-{n}")));
         assert_eq!(quota_key(1), quota_key(2));
         assert_ne!(quota_key(1), quota_key(3));
-        assert_ne!(quota_key(4), quota_key(5), "this machine's are told apart by their names");
-        assert_eq!(quota_key(6), QuotaKey::Client("client-6".into()), "and those behind no frontend");
+        assert_ne!(
+            quota_key(4),
+            quota_key(5),
+            "this machine's are told apart by their names"
+        );
+        assert_eq!(
+            quota_key(6),
+            QuotaKey::Client("client-6".into()),
+            "and those behind no frontend"
+        );
     }
 }

@@ -64,7 +64,9 @@ impl RelayLimits {
         let (from_client, to_client) = tokio::io::split(client);
         let (from_broker, mut to_broker) = broker.into_split();
         let up = async {
-            let forwarded = self.forward_up((from_client, wire_bytes), &mut to_broker, principal, &slot).await;
+            let forwarded = self
+                .forward_up((from_client, wire_bytes), &mut to_broker, principal, &slot)
+                .await;
             (forwarded, to_broker.shutdown().await)
         };
         let down = self.forward_down(from_broker, to_client, principal, &slot, cut);
@@ -97,7 +99,8 @@ impl RelayLimits {
         principal: &Principal,
         slot: &BacklogSlot,
     ) -> io::Result<()> {
-        let (mut buffer, mut scanner, mut unfinished) = (vec![0; BUFFER_BYTES], PacketScanner::default(), 0);
+        let (mut buffer, mut scanner, mut unfinished) =
+            (vec![0; BUFFER_BYTES], PacketScanner::default(), 0);
         let (mut content, mut charged) = (0, 0);
         loop {
             let read = client.read(&mut buffer).await?;
@@ -127,7 +130,12 @@ impl RelayLimits {
             let source = principal.source();
             content += read;
             let due = content.max(wire_bytes.load(Ordering::Relaxed));
-            let wait = self.throttle.charge(source, has_large_share, (due - charged, packets), clock::now());
+            let wait = self.throttle.charge(
+                source,
+                has_large_share,
+                (due - charged, packets),
+                clock::now(),
+            );
             charged = due;
             if !wait.is_zero() {
                 sleep(wait).await;
@@ -179,12 +187,19 @@ impl RelayLimits {
 }
 
 fn has_too_many_filters(header: &[u8], length: usize) -> bool {
-    header.first().is_some_and(|first| matches!(first >> 4, SUBSCRIBE | UNSUBSCRIBE)) && length > MAX_FILTERS_BYTES
+    header
+        .first()
+        .is_some_and(|first| matches!(first >> 4, SUBSCRIBE | UNSUBSCRIBE))
+        && length > MAX_FILTERS_BYTES
 }
 
 /// Sends some bytes, or, if there are none, those that TLS still holds.
 async fn send(client: &mut (impl AsyncWrite + Unpin), bytes: &[u8]) -> io::Result<usize> {
-    if bytes.is_empty() { client.flush().await.map(|()| 0) } else { client.write(bytes).await }
+    if bytes.is_empty() {
+        client.flush().await.map(|()| 0)
+    } else {
+        client.write(bytes).await
+    }
 }
 
 /// The end of a client that does not take what it gets, or does not end what it begins.

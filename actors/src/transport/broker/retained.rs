@@ -28,7 +28,10 @@ impl RetainedMessages {
             max_bytes: config.max_retained_bytes,
             pruned_at: None,
         };
-        Self { storage: DefaultRetainStorage::new(), index: Mutex::new(index) }
+        Self {
+            storage: DefaultRetainStorage::new(),
+            index: Mutex::new(index),
+        }
     }
 }
 
@@ -53,7 +56,9 @@ impl RetainStorage for RetainedMessages {
         // A copy: the received bytes are part of a larger buffer, and count as in flight.
         message.publish.payload = Bytes::copy_from_slice(&message.publish.payload);
         let properties = message.publish.properties.as_ref();
-        let expiry = properties.and_then(|p| p.message_expiry_interval).map(|s| Duration::from_secs(s.get().into()));
+        let expiry = properties
+            .and_then(|p| p.message_expiry_interval)
+            .map(|s| Duration::from_secs(s.get().into()));
         let (now, bytes) = (Instant::now(), message.publish.payload.len());
         let mut index = self.index.lock().await;
         let has_room = is_topic_bounded(topic)
@@ -108,10 +113,13 @@ impl RetainedIndex {
     /// Records a message in place of its topic's last; false when there is no room.
     fn insert(&mut self, topic: &str, bytes: usize, until: Option<Instant>, now: Instant) -> bool {
         if !self.has_room(topic, bytes)
-            && self.pruned_at.is_none_or(|pruned_at| now.duration_since(pruned_at) >= PRUNE_INTERVAL)
+            && self
+                .pruned_at
+                .is_none_or(|pruned_at| now.duration_since(pruned_at) >= PRUNE_INTERVAL)
         {
             self.pruned_at = Some(now);
-            self.entries.retain(|_, (_, until)| until.is_none_or(|until| until > now));
+            self.entries
+                .retain(|_, (_, until)| until.is_none_or(|until| until > now));
             self.bytes = self.entries.values().map(|(bytes, _)| bytes).sum();
         }
         let has_room = self.has_room(topic, bytes);
@@ -129,16 +137,25 @@ impl RetainedIndex {
 
     fn has_room(&self, topic: &str, bytes: usize) -> bool {
         let before = self.entries.get(topic).map(|(bytes, _)| bytes);
-        let is_crowded = || self.entries.len() >= self.max_topics || self.observers_beside(topic) >= MAX_OBSERVERS;
-        self.bytes - before.unwrap_or(&0) + bytes <= self.max_bytes && (before.is_some() || !is_crowded())
+        let is_crowded = || {
+            self.entries.len() >= self.max_topics || self.observers_beside(topic) >= MAX_OBSERVERS
+        };
+        self.bytes - before.unwrap_or(&0) + bytes <= self.max_bytes
+            && (before.is_some() || !is_crowded())
     }
 
     /// Number of topics of observers that share a certificate with this topic's observer.
     fn observers_beside(&self, topic: &str) -> usize {
         let name = topic.rfind('/').map_or(0, |slash| slash + 1);
         let mark = topic.get(name..).and_then(|name| name.find(OBSERVER_MARK));
-        let Some(principal) = mark.and_then(|mark| topic.get(..name + mark + OBSERVER_MARK.len())) else { return 0 };
-        self.entries.range(principal.to_owned()..).take_while(|(topic, _)| topic.starts_with(principal)).count()
+        let Some(principal) = mark.and_then(|mark| topic.get(..name + mark + OBSERVER_MARK.len()))
+        else {
+            return 0;
+        };
+        self.entries
+            .range(principal.to_owned()..)
+            .take_while(|(topic, _)| topic.starts_with(principal))
+            .count()
     }
 }
 
@@ -147,16 +164,31 @@ mod tests {
     use super::*;
 
     fn index(max_topics: usize, max_bytes: usize) -> RetainedIndex {
-        RetainedIndex { entries: BTreeMap::new(), bytes: 0, max_topics, max_bytes, pruned_at: None }
+        RetainedIndex {
+            entries: BTreeMap::new(),
+            bytes: 0,
+            max_topics,
+            max_bytes,
+            pruned_at: None,
+        }
     }
 
     #[test]
     fn topics_and_bytes_are_bounded_and_what_is_there_may_change() {
         let mut index = index(2, 100);
         let now = Instant::now();
-        assert!(index.insert("a", 60, None, now) && !index.insert("b", 50, None, now), "bytes");
-        assert!(index.insert("a", 100, None, now) && index.insert("a", 50, None, now), "in its own place");
-        assert!(index.insert("b", 50, None, now) && !index.insert("c", 0, None, now), "topics");
+        assert!(
+            index.insert("a", 60, None, now) && !index.insert("b", 50, None, now),
+            "bytes"
+        );
+        assert!(
+            index.insert("a", 100, None, now) && index.insert("a", 50, None, now),
+            "in its own place"
+        );
+        assert!(
+            index.insert("b", 50, None, now) && !index.insert("c", 0, None, now),
+            "topics"
+        );
         index.remove("a");
         assert!(index.insert("c", 50, None, now));
         assert_eq!(index.bytes, 100);
@@ -166,7 +198,9 @@ mod tests {
     fn what_has_expired_makes_room() {
         let mut index = index(1, 100);
         let (now, second) = (Instant::now(), Duration::from_secs(1));
-        assert!(index.insert("a", 100, Some(now + second), now) && !index.insert("b", 1, None, now));
+        assert!(
+            index.insert("a", 100, Some(now + second), now) && !index.insert("b", 1, None, now)
+        );
         assert!(index.insert("b", 1, None, now + 2 * second));
     }
 
@@ -174,9 +208,15 @@ mod tests {
     fn one_certificate_does_not_use_up_the_topics() {
         let mut index = index(1000, 1000);
         let now = Instant::now();
-        let entries = (0..200).filter(|n| index.insert(&format!("c--1/nodes/gauss--{n}"), 1, None, now)).count();
+        let entries = (0..200)
+            .filter(|n| index.insert(&format!("c--1/nodes/gauss--{n}"), 1, None, now))
+            .count();
         assert_eq!(entries, MAX_OBSERVERS);
-        for other in ["c--1/nodes/gauss", "c--1/nodes/euclid", "c--1/nodes/euclid--top"] {
+        for other in [
+            "c--1/nodes/gauss",
+            "c--1/nodes/euclid",
+            "c--1/nodes/euclid--top",
+        ] {
             assert!(index.insert(other, 1, None, now), "{other}");
         }
     }

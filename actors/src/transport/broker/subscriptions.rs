@@ -30,15 +30,25 @@ pub(super) struct SubscriptionQuota {
 impl SubscriptionQuota {
     pub(super) fn new(principals: PrincipalRegistry, counters: Arc<Counters>) -> Self {
         let rate = KeyedThrottle::new(MAX_SUBSCRIPTIONS as u32, INTERVAL);
-        Self { rate: Mutex::new(rate), principals, counters }
+        Self {
+            rate: Mutex::new(rate),
+            principals,
+            counters,
+        }
     }
 
     /// Registers the hooks, before the permissions.
     pub(super) async fn install(self, context: &ServerContext) {
         let register = context.extends.hook_mgr().register();
         let hook = Arc::new(self);
-        for event in [Type::ClientSubscribeCheckAcl, Type::SessionSubscribed, Type::SessionUnsubscribed] {
-            register.add_priority(event, 1, Box::new(SharedQuota(Arc::clone(&hook)))).await;
+        for event in [
+            Type::ClientSubscribeCheckAcl,
+            Type::SessionSubscribed,
+            Type::SessionUnsubscribed,
+        ] {
+            register
+                .add_priority(event, 1, Box::new(SharedQuota(Arc::clone(&hook))))
+                .await;
         }
         register.start().await;
     }
@@ -49,23 +59,35 @@ struct SharedQuota(Arc<SubscriptionQuota>);
 #[async_trait]
 impl Handler for SharedQuota {
     async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
-        let SubscriptionQuota { rate, principals, counters } = &*self.0;
+        let SubscriptionQuota {
+            rate,
+            principals,
+            counters,
+        } = &*self.0;
         match parameter {
             Parameter::SessionSubscribed(session, subscribe) => {
                 principals.note_subscription(session.id.remote_addr, &subscribe.topic_filter, true);
             }
             Parameter::SessionUnsubscribed(session, unsubscribe) => {
-                principals.note_subscription(session.id.remote_addr, &unsubscribe.topic_filter, false);
+                principals.note_subscription(
+                    session.id.remote_addr,
+                    &unsubscribe.topic_filter,
+                    false,
+                );
             }
             Parameter::ClientSubscribeCheckAcl(session, _) => {
                 let address = session.id.remote_addr;
                 let source = principals.quota_key(address, &session.id.client_id);
                 let is_allowed = principals.subscriptions(address) < MAX_SUBSCRIPTIONS
-                    && rate.lock().unwrap_or_else(PoisonError::into_inner).allow(&source, clock::now());
+                    && rate
+                        .lock()
+                        .unwrap_or_else(PoisonError::into_inner)
+                        .allow(&source, clock::now());
                 if !is_allowed {
                     principals.count_denied(address, counters);
                     tracing::debug!(source = source.as_str(), "subscription refused");
-                    let refused = SubscribeAclResult::new_failure(SubscribeAckReason::QuotaExceeded);
+                    let refused =
+                        SubscribeAclResult::new_failure(SubscribeAckReason::QuotaExceeded);
                     return (false, Some(HookResult::SubscribeAclResult(refused)));
                 }
             }

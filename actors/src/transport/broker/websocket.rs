@@ -9,7 +9,9 @@ use std::task::{Context, Poll, ready};
 
 use bytes::Bytes;
 use futures_util::{Sink, Stream};
-use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, BufReader, ReadBuf};
+use tokio::io::{
+    AsyncBufReadExt, AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, BufReader, ReadBuf,
+};
 use tokio_tungstenite::tungstenite::handshake::server::{ErrorResponse, Request, Response};
 use tokio_tungstenite::tungstenite::http::header::{HOST, ORIGIN, SEC_WEBSOCKET_PROTOCOL};
 use tokio_tungstenite::tungstenite::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, Uri};
@@ -71,9 +73,11 @@ pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
     }
     reader.get_mut().set_limit(u64::MAX);
     if !asks_for_upgrade(&request) {
-        let head = "HTTP/1.1 426 Upgrade Required\r\nUpgrade: websocket\r\nConnection: Upgrade, close\r\n";
+        let head =
+            "HTTP/1.1 426 Upgrade Required\r\nUpgrade: websocket\r\nConnection: Upgrade, close\r\n";
         let length = NO_PAGE.len();
-        let answer = format!("{head}Content-Type: text/plain\r\nContent-Length: {length}\r\n\r\n{NO_PAGE}");
+        let answer =
+            format!("{head}Content-Type: text/plain\r\nContent-Length: {length}\r\n\r\n{NO_PAGE}");
         writer.write_all(answer.as_bytes()).await?;
         writer.shutdown().await?;
         return Err(ClientRejection::Malformed);
@@ -86,9 +90,19 @@ pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
         .max_message_size(Some(MAX_MESSAGE_BYTES))
         .max_frame_size(Some(MAX_MESSAGE_BYTES));
     match accept_hdr_async_with_config(stream, answer, Some(config)).await {
-        Ok(socket) => Ok(WebSocketBytes { socket, received: Bytes::new(), fault: None, wire_bytes, content_at: 0 }),
+        Ok(socket) => Ok(WebSocketBytes {
+            socket,
+            received: Bytes::new(),
+            fault: None,
+            wire_bytes,
+            content_at: 0,
+        }),
         Err(Error::Http(refusal)) => {
-            let text = refusal.body().as_deref().map(String::from_utf8_lossy).unwrap_or_default();
+            let text = refusal
+                .body()
+                .as_deref()
+                .map(String::from_utf8_lossy)
+                .unwrap_or_default();
             Err(ClientRejection::Untrusted(text.into_owned()))
         }
         Err(Error::Io(error)) => Err(error.into()),
@@ -106,7 +120,10 @@ fn asks_for_upgrade(request: &[u8]) -> bool {
 }
 
 /// Decides about a handshake.
-#[expect(clippy::result_large_err, reason = "the type of the library's callback")]
+#[expect(
+    clippy::result_large_err,
+    reason = "the type of the library's callback"
+)]
 fn answer(request: &Request, mut response: Response) -> Result<Response, ErrorResponse> {
     let refuse = |status, reason: String| {
         let mut refusal = ErrorResponse::new(Some(reason));
@@ -116,22 +133,44 @@ fn answer(request: &Request, mut response: Response) -> Result<Response, ErrorRe
     if let Err(reason) = check_page(request.headers()) {
         return refuse(StatusCode::FORBIDDEN, reason);
     }
-    let offered = request.headers().get_all(SEC_WEBSOCKET_PROTOCOL).into_iter();
-    let mut offered = offered.filter_map(|value| value.to_str().ok()).flat_map(|value| value.split(',')).map(str::trim);
+    let offered = request
+        .headers()
+        .get_all(SEC_WEBSOCKET_PROTOCOL)
+        .into_iter();
+    let mut offered = offered
+        .filter_map(|value| value.to_str().ok())
+        .flat_map(|value| value.split(','))
+        .map(str::trim);
     if !offered.any(|protocol| protocol == "mqtt") {
-        return refuse(StatusCode::BAD_REQUEST, "the client must ask for the WebSocket protocol `mqtt`".to_owned());
+        return refuse(
+            StatusCode::BAD_REQUEST,
+            "the client must ask for the WebSocket protocol `mqtt`".to_owned(),
+        );
     }
-    response.headers_mut().insert(SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static("mqtt"));
+    response
+        .headers_mut()
+        .insert(SEC_WEBSOCKET_PROTOCOL, HeaderValue::from_static("mqtt"));
     Ok(response)
 }
 
 /// Checks the page that connects. A browser lets the page of any site connect to any address, also on loopback, and
 /// names the site. Programs name none.
 fn check_page(headers: &HeaderMap) -> Result<(), String> {
-    let Some(origin) = headers.get(ORIGIN) else { return Ok(()) };
+    let Some(origin) = headers.get(ORIGIN) else {
+        return Ok(());
+    };
     let origin = origin.to_str().unwrap_or("?");
-    let page = host(origin.split_once("://").map_or("", |(_, authority)| authority));
-    let text = |name: HeaderName| headers.get(name).and_then(|value| value.to_str().ok()).and_then(host);
+    let page = host(
+        origin
+            .split_once("://")
+            .map_or("", |(_, authority)| authority),
+    );
+    let text = |name: HeaderName| {
+        headers
+            .get(name)
+            .and_then(|value| value.to_str().ok())
+            .and_then(host)
+    };
     // The name of a foreign site can be made to lead here (DNS rebinding); an address or this machine's name cannot.
     let is_own = page.is_some() && page == text(HOST) && page.as_deref().is_some_and(is_safe_name);
     if is_own {
@@ -146,11 +185,15 @@ fn check_page(headers: &HeaderMap) -> Result<(), String> {
 /// Host of an authority, without port.
 fn host(authority: &str) -> Option<String> {
     let uri: Uri = authority.parse().ok()?;
-    uri.authority().map(|authority| authority.host().to_ascii_lowercase())
+    uri.authority()
+        .map(|authority| authority.host().to_ascii_lowercase())
 }
 
 fn is_safe_name(host: &str) -> bool {
-    let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
+    let bare = host
+        .strip_prefix('[')
+        .and_then(|host| host.strip_suffix(']'))
+        .unwrap_or(host);
     let system = rustix::system::uname();
     let own = system.nodename().to_string_lossy().to_ascii_lowercase();
     // Of `euclid.lan`, the first label is the machine's name with `.local`.
@@ -171,7 +214,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocketBytes<S> {
                 }
                 Poll::Ready(Some(Ok(Message::Close(_))) | None) => return Poll::Ready(Ok(None)),
                 Poll::Ready(Some(Err(error))) => return Poll::Ready(Err(io_error(error))),
-                Poll::Ready(Some(Ok(Message::Text(_)))) => return Poll::Ready(Err(ErrorKind::InvalidData.into())),
+                Poll::Ready(Some(Ok(Message::Text(_)))) => {
+                    return Poll::Ready(Err(ErrorKind::InvalidData.into()));
+                }
                 _ if wire_bytes - self.content_at > MAX_EMPTY_BYTES => {
                     return Poll::Ready(Err(ErrorKind::InvalidData.into()));
                 }
@@ -184,7 +229,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocketBytes<S> {
 
 impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocketBytes<S> {
     /// Fills the buffer from as many messages as have come, so that small ones cost no more than on TCP.
-    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
         let began = buffer.filled().len();
         while buffer.remaining() > 0 {
             if self.received.is_empty() {
@@ -212,12 +261,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocketBytes<S> {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for WebSocketBytes<S> {
-    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
         // What a client does not read waits outside, where it is limited.
         ready!(Pin::new(&mut self.socket).poll_ready(cx)).map_err(io_error)?;
         let chunk = Bytes::copy_from_slice(bytes.get(..CHUNK_BYTES).unwrap_or(bytes));
         let written = chunk.len();
-        Pin::new(&mut self.socket).start_send(Message::Binary(chunk)).map_err(io_error)?;
+        Pin::new(&mut self.socket)
+            .start_send(Message::Binary(chunk))
+            .map_err(io_error)?;
         Poll::Ready(Ok(written))
     }
 
@@ -250,7 +305,8 @@ pub fn read_websocket(sent: Vec<u8>) -> Option<Vec<u8>> {
         let _ = client.read_to_end(&mut content).await;
         Some(content)
     };
-    read.now_or_never().expect("bytes that are there are not waited for")
+    read.now_or_never()
+        .expect("bytes that are there are not waited for")
 }
 
 #[cfg(test)]
@@ -261,11 +317,18 @@ mod tests {
     fn a_page_connects_to_the_host_that_served_it_by_its_address() {
         let check = |origin: &str, host: &str| {
             let headers = [(ORIGIN, origin), (HOST, host)];
-            let headers = headers.map(|(name, value)| (name, HeaderValue::from_str(value).unwrap()));
+            let headers =
+                headers.map(|(name, value)| (name, HeaderValue::from_str(value).unwrap()));
             check_page(&headers.into_iter().collect())
         };
-        let own = rustix::system::uname().nodename().to_string_lossy().to_ascii_lowercase();
-        let (own, own_local) = (format!("http://{own}:8000"), format!("http://{own}.local:8000"));
+        let own = rustix::system::uname()
+            .nodename()
+            .to_string_lossy()
+            .to_ascii_lowercase();
+        let (own, own_local) = (
+            format!("http://{own}:8000"),
+            format!("http://{own}.local:8000"),
+        );
         for (origin, host) in [
             (&*own, own.trim_start_matches("http://")),
             (&*own_local, own_local.trim_start_matches("http://")),
@@ -287,6 +350,10 @@ mod tests {
         ] {
             assert!(check(origin, host).is_err(), "{origin}");
         }
-        assert_eq!(check_page(&HeaderMap::new()), Ok(()), "programs name no page");
+        assert_eq!(
+            check_page(&HeaderMap::new()),
+            Ok(()),
+            "programs name no page"
+        );
     }
 }

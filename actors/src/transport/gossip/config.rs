@@ -72,7 +72,12 @@ pub struct MulticastConfig {
 
 impl Default for MulticastConfig {
     fn default() -> Self {
-        Self { enabled: true, group: Ipv4Addr::new(239, 255, 36, 84), port: 17_885, interface: None }
+        Self {
+            enabled: true,
+            group: Ipv4Addr::new(239, 255, 36, 84),
+            port: 17_885,
+            interface: None,
+        }
     }
 }
 
@@ -102,21 +107,51 @@ impl MembershipConfig {
     /// [`ConfigError`] naming the first key that cannot be used.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.key.is_some() && self.key_file.is_some() {
-            return Err(ConfigError::new("key_file", "a file", "left out when `key` is set"));
+            return Err(ConfigError::new(
+                "key_file",
+                "a file",
+                "left out when `key` is set",
+            ));
         }
-        if self.key.as_ref().is_some_and(|key| key.reveal().trim().len() < MIN_KEY_BYTES) {
-            return Err(ConfigError::new("key", "a shorter text", format!("at least {MIN_KEY_BYTES} characters")));
+        if self
+            .key
+            .as_ref()
+            .is_some_and(|key| key.reveal().trim().len() < MIN_KEY_BYTES)
+        {
+            return Err(ConfigError::new(
+                "key",
+                "a shorter text",
+                format!("at least {MIN_KEY_BYTES} characters"),
+            ));
         }
-        if self.advertise.is_some_and(|address| address.ip().is_unspecified() || address.port() == 0) {
-            return Err(ConfigError::new("advertise", "an open address", "an address and port that others can reach"));
+        if self
+            .advertise
+            .is_some_and(|address| address.ip().is_unspecified() || address.port() == 0)
+        {
+            return Err(ConfigError::new(
+                "advertise",
+                "an open address",
+                "an address and port that others can reach",
+            ));
         }
         if let Some(seed) = self.seeds.iter().find(|seed| !is_host_and_port(seed)) {
-            return Err(ConfigError::new("seeds", seed, "host:port, such as 192.168.1.10:17884"));
+            return Err(ConfigError::new(
+                "seeds",
+                seed,
+                "host:port, such as 192.168.1.10:17884",
+            ));
         }
-        self.multicast.validate().map_err(|error| error.within("multicast"))?;
+        self.multicast
+            .validate()
+            .map_err(|error| error.within("multicast"))?;
         let ms = |key, value: u64, low: f64, high: f64| check_range(key, value as f64, low, high);
         ms("probe_ms", self.probe_ms, 10.0, 60_000.0)?;
-        ms("reply_ms", self.reply_ms, 1.0, (self.probe_ms.saturating_sub(1) / 2) as f64)?;
+        ms(
+            "reply_ms",
+            self.reply_ms,
+            1.0,
+            (self.probe_ms.saturating_sub(1) / 2) as f64,
+        )?;
         ms("suspect_ms", self.suspect_ms, 10.0, 600_000.0)?;
         ms("gossip_ms", self.gossip_ms, 5.0, 60_000.0)?;
         ms("hello_ms", self.hello_ms, 10.0, 600_000.0)?;
@@ -130,7 +165,11 @@ impl MembershipConfig {
 
     /// Gossip address without `bind`.
     pub(crate) fn default_ip(&self) -> IpAddr {
-        IpAddr::V4(if self.has_key() { Ipv4Addr::UNSPECIFIED } else { Ipv4Addr::LOCALHOST })
+        IpAddr::V4(if self.has_key() {
+            Ipv4Addr::UNSPECIFIED
+        } else {
+            Ipv4Addr::LOCALHOST
+        })
     }
 
     pub(crate) fn hello(&self) -> Duration {
@@ -141,7 +180,11 @@ impl MembershipConfig {
 impl MulticastConfig {
     fn validate(&self) -> Result<(), ConfigError> {
         if !self.group.is_multicast() {
-            return Err(ConfigError::new("group", self.group, "an address from 224.0.0.0 to 239.255.255.255"));
+            return Err(ConfigError::new(
+                "group",
+                self.group,
+                "an address from 224.0.0.0 to 239.255.255.255",
+            ));
         }
         check_range("port", f64::from(self.port), 1.0, 65_535.0)
     }
@@ -166,7 +209,10 @@ mod tests {
         assert_eq!(MembershipConfig::default().validate(), Ok(()));
         for (toml, key) in [
             ("key = \"short\"", "key"),
-            ("key = \"long enough, this\"\nkey_file = \"/etc/ecod/key\"", "key_file"),
+            (
+                "key = \"long enough, this\"\nkey_file = \"/etc/ecod/key\"",
+                "key_file",
+            ),
             ("advertise = \"0.0.0.0:1\"", "advertise"),
             ("seeds = [\"host\"]", "seeds"),
             ("reply_ms = 50", "reply_ms"),

@@ -76,6 +76,9 @@ impl FrameCounters {
 
     /// All counts by label, zeros included.
     pub fn snapshot(&self) -> BTreeMap<&'static str, u64> {
-        FrameEvent::ALL.iter().map(|event| (event.as_str(), self.get(*event))).collect()
+        FrameEvent::ALL
+            .iter()
+            .map(|event| (event.as_str(), self.get(*event)))
+            .collect()
     }
 }

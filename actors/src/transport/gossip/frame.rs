@@ -136,7 +136,9 @@ impl FrameHeader {
         if frame.len() > MAX_FRAME_BYTES {
             return Err(FrameEvent::Oversized);
         }
-        let Some((head, _)) = frame.split_first_chunk::<HEADER_BYTES>().filter(|(_, body)| body.len() >= SEAL_BYTES)
+        let Some((head, _)) = frame
+            .split_first_chunk::<HEADER_BYTES>()
+            .filter(|(_, body)| body.len() >= SEAL_BYTES)
         else {
             return Err(FrameEvent::Malformed);
         };
@@ -162,7 +164,12 @@ impl FrameHeader {
         let (Some(&sender), Some(&counter)) = (rest.first_chunk(), rest.last_chunk()) else {
             return Err(FrameEvent::Malformed);
         };
-        Ok(Self { version, kind, sender, counter: u64::from_be_bytes(counter) })
+        Ok(Self {
+            version,
+            kind,
+            sender,
+            counter: u64::from_be_bytes(counter),
+        })
     }
 
     /// Writes a whole frame, sealed.
@@ -177,7 +184,12 @@ impl FrameHeader {
     /// The head as it is on the wire.
     pub(crate) fn bytes(&self, cell: [u8; 4]) -> [u8; HEADER_BYTES] {
         let start: [&[u8]; 3] = [&MAGIC, &[self.version as u8, self.kind as u8], &cell];
-        let all = [&start.concat(), &self.sender[..], &self.counter.to_be_bytes()].concat();
+        let all = [
+            &start.concat(),
+            &self.sender[..],
+            &self.counter.to_be_bytes(),
+        ]
+        .concat();
         all.try_into().unwrap_or([0; HEADER_BYTES])
     }
 }

@@ -11,7 +11,8 @@ use ecod::wire::Role;
 
 use super::config::MembershipConfig;
 use super::frame::{
-    FrameHeader, FrameKind, Greeting, HEADER_BYTES, Handshake, Hello, Introduction, NameClaim, Version,
+    FrameHeader, FrameKind, Greeting, HEADER_BYTES, Handshake, Hello, Introduction, NameClaim,
+    Version,
 };
 use super::handshake::{Attestation, Identity, Prover, Side, SignedMessage, Transcript};
 use super::key::{BROADCAST, CellKey, Cookie, SessionId, session_of};
@@ -66,7 +67,10 @@ impl Listener {
         let mut under_way = VecDeque::new();
         for _ in 0..100 {
             for (index, machine) in [&mut *own, &mut peer].into_iter().enumerate() {
-                if machine.next_deadline().is_some_and(|deadline| deadline <= *now) {
+                if machine
+                    .next_deadline()
+                    .is_some_and(|deadline| deadline <= *now)
+                {
                     machine.tick(*now);
                 }
                 while let Some(output) = machine.poll() {
@@ -95,12 +99,31 @@ impl Listener {
     pub fn alone(proves: bool) -> Self {
         let now = Timestamp(START);
         let own = machine(OWN, 2, proves, now);
-        let sessions = [(OWN, [2; 16]), (PEER, [1; 16])]
-            .map(|(node, nonce)| if proves { session_of(&name(node), &nonce) } else { nonce });
-        let version = if proves { Version::Certificate } else { Version::Key };
+        let sessions = [(OWN, [2; 16]), (PEER, [1; 16])].map(|(node, nonce)| {
+            if proves {
+                session_of(&name(node), &nonce)
+            } else {
+                nonce
+            }
+        });
+        let version = if proves {
+            Version::Certificate
+        } else {
+            Version::Key
+        };
         let prover = proves.then(|| Prover::new(IDENTITIES[1].clone(), [1; 16]));
         let forged = 1 << 16;
-        Self { own, key: key(), version, sessions, now, forged, prover, challenge: None, proof: None }
+        Self {
+            own,
+            key: key(),
+            version,
+            sessions,
+            now,
+            forged,
+            prover,
+            challenge: None,
+            proof: None,
+        }
     }
 
     /// Processes a datagram from the peer's address.
@@ -120,7 +143,12 @@ impl Listener {
             _ => (FrameKind::Hello, BROADCAST, Version::Key),
         };
         self.forged += 1;
-        let head = FrameHeader { version, kind, sender: peer, counter: self.forged };
+        let head = FrameHeader {
+            version,
+            kind,
+            sender: peer,
+            counter: self.forged,
+        };
         let frame = head.write(self.key.tag(), body, &self.key.seal(&peer, &to));
         self.hear(&frame);
     }
@@ -136,7 +164,10 @@ impl Listener {
 
     /// Processes a challenge of the peer, which the node answers with its proof.
     pub fn hear_challenge(&mut self, edits: &Edits) {
-        let challenge = encode(&Handshake::Challenge { cookie: PEER_COOKIE, name: name(PEER) });
+        let challenge = encode(&Handshake::Challenge {
+            cookie: PEER_COOKIE,
+            name: name(PEER),
+        });
         self.hear_sealed(1, &edited(challenge, edits));
     }
 
@@ -144,27 +175,61 @@ impl Listener {
     /// attestation is changed.
     pub fn hear_proof(&mut self, message: &Edits, attestation: &Edits) {
         let Some(echo) = self.challenge else { return };
-        let proof = Handshake::Proof { echo, cookie: PEER_COOKIE, introduction: introduction() };
-        self.hear_signed(Side::Prover, OWN.as_bytes(), edited(encode(&proof), message), attestation);
+        let proof = Handshake::Proof {
+            echo,
+            cookie: PEER_COOKIE,
+            introduction: introduction(),
+        };
+        self.hear_signed(
+            Side::Prover,
+            OWN.as_bytes(),
+            edited(encode(&proof), message),
+            attestation,
+        );
     }
 
     /// Processes the peer's accept of the node's last proof, in the same way.
     pub fn hear_accept(&mut self, message: &Edits, attestation: &Edits) {
-        let Some((echo, proof)) = self.proof else { return };
-        let accept = Handshake::Accept { echo, introduction: introduction() };
-        self.hear_signed(Side::Accepter, &proof, edited(encode(&accept), message), attestation);
+        let Some((echo, proof)) = self.proof else {
+            return;
+        };
+        let accept = Handshake::Accept {
+            echo,
+            introduction: introduction(),
+        };
+        self.hear_signed(
+            Side::Accepter,
+            &proof,
+            edited(encode(&accept), message),
+            attestation,
+        );
     }
 
     fn hear_signed(&mut self, side: Side, context: &[u8], mut message: Vec<u8>, edits: &Edits) {
         let [own, peer] = self.sessions;
         // The frame that comes next.
         let counter = self.forged + 1;
-        let head = FrameHeader { version: self.version, kind: FrameKind::Handshake, sender: peer, counter };
+        let head = FrameHeader {
+            version: self.version,
+            kind: FrameKind::Handshake,
+            sender: peer,
+            counter,
+        };
         if let Some(prover) = &self.prover {
             let head = head.bytes(self.key.tag());
-            let signed = SignedMessage { side, head, receiver: own, context, message: &message };
+            let signed = SignedMessage {
+                side,
+                head,
+                receiver: own,
+                context,
+                message: &message,
+            };
             let ephemeral = prover.draw_ephemeral().map(|(_, public)| public);
-            let Some((attestation, _)) = ephemeral.and_then(|public| prover.attest(&signed, public)) else { return };
+            let Some((attestation, _)) =
+                ephemeral.and_then(|public| prover.attest(&signed, public))
+            else {
+                return;
+            };
             message.extend(edited(encode(&attestation), edits));
         }
         self.hear_sealed(1, &message);
@@ -179,7 +244,11 @@ impl Listener {
 
     /// Asserts that a node of a cell with certificates knows its peer only, whatever it heard.
     pub fn assert_nobody_else(&self) {
-        let strangers = self.own.members().into_iter().filter(|member| member.name.as_str() != PEER);
+        let strangers = self
+            .own
+            .members()
+            .into_iter()
+            .filter(|member| member.name.as_str() != PEER);
         assert!(self.version == Version::Key || strangers.count() == 0);
     }
 
@@ -196,14 +265,26 @@ impl Listener {
         let [own, peer] = self.sessions;
         let head = FrameHeader::read(frame, self.key.tag()).ok()?;
         let (open, sealed) = frame.split_at_checked(HEADER_BYTES)?;
-        let body = self.key.seal(&own, &peer).open(head.counter, open, sealed)?;
+        let body = self
+            .key
+            .seal(&own, &peer)
+            .open(head.counter, open, sealed)?;
         let (message, rest) = decode_first::<Handshake>(&body).ok()?;
         match message {
             Handshake::Challenge { cookie, .. } => self.challenge = Some(cookie),
             Handshake::Proof { cookie, .. } if self.prover.is_some() => {
-                let (attestation, head) = (decode::<Attestation>(rest).ok()?, head.bytes(self.key.tag()));
+                let (attestation, head) = (
+                    decode::<Attestation>(rest).ok()?,
+                    head.bytes(self.key.tag()),
+                );
                 let (side, message) = (Side::Prover, body.get(..body.len() - rest.len())?);
-                let signed = SignedMessage { side, head, receiver: peer, context: PEER.as_bytes(), message };
+                let signed = SignedMessage {
+                    side,
+                    head,
+                    receiver: peer,
+                    context: PEER.as_bytes(),
+                    message,
+                };
                 self.proof = Some((cookie, signed.transcript(&attestation)));
             }
             Handshake::Proof { cookie, .. } => self.proof = Some((cookie, Transcript::default())),
@@ -223,7 +304,11 @@ fn edited(mut bytes: Vec<u8>, edits: &Edits) -> Vec<u8> {
 
 /// The peer as it introduces itself.
 fn introduction() -> Introduction {
-    Introduction { id: node_id(PEER, Timestamp(START)), seen_at: address(0), claim: NameClaim::Free }
+    Introduction {
+        id: node_id(PEER, Timestamp(START)),
+        seen_at: address(0),
+        claim: NameClaim::Free,
+    }
 }
 
 fn name(text: &'static str) -> NodeName {

@@ -105,7 +105,13 @@ pub(crate) struct PendingProof {
 
 impl Prover {
     pub(crate) fn new(identity: Identity, nonce: SessionNonce) -> Self {
-        Self { identity, nonce, random: SystemRandom::new(), pending: HashMap::new(), notices: Notices::default() }
+        Self {
+            identity,
+            nonce,
+            random: SystemRandom::new(),
+            pending: HashMap::new(),
+            notices: Notices::default(),
+        }
     }
 
     /// Replaces the certificates and the time; true when the certificates are others.
@@ -131,10 +137,20 @@ impl Prover {
     }
 
     /// Verifies that a node's certificate proves its name.
-    pub(crate) fn verify(&mut self, name: &NodeName, certificate: &[u8], from: SocketAddr) -> Option<Proven> {
-        let checked = self.identity.credentials.verify_node(certificate, self.identity.wall);
+    pub(crate) fn verify(
+        &mut self,
+        name: &NodeName,
+        certificate: &[u8],
+        from: SocketAddr,
+    ) -> Option<Proven> {
+        let checked = self
+            .identity
+            .credentials
+            .verify_node(certificate, self.identity.wall);
         let refusal = match checked {
-            Ok(subject) if subject.may_act_as(name.as_str()) => return Some(proven(&subject, name, certificate)),
+            Ok(subject) if subject.may_act_as(name.as_str()) => {
+                return Some(proven(&subject, name, certificate));
+            }
             Ok(subject) => format!("its certificate is for {}", subject.name()),
             Err(Distrust::Untrusted(error)) => error.to_string(),
             Err(Distrust::Invalid(error)) => error.to_string(),
@@ -152,11 +168,24 @@ impl Prover {
     }
 
     /// This node's proof for a message, and the transcript of it.
-    pub(crate) fn attest(&self, signed: &SignedMessage<'_>, ephemeral: [u8; 32]) -> Option<(Attestation, Transcript)> {
+    pub(crate) fn attest(
+        &self,
+        signed: &SignedMessage<'_>,
+        ephemeral: [u8; 32],
+    ) -> Option<(Attestation, Transcript)> {
         let (nonce, certificate) = (self.nonce, self.certificate().to_vec());
-        let mut attestation = Attestation { ephemeral, nonce, certificate, signature: Vec::new() };
+        let mut attestation = Attestation {
+            ephemeral,
+            nonce,
+            certificate,
+            signature: Vec::new(),
+        };
         let transcript = signed.transcript(&attestation);
-        attestation.signature = self.identity.credentials.sign(&signed.side.statement(&transcript)).ok()?;
+        attestation.signature = self
+            .identity
+            .credentials
+            .sign(&signed.side.statement(&transcript))
+            .ok()?;
         Some((attestation, transcript))
     }
 
@@ -175,13 +204,16 @@ impl Prover {
         if !is_signed_by(&attestation.certificate, &statement, &attestation.signature) {
             return Err(FrameEvent::Untrusted);
         }
-        let proven = self.verify(name, &attestation.certificate, from).ok_or(FrameEvent::Untrusted)?;
+        let proven = self
+            .verify(name, &attestation.certificate, from)
+            .ok_or(FrameEvent::Untrusted)?;
         Ok((proven, transcript))
     }
 
     /// True if a challenge needs an answer: the proof for it is not under way already.
     pub(crate) fn wants_proof(&mut self, key: &PendingKey, now: Timestamp) -> bool {
-        self.pending.retain(|_, proof| now.since(proof.since) < PROOF_TIMEOUT);
+        self.pending
+            .retain(|_, proof| now.since(proof.since) < PROOF_TIMEOUT);
         let repeated = |proof: &PendingProof| now.since(proof.since) >= PROOF_RETRY;
         self.pending.get(key).is_none_or(repeated)
     }
@@ -195,20 +227,41 @@ impl Prover {
         accepter: NodeName,
         now: Timestamp,
     ) {
-        self.pending.insert(key, PendingProof { since: now, private, transcript, accepter });
+        self.pending.insert(
+            key,
+            PendingProof {
+                since: now,
+                private,
+                transcript,
+                accepter,
+            },
+        );
         if self.pending.len() > MAX_PENDING_PROOFS {
             let mut counts: BTreeMap<IpAddr, usize> = BTreeMap::new();
-            self.pending.keys().for_each(|key| *counts.entry(host_of(key)).or_default() += 1);
-            let most = self.pending.iter().max_by_key(|(key, proof)| (counts.get(&host_of(key)), Reverse(proof.since)));
+            self.pending
+                .keys()
+                .for_each(|key| *counts.entry(host_of(key)).or_default() += 1);
+            let most = self
+                .pending
+                .iter()
+                .max_by_key(|(key, proof)| (counts.get(&host_of(key)), Reverse(proof.since)));
             let most = most.map(|(key, _)| *key);
             most.and_then(|key| self.pending.remove(&key));
         }
     }
 
     /// Proofs to a session at an address that wait for an accept.
-    pub(crate) fn pending(&self, session: &SessionId, address: SocketAddr) -> Vec<(PendingKey, Transcript, NodeName)> {
-        let to = self.pending.iter().filter(|((to, at, _), _)| to == session && *at == address);
-        to.map(|(key, proof)| (*key, proof.transcript, proof.accepter.clone())).collect()
+    pub(crate) fn pending(
+        &self,
+        session: &SessionId,
+        address: SocketAddr,
+    ) -> Vec<(PendingKey, Transcript, NodeName)> {
+        let to = self
+            .pending
+            .iter()
+            .filter(|((to, at, _), _)| to == session && *at == address);
+        to.map(|(key, proof)| (*key, proof.transcript, proof.accepter.clone()))
+            .collect()
     }
 
     /// The ephemeral key of a proof that was accepted. No other proof to the session waits any more.
@@ -220,7 +273,11 @@ impl Prover {
 
     /// Notes that a node is not admitted.
     pub(crate) fn refuse(&mut self, name: &NodeName, from: SocketAddr, cause: &str) {
-        self.notices.add(name, TroubleKind::NotAdmitted, format!("not admitted from {}: {cause}", from.ip()));
+        self.notices.add(
+            name,
+            TroubleKind::NotAdmitted,
+            format!("not admitted from {}: {cause}", from.ip()),
+        );
     }
 
     /// Nodes that were not admitted since the last call.
@@ -247,10 +304,23 @@ impl Side {
 impl SignedMessage<'_> {
     /// Hash of the message and of everything that it is bound to, each part with its length.
     pub(super) fn transcript(&self, attestation: &Attestation) -> Transcript {
-        let Attestation { ephemeral, nonce, certificate, signature: _ } = attestation;
+        let Attestation {
+            ephemeral,
+            nonce,
+            certificate,
+            signature: _,
+        } = attestation;
         let mut hash = digest::Context::new(&digest::SHA256);
-        let parts: [&[u8]; 8] =
-            [self.side.label(), &self.head, &self.receiver, self.context, self.message, ephemeral, nonce, certificate];
+        let parts: [&[u8]; 8] = [
+            self.side.label(),
+            &self.head,
+            &self.receiver,
+            self.context,
+            self.message,
+            ephemeral,
+            nonce,
+            certificate,
+        ];
         for part in parts {
             hash.update(&(part.len() as u64).to_be_bytes());
             hash.update(part);
@@ -273,7 +343,12 @@ pub(crate) fn agree(
         (session.seal(own, other), session.seal(other, own))
     });
     let (to, from) = agreed.map_err(|_| FrameEvent::Untrusted)?;
-    Ok(KeySet { to, from, window: ReplayWindow::after(0), is_confirmed })
+    Ok(KeySet {
+        to,
+        from,
+        window: ReplayWindow::after(0),
+        is_confirmed,
+    })
 }
 
 fn host_of((_, address, _): &PendingKey) -> IpAddr {

@@ -68,7 +68,10 @@ pub fn check_key(config: &MembershipConfig, cell: &NodeName) -> Result<(), KeyEr
 ///
 /// # Errors
 /// [`KeyError`] when the key file cannot be used.
-pub(crate) fn payload_key(config: &MembershipConfig, cell: &NodeName) -> Result<hmac::Key, KeyError> {
+pub(crate) fn payload_key(
+    config: &MembershipConfig,
+    cell: &NodeName,
+) -> Result<hmac::Key, KeyError> {
     CellKey::load(config, cell).map(|key| key.payload_key())
 }
 
@@ -80,10 +83,15 @@ impl CellKey {
     /// [`KeyError`] when the key file cannot be used.
     pub(crate) fn load(config: &MembershipConfig, cell: &NodeName) -> Result<Self, KeyError> {
         let Some(path) = &config.key_file else {
-            return Ok(Self::new(config.key.as_ref().map_or("", |key| key.reveal().trim()), cell));
+            return Ok(Self::new(
+                config.key.as_ref().map_or("", |key| key.reveal().trim()),
+                cell,
+            ));
         };
-        let text =
-            bounded_file::read_text(path).map_err(|source| KeyError::Unreadable { path: path.clone(), source })?;
+        let text = bounded_file::read_text(path).map_err(|source| KeyError::Unreadable {
+            path: path.clone(),
+            source,
+        })?;
         if text.trim().len() < super::config::MIN_KEY_BYTES {
             return Err(KeyError::TooShort { path: path.clone() });
         }
@@ -95,17 +103,32 @@ impl CellKey {
         let mut secret = [0; 32];
         if hex::decode_to_slice(text, &mut secret).is_err() && !text.is_empty() {
             let salt = [b"ecod gossip 1 ", cell.as_str().as_bytes()].concat();
-            pbkdf2::derive(pbkdf2::PBKDF2_HMAC_SHA256, PBKDF2_ROUNDS, &salt, text.as_bytes(), &mut secret);
+            pbkdf2::derive(
+                pbkdf2::PBKDF2_HMAC_SHA256,
+                PBKDF2_ROUNDS,
+                &salt,
+                text.as_bytes(),
+                &mut secret,
+            );
         }
         let root = hkdf::Salt::new(hkdf::HKDF_SHA256, cell.as_str().as_bytes()).extract(&secret);
-        Self { root, tag: cell_tag(cell) }
+        Self {
+            root,
+            tag: cell_tag(cell),
+        }
     }
 
     /// The key that signs payloads sent through external brokers.
-    #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
+    #[expect(
+        clippy::expect_used,
+        reason = "the length asked for is fixed and allowed"
+    )]
     pub(crate) fn payload_key(&self) -> hmac::Key {
         let info: [&[u8]; 1] = [b"ecod payload 1"];
-        let key = self.root.expand(&info, hmac::HMAC_SHA256).map(hmac::Key::from);
+        let key = self
+            .root
+            .expand(&info, hmac::HMAC_SHA256)
+            .map(hmac::Key::from);
         key.expect("HKDF gives as much as a hash's length")
     }
 
@@ -115,20 +138,39 @@ impl CellKey {
     }
 
     /// The key of one session with certificates, of the secret that both sides agreed on and of their transcript.
-    #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
+    #[expect(
+        clippy::expect_used,
+        reason = "the length asked for is fixed and allowed"
+    )]
     pub(crate) fn session(&self, secret: &[u8], transcript: &[u8; 32]) -> Self {
         let info: [&[u8]; 2] = [b"ecod session 2", transcript];
-        let salt = self.root.expand(&info, hkdf::HKDF_SHA256).map(hkdf::Salt::from);
-        Self { root: salt.expect("HKDF gives as much as a hash's length").extract(secret), tag: self.tag }
+        let salt = self
+            .root
+            .expand(&info, hkdf::HKDF_SHA256)
+            .map(hkdf::Salt::from);
+        Self {
+            root: salt
+                .expect("HKDF gives as much as a hash's length")
+                .extract(secret),
+            tag: self.tag,
+        }
     }
 
     /// The cipher of frames from one session to another. The sender's frame counter is the nonce, so that no two frames
     /// share key and nonce.
-    #[expect(clippy::expect_used, reason = "the length asked for is fixed and allowed")]
+    #[expect(
+        clippy::expect_used,
+        reason = "the length asked for is fixed and allowed"
+    )]
     pub(crate) fn seal(&self, sender: &SessionId, receiver: &SessionId) -> FrameCipher {
         let info: [&[u8]; 3] = [b"ecod frame 1", sender, receiver];
-        let key = self.root.expand(&info, &aead::CHACHA20_POLY1305).map(aead::UnboundKey::from);
-        FrameCipher(aead::LessSafeKey::new(key.expect("HKDF gives as much as a cipher's key")))
+        let key = self
+            .root
+            .expand(&info, &aead::CHACHA20_POLY1305)
+            .map(aead::UnboundKey::from);
+        FrameCipher(aead::LessSafeKey::new(
+            key.expect("HKDF gives as much as a cipher's key"),
+        ))
     }
 }
 
@@ -137,10 +179,15 @@ pub(crate) struct FrameCipher(aead::LessSafeKey);
 
 impl FrameCipher {
     /// Encrypts what follows the first `head` bytes of the frame, and authenticates all of it.
-    #[expect(clippy::expect_used, reason = "the cipher seals 256 GiB, a datagram has 64 KiB")]
+    #[expect(
+        clippy::expect_used,
+        reason = "the cipher seals 256 GiB, a datagram has 64 KiB"
+    )]
     pub(crate) fn close(&self, counter: u64, frame: &mut Vec<u8>, head: usize) {
         let mut body = frame.split_off(head);
-        let sealed = self.0.seal_in_place_append_tag(nonce(counter), aead::Aad::from(&frame[..]), &mut body);
+        let sealed =
+            self.0
+                .seal_in_place_append_tag(nonce(counter), aead::Aad::from(&frame[..]), &mut body);
         sealed.expect("a frame is shorter than what the cipher can seal");
         frame.append(&mut body);
     }
@@ -148,7 +195,11 @@ impl FrameCipher {
     /// The decrypted body of a frame, if the frame is authentic.
     pub(crate) fn open(&self, counter: u64, head: &[u8], body: &[u8]) -> Option<Vec<u8>> {
         let mut body = body.to_vec();
-        let length = self.0.open_in_place(nonce(counter), aead::Aad::from(head), &mut body).ok()?.len();
+        let length = self
+            .0
+            .open_in_place(nonce(counter), aead::Aad::from(head), &mut body)
+            .ok()?
+            .len();
         body.truncate(length);
         Some(body)
     }
@@ -166,7 +217,12 @@ impl CookieFactory {
     }
 
     /// The cookie for a session at an address during one slot of time.
-    pub(crate) fn issue(&self, session: &SessionId, address: std::net::SocketAddr, slot: u64) -> Cookie {
+    pub(crate) fn issue(
+        &self,
+        session: &SessionId,
+        address: std::net::SocketAddr,
+        slot: u64,
+    ) -> Cookie {
         let text = format!("{slot} {address}");
         let tag = hmac::sign(&self.0, &[&session[..], text.as_bytes()].concat());
         tag.as_ref().first_chunk().copied().unwrap_or_default()
@@ -188,7 +244,13 @@ mod tests {
     const A: SessionId = [1; 16];
     const B: SessionId = [2; 16];
 
-    fn open(key: &CellKey, from: &SessionId, to: &SessionId, counter: u64, frame: &[u8]) -> Option<Vec<u8>> {
+    fn open(
+        key: &CellKey,
+        from: &SessionId,
+        to: &SessionId,
+        counter: u64,
+        frame: &[u8],
+    ) -> Option<Vec<u8>> {
         key.seal(from, to).open(counter, &frame[..4], &frame[4..])
     }
 
@@ -201,7 +263,16 @@ mod tests {
         assert_eq!(open(&key, &A, &B, 7, &frame).as_deref(), Some(&b"body"[..]));
         assert_eq!(open(&key, &A, &B, 8, &frame), None);
         assert_eq!(open(&key, &B, &A, 7, &frame), None);
-        assert_eq!(open(&CellKey::new("correct horse batterz", &cell), &A, &B, 7, &frame), None);
+        assert_eq!(
+            open(
+                &CellKey::new("correct horse batterz", &cell),
+                &A,
+                &B,
+                7,
+                &frame
+            ),
+            None
+        );
         let elsewhere = CellKey::new("correct horse battery", &NodeName::from_static("lot-2"));
         assert_eq!(open(&elsewhere, &A, &B, 7, &frame), None);
         for at in 0..frame.len() {
@@ -216,9 +287,14 @@ mod tests {
         let cell = NodeName::from_static("lot-1");
         let digits = "0aF1".repeat(16);
         let mut frame = b"headbody".to_vec();
-        CellKey::new(&digits, &cell).seal(&A, &B).close(1, &mut frame, 4);
+        CellKey::new(&digits, &cell)
+            .seal(&A, &B)
+            .close(1, &mut frame, 4);
         let root = hkdf::Salt::new(hkdf::HKDF_SHA256, b"lot-1").extract(&[0x0a, 0xf1].repeat(16));
-        assert_eq!(open(&CellKey { root, tag: [0; 4] }, &A, &B, 1, &frame).as_deref(), Some(&b"body"[..]));
+        assert_eq!(
+            open(&CellKey { root, tag: [0; 4] }, &A, &B, 1, &frame).as_deref(),
+            Some(&b"body"[..])
+        );
         for other in [&digits[..63], &"g".repeat(64), &digits.to_lowercase()[..62]] {
             assert_eq!(open(&CellKey::new(other, &cell), &A, &B, 1, &frame), None);
         }
@@ -228,12 +304,23 @@ mod tests {
     fn key_files_are_trimmed_and_must_hold_a_key() {
         let cell = NodeName::from_static("lot-1");
         let file = tempfile::NamedTempFile::new().unwrap();
-        let config = MembershipConfig { key_file: Some(file.path().into()), ..MembershipConfig::default() };
+        let config = MembershipConfig {
+            key_file: Some(file.path().into()),
+            ..MembershipConfig::default()
+        };
         std::fs::write(file.path(), " short\n").unwrap();
-        assert!(CellKey::load(&config, &cell).err().unwrap().to_string().contains("12 characters"));
+        assert!(
+            CellKey::load(&config, &cell)
+                .err()
+                .unwrap()
+                .to_string()
+                .contains("12 characters")
+        );
         std::fs::write(file.path(), "correct horse battery\n").unwrap();
         let mut frame = b"headbody".to_vec();
-        CellKey::new("correct horse battery", &cell).seal(&A, &B).close(1, &mut frame, 4);
+        CellKey::new("correct horse battery", &cell)
+            .seal(&A, &B)
+            .close(1, &mut frame, 4);
         assert!(open(&CellKey::load(&config, &cell).unwrap(), &A, &B, 1, &frame).is_some());
     }
 }

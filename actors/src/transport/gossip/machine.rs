@@ -97,7 +97,16 @@ struct PendingFrames {
 
 impl GossipMachine {
     pub(crate) fn new(setup: GossipSetup, config: &MembershipConfig, now: Timestamp) -> Self {
-        let GossipSetup { own, cell, key, session, identity, secret, seed, counters } = setup;
+        let GossipSetup {
+            own,
+            cell,
+            key,
+            session,
+            identity,
+            secret,
+            seed,
+            counters,
+        } = setup;
         let proves = identity.is_some();
         let clock = AwakeClock::new(now, STALL);
         Self {
@@ -143,7 +152,11 @@ impl GossipMachine {
 
     /// All living nodes but this one, by name.
     pub(crate) fn members(&self) -> Vec<Member> {
-        self.gossip.alive().values().map(|id| self.member(id)).collect()
+        self.gossip
+            .alive()
+            .values()
+            .map(|id| self.member(id))
+            .collect()
     }
 
     /// Processes a datagram.
@@ -155,7 +168,13 @@ impl GossipMachine {
         }
         let gossip = &self.gossip;
         let is_alone = gossip.alive().is_empty();
-        let arrival = Arrival { from, now: at, own: gossip.own(), is_alone, known: &|name| gossip.known(name) };
+        let arrival = Arrival {
+            from,
+            now: at,
+            own: gossip.own(),
+            is_alone,
+            known: &|name| gossip.known(name),
+        };
         let taken = match self.sessions.open(datagram, &arrival) {
             Ok(opened) => {
                 if self.seeds.contains(&from) {
@@ -189,16 +208,24 @@ impl GossipMachine {
             self.send_hellos();
             self.schedule_hello(at);
         }
-        self.pending.retain(|_, pending| at.since(pending.since) < SESSION_TIMEOUT);
+        self.pending
+            .retain(|_, pending| at.since(pending.since) < SESSION_TIMEOUT);
         self.flush_swim(at);
     }
 
     /// Sends a datagram to a node, once. A node that the gossip has just declared down is sent to for a while, too.
     pub(crate) fn send(&mut self, to: &NodeName, payload: &[u8], now: Timestamp) {
         let at = self.advance(now);
-        let address = self.gossip.alive().get(to).map(|id| id.gossip).or_else(|| self.sessions.heard_at(to, at));
+        let address = self
+            .gossip
+            .alive()
+            .get(to)
+            .map(|id| id.gossip)
+            .or_else(|| self.sessions.heard_at(to, at));
         match address {
-            Some(address) if !self.left => self.send_or_queue(to, address, FrameKind::Payload, payload, at),
+            Some(address) if !self.left => {
+                self.send_or_queue(to, address, FrameKind::Payload, payload, at)
+            }
             _ => self.counters.count(FrameEvent::NoSession),
         }
     }
@@ -219,7 +246,8 @@ impl GossipMachine {
         for name in expelled {
             tracing::warn!(node = %name, "session ended: its certificate was revoked or has expired");
             self.gossip.remove(&name, at);
-            self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Expelled { name }));
+            self.outputs
+                .push_back(GossipOutput::Tell(MembershipEvent::Expelled { name }));
         }
         for address in greeted {
             self.send_hello(address, true, at);
@@ -253,10 +281,17 @@ impl GossipMachine {
         now: Timestamp,
     ) -> Result<(), FrameEvent> {
         match opened {
-            FrameContent::Answer(frame) => self.outputs.push_back(GossipOutput::Send { to: from, frame }),
-            FrameContent::Met { introduction, answer, speaks } => {
+            FrameContent::Answer(frame) => self
+                .outputs
+                .push_back(GossipOutput::Send { to: from, frame }),
+            FrameContent::Met {
+                introduction,
+                answer,
+                speaks,
+            } => {
                 let greeter = answer.is_none();
-                self.outputs.extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
+                self.outputs
+                    .extend(answer.map(|frame| GossipOutput::Send { to: from, frame }));
                 self.meet(introduction, (from, speaks, greeter), at);
             }
             FrameContent::Gossip { from, body } => {
@@ -264,7 +299,12 @@ impl GossipMachine {
                 self.gossip.receive(&from, &body, &is_heard, at)?;
             }
             FrameContent::Payload { from, rights, body } => {
-                let event = MembershipEvent::Received { from, rights, payload: Bytes::from(body), received_at: now };
+                let event = MembershipEvent::Received {
+                    from,
+                    rights,
+                    payload: Bytes::from(body),
+                    received_at: now,
+                };
                 self.outputs.push_back(GossipOutput::Tell(event));
             }
             FrameContent::Stranger => self.send_hello(from, true, at),
@@ -276,27 +316,44 @@ impl GossipMachine {
     }
 
     /// Processes the handshake of an admitted node: its knowledge of this node, then its identity.
-    fn meet(&mut self, introduction: Introduction, (from, speaks, greeter): (SocketAddr, bool, bool), at: Timestamp) {
+    fn meet(
+        &mut self,
+        introduction: Introduction,
+        (from, speaks, greeter): (SocketAddr, bool, bool),
+        at: Timestamp,
+    ) {
         let Introduction { id, seen_at, claim } = introduction;
         match claim {
             NameClaim::Free => (),
-            NameClaim::After(life) if life <= MAX_CLAIMED_LIFE => self.gossip.start_life_after(life, at),
+            NameClaim::After(life) if life <= MAX_CLAIMED_LIFE => {
+                self.gossip.start_life_after(life, at)
+            }
             NameClaim::After(_) => (),
             NameClaim::Taken => return self.step_back(from, at),
         }
         self.excluded_since = None;
         let own = self.gossip.own().gossip.ip();
-        if self.learns_address && (own.is_unspecified() || own.is_loopback() && !seen_at.ip().is_loopback()) {
+        if self.learns_address
+            && (own.is_unspecified() || own.is_loopback() && !seen_at.ip().is_loopback())
+        {
             self.gossip.change(at, |own| own.gossip = seen_at);
         }
         if !speaks {
             return self.report_taken(&id.name, second_run(from), at);
         }
         self.gossip.note_met(&id);
-        for (kind, body) in self.pending.remove(&id.name).map(|pending| pending.frames).unwrap_or_default() {
+        for (kind, body) in self
+            .pending
+            .remove(&id.name)
+            .map(|pending| pending.frames)
+            .unwrap_or_default()
+        {
             self.send_or_queue(&id.name, seen_at, kind, &body, at);
         }
-        let alive = self.gossip.known(&id.name).is_some_and(|known| known.alive && known.life >= id.life);
+        let alive = self
+            .gossip
+            .known(&id.name)
+            .is_some_and(|known| known.alive && known.life >= id.life);
         if greeter || !alive {
             self.gossip.meet(id, at);
         }
@@ -314,9 +371,13 @@ impl GossipMachine {
                     if self.sessions.end_earlier_run(&id.name, id.run, at) {
                         self.send_hello(id.gossip, false, at);
                     }
-                    MembershipEvent::Alive { member: self.member(&id) }
+                    MembershipEvent::Alive {
+                        member: self.member(&id),
+                    }
                 }
-                SwimOutput::Changed(id) => MembershipEvent::Changed { member: self.member(&id) },
+                SwimOutput::Changed(id) => MembershipEvent::Changed {
+                    member: self.member(&id),
+                },
                 SwimOutput::Unproven(id) => {
                     self.meet_unproven(id, at);
                     continue;
@@ -329,9 +390,17 @@ impl GossipMachine {
     }
 
     /// Sends to a node, or queues a few frames until there is a session with it.
-    fn send_or_queue(&mut self, to: &NodeName, address: SocketAddr, kind: FrameKind, body: &[u8], at: Timestamp) {
+    fn send_or_queue(
+        &mut self,
+        to: &NodeName,
+        address: SocketAddr,
+        kind: FrameKind,
+        body: &[u8],
+        at: Timestamp,
+    ) {
         if let Some((address, frame)) = self.sessions.seal(to, kind, body, at) {
-            self.outputs.push_back(GossipOutput::Send { to: address, frame });
+            self.outputs
+                .push_back(GossipOutput::Send { to: address, frame });
             if let Some(address) = self.sessions.unheard(to, at) {
                 self.send_hello(address, true, at);
             }
@@ -341,18 +410,27 @@ impl GossipMachine {
             if self.pending.len() >= MAX_PENDING || address.ip().is_unspecified() {
                 return self.counters.count(FrameEvent::NoSession);
             }
-            self.pending.insert(to.clone(), PendingFrames { since: at, frames: Vec::new() });
+            self.pending.insert(
+                to.clone(),
+                PendingFrames {
+                    since: at,
+                    frames: Vec::new(),
+                },
+            );
             self.send_hello(address, true, at);
         }
         match self.pending.get_mut(to) {
-            Some(pending) if pending.frames.len() < MAX_PENDING_FRAMES => pending.frames.push((kind, body.to_vec())),
+            Some(pending) if pending.frames.len() < MAX_PENDING_FRAMES => {
+                pending.frames.push((kind, body.to_vec()))
+            }
             _ => self.counters.count(FrameEvent::NoSession),
         }
     }
 
     /// Greets a node of which others tell, and whose certificate this node has not seen.
     fn meet_unproven(&mut self, id: NodeId, at: Timestamp) {
-        self.unproven.retain(|_, greeted| at.since(*greeted) < UNPROVEN_INTERVAL);
+        self.unproven
+            .retain(|_, greeted| at.since(*greeted) < UNPROVEN_INTERVAL);
         let is_new = self.unproven.len() < MAX_UNPROVEN && !self.unproven.contains_key(&id.name);
         if is_new && !id.gossip.ip().is_unspecified() {
             self.unproven.insert(id.name, at);
@@ -373,7 +451,10 @@ impl GossipMachine {
         let frame = self.sessions.hello(self.gossip.own(), false);
         let known: Vec<_> = self.members().iter().map(|member| member.gossip).collect();
         let missing = self.seeds.iter().filter(|seed| !known.contains(seed));
-        self.outputs.extend(missing.map(|seed| GossipOutput::Send { to: *seed, frame: frame.clone() }));
+        self.outputs.extend(missing.map(|seed| GossipOutput::Send {
+            to: *seed,
+            frame: frame.clone(),
+        }));
         if self.gossip.alive().is_empty() || self.hello_count.is_multiple_of(MULTICAST_EVERY) {
             self.outputs.push_back(GossipOutput::Multicast { frame });
         }
@@ -384,11 +465,18 @@ impl GossipMachine {
     /// Names the seeds that have not answered for some greetings of a node that knows of no other. Only the other side can
     /// read whose key or cell is wrong.
     fn tell_silent_seeds(&mut self) {
-        self.unanswered = if self.gossip.alive().is_empty() { self.unanswered + 1 } else { 0 };
+        self.unanswered = if self.gossip.alive().is_empty() {
+            self.unanswered + 1
+        } else {
+            0
+        };
         if self.unanswered <= 1 {
             self.answered.clear();
         } else if self.unanswered.is_multiple_of(SILENT_SEED_HELLOS) {
-            let silent = self.seeds.iter().filter(|seed| !self.answered.contains(*seed));
+            let silent = self
+                .seeds
+                .iter()
+                .filter(|seed| !self.answered.contains(*seed));
             self.outputs.extend(silent.map(|seed| {
                 let cause =
                     "this seed does not answer: it does not run, its cell or key is another, or UDP does not pass";
@@ -404,21 +492,35 @@ impl GossipMachine {
     }
 
     fn report_taken(&mut self, name: &NodeName, cause: String, at: Timestamp) {
-        let lately = |(last, when): &(NodeName, Timestamp)| last == name && at.since(*when) < REPORT_INTERVAL;
+        let lately = |(last, when): &(NodeName, Timestamp)| {
+            last == name && at.since(*when) < REPORT_INTERVAL
+        };
         if !self.taken.as_ref().is_some_and(lately) {
             self.taken = Some((name.clone(), at));
             let (about, kind) = (name.to_string(), TroubleKind::NameTaken);
-            self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Troubled { about, kind, cause }));
+            self.outputs
+                .push_back(GossipOutput::Tell(MembershipEvent::Troubled {
+                    about,
+                    kind,
+                    cause,
+                }));
         }
     }
 
     /// Tells a node of this node's name that it is the second, or takes its word for that. A node that has just started is
     /// the second; of two that met late, the one that started later is.
-    fn meet_namesake(&mut self, id: &NodeId, answer: Option<Vec<u8>>, from: SocketAddr, at: Timestamp) {
+    fn meet_namesake(
+        &mut self,
+        id: &NodeId,
+        answer: Option<Vec<u8>>,
+        from: SocketAddr,
+        at: Timestamp,
+    ) {
         let is_new = at.since(self.started_at) < NAME_PATIENCE || self.excluded_since.is_some();
         match answer {
             Some(frame) if !is_new => {
-                self.outputs.push_back(GossipOutput::Send { to: from, frame });
+                self.outputs
+                    .push_back(GossipOutput::Send { to: from, frame });
                 self.report_taken(&id.name, second_run(from), at);
             }
             None if is_new || self.gossip.own().run > id.run => self.step_back(from, at),
@@ -430,9 +532,12 @@ impl GossipMachine {
     fn step_back(&mut self, informant: SocketAddr, at: Timestamp) {
         let since = *self.excluded_since.get_or_insert(at);
         if at.since(since) >= NAME_PATIENCE && self.gossip.alive().is_empty() {
-            self.outputs.push_back(GossipOutput::Tell(MembershipEvent::Excluded));
+            self.outputs
+                .push_back(GossipOutput::Tell(MembershipEvent::Excluded));
         }
-        let cause = format!("another run of this name takes part, says the node at {informant}; this run does not");
+        let cause = format!(
+            "another run of this name takes part, says the node at {informant}; this run does not"
+        );
         let name = self.gossip.own().name.clone();
         self.report_taken(&name, cause, at);
     }
@@ -440,14 +545,22 @@ impl GossipMachine {
     /// A node as others are told of it: by what it has proven itself, if nodes of the cell do, and not by hearsay.
     fn member(&self, id: &NodeId) -> Member {
         let address = self.sessions.address(&id.name);
-        let Some((stated, proven)) = self.sessions.proven(&id.name) else { return id.member(address) };
+        let Some((stated, proven)) = self.sessions.proven(&id.name) else {
+            return id.member(address);
+        };
         let member = stated.member(address);
         let role = proven.rights.limit_role(member.role);
-        Member { role, certificate: Some(Arc::clone(&proven.certificate)), ..member }
+        Member {
+            role,
+            certificate: Some(Arc::clone(&proven.certificate)),
+            ..member
+        }
     }
 
     fn due(&self) -> Timestamp {
-        self.gossip.next_due().map_or(self.hello_at, |due| due.min(self.hello_at))
+        self.gossip
+            .next_due()
+            .map_or(self.hello_at, |due| due.min(self.hello_at))
     }
 
     fn advance(&mut self, now: Timestamp) -> Timestamp {

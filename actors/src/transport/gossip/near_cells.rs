@@ -19,7 +19,10 @@ impl NearCells {
         if self.0.len() >= MAX_TAGS && !self.0.contains_key(&tag) {
             return None;
         }
-        self.0.entry(tag).or_insert_with(|| slips(own.as_str()).find(|name| cell_tag(name) == tag)).as_ref()
+        self.0
+            .entry(tag)
+            .or_insert_with(|| slips(own.as_str()).find(|name| cell_tag(name) == tag))
+            .as_ref()
     }
 }
 
@@ -32,17 +35,26 @@ pub(crate) fn are_numbered(one: &NodeName, other: &NodeName) -> bool {
 /// All names that one slip of the hand makes of this one (Damerau, "A technique for computer detection and correction of
 /// spelling errors", Communications of the ACM 7(3), 1964).
 fn slips(name: &str) -> impl Iterator<Item = NodeName> + '_ {
-    let letters = ('a'..='z').chain('A'..='Z').chain('0'..='9').chain(['-', '_']);
+    let letters = ('a'..='z')
+        .chain('A'..='Z')
+        .chain('0'..='9')
+        .chain(['-', '_']);
     let splits = (0..=name.len()).filter_map(|at| name.split_at_checked(at));
     let after = |rest: &'_ str| rest.char_indices().nth(1).map_or(rest.len(), |(at, _)| at);
     splits
         .flat_map(move |(before, rest)| {
             let (first, others) = rest.split_at_checked(after(rest)).unwrap_or_default();
             let (second, last) = others.split_at_checked(after(others)).unwrap_or_default();
-            let shorter = [format!("{before}{others}"), format!("{before}{second}{first}{last}")];
-            let longer = letters
-                .clone()
-                .flat_map(move |letter| [format!("{before}{letter}{rest}"), format!("{before}{letter}{others}")]);
+            let shorter = [
+                format!("{before}{others}"),
+                format!("{before}{second}{first}{last}"),
+            ];
+            let longer = letters.clone().flat_map(move |letter| {
+                [
+                    format!("{before}{letter}{rest}"),
+                    format!("{before}{letter}{others}"),
+                ]
+            });
             shorter.into_iter().chain(longer)
         })
         .filter(move |slip| slip != name)
@@ -58,22 +70,32 @@ mod tests {
         let own = NodeName::from_static("ux-lot");
         let found = |other: &'static str| {
             let other = NodeName::from_static(other);
-            NearCells::default().name_of(cell_tag(&other), &own).cloned() == Some(other)
+            NearCells::default()
+                .name_of(cell_tag(&other), &own)
+                .cloned()
+                == Some(other)
         };
-        for near in ["ux-lott", "ux-lo", "uxlot", "xu-lot", "ux_lot", "Ux-lot", "ux-lot1", "-ux-lot"] {
+        for near in [
+            "ux-lott", "ux-lo", "uxlot", "xu-lot", "ux_lot", "Ux-lot", "ux-lot1", "-ux-lot",
+        ] {
             assert!(found(near), "{near}");
         }
         for other in ["lot-1", "cell", "ux-lottt", "ux"] {
             assert!(!found(other), "{other}");
         }
-        assert!(are_numbered(&NodeName::from_static("lot-1"), &NodeName::from_static("lot-12")));
+        assert!(are_numbered(
+            &NodeName::from_static("lot-1"),
+            &NodeName::from_static("lot-12")
+        ));
         assert!(!are_numbered(&own, &NodeName::from_static("ux-lott")));
     }
 
     #[test]
     fn invented_tags_are_not_searched_for_ever() {
         let (mut cells, own) = (NearCells::default(), NodeName::from_static("lot"));
-        assert!((0..2 * MAX_TAGS as u32).all(|tag| cells.name_of(tag.to_be_bytes(), &own).is_none()));
+        assert!(
+            (0..2 * MAX_TAGS as u32).all(|tag| cells.name_of(tag.to_be_bytes(), &own).is_none())
+        );
         assert_eq!(cells.0.len(), MAX_TAGS);
     }
 }

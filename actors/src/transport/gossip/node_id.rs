@@ -37,10 +37,18 @@ impl NodeId {
     pub(crate) fn member(&self, address: Option<SocketAddr>) -> Member {
         let gossip = address.unwrap_or(self.gossip);
         let reached = |ip: IpAddr| if ip.is_unspecified() { gossip.ip() } else { ip };
-        let is_near = |broker: &SocketAddr| !broker.ip().is_loopback() || is_of_this_machine(gossip.ip());
+        let is_near =
+            |broker: &SocketAddr| !broker.ip().is_loopback() || is_of_this_machine(gossip.ip());
         let broker = self.broker.filter(is_near);
         let broker = broker.map(|broker| SocketAddr::new(reached(broker.ip()), broker.port()));
-        Member { name: self.name.clone(), run: self.run, gossip, broker, role: self.role, certificate: None }
+        Member {
+            name: self.name.clone(),
+            run: self.run,
+            gossip,
+            broker,
+            role: self.role,
+            certificate: None,
+        }
     }
 }
 
@@ -77,8 +85,18 @@ mod tests {
         };
         // An address of nobody: reserved for documentation.
         assert_eq!(id("192.0.2.7:17884").member(None).broker, None);
-        assert_eq!(id("127.0.0.1:17884").member(None).broker, id("127.0.0.1:17884").broker, "this machine's");
-        let open = NodeId { broker: Some("0.0.0.0:1883".parse().unwrap()), ..id("192.0.2.7:17884") };
-        assert_eq!(open.member(None).broker, Some("192.0.2.7:1883".parse().unwrap()));
+        assert_eq!(
+            id("127.0.0.1:17884").member(None).broker,
+            id("127.0.0.1:17884").broker,
+            "this machine's"
+        );
+        let open = NodeId {
+            broker: Some("0.0.0.0:1883".parse().unwrap()),
+            ..id("192.0.2.7:17884")
+        };
+        assert_eq!(
+            open.member(None).broker,
+            Some("192.0.2.7:1883".parse().unwrap())
+        );
     }
 }

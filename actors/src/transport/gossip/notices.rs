@@ -17,8 +17,17 @@ pub(crate) struct Notices(Vec<GossipNotice>);
 
 impl Notices {
     /// Adds a notice.
-    pub(crate) fn add(&mut self, about: &impl ToString, kind: TroubleKind, cause: impl Into<String>) {
-        self.0.push(GossipNotice { about: about.to_string(), kind, cause: cause.into() });
+    pub(crate) fn add(
+        &mut self,
+        about: &impl ToString,
+        kind: TroubleKind,
+        cause: impl Into<String>,
+    ) {
+        self.0.push(GossipNotice {
+            about: about.to_string(),
+            kind,
+            cause: cause.into(),
+        });
     }
 
     /// All notices since the last call.

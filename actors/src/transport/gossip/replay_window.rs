@@ -17,7 +17,10 @@ pub(crate) struct ReplayWindow {
 impl ReplayWindow {
     /// A window that accepts only counters above `floor`.
     pub(crate) fn after(floor: u64) -> Self {
-        Self { highest: floor, taken: u128::MAX }
+        Self {
+            highest: floor,
+            taken: u128::MAX,
+        }
     }
 
     /// Accepts a counter.
@@ -30,7 +33,11 @@ impl ReplayWindow {
             if ahead > MAX_JUMP {
                 return Err(FrameEvent::CounterJump);
             }
-            self.taken = u32::try_from(ahead).ok().and_then(|ahead| self.taken.checked_shl(ahead)).unwrap_or(0) | 1;
+            self.taken = u32::try_from(ahead)
+                .ok()
+                .and_then(|ahead| self.taken.checked_shl(ahead))
+                .unwrap_or(0)
+                | 1;
             self.highest = counter;
             return Ok(());
         }
@@ -62,7 +69,10 @@ mod tests {
     fn late_frames_are_taken_once_and_very_late_ones_not() {
         let mut window = ReplayWindow::after(100);
         let mut take = |counter| window.take(counter).is_ok();
-        assert!(!take(100) && !take(99) && !take(0), "before the session began");
+        assert!(
+            !take(100) && !take(99) && !take(0),
+            "before the session began"
+        );
         assert!(take(102) && take(101) && !take(101) && !take(102));
         assert!(take(102 + 127) && !take(101), "fell out of the window");
         assert!(take(103) && take(229 + MAX_JUMP) && !take(229 + MAX_JUMP));
@@ -79,7 +89,11 @@ mod tests {
         assert_eq!(window.take(102), Err(FrameEvent::Replayed));
         assert_eq!(window.take(u64::MAX), Ok(()));
         window.skip_to(5);
-        assert_eq!(window.take(u64::MAX), Err(FrameEvent::Replayed), "nothing goes back");
+        assert_eq!(
+            window.take(u64::MAX),
+            Err(FrameEvent::Replayed),
+            "nothing goes back"
+        );
     }
 
     proptest! {

@@ -50,7 +50,11 @@ impl ReplyThrottle {
     pub(crate) fn know(&mut self, from: SocketAddr, now: Timestamp) {
         let host = host_network(from.ip());
         if !self.known.contains_key(&host) && self.known.len() >= MAX_KNOWN {
-            let oldest = self.known.iter().min_by_key(|(_, (_, at))| *at).map(|(host, _)| *host);
+            let oldest = self
+                .known
+                .iter()
+                .min_by_key(|(_, (_, at))| *at)
+                .map(|(host, _)| *host);
             oldest.and_then(|host| self.known.remove(&host));
         }
         let new = || (TokenBucket::new(REPLY_BURST, HOST_INTERVAL, now), now);
@@ -98,17 +102,26 @@ mod tests {
         throttle.know(address(7), Timestamp(0));
         assert_eq!(verified_beside_a_flood(&mut throttle, 7), 20);
         let mut throttle = ReplyThrottle::new(Timestamp(0));
-        assert!(verified_beside_a_flood(&mut throttle, 7) < 20, "a stranger shares");
+        assert!(
+            verified_beside_a_flood(&mut throttle, 7) < 20,
+            "a stranger shares"
+        );
     }
 
     #[test]
     fn the_hosts_with_room_of_their_own_are_bounded_and_so_is_the_room() {
         let mut throttle = ReplyThrottle::new(Timestamp(0));
-        (0..2 * MAX_KNOWN as u32).for_each(|host| throttle.know(address(host), Timestamp(host.into())));
+        (0..2 * MAX_KNOWN as u32)
+            .for_each(|host| throttle.know(address(host), Timestamp(host.into())));
         assert_eq!(throttle.known.len(), MAX_KNOWN);
-        assert!(!throttle.known.contains_key(&address(0).ip()), "the oldest gave way");
+        assert!(
+            !throttle.known.contains_key(&address(0).ip()),
+            "the oldest gave way"
+        );
         let latest = address(2 * MAX_KNOWN as u32 - 1);
-        let allowed = (0..1000).filter(|_| throttle.allow_host(latest, Timestamp(5000))).count();
+        let allowed = (0..1000)
+            .filter(|_| throttle.allow_host(latest, Timestamp(5000)))
+            .count();
         assert_eq!(allowed, REPLY_BURST as usize);
     }
 }

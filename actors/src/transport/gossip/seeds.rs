@@ -28,7 +28,11 @@ pub(crate) async fn resolve(
             return;
         }
         let wait = if complete { REFRESH } else { retry };
-        retry = if complete { RETRY_MIN } else { (retry * 2).min(REFRESH) };
+        retry = if complete {
+            RETRY_MIN
+        } else {
+            (retry * 2).min(REFRESH)
+        };
         tokio::time::sleep(wait).await;
     }
 }
@@ -61,9 +65,16 @@ async fn resolve_once(
 
 /// The addresses of a seed that a socket of its family reaches.
 pub(crate) async fn look_up(seed: &str, ipv4: bool) -> io::Result<Vec<SocketAddr>> {
-    let found: Vec<_> = lookup_host(seed).await?.filter(|address| address.is_ipv4() == ipv4).collect();
+    let found: Vec<_> = lookup_host(seed)
+        .await?
+        .filter(|address| address.is_ipv4() == ipv4)
+        .collect();
     let family = if ipv4 { "IPv4" } else { "IPv6" };
-    if found.is_empty() { Err(io::Error::other(format!("no {family} address"))) } else { Ok(found) }
+    if found.is_empty() {
+        Err(io::Error::other(format!("no {family} address")))
+    } else {
+        Ok(found)
+    }
 }
 
 #[cfg(test)]
@@ -74,14 +85,23 @@ mod tests {
     async fn a_seed_of_the_wrong_family_or_without_an_address_is_tried_on() {
         let seeds = ["127.0.0.1:9", "[::1]:9", "no port"].map(str::to_owned);
         let mut unresolved = BTreeSet::from(["127.0.0.1:9".to_owned()]);
-        let (usual, before): (SocketAddr, SocketAddr) =
-            ("127.0.0.1:9".parse().unwrap(), "192.0.2.1:9".parse().unwrap());
+        let (usual, before): (SocketAddr, SocketAddr) = (
+            "127.0.0.1:9".parse().unwrap(),
+            "192.0.2.1:9".parse().unwrap(),
+        );
         let mut known = BTreeMap::from([("no port".to_owned(), vec![before])]);
         let failed = std::cell::RefCell::new(Vec::new());
         let trouble = |seed: &str, _: &io::Error| failed.borrow_mut().push(seed.to_owned());
         resolve_once(&seeds, true, &mut known, &mut unresolved, &trouble).await;
         assert_eq!(failed.into_inner(), ["[::1]:9", "no port"]);
-        assert_eq!(known.into_values().flatten().collect::<Vec<_>>(), [usual, before], "what was known once stays");
-        assert_eq!(unresolved, BTreeSet::from(["[::1]:9", "no port"].map(str::to_owned)));
+        assert_eq!(
+            known.into_values().flatten().collect::<Vec<_>>(),
+            [usual, before],
+            "what was known once stays"
+        );
+        assert_eq!(
+            unresolved,
+            BTreeSet::from(["[::1]:9", "no port"].map(str::to_owned))
+        );
     }
 }

@@ -37,12 +37,20 @@ impl KeyRing {
 
     /// The cipher for the next frame.
     pub(crate) fn to(&self) -> Option<&FrameCipher> {
-        let latest = self.sets.iter().find(|keys| keys.is_confirmed).or_else(|| self.sets.first());
+        let latest = self
+            .sets
+            .iter()
+            .find(|keys| keys.is_confirmed)
+            .or_else(|| self.sets.first());
         latest.map(|keys| &keys.to)
     }
 
     /// The body of a frame, if one of the keys opens it, and whether its counter is accepted.
-    pub(crate) fn open(&mut self, head: &FrameHeader, frame: &[u8]) -> Option<(Vec<u8>, Result<(), FrameEvent>)> {
+    pub(crate) fn open(
+        &mut self,
+        head: &FrameHeader,
+        frame: &[u8],
+    ) -> Option<(Vec<u8>, Result<(), FrameEvent>)> {
         let (open, sealed) = frame.split_at_checked(HEADER_BYTES)?;
         self.sets.iter_mut().find_map(|keys| {
             let body = keys.from.open(head.counter, open, sealed)?;
@@ -53,11 +61,15 @@ impl KeyRing {
 
     /// Takes the counter of a frame that was opened otherwise.
     pub(crate) fn take(&mut self, counter: u64) -> Result<(), FrameEvent> {
-        self.sets.first_mut().map_or(Ok(()), |keys| keys.window.take(counter))
+        self.sets
+            .first_mut()
+            .map_or(Ok(()), |keys| keys.window.take(counter))
     }
 
     /// Goes on after a counter that a handshake has proven.
     pub(crate) fn skip_to(&mut self, counter: u64) {
-        self.sets.iter_mut().for_each(|keys| keys.window.skip_to(counter));
+        self.sets
+            .iter_mut()
+            .for_each(|keys| keys.window.skip_to(counter));
     }
 }

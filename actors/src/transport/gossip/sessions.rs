@@ -25,7 +25,9 @@ use serde::de::DeserializeOwned;
 use super::counters::{FrameCounters, FrameEvent};
 use super::frame::{FrameHeader, FrameKind, Greeting, HEADER_BYTES, Hello, Introduction, Version};
 use super::handshake::{Identity, Proven, Prover};
-use super::key::{BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of};
+use super::key::{
+    BROADCAST, CellKey, CookieFactory, FrameCipher, SessionId, SessionNonce, session_of,
+};
 use super::near_cells::{NearCells, are_numbered};
 use super::node_id::NodeId;
 use super::notices::{GossipNotice, Notices};
@@ -90,7 +92,11 @@ pub(crate) enum FrameContent {
     /// A message of the SWIM protocol.
     Gossip { from: NodeName, body: Vec<u8> },
     /// A datagram of the sender's other actors.
-    Payload { from: NodeName, rights: Rights, body: Vec<u8> },
+    Payload {
+        from: NodeName,
+        rights: Rights,
+        body: Vec<u8>,
+    },
     /// A frame of a session that is not established, or not any more: greet its sender.
     Stranger,
     /// Two running nodes have this name.
@@ -111,7 +117,11 @@ impl Sessions {
         counters: Arc<FrameCounters>,
         now: Timestamp,
     ) -> Self {
-        let own = if identity.is_some() { session_of(name, &nonce) } else { nonce };
+        let own = if identity.is_some() {
+            session_of(name, &nonce)
+        } else {
+            nonce
+        };
         Self {
             everybody: key.seal(&own, &BROADCAST),
             key,
@@ -139,7 +149,9 @@ impl Sessions {
     /// A greeting frame for any node of the cell; with `wants_session` for one that is to prove itself again.
     pub(crate) fn hello(&mut self, own: &NodeId, wants_session: bool) -> Vec<u8> {
         let head = self.head(FrameKind::Hello);
-        let mut body = encode(&Hello { name: own.name.clone() });
+        let mut body = encode(&Hello {
+            name: own.name.clone(),
+        });
         if self.prove_certificates() {
             body.extend(encode(&Greeting { wants_session }));
         }
@@ -157,14 +169,19 @@ impl Sessions {
         let head = self.head(kind);
         let peer = self.peers.speaker_mut(to)?;
         peer.unheard_since.get_or_insert(now);
-        Some((peer.address, head.write(self.key.tag(), body, peer.keys.to()?)))
+        Some((
+            peer.address,
+            head.write(self.key.tag(), body, peer.keys.to()?),
+        ))
     }
 
     /// Address of a node that has answered nothing for a while, and is to be greeted for a new session.
     pub(crate) fn unheard(&mut self, name: &NodeName, now: Timestamp) -> Option<SocketAddr> {
         let proves = self.prove_certificates();
         let peer = self.peers.speaker_mut(name).filter(|_| proves)?;
-        let since = peer.unheard_since.filter(|since| now.since(*since) >= UNHEARD_TIMEOUT)?;
+        let since = peer
+            .unheard_since
+            .filter(|since| now.since(*since) >= UNHEARD_TIMEOUT)?;
         peer.unheard_since = Some(now.max(since));
         Some(peer.address)
     }
@@ -182,7 +199,9 @@ impl Sessions {
 
     /// True if a node was heard a moment ago.
     pub(crate) fn is_heard(&self, name: &NodeName, now: Timestamp) -> bool {
-        self.peers.speaker(name).is_some_and(|peer| now.since(peer.heard) < HEARD_TIME)
+        self.peers
+            .speaker(name)
+            .is_some_and(|peer| now.since(peer.heard) < HEARD_TIME)
     }
 
     /// Address of the node of a name, if it was heard lately.
@@ -209,18 +228,30 @@ impl Sessions {
     /// Takes changed certificates and the time. Ends all sessions whose certificate is no longer valid; the result are
     /// the nodes that had them, and those that are to be shown this node's new certificate.
     pub(crate) fn set_identity(&mut self, identity: Identity) -> (Vec<NodeName>, Vec<SocketAddr>) {
-        let Some(prover) = &mut self.prover else { return Default::default() };
+        let Some(prover) = &mut self.prover else {
+            return Default::default();
+        };
         let certificate = prover.certificate().to_vec();
         let has_changed = prover.set_identity(identity);
         let is_renewed = prover.certificate() != certificate;
         let expelled = self.peers.expel(|peer| {
             peer.proven.as_ref().is_none_or(|proven| {
                 let expired = prover.has_expired(proven);
-                expired || has_changed && prover.verify(&peer.id.name, &proven.certificate, peer.address).is_none()
+                expired
+                    || has_changed
+                        && prover
+                            .verify(&peer.id.name, &proven.certificate, peer.address)
+                            .is_none()
             })
         });
-        expelled.iter().for_each(|_| self.counters.count(FrameEvent::Expelled));
-        let greeted = if is_renewed { self.peers.addresses() } else { Vec::new() };
+        expelled
+            .iter()
+            .for_each(|_| self.counters.count(FrameEvent::Expelled));
+        let greeted = if is_renewed {
+            self.peers.addresses()
+        } else {
+            Vec::new()
+        };
         (expelled, greeted)
     }
 
@@ -231,7 +262,11 @@ impl Sessions {
     }
 
     /// Processes a datagram. An error means junk, which changed nothing.
-    pub(crate) fn open(&mut self, frame: &[u8], arrival: &Arrival<'_>) -> Result<FrameContent, FrameEvent> {
+    pub(crate) fn open(
+        &mut self,
+        frame: &[u8],
+        arrival: &Arrival<'_>,
+    ) -> Result<FrameContent, FrameEvent> {
         let head = FrameHeader::read(frame, self.key.tag()).inspect_err(|reason| {
             if *reason == FrameEvent::WrongCell {
                 self.note_other_cell(frame, arrival);
@@ -241,7 +276,11 @@ impl Sessions {
             return Err(self.refuse_version(&head, frame, arrival.from));
         }
         if head.sender == self.own {
-            return if head.kind == FrameKind::Hello { Ok(FrameContent::Nothing) } else { Err(FrameEvent::Replayed) };
+            return if head.kind == FrameKind::Hello {
+                Ok(FrameContent::Nothing)
+            } else {
+                Err(FrameEvent::Replayed)
+            };
         }
         match head.kind {
             FrameKind::Hello => {
@@ -250,11 +289,14 @@ impl Sessions {
                     return Err(FrameEvent::BadSeal);
                 };
                 let (hello, rest) = decode_first::<Hello>(&body)?;
-                let wants_session = self.prove_certificates() && decode::<Greeting>(rest)?.wants_session;
+                let wants_session =
+                    self.prove_certificates() && decode::<Greeting>(rest)?.wants_session;
                 self.handle_hello(&head, &hello, wants_session, arrival)
             }
             FrameKind::Handshake => {
-                let body = self.unseal(&head, &self.own, frame).ok_or(FrameEvent::BadSeal)?;
+                let body = self
+                    .unseal(&head, &self.own, frame)
+                    .ok_or(FrameEvent::BadSeal)?;
                 if !self.prove_certificates() {
                     self.peers.take_counter(&head, arrival.from, arrival.now)?;
                 }
@@ -274,10 +316,18 @@ impl Sessions {
     ) -> Result<FrameContent, FrameEvent> {
         let Some(peer) = self.peers.get_mut(&head.sender) else {
             // Without certificates the keys are known, and the node itself is not. With them it greets when unheard.
-            let unsealed = if self.prove_certificates() { None } else { self.unseal(head, &self.own, frame) };
-            return unsealed.map(|_| self.stranger(FrameEvent::Unestablished)).ok_or(FrameEvent::BadSeal);
+            let unsealed = if self.prove_certificates() {
+                None
+            } else {
+                self.unseal(head, &self.own, frame)
+            };
+            return unsealed
+                .map(|_| self.stranger(FrameEvent::Unestablished))
+                .ok_or(FrameEvent::BadSeal);
         };
-        let Some((body, taken)) = peer.keys.open(head, frame) else { return Err(FrameEvent::BadSeal) };
+        let Some((body, taken)) = peer.keys.open(head, frame) else {
+            return Err(FrameEvent::BadSeal);
+        };
         match taken {
             Ok(()) if !peer.frames.allow(now) => return Err(FrameEvent::Throttled),
             Ok(()) => peer.note_heard(now),
@@ -293,7 +343,10 @@ impl Sessions {
             Some(_) => Err(FrameEvent::Superseded),
             None if kind == FrameKind::Gossip => Ok(FrameContent::Gossip { from, body }),
             None => {
-                let rights = peer.proven.as_ref().map_or(Rights::ALL, |proven| proven.rights);
+                let rights = peer
+                    .proven
+                    .as_ref()
+                    .map_or(Rights::ALL, |proven| proven.rights);
                 Ok(FrameContent::Payload { from, rights, body })
             }
         }
@@ -313,28 +366,48 @@ impl Sessions {
 
     /// Notes a greeting under another key.
     fn note_other_key(&mut self, from: SocketAddr) {
-        let cause = format!("heard cell {} with another key, or none, from {}", self.cell, from.ip());
+        let cause = format!(
+            "heard cell {} with another key, or none, from {}",
+            self.cell,
+            from.ip()
+        );
         self.notices.add(&from.ip(), TroubleKind::WrongKey, cause);
     }
 
     /// Notes a cell with nearly this one's name. Numbered cells may be neighbours, unless this node has found nobody.
     fn note_other_cell(&mut self, frame: &[u8], arrival: &Arrival<'_>) {
-        let Some(&tag) = frame.get(4..8).and_then(<[u8]>::first_chunk) else { return };
-        let Some(other) = self.near_cells.name_of(tag, &self.cell) else { return };
+        let Some(&tag) = frame.get(4..8).and_then(<[u8]>::first_chunk) else {
+            return;
+        };
+        let Some(other) = self.near_cells.name_of(tag, &self.cell) else {
+            return;
+        };
         if !are_numbered(other, &self.cell) || arrival.is_alone {
-            let cause = format!("heard cell {other} from {}, this is {}", arrival.from.ip(), self.cell);
-            self.notices.add(&arrival.from.ip(), TroubleKind::OtherCell, cause);
+            let cause = format!(
+                "heard cell {other} from {}, this is {}",
+                arrival.from.ip(),
+                self.cell
+            );
+            self.notices
+                .add(&arrival.from.ip(), TroubleKind::OtherCell, cause);
         }
     }
 
     /// Refuses a frame of a node with certificates where this one has none, or the reverse; a greeting tells who it is.
     fn refuse_version(&mut self, head: &FrameHeader, frame: &[u8], from: SocketAddr) -> FrameEvent {
-        let greeting = if head.kind == FrameKind::Hello { self.unseal(head, &BROADCAST, frame) } else { None };
-        let hello = greeting.and_then(|body| decode_first::<Hello>(&body).ok().map(|(hello, _)| hello));
+        let greeting = if head.kind == FrameKind::Hello {
+            self.unseal(head, &BROADCAST, frame)
+        } else {
+            None
+        };
+        let hello =
+            greeting.and_then(|body| decode_first::<Hello>(&body).ok().map(|(hello, _)| hello));
         if let Some(Hello { name }) = hello {
             let has = "not admitted: it shows a certificate, and this node has no `[tls]`";
             match &mut self.prover {
-                Some(prover) => prover.refuse(&name, from, "it shows no certificate; it has no `[tls]`"),
+                Some(prover) => {
+                    prover.refuse(&name, from, "it shows no certificate; it has no `[tls]`")
+                }
                 None => self.notices.add(&name, TroubleKind::NotAdmitted, has),
             }
         }
@@ -344,17 +417,28 @@ impl Sessions {
     /// The body of a frame that the cell's key sealed.
     fn unseal(&self, head: &FrameHeader, receiver: &SessionId, frame: &[u8]) -> Option<Vec<u8>> {
         let (open, sealed) = frame.split_at_checked(HEADER_BYTES)?;
-        self.key.seal(&head.sender, receiver).open(head.counter, open, sealed)
+        self.key
+            .seal(&head.sender, receiver)
+            .open(head.counter, open, sealed)
     }
 
     /// Counts a frame that is not sent; always false.
     fn version(&self) -> Version {
-        if self.prove_certificates() { Version::Certificate } else { Version::Key }
+        if self.prove_certificates() {
+            Version::Certificate
+        } else {
+            Version::Key
+        }
     }
 
     fn head(&mut self, kind: FrameKind) -> FrameHeader {
         self.counter += 1;
-        FrameHeader { version: self.version(), kind, sender: self.own, counter: self.counter }
+        FrameHeader {
+            version: self.version(),
+            kind,
+            sender: self.own,
+            counter: self.counter,
+        }
     }
 }
 

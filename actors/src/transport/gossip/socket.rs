@@ -31,9 +31,16 @@ impl GossipSocket {
             Some(address) => open(address),
             None => open_default(config.default_ip()),
         }?;
-        let failed = |source| BindError { address: config.bind.unwrap_or(UNKNOWN), source };
+        let failed = |source| BindError {
+            address: config.bind.unwrap_or(UNKNOWN),
+            source,
+        };
         let address = own.local_addr().map_err(failed)?;
-        Ok(Self { own: UdpSocket::from_std(own).map_err(failed)?, group: OnceLock::new(), address })
+        Ok(Self {
+            own: UdpSocket::from_std(own).map_err(failed)?,
+            group: OnceLock::new(),
+            address,
+        })
     }
 
     /// Joins the multicast group, if enabled.
@@ -64,7 +71,10 @@ impl GossipSocket {
     /// Reads a datagram that waits.
     pub(crate) fn receive(&self, buffer: &mut [u8]) -> Option<(usize, SocketAddr)> {
         let sockets = [Some(&self.own), self.group.get().map(|(group, _)| group)];
-        sockets.into_iter().flatten().find_map(|socket| socket.try_recv_from(buffer).ok())
+        sockets
+            .into_iter()
+            .flatten()
+            .find_map(|socket| socket.try_recv_from(buffer).ok())
     }
 
     /// Sends a datagram, or fails when that would block.
@@ -97,7 +107,11 @@ fn open_default(ip: IpAddr) -> Result<std::net::UdpSocket, BindError> {
 
 fn open(address: SocketAddr) -> Result<std::net::UdpSocket, BindError> {
     let open = || {
-        let socket = Socket::new(Domain::for_address(address), Type::DGRAM, Some(Protocol::UDP))?;
+        let socket = Socket::new(
+            Domain::for_address(address),
+            Type::DGRAM,
+            Some(Protocol::UDP),
+        )?;
         socket.set_nonblocking(true)?;
         // The system may grant less.
         let _ = socket.set_recv_buffer_size(RECEIVE_BUFFER_BYTES);
@@ -107,8 +121,14 @@ fn open(address: SocketAddr) -> Result<std::net::UdpSocket, BindError> {
     open().map_err(|source| BindError { address, source })
 }
 
-fn join(config: &MulticastConfig, own: &UdpSocket, address: SocketAddr) -> io::Result<Option<(UdpSocket, SocketAddr)>> {
-    let IpAddr::V4(ip) = address.ip() else { return Ok(None) };
+fn join(
+    config: &MulticastConfig,
+    own: &UdpSocket,
+    address: SocketAddr,
+) -> io::Result<Option<(UdpSocket, SocketAddr)>> {
+    let IpAddr::V4(ip) = address.ip() else {
+        return Ok(None);
+    };
     if !config.enabled {
         return Ok(None);
     }
@@ -135,9 +155,16 @@ mod tests {
     #[tokio::test]
     async fn a_group_that_could_not_be_joined_is_joined_later() {
         let bind = Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)));
-        let socket = GossipSocket::bind(&MembershipConfig { bind, ..MembershipConfig::default() }).unwrap();
+        let socket = GossipSocket::bind(&MembershipConfig {
+            bind,
+            ..MembershipConfig::default()
+        })
+        .unwrap();
         // An interface of nobody: reserved for documentation.
-        let absent = MulticastConfig { interface: Some(Ipv4Addr::new(192, 0, 2, 7)), ..MulticastConfig::default() };
+        let absent = MulticastConfig {
+            interface: Some(Ipv4Addr::new(192, 0, 2, 7)),
+            ..MulticastConfig::default()
+        };
         assert!(socket.join(&absent).is_err());
         assert!(socket.multicast(b"hello").is_none());
         socket.join(&MulticastConfig::default()).unwrap();

@@ -7,7 +7,10 @@ use std::time::Duration;
 
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
-use foca::{AccumulatingRuntime, Codec, Foca, NoCustomBroadcast, OwnedNotification, PostcardCodec, State, Timer};
+use foca::{
+    AccumulatingRuntime, Codec, Foca, NoCustomBroadcast, OwnedNotification, PostcardCodec, State,
+    Timer,
+};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -60,7 +63,12 @@ struct ScheduledTimer {
 impl Swim {
     pub(crate) fn new(own: NodeId, config: &MembershipConfig, proves: bool, seed: u64) -> Self {
         Self {
-            foca: Foca::new(own, settings(config), ChaCha8Rng::seed_from_u64(seed), PostcardCodec),
+            foca: Foca::new(
+                own,
+                settings(config),
+                ChaCha8Rng::seed_from_u64(seed),
+                PostcardCodec,
+            ),
             runtime: AccumulatingRuntime::new(),
             timers: BinaryHeap::new(),
             scheduled: 0,
@@ -90,9 +98,16 @@ impl Swim {
 
     /// The state of another node.
     pub(crate) fn known(&self, name: &NodeName) -> Option<KnownMember> {
-        let member = self.foca.iter_membership_state().find(|member| member.id().name == *name)?;
+        let member = self
+            .foca
+            .iter_membership_state()
+            .find(|member| member.id().name == *name)?;
         let NodeId { run, life, .. } = *member.id();
-        Some(KnownMember { run, life, alive: member.state() != State::Down })
+        Some(KnownMember {
+            run,
+            life,
+            alive: member.state() != State::Down,
+        })
     }
 
     /// Time at which [`Self::tick`] is next needed.
@@ -121,8 +136,9 @@ impl Swim {
             return Err(FrameEvent::Malformed);
         }
         let result = if self.lives.is_some() {
-            let body =
-                self.without_hearsay(&header.src, (body, updates), is_heard).map_err(|_| FrameEvent::Malformed)?;
+            let body = self
+                .without_hearsay(&header.src, (body, updates), is_heard)
+                .map_err(|_| FrameEvent::Malformed)?;
             self.foca.handle_data(&body, &mut self.runtime)
         } else {
             self.foca.handle_data(body, &mut self.runtime)
@@ -139,9 +155,14 @@ impl Swim {
         (body, updates): (&[u8], &[u8]),
         is_heard: &dyn Fn(&NodeName) -> bool,
     ) -> Result<Vec<u8>, postcard::Error> {
-        let Some((count, mut rest)) = updates.split_first_chunk::<2>() else { return Ok(body.to_vec()) };
+        let Some((count, mut rest)) = updates.split_first_chunk::<2>() else {
+            return Ok(body.to_vec());
+        };
         self.note_met(from);
-        let mut kept = body.get(..body.len() - updates.len()).unwrap_or_default().to_vec();
+        let mut kept = body
+            .get(..body.len() - updates.len())
+            .unwrap_or_default()
+            .to_vec();
         let (mut codec, mut kept_updates) = (PostcardCodec, Vec::new());
         for _ in 0..u16::from_be_bytes(*count) {
             let update: foca::Member<NodeId> = codec.decode_member(&mut rest)?;
@@ -155,12 +176,20 @@ impl Swim {
                     }
                 }
                 Some(_) => {}
-                None if update.state() != State::Down => self.outputs.push_back(SwimOutput::Unproven(id.clone())),
+                None if update.state() != State::Down => {
+                    self.outputs.push_back(SwimOutput::Unproven(id.clone()))
+                }
                 None => {}
             }
         }
-        kept.extend(u16::try_from(kept_updates.len()).unwrap_or(u16::MAX).to_be_bytes());
-        kept_updates.iter().try_for_each(|update| codec.encode_member(update, &mut kept))?;
+        kept.extend(
+            u16::try_from(kept_updates.len())
+                .unwrap_or(u16::MAX)
+                .to_be_bytes(),
+        );
+        kept_updates
+            .iter()
+            .try_for_each(|update| codec.encode_member(update, &mut kept))?;
         kept.extend_from_slice(rest);
         Ok(kept)
     }
@@ -199,17 +228,24 @@ impl Swim {
         if let Some(lives) = &mut self.lives {
             lives.remove(name);
         }
-        let known = self.foca.iter_membership_state().find(|member| member.id().name == *name);
+        let known = self
+            .foca
+            .iter_membership_state()
+            .find(|member| member.id().name == *name);
         if let Some(id) = known.map(|member| member.id().clone()) {
             let down = foca::Member::down(id);
-            let removed = self.foca.apply_many(std::iter::once(down), true, &mut self.runtime);
+            let removed = self
+                .foca
+                .apply_many(std::iter::once(down), true, &mut self.runtime);
             self.finish("removal", removed, now);
         }
     }
 
     #[cfg(test)]
     pub(crate) fn spread(&mut self, about: foca::Member<NodeId>, now: Timestamp) {
-        let spread = self.foca.apply_many(std::iter::once(about), true, &mut self.runtime);
+        let spread = self
+            .foca
+            .apply_many(std::iter::once(about), true, &mut self.runtime);
         self.finish("lie", spread, now);
     }
 
@@ -253,16 +289,24 @@ impl Swim {
 
     fn collect(&mut self, now: Timestamp) {
         while let Some((to, body)) = self.runtime.to_send() {
-            self.outputs.push_back(SwimOutput::Send { to, body: body.into() });
+            self.outputs.push_back(SwimOutput::Send {
+                to,
+                body: body.into(),
+            });
         }
         while let Some((after, timer)) = self.runtime.to_schedule() {
             if let Timer::ChangeSuspectToDown { member_id, .. } = &timer
                 && self.alive.contains_key(&member_id.name)
             {
-                self.outputs.push_back(SwimOutput::Suspected(member_id.name.clone()));
+                self.outputs
+                    .push_back(SwimOutput::Suspected(member_id.name.clone()));
             }
             self.scheduled += 1;
-            self.timers.push(Reverse(ScheduledTimer { at: now + after, timer, order: self.scheduled }));
+            self.timers.push(Reverse(ScheduledTimer {
+                at: now + after,
+                timer,
+                order: self.scheduled,
+            }));
         }
         while let Some(notification) = self.runtime.to_notify() {
             self.take(notification, now);
@@ -284,13 +328,23 @@ impl Swim {
                 if let Some(before) = self.alive.get_mut(&id.name) {
                     let before = std::mem::replace(before, id.clone());
                     let same = (before.run, before.role) == (id.run, id.role);
-                    self.outputs.push_back(if same { SwimOutput::Changed(id) } else { SwimOutput::Alive(id) });
+                    self.outputs.push_back(if same {
+                        SwimOutput::Changed(id)
+                    } else {
+                        SwimOutput::Alive(id)
+                    });
                 }
             }
             OwnedNotification::Defunct if !self.left => {
                 // Others declared this node down, such as while its process was stopped.
-                let earliest = self.renewed_at.map_or(now, |renewed_at| renewed_at + MIN_RENEW_INTERVAL);
-                if earliest <= now { self.renew(now) } else { self.renew_at = Some(earliest) }
+                let earliest = self
+                    .renewed_at
+                    .map_or(now, |renewed_at| renewed_at + MIN_RENEW_INTERVAL);
+                if earliest <= now {
+                    self.renew(now)
+                } else {
+                    self.renew_at = Some(earliest)
+                }
             }
             OwnedNotification::Active
             | OwnedNotification::Idle
@@ -306,7 +360,10 @@ const MIN_RENEW_INTERVAL: Duration = Duration::from_secs(1);
 fn settings(config: &MembershipConfig) -> foca::Config {
     let ms = Duration::from_millis;
     let periodic = |frequency, nodes| {
-        Some(foca::PeriodicParams { frequency, num_members: NonZeroUsize::new(nodes).unwrap_or(NonZeroUsize::MIN) })
+        Some(foca::PeriodicParams {
+            frequency,
+            num_members: NonZeroUsize::new(nodes).unwrap_or(NonZeroUsize::MIN),
+        })
     };
     foca::Config {
         probe_period: ms(config.probe_ms),

@@ -23,16 +23,28 @@ impl TrialAuthority {
     pub(crate) fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let count = COUNT.fetch_add(1, Ordering::Relaxed);
-        let directory = std::env::temp_dir().join(format!("ecod-trial-ca-{}-{count}", std::process::id()));
-        let authority = Authority::init(&directory, &NodeName::from_static("lot-1"), now()).expect("a CA is made");
-        Self { directory, authority }
+        let directory =
+            std::env::temp_dir().join(format!("ecod-trial-ca-{}-{count}", std::process::id()));
+        let authority = Authority::init(&directory, &NodeName::from_static("lot-1"), now())
+            .expect("a CA is made");
+        Self {
+            directory,
+            authority,
+        }
     }
 
     /// A new certificate's files.
     #[expect(clippy::expect_used, reason = "a test ends without its certificate")]
-    pub(crate) fn issue(&mut self, name: &str, rights: impl Into<Rights>, valid: Duration) -> TlsConfig {
+    pub(crate) fn issue(
+        &mut self,
+        name: &str,
+        rights: impl Into<Rights>,
+        valid: Duration,
+    ) -> TlsConfig {
         let name = NodeName::new(name).expect("a name");
-        self.authority.issue(&name, rights, valid, now()).expect("a certificate is made");
+        self.authority
+            .issue(&name, rights, valid, now())
+            .expect("a certificate is made");
         self.files(&name)
     }
 
@@ -45,21 +57,33 @@ impl TrialAuthority {
     /// The identity of a node with its last certificate and the present revocation list.
     #[expect(clippy::expect_used, reason = "a test ends without its certificate")]
     pub(crate) fn read(files: &TlsConfig, name: &str) -> Identity {
-        let credentials = Credentials::load(files, &NodeName::new(name).expect("a name")).expect("files of a node");
-        Identity { credentials: credentials.current(), wall: UnixTime::now() }
+        let credentials = Credentials::load(files, &NodeName::new(name).expect("a name"))
+            .expect("files of a node");
+        Identity {
+            credentials: credentials.current(),
+            wall: UnixTime::now(),
+        }
     }
 
     /// Paths of a node's files.
     pub(crate) fn files(&self, name: &NodeName) -> TlsConfig {
         let (certificate, key) = self.authority.files_of(name);
         let (ca, list) = (self.authority.ca(), self.authority.revocation_list());
-        TlsConfig { ca, certificate, key, revocation_list: Some(list), city: None }
+        TlsConfig {
+            ca,
+            certificate,
+            key,
+            revocation_list: Some(list),
+            city: None,
+        }
     }
 
     /// Revokes a node; the others learn of it when they read the list.
     #[cfg(test)]
     pub(crate) fn revoke(&mut self, name: &NodeName) {
-        self.authority.revoke(name, now()).expect("a certificate to revoke");
+        self.authority
+            .revoke(name, now())
+            .expect("a certificate to revoke");
     }
 }
 

@@ -7,7 +7,9 @@ use std::time::Duration;
 use rcgen::{CertificateParams, KeyPair};
 use ring::digest::{SHA256, digest};
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
-use rustls::crypto::{CryptoProvider, ring as provider, verify_tls12_signature, verify_tls13_signature};
+use rustls::crypto::{
+    CryptoProvider, ring as provider, verify_tls12_signature, verify_tls13_signature,
+};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{CertificateError, ClientConfig, DigitallySignedStruct, SignatureScheme};
 use tokio::io::BufStream;
@@ -17,8 +19,8 @@ use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
 use super::{
-    CONVERSATION_TIME, HOST_NAME, KEPT, MAX_REPLY_BYTES, MAX_REQUEST_BYTES, Reply, Request, Token, Welcome, read_line,
-    write_line,
+    CONVERSATION_TIME, HOST_NAME, KEPT, MAX_REPLY_BYTES, MAX_REQUEST_BYTES, Reply, Request, Token,
+    Welcome, read_line, write_line,
 };
 
 /// Maximum time for a connection to one address of the host.
@@ -37,7 +39,9 @@ pub struct Joined {
 #[derive(Debug, thiserror::Error)]
 pub enum JoinError {
     /// No address of the host can be reached.
-    #[error("no host at {addresses}: is `ecod-node invite` still running there, and the address reachable? ({reason})")]
+    #[error(
+        "no host at {addresses}: is `ecod-node invite` still running there, and the address reachable? ({reason})"
+    )]
     Unreachable {
         /// All that were tried.
         addresses: String,
@@ -61,20 +65,35 @@ pub enum JoinError {
 /// [`JoinError`].
 pub async fn redeem(token: &Token) -> Result<Joined, JoinError> {
     let key = KeyPair::generate()?;
-    let signing = CertificateParams::default().serialize_request(&key)?.pem()?;
-    let request = Request { node: token.node.clone(), secret: hex::encode(token.secret), request: signing };
+    let signing = CertificateParams::default()
+        .serialize_request(&key)?
+        .pem()?;
+    let request = Request {
+        node: token.node.clone(),
+        secret: hex::encode(token.secret),
+        request: signing,
+    };
     let conversation = async {
         let mut stream = BufStream::new(connect(token).await?);
         write_line(&mut stream, &request).await?;
         let reply: Reply = read_line(&mut stream, MAX_REPLY_BYTES).await?;
         match reply {
-            Reply::Welcome(welcome) => Ok(Joined { welcome: *welcome, key: key.serialize_pem(), stream }),
+            Reply::Welcome(welcome) => Ok(Joined {
+                welcome: *welcome,
+                key: key.serialize_pem(),
+                stream,
+            }),
             Reply::Refused(reason) => Err(JoinError::Refused(reason)),
         }
     };
     let late = |_| JoinError::Conversation(io::ErrorKind::TimedOut.into());
     let tries = u32::try_from(token.addresses.len()).unwrap_or(u32::MAX);
-    timeout(CONNECT_TIME.saturating_mul(tries) + CONVERSATION_TIME, conversation).await.map_err(late)?
+    timeout(
+        CONNECT_TIME.saturating_mul(tries) + CONVERSATION_TIME,
+        conversation,
+    )
+    .await
+    .map_err(late)?
 }
 
 impl Joined {
@@ -93,7 +112,10 @@ impl Joined {
 
 async fn connect(token: &Token) -> Result<TlsStream<TcpStream>, JoinError> {
     let provider = Arc::new(provider::default_provider());
-    let verifier = PinnedVerifier { fingerprint: token.fingerprint, provider: Arc::clone(&provider) };
+    let verifier = PinnedVerifier {
+        fingerprint: token.fingerprint,
+        provider: Arc::clone(&provider),
+    };
     let config = ClientConfig::builder_with_provider(provider)
         .with_protocol_versions(&[&rustls::version::TLS13])
         .map_err(io::Error::other)?
@@ -104,14 +126,24 @@ async fn connect(token: &Token) -> Result<TlsStream<TcpStream>, JoinError> {
     let name = ServerName::try_from(HOST_NAME).map_err(io::Error::other)?;
     let mut reason = String::from("the token names no address");
     for address in &token.addresses {
-        let attempt = async { connector.connect(name.clone(), TcpStream::connect(address).await?).await };
-        match timeout(CONNECT_TIME, attempt).await.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into())) {
+        let attempt = async {
+            connector
+                .connect(name.clone(), TcpStream::connect(address).await?)
+                .await
+        };
+        match timeout(CONNECT_TIME, attempt)
+            .await
+            .unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
+        {
             Ok(stream) => return Ok(stream),
             Err(error) => reason = format!("{address}: {error}"),
         }
     }
     let addresses: Vec<String> = token.addresses.iter().map(ToString::to_string).collect();
-    Err(JoinError::Unreachable { addresses: addresses.join(", "), reason })
+    Err(JoinError::Unreachable {
+        addresses: addresses.join(", "),
+        reason,
+    })
 }
 
 /// Trust in one certificate, whatever its names and validity.
@@ -143,7 +175,12 @@ impl ServerCertVerifier for PinnedVerifier {
         certificate: &CertificateDer<'_>,
         signature: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        verify_tls12_signature(message, certificate, signature, &self.provider.signature_verification_algorithms)
+        verify_tls12_signature(
+            message,
+            certificate,
+            signature,
+            &self.provider.signature_verification_algorithms,
+        )
     }
 
     fn verify_tls13_signature(
@@ -152,10 +189,17 @@ impl ServerCertVerifier for PinnedVerifier {
         certificate: &CertificateDer<'_>,
         signature: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, rustls::Error> {
-        verify_tls13_signature(message, certificate, signature, &self.provider.signature_verification_algorithms)
+        verify_tls13_signature(
+            message,
+            certificate,
+            signature,
+            &self.provider.signature_verification_algorithms,
+        )
     }
 
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        self.provider.signature_verification_algorithms.supported_schemes()
+        self.provider
+            .signature_verification_algorithms
+            .supported_schemes()
     }
 }

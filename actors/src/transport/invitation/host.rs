@@ -21,8 +21,8 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tokio_rustls::TlsAcceptor;
 
 use super::{
-    CONVERSATION_TIME, CityFiles, HOST_NAME, KEPT, MAX_REQUEST_BYTES, Reply, Request, Token, Welcome, read_line,
-    write_line,
+    CONVERSATION_TIME, CityFiles, HOST_NAME, KEPT, MAX_REQUEST_BYTES, Reply, Request, Token,
+    Welcome, read_line, write_line,
 };
 use crate::platform::bounded_file;
 use crate::platform::clock;
@@ -93,10 +93,22 @@ impl Host {
         let provider = Arc::new(rustls::crypto::ring::default_provider());
         let tls = ServerConfig::builder_with_provider(provider)
             .with_protocol_versions(&[&rustls::version::TLS13])
-            .and_then(|builder| builder.with_no_client_auth().with_single_cert(chain, private))
+            .and_then(|builder| {
+                builder
+                    .with_no_client_auth()
+                    .with_single_cert(chain, private)
+            })
             .map_err(|error| AuthorityError::Crypto(error.to_string()))?;
         let tls = TlsAcceptor::from(Arc::new(tls));
-        Ok(Self { authority, cell_key, seeds, city, guests: BTreeMap::new(), tls, fingerprint })
+        Ok(Self {
+            authority,
+            cell_key,
+            seeds,
+            city,
+            guests: BTreeMap::new(),
+            tls,
+            fingerprint,
+        })
     }
 
     /// The token of a node, which finds the host at one of the addresses. A former token of the node does not work
@@ -114,14 +126,31 @@ impl Host {
         let mut secret = [0; 16];
         let drawn = SystemRandom::new().fill(&mut secret);
         drawn.map_err(|_| AuthorityError::Crypto("the system gives no random numbers".into()))?;
-        self.guests.insert(node.clone(), Guest { rights: rights.into(), secret, issued: None });
-        Ok(Token { node: node.clone(), addresses, fingerprint: self.fingerprint, secret })
+        self.guests.insert(
+            node.clone(),
+            Guest {
+                rights: rights.into(),
+                secret,
+                issued: None,
+            },
+        );
+        Ok(Token {
+            node: node.clone(),
+            addresses,
+            fingerprint: self.fingerprint,
+            secret,
+        })
     }
 
     /// Serves guests until all have joined or the time is over, and tells of each visit; gives those that did not come.
     ///
     /// Of each host, one failure for each reason is told. Certificates that were not kept are revoked at the end.
-    pub async fn serve(mut self, listener: TcpListener, until: Instant, tell: impl Fn(Visit)) -> Vec<NodeName> {
+    pub async fn serve(
+        mut self,
+        listener: TcpListener,
+        until: Instant,
+        tell: impl Fn(Visit),
+    ) -> Vec<NodeName> {
         let mut visits = JoinSet::new();
         let mut failures = BTreeSet::new();
         let (ask, mut questions) = mpsc::channel::<Question>(MAX_VISITS);
@@ -164,7 +193,11 @@ impl Host {
                 () = sleep_until(until) => break,
             }
         }
-        for serial in self.guests.values().filter_map(|guest| guest.issued.as_ref()) {
+        for serial in self
+            .guests
+            .values()
+            .filter_map(|guest| guest.issued.as_ref())
+        {
             if let Err(error) = self.authority.revoke_serial(serial, clock::now()) {
                 tracing::warn!(%error, "a certificate that was not kept stays valid");
             }
@@ -180,27 +213,42 @@ impl Host {
     }
 
     fn welcome(&mut self, request: &Request) -> Result<(Welcome, String), String> {
-        let unusable = |error: &dyn std::fmt::Display| format!("the host cannot issue a certificate: {error}");
+        let unusable =
+            |error: &dyn std::fmt::Display| format!("the host cannot issue a certificate: {error}");
         // Hashes are compared: the time that it takes tells nothing of the secret.
         let hash = |secret: &[u8]| digest(&SHA256, secret).as_ref().to_vec();
         let secret = hex::decode(&request.secret).unwrap_or_default();
-        let guest = self.guests.get_mut(&request.node).filter(|guest| hash(&guest.secret) == hash(&secret));
-        let guest = guest.ok_or("the token was used already, or is of another `ecod-node invite`")?;
+        let guest = self
+            .guests
+            .get_mut(&request.node)
+            .filter(|guest| hash(&guest.secret) == hash(&secret));
+        let guest =
+            guest.ok_or("the token was used already, or is of another `ecod-node invite`")?;
         let signing = CertificateSigningRequestParams::from_pem(&request.request)
             .map_err(|error| format!("the certificate signing request cannot be used: {error}"))?;
         let (node, now) = (&request.node, clock::now());
         if let Some(serial) = &guest.issued {
-            self.authority.revoke_serial(serial, now).map_err(|error| unusable(&error))?;
+            self.authority
+                .revoke_serial(serial, now)
+                .map_err(|error| unusable(&error))?;
         }
         let rights = guest.rights;
         let valid = Duration::from_secs(u64::from(DEFAULT_DAYS) * 86_400);
-        let issued = self.authority.certify(node, rights, valid, now, &signing.public_key);
+        let issued = self
+            .authority
+            .certify(node, rights, valid, now, &signing.public_key);
         let (certificate, serial) = issued.map_err(|error| unusable(&error))?;
         guest.issued = Some(serial.clone());
         let read = |path: &Path| bounded_file::read_text(path).map_err(|error| unusable(&error));
         let city = |city: &CityTlsConfig| {
-            let list = city.revocation_list.as_deref().ok_or("the city has no revocation list")?;
-            Ok::<_, String>(CityFiles { ca: read(&city.ca)?, revocation_list: read(list)? })
+            let list = city
+                .revocation_list
+                .as_deref()
+                .ok_or("the city has no revocation list")?;
+            Ok::<_, String>(CityFiles {
+                ca: read(&city.ca)?,
+                revocation_list: read(list)?,
+            })
         };
         let welcome = Welcome {
             cell: self.authority.cell().clone(),
@@ -223,7 +271,9 @@ pub fn read_request(sent: &[u8]) -> Option<Vec<u8>> {
     use rcgen::PublicKeyData;
 
     let read = read_line::<Request>(&mut &*sent, MAX_REQUEST_BYTES).now_or_never();
-    let request = read.expect("bytes that are there are not waited for").ok()?;
+    let request = read
+        .expect("bytes that are there are not waited for")
+        .ok()?;
     let signing = CertificateSigningRequestParams::from_pem(&request.request).ok()?;
     Some(signing.public_key.der_bytes().to_vec())
 }

@@ -24,7 +24,9 @@ pub struct Token {
 
 /// A text that is no token, or not a whole one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("this is no token, or not the whole of it; `ecod-node invite NAME` prints one, which begins with `{PREFIX}`")]
+#[error(
+    "this is no token, or not the whole of it; `ecod-node invite NAME` prints one, which begins with `{PREFIX}`"
+)]
 pub struct TokenError;
 
 /// Beginning of each token: kind and version.
@@ -49,7 +51,10 @@ fn text_of(mut content: Vec<u8>) -> String {
 
 impl fmt::Debug for Token {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Token").field("node", &self.node).field("addresses", &self.addresses).finish_non_exhaustive()
+        f.debug_struct("Token")
+            .field("node", &self.node)
+            .field("addresses", &self.addresses)
+            .finish_non_exhaustive()
     }
 }
 
@@ -58,8 +63,12 @@ impl FromStr for Token {
 
     fn from_str(text: &str) -> Result<Self, TokenError> {
         let encoded = text.trim().strip_prefix(PREFIX).ok_or(TokenError)?;
-        let bytes = BASE64_URL_SAFE_NO_PAD.decode(encoded).map_err(|_| TokenError)?;
-        let (content, checksum) = bytes.split_last_chunk::<CHECKSUM_BYTES>().ok_or(TokenError)?;
+        let bytes = BASE64_URL_SAFE_NO_PAD
+            .decode(encoded)
+            .map_err(|_| TokenError)?;
+        let (content, checksum) = bytes
+            .split_last_chunk::<CHECKSUM_BYTES>()
+            .ok_or(TokenError)?;
         if !digest(&SHA256, content).as_ref().starts_with(checksum) {
             return Err(TokenError);
         }
@@ -80,14 +89,29 @@ mod tests {
 
     #[test]
     fn a_token_is_read_as_it_was_written_and_no_part_of_it_is() {
-        let addresses = vec!["192.168.1.10:40000".parse().unwrap(), "[fe80::1]:40000".parse().unwrap()];
-        let token = Token { node: NodeName::from_static("gauss"), addresses, fingerprint: [7; 32], secret: [0xd3; 16] };
+        let addresses = vec![
+            "192.168.1.10:40000".parse().unwrap(),
+            "[fe80::1]:40000".parse().unwrap(),
+        ];
+        let token = Token {
+            node: NodeName::from_static("gauss"),
+            addresses,
+            fingerprint: [7; 32],
+            secret: [0xd3; 16],
+        };
         let text = token.to_string();
         assert!(text.len() < 160, "{text}");
         assert_eq!(format!(" {text}\n").parse(), Ok(token.clone()));
-        assert!(!format!("{token:?}").contains("d3") && !format!("{token:?}").contains("211"), "{token:?}");
+        assert!(
+            !format!("{token:?}").contains("d3") && !format!("{token:?}").contains("211"),
+            "{token:?}"
+        );
         for cut in 0..text.len() {
-            assert_eq!(text[..cut].parse::<Token>(), Err(TokenError), "{cut} characters");
+            assert_eq!(
+                text[..cut].parse::<Token>(),
+                Err(TokenError),
+                "{cut} characters"
+            );
         }
         let swapped = text.replacen('d', "e", 1);
         assert_eq!(swapped.parse::<Token>(), Err(TokenError));

@@ -98,28 +98,65 @@ impl MqttConfig {
             // The minimum of the client library.
             MqttVersion::V5 => 5.0,
         };
-        check_range("keep_alive_s", f64::from(self.keep_alive_s), min_keep_alive_s, 3600.0)?;
-        check_range("connect_timeout_ms", self.connect_timeout_ms as f64, 10.0, 60_000.0)?;
+        check_range(
+            "keep_alive_s",
+            f64::from(self.keep_alive_s),
+            min_keep_alive_s,
+            3600.0,
+        )?;
+        check_range(
+            "connect_timeout_ms",
+            self.connect_timeout_ms as f64,
+            10.0,
+            60_000.0,
+        )?;
         check_range("retry_min_ms", self.retry_min_ms as f64, 1.0, 60_000.0)?;
-        check_range("retry_max_ms", self.retry_max_ms as f64, self.retry_min_ms as f64, 600_000.0)?;
+        check_range(
+            "retry_max_ms",
+            self.retry_max_ms as f64,
+            self.retry_min_ms as f64,
+            600_000.0,
+        )?;
         check_range("send_queue", self.send_queue as f64, 8.0, 65_536.0)?;
         check_range("max_report_hz", f64::from(self.max_report_hz), 1.0, 1e5)?;
         check_range("inbox", self.inbox as f64, 1.0, 1e6)?;
-        check_range("max_payload_bytes", self.max_payload_bytes as f64, 256.0, MAX_PAYLOAD_BYTES)?;
-        check_range("max_map_bytes", self.max_map_bytes as f64, 1024.0, MAX_PAYLOAD_BYTES)?;
+        check_range(
+            "max_payload_bytes",
+            self.max_payload_bytes as f64,
+            256.0,
+            MAX_PAYLOAD_BYTES,
+        )?;
+        check_range(
+            "max_map_bytes",
+            self.max_map_bytes as f64,
+            1024.0,
+            MAX_PAYLOAD_BYTES,
+        )?;
         check_range("max_objects", self.max_objects as f64, 1.0, 1e6)?;
         if self.user.is_none() && self.password.is_some() {
-            return Err(ConfigError::new("password", "a password", "set together with `user`"));
+            return Err(ConfigError::new(
+                "password",
+                "a password",
+                "set together with `user`",
+            ));
         }
         if self.ca.is_some() && self.broker.is_none() {
-            return Err(ConfigError::new("ca", "a file", "set together with `broker`"));
+            return Err(ConfigError::new(
+                "ca",
+                "a file",
+                "set together with `broker`",
+            ));
         }
         Ok(())
     }
 
     /// Limits of decoded messages.
     pub fn limits(&self) -> Limits {
-        Limits { payload_bytes: self.max_payload_bytes, map_bytes: self.max_map_bytes, objects: self.max_objects }
+        Limits {
+            payload_bytes: self.max_payload_bytes,
+            map_bytes: self.max_map_bytes,
+            objects: self.max_objects,
+        }
     }
 
     /// Largest packet in bytes that carries a payload within the limits. A larger one cuts the link.
@@ -161,20 +198,37 @@ mod tests {
     #[test]
     fn defaults_are_valid_and_errors_name_the_key() {
         MqttConfig::default().validate().unwrap();
-        let error = MqttConfig { keep_alive_s: 0, ..MqttConfig::default() }.validate().unwrap_err();
+        let error = MqttConfig {
+            keep_alive_s: 0,
+            ..MqttConfig::default()
+        }
+        .validate()
+        .unwrap_err();
         assert_eq!(error.key, "keep_alive_s");
-        let v5 = MqttConfig { keep_alive_s: 4, version: MqttVersion::V5, ..MqttConfig::default() };
-        assert_eq!(v5.validate().unwrap_err().allowed, "a number from 5 to 3600");
-        let lone = MqttConfig { password: Some(Secret::new("x")), ..MqttConfig::default() };
+        let v5 = MqttConfig {
+            keep_alive_s: 4,
+            version: MqttVersion::V5,
+            ..MqttConfig::default()
+        };
+        assert_eq!(
+            v5.validate().unwrap_err().allowed,
+            "a number from 5 to 3600"
+        );
+        let lone = MqttConfig {
+            password: Some(Secret::new("x")),
+            ..MqttConfig::default()
+        };
         assert_eq!(lone.validate().unwrap_err().key, "password");
     }
 
     #[test]
     fn toml_is_read_and_passwords_are_never_shown() {
-        let text =
-            "broker = \"10.0.0.2:1883\"\nversion = \"5\"\nuser = \"u\"\npassword = \"hush\"\nencoding = \"cbor\"";
+        let text = "broker = \"10.0.0.2:1883\"\nversion = \"5\"\nuser = \"u\"\npassword = \"hush\"\nencoding = \"cbor\"";
         let config: MqttConfig = toml::from_str(text).unwrap();
-        assert_eq!((config.version, config.encoding), (MqttVersion::V5, Encoding::Cbor));
+        assert_eq!(
+            (config.version, config.encoding),
+            (MqttVersion::V5, Encoding::Cbor)
+        );
         assert_eq!(config.password.as_ref().map(Secret::reveal), Some("hush"));
         assert!(!format!("{config:?}{}", toml::to_string(&config).unwrap()).contains("hush"));
         assert!(toml::from_str::<MqttConfig>("brokr = \"x:1\"").is_err());

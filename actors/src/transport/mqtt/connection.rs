@@ -107,8 +107,11 @@ impl ConnectionError {
         let io_errors = || causes().filter_map(|error| error.downcast_ref::<io::Error>());
         let rejected_certificate = |error: &io::Error| {
             let error = error.get_ref()?.downcast_ref()?;
-            matches!(error, rustls::Error::InvalidCertificate(_) | rustls::Error::AlertReceived(_))
-                .then(|| error.to_string())
+            matches!(
+                error,
+                rustls::Error::InvalidCertificate(_) | rustls::Error::AlertReceived(_)
+            )
+            .then(|| error.to_string())
         };
         if let Some(reason) = io_errors().find_map(rejected_certificate) {
             Self::Rejected(reason)
@@ -125,9 +128,9 @@ impl From<rumqttc::ConnectionError> for ConnectionError {
         use rumqttc::{ConnectionError, Error, StateError};
         match &error {
             ConnectionError::ConnectionRefused(code) => Self::Rejected(format!("{code:?}")),
-            ConnectionError::MqttState(StateError::Deserialization(Error::PayloadSizeLimitExceeded(_))) => {
-                Self::Oversized(error.to_string())
-            }
+            ConnectionError::MqttState(StateError::Deserialization(
+                Error::PayloadSizeLimitExceeded(_),
+            )) => Self::Oversized(error.to_string()),
             _ => Self::of(&error),
         }
     }
@@ -157,7 +160,12 @@ pub(crate) struct LastWill {
 
 /// Payload of the last will of a node with this status.
 pub(crate) fn offline_payload(status: &NodeStatus, encoding: Encoding) -> Vec<u8> {
-    let gone = NodeStatus { state: NodeState::Offline, aggregator: None, troubles: Vec::new(), ..status.clone() };
+    let gone = NodeStatus {
+        state: NodeState::Offline,
+        aggregator: None,
+        troubles: Vec::new(),
+        ..status.clone()
+    };
     encode(&gone, encoding)
 }
 
@@ -173,10 +181,17 @@ pub(crate) fn open(
     let mut network = rumqttc::NetworkOptions::new();
     network.set_tcp_nodelay(true);
     network.set_connection_timeout(timeout_s);
-    let login = config.user.as_deref().map(|user| (user, config.password.as_ref().map_or("", |p| p.reveal())));
+    let login = config
+        .user
+        .as_deref()
+        .map(|user| (user, config.password.as_ref().map_or("", |p| p.reveal())));
     let port = address.port();
     // The client library compares the host with the name in the certificate, which has no brackets.
-    let host = if tls.is_some() { address.host().trim_matches(['[', ']']) } else { address.host() };
+    let host = if tls.is_some() {
+        address.host().trim_matches(['[', ']'])
+    } else {
+        address.host()
+    };
     let transport = tls.map(|tls| Transport::tls_with_config(TlsConfiguration::Rustls(tls)));
     let max_packet_bytes = config.max_packet_bytes();
     match config.version {
@@ -189,7 +204,12 @@ pub(crate) fn open(
             }
             if let Some(will) = will {
                 let payload = will.payload.clone();
-                options.set_last_will(rumqttc::LastWill::new(&will.topic, payload, QoS4::AtLeastOnce, true));
+                options.set_last_will(rumqttc::LastWill::new(
+                    &will.topic,
+                    payload,
+                    QoS4::AtLeastOnce,
+                    true,
+                ));
             }
             if let Some((user, password)) = login {
                 options.set_credentials(user, password);
@@ -208,7 +228,13 @@ pub(crate) fn open(
             }
             if let Some(will) = will {
                 let payload = will.payload.clone();
-                let will = v5::mqttbytes::v5::LastWill::new(&will.topic, payload, QoS5::AtLeastOnce, true, None);
+                let will = v5::mqttbytes::v5::LastWill::new(
+                    &will.topic,
+                    payload,
+                    QoS5::AtLeastOnce,
+                    true,
+                    None,
+                );
                 options.set_last_will(will);
             }
             options.set_network_options(network);
@@ -228,12 +254,24 @@ impl Client {
         let is_acknowledged = matches!(retention, Retention::Retained | Retention::Acknowledged);
         match self {
             Self::V311(client) => {
-                let qos = if is_acknowledged { QoS4::AtLeastOnce } else { QoS4::AtMostOnce };
-                client.try_publish(topic, qos, retain, payload.clone()).is_ok()
+                let qos = if is_acknowledged {
+                    QoS4::AtLeastOnce
+                } else {
+                    QoS4::AtMostOnce
+                };
+                client
+                    .try_publish(topic, qos, retain, payload.clone())
+                    .is_ok()
             }
             Self::V5(client) => {
-                let qos = if is_acknowledged { QoS5::AtLeastOnce } else { QoS5::AtMostOnce };
-                client.try_publish(topic, qos, retain, payload.clone()).is_ok()
+                let qos = if is_acknowledged {
+                    QoS5::AtLeastOnce
+                } else {
+                    QoS5::AtMostOnce
+                };
+                client
+                    .try_publish(topic, qos, retain, payload.clone())
+                    .is_ok()
             }
         }
     }
@@ -246,7 +284,9 @@ impl Client {
                     MaxQos::AtMostOnce => QoS4::AtMostOnce,
                     MaxQos::AtLeastOnce => QoS4::AtLeastOnce,
                 };
-                let filters = filters.iter().map(|path| rumqttc::SubscribeFilter::new(path.clone(), qos));
+                let filters = filters
+                    .iter()
+                    .map(|path| rumqttc::SubscribeFilter::new(path.clone(), qos));
                 client.try_subscribe_many(filters).is_ok()
             }
             Self::V5(client) => {
@@ -254,7 +294,9 @@ impl Client {
                     MaxQos::AtMostOnce => QoS5::AtMostOnce,
                     MaxQos::AtLeastOnce => QoS5::AtLeastOnce,
                 };
-                let filters = filters.iter().map(|path| v5::mqttbytes::v5::Filter::new(path.clone(), qos));
+                let filters = filters
+                    .iter()
+                    .map(|path| v5::mqttbytes::v5::Filter::new(path.clone(), qos));
                 client.try_subscribe_many(filters).is_ok()
             }
         }
@@ -280,16 +322,19 @@ impl Client {
 impl Connection {
     /// Sends and receives until there is a packet to report, for at most `patience`.
     pub(crate) async fn next(&mut self, patience: Duration) -> Result<Packet, ConnectionError> {
-        tokio::time::timeout(patience, self.poll()).await.unwrap_or(Err(ConnectionError::Timeout(patience)))
+        tokio::time::timeout(patience, self.poll())
+            .await
+            .unwrap_or(Err(ConnectionError::Timeout(patience)))
     }
 
     async fn poll(&mut self) -> Result<Packet, ConnectionError> {
         Ok(match self {
             Self::V311(events) => match events.poll().await? {
                 rumqttc::Event::Incoming(rumqttc::Packet::ConnAck(_)) => Packet::Accepted,
-                rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) => {
-                    Packet::Message { topic: publish.topic.into(), payload: publish.payload }
-                }
+                rumqttc::Event::Incoming(rumqttc::Packet::Publish(publish)) => Packet::Message {
+                    topic: publish.topic.into(),
+                    payload: publish.payload,
+                },
                 rumqttc::Event::Incoming(rumqttc::Packet::SubAck(answer)) => {
                     refused_filters(answer.return_codes, |code| {
                         matches!(code, rumqttc::SubscribeReasonCode::Success(_))
@@ -301,16 +346,21 @@ impl Connection {
             },
             Self::V5(events) => match events.poll().await? {
                 v5::Event::Incoming(v5::Incoming::ConnAck(_)) => Packet::Accepted,
-                v5::Event::Incoming(v5::Incoming::Publish(publish)) => {
-                    Packet::Message { topic: publish.topic, payload: publish.payload }
+                v5::Event::Incoming(v5::Incoming::Publish(publish)) => Packet::Message {
+                    topic: publish.topic,
+                    payload: publish.payload,
+                },
+                v5::Event::Incoming(v5::Incoming::SubAck(answer)) => {
+                    refused_filters(answer.return_codes, |code| {
+                        matches!(code, v5::mqttbytes::v5::SubscribeReasonCode::Success(_))
+                    })
                 }
-                v5::Event::Incoming(v5::Incoming::SubAck(answer)) => refused_filters(answer.return_codes, |code| {
-                    matches!(code, v5::mqttbytes::v5::SubscribeReasonCode::Success(_))
-                }),
                 v5::Event::Incoming(v5::Incoming::PubAck(answer)) => match answer.reason {
                     PubAckReason::Success | PubAckReason::NoMatchingSubscribers => Packet::Other,
                     code => {
-                        let text = answer.properties.and_then(|properties| properties.reason_string);
+                        let text = answer
+                            .properties
+                            .and_then(|properties| properties.reason_string);
                         Packet::PublishRefused(text.unwrap_or_else(|| format!("{code:?}")))
                     }
                 },
@@ -330,5 +380,9 @@ fn refused_filters<C: std::fmt::Debug>(codes: Vec<C>, granted: impl Fn(&C) -> bo
         .filter(|(_, code)| !granted(code))
         .map(|(index, code)| (index, format!("{code:?}")))
         .collect();
-    if refused.is_empty() { Packet::Other } else { Packet::SubscriptionRefused(refused) }
+    if refused.is_empty() {
+        Packet::Other
+    } else {
+        Packet::SubscriptionRefused(refused)
+    }
 }

@@ -8,7 +8,8 @@ use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    CellDescription, GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations, Verdicts,
+    CellDescription, GlobalMap, LedgerShare, NodeStatus, ObjectReport, ReportKind, Reputations,
+    Verdicts,
 };
 use tokio::sync::OwnedSemaphorePermit;
 
@@ -76,13 +77,31 @@ pub struct Delivery<T = Incoming> {
 impl<T> Delivery<T> {
     /// A message of this node itself. It occupies no place: the node's own pace bounds it.
     pub(crate) fn local(message: T, at: Timestamp) -> Self {
-        Self { message, received_at: at, origin: Origin::Proven, broker: None, _place: None }
+        Self {
+            message,
+            received_at: at,
+            origin: Origin::Proven,
+            broker: None,
+            _place: None,
+        }
     }
 
     /// The same delivery of a part of its message: all else stays.
     pub(crate) fn map<U>(self, part: impl FnOnce(T) -> U) -> Delivery<U> {
-        let Self { message, received_at, origin, broker, _place } = self;
-        Delivery { message: part(message), received_at, origin, broker, _place }
+        let Self {
+            message,
+            received_at,
+            origin,
+            broker,
+            _place,
+        } = self;
+        Delivery {
+            message: part(message),
+            received_at,
+            origin,
+            broker,
+            _place,
+        }
     }
 }
 

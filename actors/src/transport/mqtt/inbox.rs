@@ -9,8 +9,9 @@ use ecod::leadership::round_filter::Origin;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use ecod::wire::{
-    Flaw, GlobalMap, InvalidEntry, Limits, NodeState, NodeStatus, Payload, RejectReason, ReportKind, Reputations,
-    Topic, Topics, Verdicts, check_fused_at, decode, decode_entries, decode_report, decode_share,
+    Flaw, GlobalMap, InvalidEntry, Limits, NodeState, NodeStatus, Payload, RejectReason,
+    ReportKind, Reputations, Topic, Topics, Verdicts, check_fused_at, decode, decode_entries,
+    decode_report, decode_share,
 };
 use tokio::sync::Semaphore;
 use uuid::Uuid;
@@ -71,7 +72,10 @@ impl Inbox {
     }
 
     pub(crate) fn set_subscriber(&self, subscriber: Subscriber) {
-        *self.subscriber.write().unwrap_or_else(PoisonError::into_inner) = subscriber;
+        *self
+            .subscriber
+            .write()
+            .unwrap_or_else(PoisonError::into_inner) = subscriber;
     }
 
     /// Delivers a message that this node itself publishes or observes.
@@ -81,22 +85,45 @@ impl Inbox {
 
     /// Delivers the state of a link to a broker.
     pub(crate) fn deliver_link(&self, via: Via<'_>, state: LinkState) {
-        let message = Incoming::Link { broker: via.address.clone(), state };
-        self.hand_over(Delivery { broker: via.node.cloned(), ..Delivery::local(message, clock::now()) });
+        let message = Incoming::Link {
+            broker: via.address.clone(),
+            state,
+        };
+        self.hand_over(Delivery {
+            broker: via.node.cloned(),
+            ..Delivery::local(message, clock::now())
+        });
     }
 
     /// Delivers a message of a broker. Dropped and counted when receivers are too far behind.
-    fn deliver(&self, via: Via<'_>, message: Incoming, origin: Origin, received_at: Timestamp) -> PacketOutcome {
+    fn deliver(
+        &self,
+        via: Via<'_>,
+        message: Incoming,
+        origin: Origin,
+        received_at: Timestamp,
+    ) -> PacketOutcome {
         let broker = via.node.cloned();
         match Arc::clone(&self.capacity).try_acquire_owned() {
-            Ok(place) => self.hand_over(Delivery { message, received_at, origin, broker, _place: Some(place) }),
+            Ok(place) => self.hand_over(Delivery {
+                message,
+                received_at,
+                origin,
+                broker,
+                _place: Some(place),
+            }),
             Err(_) => self.counters.count(Event::InboxFull),
         }
         PacketOutcome::Done
     }
 
     fn hand_over(&self, delivery: Delivery) {
-        let subscriber = Arc::clone(&self.subscriber.read().unwrap_or_else(PoisonError::into_inner));
+        let subscriber = Arc::clone(
+            &self
+                .subscriber
+                .read()
+                .unwrap_or_else(PoisonError::into_inner),
+        );
         subscriber(delivery);
     }
 
@@ -110,27 +137,47 @@ impl Inbox {
         let path = std::str::from_utf8(topic).map_err(|_| RejectReason::UnknownTopic)?;
         let payload = match &self.security.signing {
             // An empty payload deletes a retained message. It carries nothing to sign.
-            Some(key) if !payload.is_empty() => key.verify(topic, payload).ok_or(RejectReason::BadSignature)?,
+            Some(key) if !payload.is_empty() => key
+                .verify(topic, payload)
+                .ok_or(RejectReason::BadSignature)?,
             _ => payload,
         };
-        let origin = |aggregator| self.origin(via, aggregator, topic, payload).ok_or(RejectReason::BadSignature);
+        let origin = |aggregator| {
+            self.origin(via, aggregator, topic, payload)
+                .ok_or(RejectReason::BadSignature)
+        };
         let (message, origin) = match self.topics.parse(path).ok_or(RejectReason::UnknownTopic)? {
             Topic::Detections(node) => {
                 return self.read_report(via, ReportKind::Detections, &node, payload, received_at);
             }
             Topic::VoteDetections(node) => {
-                return self.read_report(via, ReportKind::VoteDetections, &node, payload, received_at);
+                return self.read_report(
+                    via,
+                    ReportKind::VoteDetections,
+                    &node,
+                    payload,
+                    received_at,
+                );
             }
             Topic::Nodes(node) => return self.read_status(via, &node, payload, received_at),
             Topic::Ledger(node) if node == self.node => return Ok(self.echo()),
             Topic::Ledger(node) => {
-                if self.is_shed(&self.ledger_throttle, ShedReason::LedgerThrottled, &node, received_at) {
+                if self.is_shed(
+                    &self.ledger_throttle,
+                    ShedReason::LedgerThrottled,
+                    &node,
+                    received_at,
+                ) {
                     return Ok(PacketOutcome::Done);
                 }
-                (Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?)), Origin::Claimed)
+                (
+                    Incoming::Ledger(Arc::new(decode_share(payload, &node, &self.limits)?)),
+                    Origin::Claimed,
+                )
             }
             Topic::GlobalDetections => {
-                let map: GlobalMap = self.decode_entries(payload, |map: &GlobalMap| Some(&map.aggregator))?;
+                let map: GlobalMap =
+                    self.decode_entries(payload, |map: &GlobalMap| Some(&map.aggregator))?;
                 if map.aggregator == self.node {
                     return Ok(self.echo());
                 }
@@ -148,11 +195,18 @@ impl Inbox {
                 let origin = origin(Some(&verdicts.aggregator))?;
                 (Incoming::Verdicts(Arc::new(verdicts)), origin)
             }
-            Topic::Cell | Topic::Reputations if payload.is_empty() => return Ok(PacketOutcome::Done),
-            Topic::Cell => (Incoming::Description(Arc::new(decode(payload, &self.limits)?)), Origin::Claimed),
+            Topic::Cell | Topic::Reputations if payload.is_empty() => {
+                return Ok(PacketOutcome::Done);
+            }
+            Topic::Cell => (
+                Incoming::Description(Arc::new(decode(payload, &self.limits)?)),
+                Origin::Claimed,
+            ),
             Topic::Reputations => {
-                let reputations: Reputations =
-                    self.decode_entries(payload, |reputations: &Reputations| reputations.aggregator.as_ref())?;
+                let reputations: Reputations = self
+                    .decode_entries(payload, |reputations: &Reputations| {
+                        reputations.aggregator.as_ref()
+                    })?;
                 if reputations.aggregator.as_ref() == Some(&self.node) {
                     return Ok(self.echo());
                 }
@@ -174,22 +228,36 @@ impl Inbox {
         if let Some(aggregator) = aggregator {
             for InvalidEntry { reason, .. } in invalid {
                 self.counters.count(Event::EntryLeftOut);
-                self.counters.reject_message(reason, aggregator.as_str(), || {
-                    format!("an entry that it publishes is not used: {}", reason.in_words())
-                });
+                self.counters
+                    .reject_message(reason, aggregator.as_str(), || {
+                        format!(
+                            "an entry that it publishes is not used: {}",
+                            reason.in_words()
+                        )
+                    });
             }
         }
         Ok(message)
     }
 
     /// Proof of a round's aggregator; `None` if the broker is not to be believed.
-    fn origin(&self, via: Via<'_>, aggregator: Option<&NodeName>, topic: &[u8], payload: &[u8]) -> Option<Origin> {
-        Origin::of(aggregator, via.node, || self.security.check_round(aggregator, topic, payload))
+    fn origin(
+        &self,
+        via: Via<'_>,
+        aggregator: Option<&NodeName>,
+        topic: &[u8],
+        payload: &[u8],
+    ) -> Option<Origin> {
+        Origin::of(aggregator, via.node, || {
+            self.security.check_round(aggregator, topic, payload)
+        })
     }
 
     /// Checks that a round is not from the far future, as far as this node knows the time.
     fn check_date(&self, fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
-        self.clock.date_if_set(received_at).map_or(Ok(()), |date| check_fused_at(fused_at, date))
+        self.clock
+            .date_if_set(received_at)
+            .map_or(Ok(()), |date| check_fused_at(fused_at, date))
     }
 
     fn read_report(
@@ -210,7 +278,12 @@ impl Inbox {
             return Ok(PacketOutcome::Done);
         }
         let report = Arc::new(decode_report(payload, node, &self.limits)?);
-        Ok(self.deliver(via, Incoming::Report { kind, report }, Origin::Claimed, received_at))
+        Ok(self.deliver(
+            via,
+            Incoming::Report { kind, report },
+            Origin::Claimed,
+            received_at,
+        ))
     }
 
     fn read_status(
@@ -220,12 +293,22 @@ impl Inbox {
         payload: &[u8],
         received_at: Timestamp,
     ) -> Result<PacketOutcome, RejectReason> {
-        let is_shed = |vehicle| self.is_shed(&self.status_throttle, ShedReason::StatusThrottled, vehicle, received_at);
+        let is_shed = |vehicle| {
+            self.is_shed(
+                &self.status_throttle,
+                ShedReason::StatusThrottled,
+                vehicle,
+                received_at,
+            )
+        };
         if is_shed(&node.vehicle()) {
             return Ok(PacketOutcome::Done);
         }
         if payload.is_empty() {
-            let message = Incoming::StatusWithdrawn { node: node.clone(), via: via.address.clone() };
+            let message = Incoming::StatusWithdrawn {
+                node: node.clone(),
+                via: via.address.clone(),
+            };
             return Ok(self.deliver(via, message, Origin::Claimed, received_at));
         }
         let status: NodeStatus = decode(payload, &self.limits)?;
@@ -234,7 +317,10 @@ impl Inbox {
         }
         if status.node != self.node {
             let status = Arc::new(status);
-            let message = Incoming::Status { status, via: via.address.clone() };
+            let message = Incoming::Status {
+                status,
+                via: via.address.clone(),
+            };
             return Ok(self.deliver(via, message, Origin::Claimed, received_at));
         }
         Ok(if status.state == NodeState::Offline {
@@ -250,20 +336,32 @@ impl Inbox {
 
     /// Name of the node that a topic belongs to, or else the address of the broker.
     fn source(&self, via: Via<'_>, topic: &[u8]) -> String {
-        let topic = std::str::from_utf8(topic).ok().and_then(|path| self.topics.parse(path));
+        let topic = std::str::from_utf8(topic)
+            .ok()
+            .and_then(|path| self.topics.parse(path));
         match topic {
-            Some(Topic::Detections(node) | Topic::VoteDetections(node) | Topic::Ledger(node) | Topic::Nodes(node)) => {
-                node.to_string()
-            }
+            Some(
+                Topic::Detections(node)
+                | Topic::VoteDetections(node)
+                | Topic::Ledger(node)
+                | Topic::Nodes(node),
+            ) => node.to_string(),
             _ => via.address.to_string(),
         }
     }
 
     /// The fault of a rejected report, with the field.
     fn fault(&self, topic: &[u8], payload: &[u8], reason: RejectReason) -> String {
-        let signed = self.security.signing.as_ref().map(|key| key.verify(topic, payload));
+        let signed = self
+            .security
+            .signing
+            .as_ref()
+            .map(|key| key.verify(topic, payload));
         match signed.unwrap_or(Some(payload)) {
-            Some(report) => format!("report rejected: {}", Flaw::of_report(report, reason, &self.limits)),
+            Some(report) => format!(
+                "report rejected: {}",
+                Flaw::of_report(report, reason, &self.limits)
+            ),
             None => format!("report rejected: {}", reason.in_words()),
         }
     }
@@ -275,8 +373,17 @@ impl Inbox {
     }
 
     /// Counts a message of a node that sends too many; false when there is still room for it.
-    fn is_shed(&self, throttle: &NodeThrottle, reason: ShedReason, node: &NodeName, at: Timestamp) -> bool {
-        let is_shed = !throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(node, at);
+    fn is_shed(
+        &self,
+        throttle: &NodeThrottle,
+        reason: ShedReason,
+        node: &NodeName,
+        at: Timestamp,
+    ) -> bool {
+        let is_shed = !throttle
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .allow(node, at);
         if is_shed {
             self.counters.shed(reason, node.as_str());
         }
@@ -286,7 +393,13 @@ impl Inbox {
 
 impl PacketSink for Inbox {
     /// Processes one packet of a broker. A payload that cannot be used is counted by its reason.
-    fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome {
+    fn accept(
+        &self,
+        via: Via<'_>,
+        topic: &[u8],
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> PacketOutcome {
         self.counters.count(Event::Received);
         self.read(via, topic, payload, received_at).unwrap_or_else(|reason| {
             let source = self.source(via, topic);
@@ -319,8 +432,17 @@ mod tests {
         counters: &Arc<Counters>,
         receiver: impl Fn(Delivery) + Send + Sync + 'static,
     ) -> Inbox {
-        let own = NodeStatus::starting(NodeName::from_static("edge"), Uuid::nil(), Role::Edge, "0.1.0");
-        let config = MqttConfig { inbox: capacity, max_report_hz, ..MqttConfig::default() };
+        let own = NodeStatus::starting(
+            NodeName::from_static("edge"),
+            Uuid::nil(),
+            Role::Edge,
+            "0.1.0",
+        );
+        let config = MqttConfig {
+            inbox: capacity,
+            max_report_hz,
+            ..MqttConfig::default()
+        };
         let topics = Topics::new(&NodeName::from_static("lot"));
         Inbox::new(
             &own,
@@ -335,7 +457,15 @@ mod tests {
 
     fn accept(inbox: &Inbox, topic: &[u8], payload: &[u8], at: Timestamp) -> PacketOutcome {
         let address = "10.0.0.2:1883".parse().unwrap();
-        inbox.accept(Via { address: &address, node: None }, topic, payload, at)
+        inbox.accept(
+            Via {
+                address: &address,
+                node: None,
+            },
+            topic,
+            payload,
+            at,
+        )
     }
 
     /// One of 30 reports a second that counts what it delivers by the node that `node_of` names.
@@ -346,9 +476,15 @@ mod tests {
         let taken = Arc::new(Mutex::new(BTreeMap::<NodeName, u64>::new()));
         let receiver = Arc::clone(&taken);
         let inbox = inbox((16, 30), counters, move |delivery| {
-            *receiver.lock().unwrap().entry(node_of(&delivery.message).clone()).or_default() += 1;
+            *receiver
+                .lock()
+                .unwrap()
+                .entry(node_of(&delivery.message).clone())
+                .or_default() += 1;
         });
-        (inbox, move |node| taken.lock().unwrap()[&NodeName::from_static(node)])
+        (inbox, move |node| {
+            taken.lock().unwrap()[&NodeName::from_static(node)]
+        })
     }
 
     #[test]
@@ -356,15 +492,28 @@ mod tests {
         let counters = Arc::new(Counters::default());
         let held = Arc::new(Mutex::new(Vec::new()));
         let receiver = Arc::clone(&held);
-        let inbox = inbox((2, 100), &counters, move |delivery| receiver.lock().unwrap().push(delivery));
+        let inbox = inbox((2, 100), &counters, move |delivery| {
+            receiver.lock().unwrap().push(delivery)
+        });
         let payload = |aggregator: &str| {
             let aggregator = NodeName::new(aggregator).ok();
-            let reputations =
-                Reputations { schema: 1, aggregator, epoch: 1, round: 1, reputations: Default::default() };
+            let reputations = Reputations {
+                schema: 1,
+                aggregator,
+                epoch: 1,
+                round: 1,
+                reputations: Default::default(),
+            };
             encode(&reputations, Encoding::Json)
         };
-        let accept_from =
-            |aggregator: &str, at| accept(&inbox, b"ecod/v1/lot/reputations", &payload(aggregator), Timestamp(at));
+        let accept_from = |aggregator: &str, at| {
+            accept(
+                &inbox,
+                b"ecod/v1/lot/reputations",
+                &payload(aggregator),
+                Timestamp(at),
+            )
+        };
         let accept = |at| accept_from("gauss", at);
         for at in 1..=5 {
             assert_eq!(accept(at), PacketOutcome::Done);
@@ -373,11 +522,22 @@ mod tests {
         assert_eq!(held.lock().unwrap().remove(0).received_at, Timestamp(1));
         accept(6);
         assert_eq!(counters.events(Event::InboxFull), 3);
-        let kept: Vec<_> = held.lock().unwrap().iter().map(|delivery| delivery.received_at).collect();
+        let kept: Vec<_> = held
+            .lock()
+            .unwrap()
+            .iter()
+            .map(|delivery| delivery.received_at)
+            .collect();
         assert_eq!(kept, [Timestamp(2), Timestamp(6)]);
 
         accept_from("edge", 7);
-        assert_eq!((counters.events(Event::Echo), counters.events(Event::InboxFull)), (1, 3));
+        assert_eq!(
+            (
+                counters.events(Event::Echo),
+                counters.events(Event::InboxFull)
+            ),
+            (1, 3)
+        );
     }
 
     #[test]
@@ -391,7 +551,12 @@ mod tests {
             let accept = |node: &str| {
                 let report = ObjectReport::new(NodeName::new(node).unwrap(), ms, Timestamp(ms));
                 let topic = format!("ecod/v1/lot/detections/{node}");
-                accept(&inbox, topic.as_bytes(), &encode(&report, Encoding::Json), Timestamp(ms * 1000))
+                accept(
+                    &inbox,
+                    topic.as_bytes(),
+                    &encode(&report, Encoding::Json),
+                    Timestamp(ms * 1000),
+                )
             };
             for _ in 0..10 {
                 accept("mallory");
@@ -400,8 +565,16 @@ mod tests {
                 accept("euclid");
             }
         }
-        assert_eq!(["mallory", "euclid"].map(taken), [59, 10], "a second's worth at once, then 30 a second");
-        let shed = Shed { reason: ShedReason::ReportThrottled, source: "mallory".into(), times: 10_000 - 59 };
+        assert_eq!(
+            ["mallory", "euclid"].map(taken),
+            [59, 10],
+            "a second's worth at once, then 30 a second"
+        );
+        let shed = Shed {
+            reason: ShedReason::ReportThrottled,
+            source: "mallory".into(),
+            times: 10_000 - 59,
+        };
         assert_eq!(counters.all_shed(), [shed]);
     }
 
@@ -413,9 +586,19 @@ mod tests {
             other => panic!("{other:?}"),
         });
         let accept = |node: &'static str, ms: u64| {
-            let status = NodeStatus::starting(NodeName::from_static(node), Uuid::max(), Role::Auto, "0.1.0");
+            let status = NodeStatus::starting(
+                NodeName::from_static(node),
+                Uuid::max(),
+                Role::Auto,
+                "0.1.0",
+            );
             let topic = format!("ecod/v1/lot/nodes/{node}");
-            accept(&inbox, topic.as_bytes(), &encode(&status, Encoding::Json), Timestamp(ms * 1000))
+            accept(
+                &inbox,
+                topic.as_bytes(),
+                &encode(&status, Encoding::Json),
+                Timestamp(ms * 1000),
+            )
         };
         for ms in 0..1000 {
             accept("mallory", ms);
@@ -423,8 +606,16 @@ mod tests {
                 accept("euclid", ms);
             }
         }
-        assert_eq!(["mallory", "euclid"].map(taken), [59, 4], "a second's worth at once, then 30 a second");
-        let shed = Shed { reason: ShedReason::StatusThrottled, source: "mallory".into(), times: 1000 - 59 };
+        assert_eq!(
+            ["mallory", "euclid"].map(taken),
+            [59, 4],
+            "a second's worth at once, then 30 a second"
+        );
+        let shed = Shed {
+            reason: ShedReason::StatusThrottled,
+            source: "mallory".into(),
+            times: 1000 - 59,
+        };
         assert_eq!(counters.all_shed(), [shed]);
     }
 }

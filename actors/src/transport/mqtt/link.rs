@@ -40,7 +40,10 @@ pub struct LinkEvent {
 #[derive(Debug)]
 pub(crate) enum LinkChange {
     /// The broker accepted the connection; nothing is subscribed yet. `node` is the one whose certificate it has, if any.
-    Accepted { client: Client, node: Option<NodeName> },
+    Accepted {
+        client: Client,
+        node: Option<NodeName>,
+    },
     /// The broker published this node's last will, although it is alive.
     DeclaredOffline,
     /// Another run with this node's name is alive.
@@ -84,7 +87,12 @@ pub(crate) struct Link {
 }
 
 impl Link {
-    pub(crate) fn spawn(id: LinkId, broker: BrokerAddress, setup: Arc<LinkSetup>, report: LinkSink) -> Self {
+    pub(crate) fn spawn(
+        id: LinkId,
+        broker: BrokerAddress,
+        setup: Arc<LinkSetup>,
+        report: LinkSink,
+    ) -> Self {
         let backoff = Backoff::new(&setup.config, setup.seed.wrapping_add(id.0));
         let (hearing, at) = (Arc::<Hearing>::default(), broker.clone());
         let task = LinkTask {
@@ -100,12 +108,23 @@ impl Link {
         let hearing = Arc::clone(&task.hearing);
         let task = tokio::spawn(task.run(backoff));
         let (abort, echo) = (task.abort_handle(), EchoMonitor::default());
-        Self { broker, state: LinkState::Down, client: None, node: None, hearing, echo, abort, task: Some(task) }
+        Self {
+            broker,
+            state: LinkState::Down,
+            client: None,
+            node: None,
+            hearing,
+            echo,
+            abort,
+            task: Some(task),
+        }
     }
 
     /// Queues a message; false when there is no connection or no room.
     pub(crate) fn publish(&self, topic: &str, payload: &Bytes, retention: Retention) -> bool {
-        self.client.as_ref().is_some_and(|client| client.publish(topic, payload, retention))
+        self.client
+            .as_ref()
+            .is_some_and(|client| client.publish(topic, payload, retention))
     }
 
     /// Records a message whose echo is expected, even if there was no room to send it; true when the broker is stalled.
@@ -137,7 +156,11 @@ impl Drop for Link {
 
 /// Waits before the first attempts after a broken session. They find out soon whether the broker's process is gone: it
 /// may hold the port for a moment after its connections broke.
-const FIRST_RETRIES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(10)];
+const FIRST_RETRIES: [Duration; 3] = [
+    Duration::ZERO,
+    Duration::from_millis(5),
+    Duration::from_millis(10),
+];
 
 /// Minimum length of a session that is followed by [`FIRST_RETRIES`]. Without it, a broker that ends every session would
 /// be tried without pause.
@@ -185,7 +208,9 @@ impl LinkTask {
                 self.report_refusal(format!("{NOT_ADMITTED}: {reason}"));
             }
             if matches!(error, ConnectionError::Oversized(_)) {
-                self.setup.counters.reject(RejectReason::TooLarge, &self.broker.to_string());
+                self.setup
+                    .counters
+                    .reject(RejectReason::TooLarge, &self.broker.to_string());
                 if !std::mem::replace(&mut self.has_reported_oversized, true) {
                     let limit = self.setup.config.max_packet_bytes();
                     tracing::warn!(broker = %self.broker, limit, "link lost to a packet that is too large; if it is \
@@ -201,7 +226,10 @@ impl LinkTask {
             if begun.elapsed() > MIN_SESSION {
                 checks = FIRST_RETRIES.iter();
             }
-            let wait = checks.next().copied().unwrap_or_else(|| backoff.next_wait());
+            let wait = checks
+                .next()
+                .copied()
+                .unwrap_or_else(|| backoff.next_wait());
             tokio::time::sleep(wait).await;
         }
     }
@@ -222,20 +250,39 @@ impl LinkTask {
     }
 
     /// One connection from CONNECT to its end; `Ok` after DISCONNECT.
-    async fn session(&mut self, tls: Option<(Arc<ClientConfig>, BrokerIdentity)>) -> Result<(), ConnectionError> {
+    async fn session(
+        &mut self,
+        tls: Option<(Arc<ClientConfig>, BrokerIdentity)>,
+    ) -> Result<(), ConnectionError> {
         let setup = Arc::clone(&self.setup);
-        let LinkSetup { client_id, will, config, sink, counters, .. } = &*setup;
+        let LinkSetup {
+            client_id,
+            will,
+            config,
+            sink,
+            counters,
+            ..
+        } = &*setup;
         let will = will.lock().unwrap_or_else(PoisonError::into_inner).clone();
         let (tls, identity) = tls.unzip();
-        let (client, mut connection) = connection::open(&self.broker, client_id, Some(&will), config, tls);
+        let (client, mut connection) =
+            connection::open(&self.broker, client_id, Some(&will), config, tls);
         // The protocol's own timeouts are whole seconds.
-        connection.next(config.connect_timeout()).await.inspect_err(|_| counters.count(Event::ConnectFailed))?;
+        connection
+            .next(config.connect_timeout())
+            .await
+            .inspect_err(|_| counters.count(Event::ConnectFailed))?;
         counters.count(Event::Connected);
         let node = identity.and_then(|identity| identity.node());
         self.hearing.note();
         self.end_refusal(|refusal| refusal.starts_with(NOT_ADMITTED));
-        counters.troubles().settle(setup.unreachable, Some(&self.broker.to_string()));
-        if !self.tell(LinkChange::Accepted { client, node: node.clone() }) {
+        counters
+            .troubles()
+            .settle(setup.unreachable, Some(&self.broker.to_string()));
+        if !self.tell(LinkChange::Accepted {
+            client,
+            node: node.clone(),
+        }) {
             return Ok(());
         }
         // A working connection receives at least the answers to pings. Sent packets are no sign of life. A poll that
@@ -260,7 +307,10 @@ impl LinkTask {
             }
             match packet {
                 Packet::Message { topic, payload } => {
-                    let via = Via { address: &self.broker, node: node.as_ref() };
+                    let via = Via {
+                        address: &self.broker,
+                        node: node.as_ref(),
+                    };
                     match sink.accept(via, &topic, &payload, clock::now()) {
                         PacketOutcome::DeclaredOffline => {
                             self.tell(LinkChange::DeclaredOffline);
@@ -277,7 +327,10 @@ impl LinkTask {
                 }
                 Packet::SubscriptionRefused(refused) => {
                     let name = |(index, reason): (usize, String)| {
-                        format!("{} ({reason})", setup.filters.get(index).map_or("?", String::as_str))
+                        format!(
+                            "{} ({reason})",
+                            setup.filters.get(index).map_or("?", String::as_str)
+                        )
                     };
                     let refused: Vec<_> = refused.into_iter().map(name).collect();
                     self.report_refusal(format!("subscription refused: {}", refused.join(", ")));
@@ -286,7 +339,10 @@ impl LinkTask {
                 // The return of the node's own status decides.
                 Packet::Accepted | Packet::Sent | Packet::PublishRefused(_) | Packet::Other => {}
             }
-            if !heard_itself && listened > config.connect_timeout() && self.reported_refusal.is_none() {
+            if !heard_itself
+                && listened > config.connect_timeout()
+                && self.reported_refusal.is_none()
+            {
                 self.report_refusal(NOT_HEARD.to_owned());
             }
         }
@@ -295,9 +351,16 @@ impl LinkTask {
     /// Notes that the configured broker is not reached. Others come and go with their nodes, which the election knows.
     fn note_unreachable(&self, error: &ConnectionError) {
         let is_expected = self.setup.config.broker.as_ref() == Some(&self.broker);
-        if is_expected && error.rejection().is_none() && !matches!(error, ConnectionError::Oversized(_)) {
+        if is_expected
+            && error.rejection().is_none()
+            && !matches!(error, ConnectionError::Oversized(_))
+        {
             let (broker, troubles) = (self.broker.to_string(), self.setup.counters.troubles());
-            troubles.note_about(&broker, self.setup.unreachable, &format!("broker not reached: {error}"));
+            troubles.note_about(
+                &broker,
+                self.setup.unreachable,
+                &format!("broker not reached: {error}"),
+            );
         }
     }
 
@@ -305,7 +368,10 @@ impl LinkTask {
     fn report_refusal(&mut self, refusal: String) {
         let broker = self.broker.to_string();
         let cause = format!("broker refuses this node: {refusal}");
-        self.setup.counters.troubles().note_about(&broker, TroubleKind::BrokerRefuses, &cause);
+        self.setup
+            .counters
+            .troubles()
+            .note_about(&broker, TroubleKind::BrokerRefuses, &cause);
         if self.reported_refusal.as_ref() != Some(&refusal) {
             self.setup.counters.count(Event::BrokerRefused);
             self.reported_refusal = Some(refusal);
@@ -314,7 +380,11 @@ impl LinkTask {
 
     /// Notes that the broker takes back a refusal for which `is_over` is true.
     fn end_refusal(&mut self, is_over: impl Fn(&str) -> bool) {
-        if self.reported_refusal.take_if(|refusal| is_over(refusal)).is_some() {
+        if self
+            .reported_refusal
+            .take_if(|refusal| is_over(refusal))
+            .is_some()
+        {
             let troubles = self.setup.counters.troubles();
             troubles.settle(TroubleKind::BrokerRefuses, Some(&self.broker.to_string()));
         }
@@ -322,7 +392,10 @@ impl LinkTask {
 
     /// Sends to the gateway; false when it has ended.
     fn tell(&self, change: LinkChange) -> bool {
-        (self.report)(LinkEvent { link: self.id, change })
+        (self.report)(LinkEvent {
+            link: self.id,
+            change,
+        })
     }
 }
 
@@ -330,7 +403,10 @@ impl Drop for LinkTask {
     fn drop(&mut self) {
         self.end_refusal(|_| true);
         // A link that is not wanted any more misses no broker.
-        self.setup.counters.troubles().settle(self.setup.unreachable, Some(&self.broker.to_string()));
+        self.setup
+            .counters
+            .troubles()
+            .settle(self.setup.unreachable, Some(&self.broker.to_string()));
     }
 }
 
@@ -338,7 +414,8 @@ impl Drop for LinkTask {
 const NOT_ADMITTED: &str = "connection refused";
 
 /// Refusal that shows only by a missing echo: brokers acknowledge messages that they do not permit.
-const NOT_HEARD: &str = "this node's own status does not come back: publishing or subscribing to it is not permitted";
+const NOT_HEARD: &str =
+    "this node's own status does not come back: publishing or subscribing to it is not permitted";
 
 /// Waits that double with every failure, each shortened by a random part of up to half.
 struct Backoff {
@@ -352,7 +429,12 @@ impl Backoff {
     fn new(config: &MqttConfig, seed: u64) -> Self {
         let least = Duration::from_millis(config.retry_min_ms);
         let most = Duration::from_millis(config.retry_max_ms);
-        Self { least, most, next: least, rng: ChaCha8Rng::seed_from_u64(seed) }
+        Self {
+            least,
+            most,
+            next: least,
+            rng: ChaCha8Rng::seed_from_u64(seed),
+        }
     }
 
     fn reset(&mut self) {
@@ -372,7 +454,11 @@ mod tests {
 
     #[test]
     fn waits_grow_to_the_bound_with_jitter_and_start_over_after_success() {
-        let config = MqttConfig { retry_min_ms: 50, retry_max_ms: 400, ..MqttConfig::default() };
+        let config = MqttConfig {
+            retry_min_ms: 50,
+            retry_max_ms: 400,
+            ..MqttConfig::default()
+        };
         let waits = |seed| {
             let mut backoff = Backoff::new(&config, seed);
             let waits: Vec<_> = (0..6).map(|_| backoff.next_wait()).collect();

@@ -29,5 +29,11 @@ pub(crate) enum PacketOutcome {
 /// Receiver of the messages that come in on links.
 pub(crate) trait PacketSink: Send + Sync {
     /// Processes one packet of a broker, on the link's task; it must not block.
-    fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome;
+    fn accept(
+        &self,
+        via: Via<'_>,
+        topic: &[u8],
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> PacketOutcome;
 }

@@ -20,7 +20,13 @@ pub async fn probe(
 ) -> Result<(), String> {
     let client_id = format!("{node}{OBSERVER_MARK}probe-{}", Uuid::now_v7().simple());
     let tls = security.tls(address).map_err(|error| error.to_string())?;
-    let (client, mut connection) = open(address, &client_id, None, config, tls.map(|tls| tls.client()));
+    let (client, mut connection) = open(
+        address,
+        &client_id,
+        None,
+        config,
+        tls.map(|tls| tls.client()),
+    );
     let patience = config.connect_timeout();
     loop {
         match connection.next(patience).await {
@@ -30,7 +36,10 @@ pub async fn probe(
         }
     }
     if client.disconnect() {
-        while !matches!(connection.next(patience).await, Ok(Packet::Disconnected) | Err(_)) {}
+        while !matches!(
+            connection.next(patience).await,
+            Ok(Packet::Disconnected) | Err(_)
+        ) {}
     }
     Ok(())
 }

@@ -8,8 +8,8 @@ use ecod::model::quadkey::Quadkey;
 use ecod::model::time::Timestamp;
 use ecod::neighbours::MAX_MAP_HZ;
 use ecod::wire::{
-    CellMap, CellReputation, Limits, NodeState, NodeStatus, RegionTopic, RegionTopicKind, RejectReason,
-    ReputationTopic, decode,
+    CellMap, CellReputation, Limits, NodeState, NodeStatus, RegionTopic, RegionTopicKind,
+    RejectReason, ReputationTopic, decode,
 };
 use tokio::sync::Semaphore;
 use uuid::Uuid;
@@ -90,14 +90,26 @@ impl RegionInbox {
         }
     }
 
-    fn read(&self, topic: &RegionTopic, payload: &[u8], received_at: Timestamp) -> Result<PacketOutcome, RejectReason> {
+    fn read(
+        &self,
+        topic: &RegionTopic,
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> Result<PacketOutcome, RejectReason> {
         let is_own = topic.cell == self.cell;
         match topic.kind {
             RegionTopicKind::Map if is_own => self.counters.count(Event::Echo),
             RegionTopicKind::Map => {
                 if self.allows(&self.throttle, &topic.cell, received_at) {
                     let map = Box::new(decode(payload, &self.limits)?);
-                    self.deliver(&self.capacity, FromRegion::Map { topic: topic.clone(), map }, received_at);
+                    self.deliver(
+                        &self.capacity,
+                        FromRegion::Map {
+                            topic: topic.clone(),
+                            map,
+                        },
+                        received_at,
+                    );
                 }
             }
             RegionTopicKind::Status if is_own && topic.tile == self.tile && !payload.is_empty() => {
@@ -109,7 +121,9 @@ impl RegionInbox {
                 self.deliver(&self.capacity, FromRegion::Status(status), received_at);
             }
             RegionTopicKind::Status if is_own && topic.tile == self.tile => {}
-            RegionTopicKind::Status | RegionTopicKind::Cell => return Err(RejectReason::UnknownTopic),
+            RegionTopicKind::Status | RegionTopicKind::Cell => {
+                return Err(RejectReason::UnknownTopic);
+            }
         }
         Ok(PacketOutcome::Done)
     }
@@ -131,13 +145,25 @@ impl RegionInbox {
         if message.cell == self.cell {
             self.counters.count(Event::Echo);
         }
-        self.deliver(&self.reputation_capacity, FromRegion::Reputation(message), received_at);
+        self.deliver(
+            &self.reputation_capacity,
+            FromRegion::Reputation(message),
+            received_at,
+        );
         Ok(PacketOutcome::Done)
     }
 
     /// True if one more message of a cell is decoded.
-    fn allows(&self, throttle: &Mutex<KeyedThrottle<NodeName>>, cell: &NodeName, received_at: Timestamp) -> bool {
-        let is_allowed = throttle.lock().unwrap_or_else(PoisonError::into_inner).allow(cell, received_at);
+    fn allows(
+        &self,
+        throttle: &Mutex<KeyedThrottle<NodeName>>,
+        cell: &NodeName,
+        received_at: Timestamp,
+    ) -> bool {
+        let is_allowed = throttle
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .allow(cell, received_at);
         if !is_allowed {
             self.counters.shed(ShedReason::CellThrottled, &source(cell));
         }
@@ -148,7 +174,13 @@ impl RegionInbox {
         match Arc::clone(capacity).try_acquire_owned() {
             Ok(place) => {
                 let origin = Origin::Claimed;
-                (self.subscriber)(Delivery { message, received_at, origin, broker: None, _place: Some(place) });
+                (self.subscriber)(Delivery {
+                    message,
+                    received_at,
+                    origin,
+                    broker: None,
+                    _place: Some(place),
+                });
             }
             Err(_) => self.counters.count(Event::InboxFull),
         }
@@ -157,7 +189,13 @@ impl RegionInbox {
 
 impl PacketSink for RegionInbox {
     /// Processes one packet of the region's broker. A payload that cannot be used is counted by its reason and cell.
-    fn accept(&self, via: Via<'_>, topic: &[u8], payload: &[u8], received_at: Timestamp) -> PacketOutcome {
+    fn accept(
+        &self,
+        via: Via<'_>,
+        topic: &[u8],
+        payload: &[u8],
+        received_at: Timestamp,
+    ) -> PacketOutcome {
         self.counters.count(Event::RegionReceived);
         let path = std::str::from_utf8(topic).unwrap_or_default();
         let (of_cell, of_vehicle) = (RegionTopic::parse(path), ReputationTopic::parse(path));

@@ -41,14 +41,27 @@ pub(super) fn statement(topic: &[u8], signed: &[u8]) -> Vec<u8> {
 }
 
 /// Appends a signature to a round's payload. `None` if `sign` gives none, or the payload is not one of a round.
-pub(super) fn append(payload: &[u8], sign: impl FnOnce(&[u8]) -> Option<Vec<u8>>) -> Option<Vec<u8>> {
+pub(super) fn append(
+    payload: &[u8],
+    sign: impl FnOnce(&[u8]) -> Option<Vec<u8>>,
+) -> Option<Vec<u8>> {
     let (&first, rest) = payload.split_first()?;
     let (mut signed, is_text) = match first {
-        b'{' => ([payload.strip_suffix(b"}")?, format!(",\"{FIELD}\":\"").as_bytes()].concat(), true),
+        b'{' => (
+            [
+                payload.strip_suffix(b"}")?,
+                format!(",\"{FIELD}\":\"").as_bytes(),
+            ]
+            .concat(),
+            true,
+        ),
         MAP.. if first < MAP + MAX_COUNT => ([&[first + 1], rest, &name()].concat(), false),
         ARRAY.. if first <= ARRAY + PLACE => {
             let missing = usize::from(ARRAY + PLACE - first);
-            ([&[ARRAY + PLACE + 1], rest, &vec![NULL; missing]].concat(), false)
+            (
+                [&[ARRAY + PLACE + 1], rest, &vec![NULL; missing]].concat(),
+                false,
+            )
         }
         _ => return None,
     };
@@ -68,12 +81,18 @@ pub(super) fn split(payload: &[u8]) -> Option<(&[u8], Vec<u8>)> {
         let at = text.iter().rposition(|byte| *byte == b'"')? + 1;
         let (signed, signature) = text.split_at_checked(at)?;
         let is_field = signed.ends_with(format!(",\"{FIELD}\":\"").as_bytes());
-        return is_field.then(|| BASE64.decode(signature).ok()).flatten().map(|signature| (signed, signature));
+        return is_field
+            .then(|| BASE64.decode(signature).ok())
+            .flatten()
+            .map(|signature| (signed, signature));
     }
     SIGNATURE_BYTES.rev().find_map(|length| {
-        let (signed, value) = payload.split_at_checked(payload.len().checked_sub(usize::from(length) + 2)?)?;
+        let (signed, value) =
+            payload.split_at_checked(payload.len().checked_sub(usize::from(length) + 2)?)?;
         let signature = value.strip_prefix(&[BYTES, length])?;
-        signature.starts_with(&[SEQUENCE, length - 2]).then(|| (signed, signature.to_vec()))
+        signature
+            .starts_with(&[SEQUENCE, length - 2])
+            .then(|| (signed, signature.to_vec()))
     })
 }
 
@@ -82,7 +101,11 @@ pub(super) fn split(payload: &[u8]) -> Option<(&[u8], Vec<u8>)> {
 pub fn splits_as_appended(bytes: &[u8]) -> bool {
     drop(split(bytes));
     let length = *SIGNATURE_BYTES.end();
-    let signature = [&[SEQUENCE, length - 2], &vec![0x5a; usize::from(length) - 2][..]].concat();
+    let signature = [
+        &[SEQUENCE, length - 2],
+        &vec![0x5a; usize::from(length) - 2][..],
+    ]
+    .concat();
     let mut signed = Vec::new();
     let appended = append(bytes, |statement| {
         signed = statement.to_vec();
@@ -107,20 +130,42 @@ mod tests {
     use super::*;
 
     fn signature(length: u8) -> Vec<u8> {
-        [&[SEQUENCE, length - 2], &vec![0x5a; usize::from(length) - 2][..]].concat()
+        [
+            &[SEQUENCE, length - 2],
+            &vec![0x5a; usize::from(length) - 2][..],
+        ]
+        .concat()
     }
 
     fn map() -> GlobalMap {
-        GlobalMap::new(&Epoch::new(7, NodeName::from_static("edge")), 88, Timestamp(5))
+        GlobalMap::new(
+            &Epoch::new(7, NodeName::from_static("edge")),
+            88,
+            Timestamp(5),
+        )
     }
 
     #[test]
     fn a_signature_comes_off_as_it_was_put_on_and_the_round_stays_readable() {
-        let verdicts = Verdicts::new(&Epoch::new(7, NodeName::from_static("edge")), 88, Timestamp(5), Vec::new());
-        let reputations =
-            Reputations { schema: 1, aggregator: None, epoch: 7, round: 88, reputations: Default::default() };
+        let verdicts = Verdicts::new(
+            &Epoch::new(7, NodeName::from_static("edge")),
+            88,
+            Timestamp(5),
+            Vec::new(),
+        );
+        let reputations = Reputations {
+            schema: 1,
+            aggregator: None,
+            epoch: 7,
+            round: 88,
+            reputations: Default::default(),
+        };
         for encoding in [Encoding::Json, Encoding::Cbor, Encoding::Compact] {
-            let rounds = [encode(&map(), encoding), encode(&verdicts, encoding), encode(&reputations, encoding)];
+            let rounds = [
+                encode(&map(), encoding),
+                encode(&verdicts, encoding),
+                encode(&reputations, encoding),
+            ];
             for length in SIGNATURE_BYTES {
                 for (kind, payload) in rounds.iter().enumerate() {
                     let mut statement = Vec::new();
@@ -129,7 +174,11 @@ mod tests {
                         Some(signature(length))
                     });
                     let signed = signed.unwrap();
-                    assert_eq!(split(&signed), Some((&statement[..], signature(length))), "{encoding:?} {kind}");
+                    assert_eq!(
+                        split(&signed),
+                        Some((&statement[..], signature(length))),
+                        "{encoding:?} {kind}"
+                    );
                     let limits = Limits::default();
                     match kind {
                         0 => assert_eq!(decode(&signed, &limits), Ok(map())),
@@ -148,7 +197,16 @@ mod tests {
         for end in 0..whole.len() {
             let _ = split(&whole[..end]);
         }
-        for bytes in [&b""[..], b"\"}", b"\"\"}", b"{", b"}", &[MAP + MAX_COUNT], &[ARRAY + PLACE + 1], &[0xff]] {
+        for bytes in [
+            &b""[..],
+            b"\"}",
+            b"\"\"}",
+            b"{",
+            b"}",
+            &[MAP + MAX_COUNT],
+            &[ARRAY + PLACE + 1],
+            &[0xff],
+        ] {
             assert_eq!(split(bytes), None, "{bytes:?}");
             assert_eq!(append(bytes, |_| Some(signature(70))), None, "{bytes:?}");
         }

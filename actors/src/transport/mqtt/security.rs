@@ -15,7 +15,9 @@ use super::config::MqttConfig;
 use super::round_signature;
 use crate::platform::clock;
 use crate::transport::gossip::{KeyError, Member, MembershipConfig, payload_key};
-use crate::transport::pki::{BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker, is_signed_by};
+use crate::transport::pki::{
+    BrokerTrust, Credentials, CredentialsError, TlsConfig, external_broker, is_signed_by,
+};
 
 /// Protection of links and payloads; by default there is none.
 #[derive(Debug, Clone, Default)]
@@ -57,13 +59,24 @@ impl Security {
         mqtt: &MqttConfig,
         (membership, cell): (&MembershipConfig, &NodeName),
     ) -> Result<Self, SecurityError> {
-        let credentials = tls.map(|(files, name)| Credentials::load(files, name)).transpose()?.map(Arc::new);
-        let external = mqtt
-            .broker
-            .clone()
-            .map(|address| ExternalBroker { address, ca: mqtt.ca.clone().map(|ca| ("mqtt.ca", ca)) });
-        let signing = mqtt.sign.then(|| payload_key(membership, cell)).transpose()?;
-        let security = Self { credentials, external, signing: signing.map(SigningKey), members: None };
+        let credentials = tls
+            .map(|(files, name)| Credentials::load(files, name))
+            .transpose()?
+            .map(Arc::new);
+        let external = mqtt.broker.clone().map(|address| ExternalBroker {
+            address,
+            ca: mqtt.ca.clone().map(|ca| ("mqtt.ca", ca)),
+        });
+        let signing = mqtt
+            .sign
+            .then(|| payload_key(membership, cell))
+            .transpose()?;
+        let security = Self {
+            credentials,
+            external,
+            signing: signing.map(SigningKey),
+            members: None,
+        };
         if let Some(external) = &security.external {
             security.tls(&external.address)?;
         }
@@ -74,17 +87,31 @@ impl Security {
     ///
     /// # Errors
     /// When the file of the CA cannot be used.
-    pub fn of_uplink(&self, broker: BrokerAddress, ca: Option<PathBuf>) -> Result<Self, CredentialsError> {
-        let external = ExternalBroker { address: broker, ca: ca.map(|ca| ("uplink.ca", ca)) };
+    pub fn of_uplink(
+        &self,
+        broker: BrokerAddress,
+        ca: Option<PathBuf>,
+    ) -> Result<Self, CredentialsError> {
+        let external = ExternalBroker {
+            address: broker,
+            ca: ca.map(|ca| ("uplink.ca", ca)),
+        };
         let broker = external.address.clone();
-        let security = Self { credentials: self.credentials.clone(), external: Some(external), ..Self::default() };
+        let security = Self {
+            credentials: self.credentials.clone(),
+            external: Some(external),
+            ..Self::default()
+        };
         security.tls(&broker)?;
         Ok(security)
     }
 
     /// The same protection for a node that knows the others: it verifies their signatures under rounds.
     pub fn with_members(self, members: watch::Receiver<Vec<Member>>) -> Self {
-        Self { members: Some(members), ..self }
+        Self {
+            members: Some(members),
+            ..self
+        }
     }
 
     /// TLS for one connection to a broker; `None` for plaintext.
@@ -92,9 +119,19 @@ impl Security {
     /// # Errors
     /// When the credentials can no longer be used.
     pub fn tls(&self, broker: &BrokerAddress) -> Result<Option<BrokerTrust>, CredentialsError> {
-        match self.external.as_ref().filter(|external| external.address == *broker) {
-            Some(ExternalBroker { ca: Some((key, ca)), .. }) => {
-                let current = self.credentials.as_ref().map(|credentials| credentials.current());
+        match self
+            .external
+            .as_ref()
+            .filter(|external| external.address == *broker)
+        {
+            Some(ExternalBroker {
+                ca: Some((key, ca)),
+                ..
+            }) => {
+                let current = self
+                    .credentials
+                    .as_ref()
+                    .map(|credentials| credentials.current());
                 external_broker((*key, ca), current.as_deref()).map(Some)
             }
             Some(ExternalBroker { ca: None, .. }) => Ok(None),
@@ -106,10 +143,19 @@ impl Security {
     /// connections are tried on and on, and succeed once the clock is set.
     pub fn clock_fault(&self) -> Option<String> {
         let credentials = self.credentials.as_ref()?.current();
-        let (wall, begins, expires) = (clock::wall(), credentials.identity.begins(), credentials.identity.expires());
+        let (wall, begins, expires) = (
+            clock::wall(),
+            credentials.identity.begins(),
+            credentials.identity.expires(),
+        );
         let date = |time: Timestamp| {
-            let date = i64::try_from(time.micros()).ok().and_then(DateTime::from_timestamp_micros);
-            date.map_or_else(|| time.to_string(), |date| date.format("%Y-%m-%dT%H:%MZ").to_string())
+            let date = i64::try_from(time.micros())
+                .ok()
+                .and_then(DateTime::from_timestamp_micros);
+            date.map_or_else(
+                || time.to_string(),
+                |date| date.format("%Y-%m-%dT%H:%MZ").to_string(),
+            )
         };
         (wall < begins || wall > expires).then(|| {
             let (wall, begins, expires) = (date(wall), date(begins), date(expires));
@@ -130,14 +176,25 @@ impl Security {
 
     /// A round with this node's signature, if the node has certificates.
     pub(crate) fn sign_round(&self, topic: &str, payload: Vec<u8>) -> Vec<u8> {
-        let Some(credentials) = &self.credentials else { return payload };
-        let sign =
-            |signed: &[u8]| credentials.current().sign(&round_signature::statement(topic.as_bytes(), signed)).ok();
+        let Some(credentials) = &self.credentials else {
+            return payload;
+        };
+        let sign = |signed: &[u8]| {
+            credentials
+                .current()
+                .sign(&round_signature::statement(topic.as_bytes(), signed))
+                .ok()
+        };
         round_signature::append(&payload, sign).unwrap_or(payload)
     }
 
     /// State of the signature under a round.
-    pub(crate) fn check_round(&self, aggregator: Option<&NodeName>, topic: &[u8], payload: &[u8]) -> SignatureState {
+    pub(crate) fn check_round(
+        &self,
+        aggregator: Option<&NodeName>,
+        topic: &[u8],
+        payload: &[u8],
+    ) -> SignatureState {
         let Some(members) = self.members.as_ref().filter(|_| self.credentials.is_some()) else {
             return SignatureState::Unverifiable;
         };
@@ -146,24 +203,39 @@ impl Security {
             .iter()
             .find(|member| Some(&member.name) == aggregator)
             .and_then(|member| member.certificate.clone());
-        let is_valid =
-            certificate.zip(round_signature::split(payload)).is_some_and(|(certificate, (signed, signature))| {
-                is_signed_by(&certificate, &round_signature::statement(topic, signed), &signature)
+        let is_valid = certificate
+            .zip(round_signature::split(payload))
+            .is_some_and(|(certificate, (signed, signature))| {
+                is_signed_by(
+                    &certificate,
+                    &round_signature::statement(topic, signed),
+                    &signature,
+                )
             });
-        if is_valid { SignatureState::Valid } else { SignatureState::Invalid }
+        if is_valid {
+            SignatureState::Valid
+        } else {
+            SignatureState::Invalid
+        }
     }
 
     /// True if arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz targets.
     #[cfg(fuzzing)]
     pub fn rejects_forgery(&self, topic: &str, bytes: &[u8]) -> bool {
-        let Some(key) = &self.signing else { return false };
+        let Some(key) = &self.signing else {
+            return false;
+        };
         key.verify(topic.as_bytes(), bytes).is_none()
             && key.verify(topic.as_bytes(), &key.sign(topic, bytes)) == Some(bytes)
     }
 
     /// Bytes that a signature adds to a payload.
     pub fn envelope_bytes(&self) -> usize {
-        if self.signing.is_some() { ENVELOPE_BYTES } else { 0 }
+        if self.signing.is_some() {
+            ENVELOPE_BYTES
+        } else {
+            0
+        }
     }
 }
 
@@ -195,7 +267,9 @@ impl SigningKey {
 
     /// The payload of an envelope that was signed with this key for this topic.
     pub(crate) fn verify<'a>(&self, topic: &[u8], envelope: &'a [u8]) -> Option<&'a [u8]> {
-        let (tag, payload) = envelope.strip_prefix(&[MARK])?.split_at_checked(TAG_BYTES)?;
+        let (tag, payload) = envelope
+            .strip_prefix(&[MARK])?
+            .split_at_checked(TAG_BYTES)?;
         hmac::verify(&self.0, &signed(topic, payload), tag).ok()?;
         Some(payload)
     }
@@ -221,34 +295,68 @@ mod tests {
         let (name, cell) = (NodeName::from_static("edge"), NodeName::from_static("lot"));
         let month_us = 30 * 86_400 * 1_000_000;
         let now = clock::now();
-        for (issued_at, is_wrong) in
-            [(now, false), (Timestamp(now.micros() + month_us), true), (Timestamp(now.micros() - month_us), true)]
-        {
+        for (issued_at, is_wrong) in [
+            (now, false),
+            (Timestamp(now.micros() + month_us), true),
+            (Timestamp(now.micros() - month_us), true),
+        ] {
             let directory = tempfile::tempdir().unwrap();
             let mut authority = Authority::init(directory.path(), &cell, issued_at).unwrap();
-            authority.issue(&name, Role::Edge, Duration::from_secs(3600), issued_at).unwrap();
+            authority
+                .issue(&name, Role::Edge, Duration::from_secs(3600), issued_at)
+                .unwrap();
             let (certificate, key) = authority.files_of(&name);
-            let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
+            let tls = TlsConfig {
+                ca: authority.ca(),
+                certificate,
+                key,
+                revocation_list: None,
+                city: None,
+            };
             let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
-            let security = Security::load(Some((&tls, &name)), &mqtt, (&membership, &cell)).unwrap();
+            let security =
+                Security::load(Some((&tls, &name)), &mqtt, (&membership, &cell)).unwrap();
             let fault = security.clock_fault();
-            assert_eq!(fault.as_ref().is_some_and(|fault| fault.contains("set the clock")), is_wrong, "{fault:?}");
+            assert_eq!(
+                fault
+                    .as_ref()
+                    .is_some_and(|fault| fault.contains("set the clock")),
+                is_wrong,
+                "{fault:?}"
+            );
         }
     }
 
     #[test]
     fn a_signed_round_is_its_aggregators_and_any_change_shows() {
-        let (cell, [edge, euclid]) = (NodeName::from_static("lot"), ["edge", "euclid"].map(NodeName::from_static));
+        let (cell, [edge, euclid]) = (
+            NodeName::from_static("lot"),
+            ["edge", "euclid"].map(NodeName::from_static),
+        );
         let directory = tempfile::tempdir().unwrap();
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
         let [of_edge, of_euclid] = [&edge, &euclid].map(|name| {
-            authority.issue(name, Role::Auto, Duration::from_secs(3600), clock::now()).unwrap();
+            authority
+                .issue(name, Role::Auto, Duration::from_secs(3600), clock::now())
+                .unwrap();
             let (certificate, key) = authority.files_of(name);
-            let tls = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
+            let tls = TlsConfig {
+                ca: authority.ca(),
+                certificate,
+                key,
+                revocation_list: None,
+                city: None,
+            };
             let (mqtt, membership) = (MqttConfig::default(), MembershipConfig::default());
             Security::load(Some((&tls, name)), &mqtt, (&membership, &cell)).unwrap()
         });
-        let certificate = of_edge.credentials.as_ref().unwrap().current().certificate().into();
+        let certificate = of_edge
+            .credentials
+            .as_ref()
+            .unwrap()
+            .current()
+            .certificate()
+            .into();
         let gossip = "10.0.0.2:17884".parse().unwrap();
         let member = Member {
             name: edge.clone(),
@@ -260,28 +368,55 @@ mod tests {
         };
         let (members, told) = watch::channel(vec![member]);
         let receiver = of_euclid.clone().with_members(told);
-        let (topic, payload) = ("ecod/v1/lot/global_detections", br#"{"schema":1,"round":7}"#.to_vec());
+        let (topic, payload) = (
+            "ecod/v1/lot/global_detections",
+            br#"{"schema":1,"round":7}"#.to_vec(),
+        );
         let signed = of_edge.sign_round(topic, payload.clone());
-        let check = |topic: &str, payload: &[u8]| receiver.check_round(Some(&edge), topic.as_bytes(), payload);
+        let check = |topic: &str, payload: &[u8]| {
+            receiver.check_round(Some(&edge), topic.as_bytes(), payload)
+        };
         assert_eq!(check(topic, &signed), SignatureState::Valid);
-        assert_eq!(check("ecod/v1/lot/global_verdicts", &signed), SignatureState::Invalid);
+        assert_eq!(
+            check("ecod/v1/lot/global_verdicts", &signed),
+            SignatureState::Invalid
+        );
         assert_eq!(check(topic, &payload), SignatureState::Invalid, "none");
-        assert_eq!(check(topic, &of_euclid.sign_round(topic, payload.clone())), SignatureState::Invalid);
-        assert_eq!(receiver.check_round(Some(&euclid), topic.as_bytes(), &signed), SignatureState::Invalid);
+        assert_eq!(
+            check(topic, &of_euclid.sign_round(topic, payload.clone())),
+            SignatureState::Invalid
+        );
+        assert_eq!(
+            receiver.check_round(Some(&euclid), topic.as_bytes(), &signed),
+            SignatureState::Invalid
+        );
         for at in 0..signed.len() - 2 {
             let mut changed = signed.clone();
             changed[at] ^= 1;
             assert_eq!(check(topic, &changed), SignatureState::Invalid, "byte {at}");
         }
-        assert_eq!(of_euclid.check_round(Some(&edge), topic.as_bytes(), &signed), SignatureState::Unverifiable);
+        assert_eq!(
+            of_euclid.check_round(Some(&edge), topic.as_bytes(), &signed),
+            SignatureState::Unverifiable
+        );
         members.send_replace(Vec::new());
-        assert_eq!(check(topic, &signed), SignatureState::Invalid, "no member any more");
-        assert_eq!(Security::default().sign_round(topic, payload.clone()), payload, "without certificates");
+        assert_eq!(
+            check(topic, &signed),
+            SignatureState::Invalid,
+            "no member any more"
+        );
+        assert_eq!(
+            Security::default().sign_round(topic, payload.clone()),
+            payload,
+            "without certificates"
+        );
     }
 
     fn key(text: &str, cell: &'static str) -> SigningKey {
-        let membership =
-            MembershipConfig { key: Some(crate::platform::secret::Secret::new(text)), ..MembershipConfig::default() };
+        let membership = MembershipConfig {
+            key: Some(crate::platform::secret::Secret::new(text)),
+            ..MembershipConfig::default()
+        };
         SigningKey(payload_key(&membership, &NodeName::from_static(cell)).unwrap())
     }
 
@@ -291,8 +426,14 @@ mod tests {
         let envelope = key_of_cell.sign("a/b", b"payload");
         assert_eq!(key_of_cell.verify(b"a/b", &envelope), Some(&b"payload"[..]));
         assert_eq!(key_of_cell.verify(b"a/", &envelope), None);
-        assert_eq!(key("correct horse batterz", "lot-1").verify(b"a/b", &envelope), None);
-        assert_eq!(key("correct horse battery", "lot-2").verify(b"a/b", &envelope), None);
+        assert_eq!(
+            key("correct horse batterz", "lot-1").verify(b"a/b", &envelope),
+            None
+        );
+        assert_eq!(
+            key("correct horse battery", "lot-2").verify(b"a/b", &envelope),
+            None
+        );
         for at in 0..envelope.len() {
             let mut changed = envelope.clone();
             changed[at] ^= 1;

@@ -30,7 +30,9 @@ pub(crate) enum Distrust {
 impl LoadedCredentials {
     /// The node's own certificate in DER.
     pub(crate) fn certificate(&self) -> &[u8] {
-        self.certificates.first().map_or(&[], |certificate| certificate)
+        self.certificates
+            .first()
+            .map_or(&[], |certificate| certificate)
     }
 
     /// The signature of a message by the node's key: ECDSA over P-256 with SHA-256, in DER.
@@ -39,40 +41,67 @@ impl LoadedCredentials {
     }
 
     /// Verifies that a certificate is directly signed by the cell's CA, valid at this time and not revoked.
-    pub(crate) fn verify_node(&self, certificate: &[u8], wall: UnixTime) -> Result<CertificateSubject, Distrust> {
+    pub(crate) fn verify_node(
+        &self,
+        certificate: &[u8],
+        wall: UnixTime,
+    ) -> Result<CertificateSubject, Distrust> {
         let subject = self.subject_of(certificate)?;
-        let verified = self.clients.verify_client_cert(&CertificateDer::from(certificate), &[], wall);
+        let verified =
+            self.clients
+                .verify_client_cert(&CertificateDer::from(certificate), &[], wall);
         verified.map(|_| subject).map_err(Distrust::Untrusted)
     }
 
     /// True if the cell's CA has revoked a certificate, which may have expired, or the city that CA.
     pub(crate) fn has_revoked(&self, certificate: &[u8]) -> bool {
-        if self.revoked_cas.iter().any(|ca| is_issued_by(ca, certificate)) {
+        if self
+            .revoked_cas
+            .iter()
+            .any(|ca| is_issued_by(ca, certificate))
+        {
             return true;
         }
-        let Some(began) = began(certificate) else { return false };
-        let verified = self.clients.verify_client_cert(&CertificateDer::from(certificate), &[], began);
-        verified.is_err_and(|error| error == rustls::Error::InvalidCertificate(CertificateError::Revoked))
+        let Some(began) = began(certificate) else {
+            return false;
+        };
+        let verified =
+            self.clients
+                .verify_client_cert(&CertificateDer::from(certificate), &[], began);
+        verified.is_err_and(|error| {
+            error == rustls::Error::InvalidCertificate(CertificateError::Revoked)
+        })
     }
 }
 
 /// True if a CA has signed a certificate, by ECDSA over P-256 with SHA-256.
 pub(super) fn is_issued_by(ca: &[u8], certificate: &[u8]) -> bool {
-    let (Ok((_, ca)), Ok((_, certificate))) = (X509Certificate::from_der(ca), X509Certificate::from_der(certificate))
-    else {
+    let (Ok((_, ca)), Ok((_, certificate))) = (
+        X509Certificate::from_der(ca),
+        X509Certificate::from_der(certificate),
+    ) else {
         return false;
     };
-    let (key, signature) = (&ca.public_key().subject_public_key.data, &certificate.signature_value.data);
-    certificate.issuer() == ca.subject() && is_signed_with(key, certificate.tbs_certificate.as_ref(), signature)
+    let (key, signature) = (
+        &ca.public_key().subject_public_key.data,
+        &certificate.signature_value.data,
+    );
+    certificate.issuer() == ca.subject()
+        && is_signed_with(key, certificate.tbs_certificate.as_ref(), signature)
 }
 
 /// True if a revocation list is one of a CA, which has signed it by ECDSA over P-256 with SHA-256.
 pub(super) fn is_list_of(ca: &[u8], list: &[u8]) -> bool {
-    let (Ok((_, ca)), Ok((_, list))) = (X509Certificate::from_der(ca), CertificateRevocationList::from_der(list))
-    else {
+    let (Ok((_, ca)), Ok((_, list))) = (
+        X509Certificate::from_der(ca),
+        CertificateRevocationList::from_der(list),
+    ) else {
         return false;
     };
-    let (key, signature) = (&ca.public_key().subject_public_key.data, &list.signature_value.data);
+    let (key, signature) = (
+        &ca.public_key().subject_public_key.data,
+        &list.signature_value.data,
+    );
     list.issuer() == ca.subject() && is_signed_with(key, list.tbs_cert_list.as_ref(), signature)
 }
 
@@ -85,16 +114,26 @@ pub(super) fn began(certificate: &[u8]) -> Option<UnixTime> {
 
 /// Signer with a node's key; `None` for a key other than ECDSA P-256.
 pub(super) fn signer(key: &PrivateKeyDer<'_>) -> Option<Box<dyn Signer>> {
-    any_ecdsa_type(key).ok()?.choose_scheme(&[SignatureScheme::ECDSA_NISTP256_SHA256])
+    any_ecdsa_type(key)
+        .ok()?
+        .choose_scheme(&[SignatureScheme::ECDSA_NISTP256_SHA256])
 }
 
 /// True if the owner of a certificate signed a message.
 pub(crate) fn is_signed_by(certificate: &[u8], message: &[u8], signature: &[u8]) -> bool {
-    let Ok((_, parsed)) = X509Certificate::from_der(certificate) else { return false };
-    is_signed_with(&parsed.public_key().subject_public_key.data, message, signature)
+    let Ok((_, parsed)) = X509Certificate::from_der(certificate) else {
+        return false;
+    };
+    is_signed_with(
+        &parsed.public_key().subject_public_key.data,
+        message,
+        signature,
+    )
 }
 
 /// True if the owner of a public key signed a message.
 pub(super) fn is_signed_with(public_key: &[u8], message: &[u8], signature: &[u8]) -> bool {
-    UnparsedPublicKey::new(&ECDSA_P256_SHA256_ASN1, public_key).verify(message, signature).is_ok()
+    UnparsedPublicKey::new(&ECDSA_P256_SHA256_ASN1, public_key)
+        .verify(message, signature)
+        .is_ok()
 }

@@ -11,9 +11,9 @@ use ecod::leadership::Rights;
 use ecod::model::names::NodeName;
 use ecod::model::time::Timestamp;
 use rcgen::{
-    BasicConstraints, Certificate, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose,
-    IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, PublicKeyData, RevocationReason, RevokedCertParams,
-    SerialNumber,
+    BasicConstraints, Certificate, CertificateParams, CertificateRevocationListParams, DnType,
+    ExtendedKeyUsagePurpose, IsCa, Issuer, KeyIdMethod, KeyPair, KeyUsagePurpose, PublicKeyData,
+    RevocationReason, RevokedCertParams, SerialNumber,
 };
 use ring::rand::{SecureRandom, SystemRandom};
 use serde::{Deserialize, Serialize};
@@ -121,7 +121,9 @@ impl Authority {
     /// [`AuthorityError`] when there is a CA or the directory cannot be written.
     pub fn init(directory: &Path, cell: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
         let parameters = ca_parameters(&format!("ECOD cell {cell}"), 0, now)?;
-        Self::make(directory, cell, false, now, |key| Ok(parameters.self_signed(key)?))
+        Self::make(directory, cell, false, now, |key| {
+            Ok(parameters.self_signed(key)?)
+        })
     }
 
     /// Makes a CA whose certificate is signed by `certify`.
@@ -132,7 +134,10 @@ impl Authority {
         now: Timestamp,
         certify: impl FnOnce(&KeyPair) -> Result<Certificate, AuthorityError>,
     ) -> Result<Self, AuthorityError> {
-        let file = |path: &Path, source| AuthorityError::File { path: path.into(), source };
+        let file = |path: &Path, source| AuthorityError::File {
+            path: path.into(),
+            source,
+        };
         fs::create_dir_all(directory.join(NODES)).map_err(|source| file(directory, source))?;
         if directory.join(CA_KEY).exists() {
             return Err(AuthorityError::Exists(directory.into()));
@@ -141,8 +146,16 @@ impl Authority {
         let certificate = certify(&key)?;
         let secret = key.serialize_pem();
         write(&directory.join(CA), &certificate.pem())?;
-        let register = IssuedCertificates { cell: name.clone(), is_city, revision: 0, issued: Vec::new() };
-        let mut authority = Self { directory: directory.into(), register };
+        let register = IssuedCertificates {
+            cell: name.clone(),
+            is_city,
+            revision: 0,
+            issued: Vec::new(),
+        };
+        let mut authority = Self {
+            directory: directory.into(),
+            register,
+        };
         authority.save(&Issuer::from_ca_cert_pem(&certificate.pem(), key)?, now)?;
         // Last: the key makes a CA complete. An attempt that failed before it can be repeated.
         write_secret(&directory.join(CA_KEY), &secret)?;
@@ -154,7 +167,10 @@ impl Authority {
     /// # Errors
     /// [`AuthorityError`] when there is none.
     pub fn open(directory: &Path) -> Result<Self, AuthorityError> {
-        Ok(Self { directory: directory.into(), register: read_register(directory)? })
+        Ok(Self {
+            directory: directory.into(),
+            register: read_register(directory)?,
+        })
     }
 
     /// Lock of the directory for a change, with the register as it is now: another command may have changed it.
@@ -201,17 +217,28 @@ impl Authority {
     ) -> Result<(String, String), AuthorityError> {
         check_name(node)?;
         let mut parameters = CertificateParams::default();
-        parameters.distinguished_name.push(DnType::CommonName, node.as_str());
+        parameters
+            .distinguished_name
+            .push(DnType::CommonName, node.as_str());
         parameters.use_authority_key_identifier_extension = true;
         parameters.key_usages = vec![KeyUsagePurpose::DigitalSignature];
-        parameters.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth, ExtendedKeyUsagePurpose::ServerAuth];
+        parameters.extended_key_usages = vec![
+            ExtendedKeyUsagePurpose::ClientAuth,
+            ExtendedKeyUsagePurpose::ServerAuth,
+        ];
         let may_lead = |rights: &Rights| rights.may_lead() && !self.register.is_city;
         let rights = Some(rights.into()).filter(may_lead).unwrap_or(Rights::NONE);
-        parameters.subject_alt_names.push(rcgen::SanType::URI(rights_uri(rights).try_into()?));
+        parameters
+            .subject_alt_names
+            .push(rcgen::SanType::URI(rights_uri(rights).try_into()?));
         if rights.may_lead() {
-            parameters.subject_alt_names.push(rcgen::SanType::DnsName(BROKER_NAME.try_into()?));
+            parameters
+                .subject_alt_names
+                .push(rcgen::SanType::DnsName(BROKER_NAME.try_into()?));
         }
-        parameters.subject_alt_names.push(rcgen::SanType::DnsName(DOOR_NAME.try_into()?));
+        parameters
+            .subject_alt_names
+            .push(rcgen::SanType::DnsName(DOOR_NAME.try_into()?));
         set_validity(&mut parameters, now, valid);
         let serial = draw_serial()?;
         parameters.serial_number = Some(serial.clone());
@@ -248,8 +275,13 @@ impl Authority {
 
     /// True if a node has a certificate that is neither revoked nor expired.
     pub(crate) fn has_certificate(&self, node: &NodeName, now: Timestamp) -> bool {
-        let is_valid = |issued: &IssuedCertificate| issued.revoked_at_us.is_none() && issued.expires_at_us > now;
-        self.register.issued.iter().any(|issued| issued.node == *node && is_valid(issued))
+        let is_valid = |issued: &IssuedCertificate| {
+            issued.revoked_at_us.is_none() && issued.expires_at_us > now
+        };
+        self.register
+            .issued
+            .iter()
+            .any(|issued| issued.node == *node && is_valid(issued))
     }
 
     /// Revokes all certificates of a node, also those that have expired, and rewrites the revocation list; returns their
@@ -265,8 +297,13 @@ impl Authority {
     }
 
     /// Revokes one certificate, unless it is revoked already.
-    pub(crate) fn revoke_serial(&mut self, serial: &str, now: Timestamp) -> Result<(), AuthorityError> {
-        self.revoke_where(|issued| issued.serial == serial, now).map(drop)
+    pub(crate) fn revoke_serial(
+        &mut self,
+        serial: &str,
+        now: Timestamp,
+    ) -> Result<(), AuthorityError> {
+        self.revoke_where(|issued| issued.serial == serial, now)
+            .map(drop)
     }
 
     fn revoke_where(
@@ -276,7 +313,11 @@ impl Authority {
     ) -> Result<usize, AuthorityError> {
         let _lock = self.lock()?;
         let mut revoked = 0;
-        let issued = self.register.issued.iter_mut().filter(|issued| issued.revoked_at_us.is_none());
+        let issued = self
+            .register
+            .issued
+            .iter_mut()
+            .filter(|issued| issued.revoked_at_us.is_none());
         for issued in issued.filter(|issued| is_meant(issued)) {
             issued.revoked_at_us = Some(now);
             revoked += 1;
@@ -300,7 +341,10 @@ impl Authority {
     /// Paths of a node's certificate and key, issued or not.
     pub fn files_of(&self, node: &NodeName) -> (PathBuf, PathBuf) {
         let nodes = self.directory.join(NODES);
-        (nodes.join(format!("{node}.pem")), nodes.join(format!("{node}.key")))
+        (
+            nodes.join(format!("{node}.pem")),
+            nodes.join(format!("{node}.key")),
+        )
     }
 
     fn issuer(&self) -> Result<Issuer<'static, KeyPair>, AuthorityError> {
@@ -315,7 +359,12 @@ impl Authority {
             let serial = SerialNumber::from_slice(&hex::decode(&issued.serial).unwrap_or_default());
             let revocation_time = time(issued.revoked_at_us?).into();
             let reason_code = Some(RevocationReason::PrivilegeWithdrawn);
-            Some(RevokedCertParams { serial_number: serial, revocation_time, reason_code, invalidity_date: None })
+            Some(RevokedCertParams {
+                serial_number: serial,
+                revocation_time,
+                reason_code,
+                invalidity_date: None,
+            })
         };
         let list = CertificateRevocationListParams {
             this_update: time(now).into(),
@@ -326,9 +375,17 @@ impl Authority {
             key_identifier_method: KeyIdMethod::Sha256,
         };
         write(&self.revocation_list(), &list.signed_by(issuer)?.pem()?)?;
-        let text = serde_json::to_string_pretty(&self.register)
-            .map_err(|error| AuthorityError::Register { path: REGISTER.into(), reason: error.to_string() })?;
-        replace(&self.directory.join(REGISTER), &with_checksum((text + "\n").as_bytes()), 0o644)
+        let text = serde_json::to_string_pretty(&self.register).map_err(|error| {
+            AuthorityError::Register {
+                path: REGISTER.into(),
+                reason: error.to_string(),
+            }
+        })?;
+        replace(
+            &self.directory.join(REGISTER),
+            &with_checksum((text + "\n").as_bytes()),
+            0o644,
+        )
     }
 }
 
@@ -337,7 +394,11 @@ impl Authority {
 /// # Errors
 /// [`AuthorityError::Name`] when it is one of an observer.
 pub(crate) fn check_name(node: &NodeName) -> Result<(), AuthorityError> {
-    if node.as_str().contains(OBSERVER_MARK) { Err(AuthorityError::Name(node.clone())) } else { Ok(()) }
+    if node.as_str().contains(OBSERVER_MARK) {
+        Err(AuthorityError::Name(node.clone()))
+    } else {
+        Ok(())
+    }
 }
 
 const CA: &str = "ca.pem";
@@ -354,12 +415,17 @@ fn read_register(directory: &Path) -> Result<IssuedCertificates, AuthorityError>
     }
     let text = read(&path)?;
     let register = content(text.as_bytes());
-    let register = register.and_then(|register| serde_json::from_slice(register).map_err(|error| error.to_string()));
+    let register = register
+        .and_then(|register| serde_json::from_slice(register).map_err(|error| error.to_string()));
     register.map_err(|reason| AuthorityError::Register { path, reason })
 }
 
 /// Parameters of a CA's certificate with so many CAs below it in a row.
-fn ca_parameters(name: &str, below: u8, now: Timestamp) -> Result<CertificateParams, AuthorityError> {
+fn ca_parameters(
+    name: &str,
+    below: u8,
+    now: Timestamp,
+) -> Result<CertificateParams, AuthorityError> {
     let mut parameters = CertificateParams::default();
     parameters.distinguished_name.push(DnType::CommonName, name);
     parameters.is_ca = IsCa::Ca(BasicConstraints::Constrained(below));
@@ -397,7 +463,10 @@ fn draw_serial() -> Result<SerialNumber, AuthorityError> {
 }
 
 fn read(path: &Path) -> Result<String, AuthorityError> {
-    bounded_file::read_text(path).map_err(|source| AuthorityError::File { path: path.into(), source })
+    bounded_file::read_text(path).map_err(|source| AuthorityError::File {
+        path: path.into(),
+        source,
+    })
 }
 
 fn write(path: &Path, text: &str) -> Result<(), AuthorityError> {
@@ -409,7 +478,10 @@ fn write_secret(path: &Path, text: &str) -> Result<(), AuthorityError> {
 }
 
 fn replace(path: &Path, bytes: &[u8], mode: u32) -> Result<(), AuthorityError> {
-    replace_file(path, bytes, mode).map_err(|source| AuthorityError::File { path: path.into(), source })
+    replace_file(path, bytes, mode).map_err(|source| AuthorityError::File {
+        path: path.into(),
+        source,
+    })
 }
 
 #[cfg(test)]
@@ -425,9 +497,19 @@ mod tests {
     fn a_ca_is_made_once_and_its_keys_are_for_its_owner_only() {
         let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
-        authority.issue(&NodeName::from_static("edge"), Role::Edge, days(1), clock::now()).unwrap();
+        authority
+            .issue(
+                &NodeName::from_static("edge"),
+                Role::Edge,
+                days(1),
+                clock::now(),
+            )
+            .unwrap();
         for key in ["ca.key", "nodes/edge.key"] {
-            let mode = fs::metadata(directory.path().join(key)).unwrap().permissions().mode();
+            let mode = fs::metadata(directory.path().join(key))
+                .unwrap()
+                .permissions()
+                .mode();
             assert_eq!(mode & 0o777, 0o600, "{key}");
         }
         let again = Authority::init(directory.path(), &cell, clock::now()).unwrap_err();
@@ -443,7 +525,14 @@ mod tests {
         fs::remove_dir(&obstacle).unwrap();
         Authority::init(directory.path(), &cell, clock::now()).unwrap();
         let mut authority = Authority::open(directory.path()).unwrap();
-        authority.issue(&NodeName::from_static("edge"), Role::Edge, days(1), clock::now()).unwrap();
+        authority
+            .issue(
+                &NodeName::from_static("edge"),
+                Role::Edge,
+                days(1),
+                clock::now(),
+            )
+            .unwrap();
     }
 
     #[test]
@@ -451,21 +540,36 @@ mod tests {
         let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
         let [edge, euclid, gauss] = ["edge", "euclid", "gauss"].map(NodeName::from_static);
         let mut long = Authority::init(directory.path(), &cell, clock::now()).unwrap();
-        long.issue(&edge, Role::Edge, days(1), clock::now()).unwrap();
+        long.issue(&edge, Role::Edge, days(1), clock::now())
+            .unwrap();
         let mut short = Authority::open(directory.path()).unwrap();
-        short.issue(&euclid, Role::Auto, days(1), clock::now()).unwrap();
+        short
+            .issue(&euclid, Role::Auto, days(1), clock::now())
+            .unwrap();
         short.revoke(&edge, clock::now()).unwrap();
-        long.issue(&gauss, Role::Auto, days(1), clock::now()).unwrap();
+        long.issue(&gauss, Role::Auto, days(1), clock::now())
+            .unwrap();
         let mut later = Authority::open(directory.path()).unwrap();
         let revoked = [edge, euclid, gauss].map(|node| later.revoke(&node, clock::now()).ok());
-        assert_eq!(revoked, [None, Some(1), Some(1)], "the edge's was revoked before");
+        assert_eq!(
+            revoked,
+            [None, Some(1), Some(1)],
+            "the edge's was revoked before"
+        );
     }
 
     #[test]
     fn a_register_with_one_wrong_byte_is_told_and_not_used() {
         let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
         let mut authority = Authority::init(directory.path(), &cell, clock::now()).unwrap();
-        authority.issue(&NodeName::from_static("edge"), Role::Edge, days(1), clock::now()).unwrap();
+        authority
+            .issue(
+                &NodeName::from_static("edge"),
+                Role::Edge,
+                days(1),
+                clock::now(),
+            )
+            .unwrap();
         let path = directory.path().join(REGISTER);
         let whole = fs::read(&path).unwrap();
         for place in 0..whole.len() {
@@ -481,17 +585,31 @@ mod tests {
     #[test]
     fn only_what_was_issued_can_be_revoked_and_once() {
         let (directory, cell) = (tempfile::tempdir().unwrap(), NodeName::from_static("lot-1"));
-        let (edge, euclid) = (NodeName::from_static("edge"), NodeName::from_static("euclid"));
+        let (edge, euclid) = (
+            NodeName::from_static("edge"),
+            NodeName::from_static("euclid"),
+        );
         Authority::init(directory.path(), &cell, clock::now()).unwrap();
         let mut authority = Authority::open(directory.path()).unwrap();
         for _ in 0..2 {
-            authority.issue(&edge, Role::Edge, days(1), clock::now()).unwrap();
+            authority
+                .issue(&edge, Role::Edge, days(1), clock::now())
+                .unwrap();
         }
-        assert!(matches!(authority.revoke(&euclid, clock::now()), Err(AuthorityError::NotIssued(_))));
+        assert!(matches!(
+            authority.revoke(&euclid, clock::now()),
+            Err(AuthorityError::NotIssued(_))
+        ));
         assert_eq!(authority.revoke(&edge, clock::now()).unwrap(), 2);
         let mut reopened = Authority::open(directory.path()).unwrap();
-        assert!(matches!(reopened.revoke(&edge, clock::now()), Err(AuthorityError::NotIssued(_))));
+        assert!(matches!(
+            reopened.revoke(&edge, clock::now()),
+            Err(AuthorityError::NotIssued(_))
+        ));
         let observer = NodeName::from_static("edge--top");
-        assert!(matches!(reopened.issue(&observer, Role::Cav, days(1), clock::now()), Err(AuthorityError::Name(_))));
+        assert!(matches!(
+            reopened.issue(&observer, Role::Cav, days(1), clock::now()),
+            Err(AuthorityError::Name(_))
+        ));
     }
 }

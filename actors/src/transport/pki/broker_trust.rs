@@ -29,9 +29,19 @@ pub struct BrokerIdentity(Option<Arc<RecordingVerifier>>);
 impl BrokerIdentity {
     /// The node whose certificate the broker has; `None` for a broker outside the cell.
     pub fn node(&self) -> Option<NodeName> {
-        let chain = self.0.as_ref()?.chain.lock().unwrap_or_else(PoisonError::into_inner);
+        let chain = self
+            .0
+            .as_ref()?
+            .chain
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         let (certificates, _) = chain.as_ref()?;
-        Some(CertificateSubject::of(certificates.first()?).ok()?.name().clone())
+        Some(
+            CertificateSubject::of(certificates.first()?)
+                .ok()?
+                .name()
+                .clone(),
+        )
     }
 }
 
@@ -47,15 +57,30 @@ impl BrokerTrust {
     ) -> Self {
         let recorded = Arc::new(RecordingVerifier::new(Arc::clone(&verifier), name));
         let mut client = client.clone();
-        client.dangerous().set_certificate_verifier(Arc::clone(&recorded) as Arc<dyn ServerCertVerifier>);
-        Self { client: Arc::new(client), recorded, verifier, reloaded_from: None, checked: Instant::now() }
+        client
+            .dangerous()
+            .set_certificate_verifier(Arc::clone(&recorded) as Arc<dyn ServerCertVerifier>);
+        Self {
+            client: Arc::new(client),
+            recorded,
+            verifier,
+            reloaded_from: None,
+            checked: Instant::now(),
+        }
     }
 
     /// Trust in brokers of the cell, by the present content of the node's files.
     pub fn of_cell(credentials: &Arc<Credentials>) -> Self {
         let current = credentials.current();
-        let trust = Self::new(&current.client, Arc::clone(&current.brokers), Some(current.broker_name.clone()));
-        Self { reloaded_from: Some((Arc::clone(credentials), current)), ..trust }
+        let trust = Self::new(
+            &current.client,
+            Arc::clone(&current.brokers),
+            Some(current.broker_name.clone()),
+        );
+        Self {
+            reloaded_from: Some((Arc::clone(credentials), current)),
+            ..trust
+        }
     }
 
     /// Trust in the door of the node whose certificates these are.
@@ -63,7 +88,11 @@ impl BrokerTrust {
     /// The certificate is verified in the handshake alone: programs connect for a moment.
     pub fn of_door(credentials: &Credentials) -> Self {
         let current = credentials.current();
-        Self::new(&current.client, Arc::clone(&current.doors), ServerName::try_from(DOOR_NAME).ok())
+        Self::new(
+            &current.client,
+            Arc::clone(&current.doors),
+            ServerName::try_from(DOOR_NAME).ok(),
+        )
     }
 
     /// TLS configuration for one connection.
@@ -73,14 +102,20 @@ impl BrokerTrust {
 
     /// The broker's own name, to be asked for after the handshake.
     pub fn identity(&self) -> BrokerIdentity {
-        BrokerIdentity(self.reloaded_from.as_ref().map(|_| Arc::clone(&self.recorded)))
+        BrokerIdentity(
+            self.reloaded_from
+                .as_ref()
+                .map(|_| Arc::clone(&self.recorded)),
+        )
     }
 
     /// Waits until the broker's certificate is no longer valid; the result is the reason.
     pub async fn invalidated(mut self) -> rustls::Error {
         loop {
             match &self.reloaded_from {
-                Some((credentials, known)) => drop(timeout(RECHECK_INTERVAL, credentials.changed(known)).await),
+                Some((credentials, known)) => {
+                    drop(timeout(RECHECK_INTERVAL, credentials.changed(known)).await)
+                }
                 None => sleep(RECHECK_INTERVAL).await,
             }
             if let Err(error) = self.recheck(Instant::now()) {
@@ -115,16 +150,29 @@ pub(super) struct RecordingVerifier {
 }
 
 impl RecordingVerifier {
-    pub(super) fn new(verifier: Arc<dyn ServerCertVerifier>, name: Option<ServerName<'static>>) -> Self {
-        Self { verifier, name, chain: Mutex::default() }
+    pub(super) fn new(
+        verifier: Arc<dyn ServerCertVerifier>,
+        name: Option<ServerName<'static>>,
+    ) -> Self {
+        Self {
+            verifier,
+            name,
+            chain: Mutex::default(),
+        }
     }
 
     /// Verifies again what was shown, if anything was.
     fn check(&self, verifier: &dyn ServerCertVerifier) -> Result<(), rustls::Error> {
         let chain = self.chain.lock().unwrap_or_else(PoisonError::into_inner);
-        let Some((chain, name)) = &*chain else { return Ok(()) };
-        let Some((own, intermediates)) = chain.split_first() else { return Ok(()) };
-        verifier.verify_server_cert(own, intermediates, name, &[], UnixTime::now()).map(drop)
+        let Some((chain, name)) = &*chain else {
+            return Ok(());
+        };
+        let Some((own, intermediates)) = chain.split_first() else {
+            return Ok(());
+        };
+        verifier
+            .verify_server_cert(own, intermediates, name, &[], UnixTime::now())
+            .map(drop)
     }
 }
 
@@ -142,9 +190,18 @@ impl ServerCertVerifier for RecordingVerifier {
             Some(name) => (name, &[][..]),
             None => (name, intermediates),
         };
-        let verified = self.verifier.verify_server_cert(end_entity, intermediates, name, ocsp_response, now)?;
-        let chain =
-            [end_entity].into_iter().chain(intermediates).map(|recorded| recorded.clone().into_owned()).collect();
+        let verified = self.verifier.verify_server_cert(
+            end_entity,
+            intermediates,
+            name,
+            ocsp_response,
+            now,
+        )?;
+        let chain = [end_entity]
+            .into_iter()
+            .chain(intermediates)
+            .map(|recorded| recorded.clone().into_owned())
+            .collect();
         *self.chain.lock().unwrap_or_else(PoisonError::into_inner) = Some((chain, name.to_owned()));
         Ok(verified)
     }
@@ -188,23 +245,46 @@ mod tests {
 
     /// The credentials of `euclid`, and certificates of `edge` and, for five seconds, of `brief`.
     fn credentials(directory: &Path) -> (Authority, Arc<Credentials>) {
-        let mut authority = Authority::init(directory, &NodeName::from_static("lot"), clock::now()).unwrap();
+        let mut authority =
+            Authority::init(directory, &NodeName::from_static("lot"), clock::now()).unwrap();
         let [euclid, edge, brief] = ["euclid", "edge", "brief"].map(NodeName::from_static);
-        for (name, valid) in [(&euclid, DAY), (&edge, DAY), (&brief, Duration::from_secs(5))] {
-            authority.issue(name, Role::Auto, valid, clock::now()).unwrap();
+        for (name, valid) in [
+            (&euclid, DAY),
+            (&edge, DAY),
+            (&brief, Duration::from_secs(5)),
+        ] {
+            authority
+                .issue(name, Role::Auto, valid, clock::now())
+                .unwrap();
         }
         let ((certificate, key), list) = (authority.files_of(&euclid), authority.revocation_list());
-        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(list), city: None };
-        (authority, Arc::new(Credentials::load(&files, &euclid).unwrap()))
+        let files = TlsConfig {
+            ca: authority.ca(),
+            certificate,
+            key,
+            revocation_list: Some(list),
+            city: None,
+        };
+        (
+            authority,
+            Arc::new(Credentials::load(&files, &euclid).unwrap()),
+        )
     }
 
     /// Trust of a connection to a broker, after the handshake.
-    fn connected(credentials: &Arc<Credentials>, authority: &Authority, broker: &NodeName) -> BrokerTrust {
+    fn connected(
+        credentials: &Arc<Credentials>,
+        authority: &Authority,
+        broker: &NodeName,
+    ) -> BrokerTrust {
         let trust = BrokerTrust::of_cell(credentials);
         let recorded = CertificateDer::from_pem_file(authority.files_of(broker).0).unwrap();
         let name = ServerName::try_from(BROKER_NAME).unwrap();
         assert_eq!(trust.identity().node(), None, "before the handshake");
-        trust.recorded.verify_server_cert(&recorded, &[], &name, &[], UnixTime::now()).unwrap();
+        trust
+            .recorded
+            .verify_server_cert(&recorded, &[], &name, &[], UnixTime::now())
+            .unwrap();
         assert_eq!(trust.identity().node().as_ref(), Some(broker));
         trust
     }
@@ -239,13 +319,26 @@ mod tests {
         let [edge, brief] = ["edge", "brief"].map(NodeName::from_static);
         let connected = |broker: &NodeName| connected(&credentials, &authority, broker);
         let (mut brief_trust, mut edge_trust) = (connected(&brief), connected(&edge));
-        assert_eq!(brief_trust.recheck(Instant::now() + RECHECK_INTERVAL), Ok(()));
+        assert_eq!(
+            brief_trust.recheck(Instant::now() + RECHECK_INTERVAL),
+            Ok(())
+        );
         std::thread::sleep(Duration::from_millis(6100));
-        assert_eq!(brief_trust.recheck(Instant::now()), Ok(()), "looked at from time to time only");
+        assert_eq!(
+            brief_trust.recheck(Instant::now()),
+            Ok(()),
+            "looked at from time to time only"
+        );
         let expired = brief_trust.recheck(Instant::now() + 2 * RECHECK_INTERVAL);
-        assert!(matches!(expired, Err(rustls::Error::InvalidCertificate(_))), "{expired:?}");
+        assert!(
+            matches!(expired, Err(rustls::Error::InvalidCertificate(_))),
+            "{expired:?}"
+        );
 
-        assert_eq!(edge_trust.recheck(Instant::now() + RECHECK_INTERVAL), Ok(()));
+        assert_eq!(
+            edge_trust.recheck(Instant::now() + RECHECK_INTERVAL),
+            Ok(())
+        );
         authority.revoke(&edge, clock::now()).unwrap();
         std::thread::sleep(Duration::from_millis(600));
         let revoked = edge_trust.recheck(Instant::now());

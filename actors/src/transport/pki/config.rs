@@ -41,24 +41,42 @@ impl TlsConfig {
     /// # Errors
     /// [`ConfigError`] with the key, the value and what is allowed.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let list = self.revocation_list.as_ref().map(|list| ("revocation_list", list));
+        let list = self
+            .revocation_list
+            .as_ref()
+            .map(|list| ("revocation_list", list));
         let city = self.city.as_ref();
-        let city_list = city.and_then(|city| city.revocation_list.as_ref()).map(|list| ("city.revocation_list", list));
-        let paths = [("ca", &self.ca), ("certificate", &self.certificate), ("key", &self.key)];
+        let city_list = city
+            .and_then(|city| city.revocation_list.as_ref())
+            .map(|list| ("city.revocation_list", list));
+        let paths = [
+            ("ca", &self.ca),
+            ("certificate", &self.certificate),
+            ("key", &self.key),
+        ];
         let city_ca = city.map(|city| ("city.ca", &city.ca));
-        for (key, path) in paths.into_iter().chain(list).chain(city_ca).chain(city_list) {
+        for (key, path) in paths
+            .into_iter()
+            .chain(list)
+            .chain(city_ca)
+            .chain(city_list)
+        {
             if path.as_os_str().is_empty() {
                 return Err(ConfigError::new(key, "nothing", "the path of a PEM file"));
             }
         }
         // Where there is any list, certificates of a CA without one are refused.
         match (list, city_list) {
-            (None, Some(_)) => {
-                Err(ConfigError::new("revocation_list", "nothing", "set together with `city.revocation_list`"))
-            }
-            (Some(_), None) if city.is_some() => {
-                Err(ConfigError::new("city.revocation_list", "nothing", "set together with `revocation_list`"))
-            }
+            (None, Some(_)) => Err(ConfigError::new(
+                "revocation_list",
+                "nothing",
+                "set together with `city.revocation_list`",
+            )),
+            (Some(_), None) if city.is_some() => Err(ConfigError::new(
+                "city.revocation_list",
+                "nothing",
+                "set together with `revocation_list`",
+            )),
             _ => Ok(()),
         }
     }
@@ -71,8 +89,13 @@ mod tests {
     #[test]
     fn a_city_has_a_list_where_the_cell_has_one() {
         let read = |cell: &str, city: &str| {
-            let text = format!("ca = \"a\"\ncertificate = \"b\"\nkey = \"c\"\n{cell}\n[city]\nca = \"d\"\n{city}");
-            toml::from_str::<TlsConfig>(&text).unwrap().validate().map_err(|error| error.key)
+            let text = format!(
+                "ca = \"a\"\ncertificate = \"b\"\nkey = \"c\"\n{cell}\n[city]\nca = \"d\"\n{city}"
+            );
+            toml::from_str::<TlsConfig>(&text)
+                .unwrap()
+                .validate()
+                .map_err(|error| error.key)
         };
         let list = "revocation_list = \"e\"";
         assert_eq!([read("", ""), read(list, list)], [Ok(()), Ok(())]);

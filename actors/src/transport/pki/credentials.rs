@@ -26,7 +26,10 @@ use tokio::time::timeout;
 use super::attestation::signer;
 use super::broker_trust::RecordingVerifier;
 use super::subject::{rights_uri, role_name};
-use super::{BROKER_NAME, BrokerTrust, CertificateSubject, InvalidCertificate, MAX_CERTIFICATE_BYTES, TlsConfig};
+use super::{
+    BROKER_NAME, BrokerTrust, CertificateSubject, InvalidCertificate, MAX_CERTIFICATE_BYTES,
+    TlsConfig,
+};
 use city_trust::CityAuthorities;
 use issuers::{Issuers, ServingNodes};
 
@@ -130,7 +133,10 @@ impl LoadedCredentials {
     ///
     /// # Errors
     /// [`InvalidCertificate`] when it names no node.
-    pub(crate) fn subject_of(&self, certificate: &[u8]) -> Result<CertificateSubject, InvalidCertificate> {
+    pub(crate) fn subject_of(
+        &self,
+        certificate: &[u8],
+    ) -> Result<CertificateSubject, InvalidCertificate> {
         subject_of(&self.issuers, certificate)
     }
 }
@@ -142,8 +148,17 @@ impl Credentials {
     /// [`CredentialsError`] naming the file.
     pub fn load(files: &TlsConfig, node: &NodeName) -> Result<Self, CredentialsError> {
         let (fingerprints, current) = (fingerprints(files), Arc::new(read(files, node)?));
-        let cache = Mutex::new(CachedCredentials { checked_at: Instant::now(), fingerprints, current });
-        Ok(Self { files: files.clone(), node: node.clone(), cache, changed: Notify::new() })
+        let cache = Mutex::new(CachedCredentials {
+            checked_at: Instant::now(),
+            fingerprints,
+            current,
+        });
+        Ok(Self {
+            files: files.clone(),
+            node: node.clone(),
+            cache,
+            changed: Notify::new(),
+        })
     }
 
     /// Checks that the node's certificate allows what the node is configured to be.
@@ -156,7 +171,13 @@ impl Credentials {
             return Ok(());
         }
         let (path, node) = (self.files.certificate.clone(), self.node.clone());
-        Err(CredentialsError::Overreached { path, node, role: role_name(role), priority, allowed: rights_uri(rights) })
+        Err(CredentialsError::Overreached {
+            path,
+            node,
+            role: role_name(role),
+            priority,
+            allowed: rights_uri(rights),
+        })
     }
 
     /// True if the node's certificate is an operator's, so that the cell's description may be set here.
@@ -195,8 +216,15 @@ impl Credentials {
                 return current;
             }
             // Others look at the files, too: half a second after the last look the next one is due.
-            let since = self.cache.lock().unwrap_or_else(PoisonError::into_inner).checked_at.elapsed();
-            let due = RELOAD_INTERVAL.saturating_sub(since).max(Duration::from_millis(1));
+            let since = self
+                .cache
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .checked_at
+                .elapsed();
+            let due = RELOAD_INTERVAL
+                .saturating_sub(since)
+                .max(Duration::from_millis(1));
             timeout(due, changed).await.unwrap_or_default();
         }
     }
@@ -212,12 +240,16 @@ pub fn external_broker(
     own: Option<&LoadedCredentials>,
 ) -> Result<BrokerTrust, CredentialsError> {
     let roots = Arc::new(roots(key, ca)?);
-    let verifier = WebPkiServerVerifier::builder_with_provider(Arc::clone(&roots), crypto()).build();
+    let verifier =
+        WebPkiServerVerifier::builder_with_provider(Arc::clone(&roots), crypto()).build();
     let verifier = verifier.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
-    let builder = ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
+    let builder =
+        ClientConfig::builder_with_provider(crypto()).with_safe_default_protocol_versions();
     let builder = builder.map_err(unusable)?.with_root_certificates(roots);
     let client = match own {
-        Some(own) => builder.with_client_auth_cert(own.certificates.clone(), own.key.clone_key()).map_err(unusable)?,
+        Some(own) => builder
+            .with_client_auth_cert(own.certificates.clone(), own.key.clone_key())
+            .map_err(unusable)?,
         None => builder.with_no_client_auth(),
     };
     Ok(BrokerTrust::new(&client, verifier, None))
@@ -232,29 +264,44 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .unwrap_or_default();
     let (issuers, revoked_cas) = match &files.city {
         Some(city) => {
-            let CityAuthorities { of_cell, revoked, of_city } =
-                city_trust::authorities_of(&files.ca, city, &mut lists)?;
+            let CityAuthorities {
+                of_cell,
+                revoked,
+                of_city,
+            } = city_trust::authorities_of(&files.ca, city, &mut lists)?;
             (Issuers::new(of_cell, Some(of_city), &lists)?, revoked)
         }
-        None => (Issuers::new(authorities("tls.ca", &files.ca)?, None, &lists)?, Vec::new()),
+        None => (
+            Issuers::new(authorities("tls.ca", &files.ca)?, None, &lists)?,
+            Vec::new(),
+        ),
     };
     let issuers = Arc::new(issuers);
     let certificates: Vec<CertificateDer<'static>> = pem("tls.certificate", &files.certificate)?;
     let key = PrivateKeyDer::from_pem_slice(&bytes("tls.key", &files.key)?);
     let key = key.map_err(|error| file_error("tls.key", &files.key, &error))?;
-    let own =
-        certificates.first().ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
-    let identity =
-        subject_of(&issuers, own).map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
+    let own = certificates
+        .first()
+        .ok_or_else(|| file_error("tls.certificate", &files.certificate, "no certificate"))?;
+    let identity = subject_of(&issuers, own)
+        .map_err(|error| file_error("tls.certificate", &files.certificate, &error))?;
     if !identity.may_act_as(node.as_str()) {
         let (path, found) = (files.certificate.clone(), identity.name().clone());
-        return Err(CredentialsError::WrongName { path, found, node: node.clone() });
+        return Err(CredentialsError::WrongName {
+            path,
+            found,
+            node: node.clone(),
+        });
     }
     if own.len() > MAX_CERTIFICATE_BYTES {
-        let reason = format!("{} bytes, at most {MAX_CERTIFICATE_BYTES} fit a datagram", own.len());
+        let reason = format!(
+            "{} bytes, at most {MAX_CERTIFICATE_BYTES} fit a datagram",
+            own.len()
+        );
         return Err(file_error("tls.certificate", &files.certificate, &reason));
     }
-    let signer = signer(&key).ok_or_else(|| file_error("tls.key", &files.key, "not an ECDSA P-256 key"))?;
+    let signer =
+        signer(&key).ok_or_else(|| file_error("tls.key", &files.key, "not an ECDSA P-256 key"))?;
     let clients = Arc::clone(&issuers) as Arc<dyn ClientCertVerifier>;
     let mut server = ServerConfig::builder_with_provider(crypto())
         .with_protocol_versions(&[&TLS13])
@@ -264,7 +311,10 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
         .map_err(unusable)?;
     server.session_storage = Arc::new(NoServerSessionStorage {});
     server.send_tls13_tickets = 0;
-    let (brokers, doors) = (ServingNodes::brokers(&issuers), ServingNodes::doors(&issuers));
+    let (brokers, doors) = (
+        ServingNodes::brokers(&issuers),
+        ServingNodes::doors(&issuers),
+    );
     let broker_name = ServerName::try_from(BROKER_NAME);
     let broker_name = broker_name.map_err(|error| CredentialsError::Unusable(error.to_string()))?;
     let mut client = ClientConfig::builder_with_provider(crypto())
@@ -296,9 +346,16 @@ fn read(files: &TlsConfig, node: &NodeName) -> Result<LoadedCredentials, Credent
 }
 
 /// The node that a certificate names, and the rights that count.
-fn subject_of(issuers: &Issuers, certificate: &[u8]) -> Result<CertificateSubject, InvalidCertificate> {
+fn subject_of(
+    issuers: &Issuers,
+    certificate: &[u8],
+) -> Result<CertificateSubject, InvalidCertificate> {
     let subject = CertificateSubject::of(certificate)?;
-    Ok(if issuers.give_rights(certificate) { subject } else { subject.without_rights() })
+    Ok(if issuers.give_rights(certificate) {
+        subject
+    } else {
+        subject.without_rights()
+    })
 }
 
 fn crypto() -> Arc<CryptoProvider> {
@@ -308,21 +365,37 @@ fn crypto() -> Arc<CryptoProvider> {
 fn roots(key: &'static str, path: &Path) -> Result<RootCertStore, CredentialsError> {
     let mut roots = RootCertStore::empty();
     for certificate in authorities(key, path)? {
-        roots.add(certificate).map_err(|error| file_error(key, path, &error))?;
+        roots
+            .add(certificate)
+            .map_err(|error| file_error(key, path, &error))?;
     }
     Ok(roots)
 }
 
 /// Certificates of CAs; at least one.
-fn authorities(key: &'static str, path: &Path) -> Result<Vec<CertificateDer<'static>>, CredentialsError> {
+fn authorities(
+    key: &'static str,
+    path: &Path,
+) -> Result<Vec<CertificateDer<'static>>, CredentialsError> {
     let certificates = pem(key, path)?;
-    if certificates.is_empty() { Err(file_error(key, path, "no certificate")) } else { Ok(certificates) }
+    if certificates.is_empty() {
+        Err(file_error(key, path, "no certificate"))
+    } else {
+        Ok(certificates)
+    }
 }
 
 /// Reads revocation lists. A file without any, such as one copied by half, is an error and not an empty list.
-fn lists(key: &'static str, path: &Path) -> Result<Vec<CertificateRevocationListDer<'static>>, CredentialsError> {
+fn lists(
+    key: &'static str,
+    path: &Path,
+) -> Result<Vec<CertificateRevocationListDer<'static>>, CredentialsError> {
     let lists = pem(key, path)?;
-    if lists.is_empty() { Err(file_error(key, path, "no revocation list")) } else { Ok(lists) }
+    if lists.is_empty() {
+        Err(file_error(key, path, "no revocation list"))
+    } else {
+        Ok(lists)
+    }
 }
 
 fn pem<T: PemObject>(key: &'static str, path: &Path) -> Result<Vec<T>, CredentialsError> {
@@ -334,8 +407,16 @@ fn bytes(key: &'static str, path: &Path) -> Result<Vec<u8>, CredentialsError> {
     bounded_file::read(path, MAX_PEM_BYTES).map_err(|error| file_error(key, path, &error))
 }
 
-fn file_error(key: &'static str, path: &Path, reason: &(impl ToString + ?Sized)) -> CredentialsError {
-    CredentialsError::File { key, path: path.into(), reason: reason.to_string() }
+fn file_error(
+    key: &'static str,
+    path: &Path,
+    reason: &(impl ToString + ?Sized),
+) -> CredentialsError {
+    CredentialsError::File {
+        key,
+        path: path.into(),
+        reason: reason.to_string(),
+    }
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "takes what map_err gives")]
@@ -349,9 +430,17 @@ fn fingerprints(files: &TlsConfig) -> Vec<Option<(SystemTime, u64)>> {
         let facts = fs::metadata(path).ok()?;
         Some((facts.modified().ok()?, facts.len()))
     };
-    let city = files.city.iter().flat_map(|city| std::iter::once(&city.ca).chain(&city.revocation_list));
+    let city = files
+        .city
+        .iter()
+        .flat_map(|city| std::iter::once(&city.ca).chain(&city.revocation_list));
     let paths = [&files.ca, &files.certificate, &files.key];
-    paths.into_iter().chain(&files.revocation_list).chain(city).map(stamp).collect()
+    paths
+        .into_iter()
+        .chain(&files.revocation_list)
+        .chain(city)
+        .map(stamp)
+        .collect()
 }
 
 #[cfg(test)]
@@ -363,40 +452,95 @@ mod tests {
     #[test]
     fn a_revocation_list_without_a_list_is_refused_and_the_one_before_stays_in_use() {
         let (directory, edge) = (tempfile::tempdir().unwrap(), NodeName::from_static("edge"));
-        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
-        authority.issue(&edge, Role::Edge, Duration::from_secs(60), clock::now()).unwrap();
-        let ((certificate, key), list) = (authority.files_of(&edge), directory.path().join("copied.pem"));
+        let mut authority = Authority::init(
+            directory.path(),
+            &NodeName::from_static("lot"),
+            clock::now(),
+        )
+        .unwrap();
+        authority
+            .issue(&edge, Role::Edge, Duration::from_secs(60), clock::now())
+            .unwrap();
+        let ((certificate, key), list) = (
+            authority.files_of(&edge),
+            directory.path().join("copied.pem"),
+        );
         fs::copy(authority.revocation_list(), &list).unwrap();
-        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: Some(list.clone()), city: None };
+        let files = TlsConfig {
+            ca: authority.ca(),
+            certificate,
+            key,
+            revocation_list: Some(list.clone()),
+            city: None,
+        };
         let credentials = Credentials::load(&files, &edge).unwrap();
         let before = credentials.current();
         for text in ["", "# revoked\n", "-----BEGIN X509 CRL-----\nMIIB"] {
             fs::write(&list, text).unwrap();
             let error = Credentials::load(&files, &edge).unwrap_err().to_string();
-            assert!(error.starts_with("key `tls.revocation_list`: ") && error.contains("copied.pem"), "{error}");
+            assert!(
+                error.starts_with("key `tls.revocation_list`: ") && error.contains("copied.pem"),
+                "{error}"
+            );
         }
         std::thread::sleep(RELOAD_INTERVAL);
-        assert!(Arc::ptr_eq(&credentials.current(), &before), "still checked against the list before");
+        assert!(
+            Arc::ptr_eq(&credentials.current(), &before),
+            "still checked against the list before"
+        );
         fs::copy(authority.revocation_list(), &list).unwrap();
         std::thread::sleep(RELOAD_INTERVAL);
-        assert!(!Arc::ptr_eq(&credentials.current(), &before), "and against the next");
+        assert!(
+            !Arc::ptr_eq(&credentials.current(), &before),
+            "and against the next"
+        );
     }
 
     #[test]
     fn a_node_that_is_to_be_more_than_its_certificate_allows_is_told_both() {
-        let (directory, euclid) = (tempfile::tempdir().unwrap(), NodeName::from_static("euclid"));
-        let mut authority = Authority::init(directory.path(), &NodeName::from_static("lot"), clock::now()).unwrap();
-        authority.issue(&euclid, Role::Auto, Duration::from_secs(60), clock::now()).unwrap();
+        let (directory, euclid) = (
+            tempfile::tempdir().unwrap(),
+            NodeName::from_static("euclid"),
+        );
+        let mut authority = Authority::init(
+            directory.path(),
+            &NodeName::from_static("lot"),
+            clock::now(),
+        )
+        .unwrap();
+        authority
+            .issue(&euclid, Role::Auto, Duration::from_secs(60), clock::now())
+            .unwrap();
         let (certificate, key) = authority.files_of(&euclid);
-        let files = TlsConfig { ca: authority.ca(), certificate, key, revocation_list: None, city: None };
+        let files = TlsConfig {
+            ca: authority.ca(),
+            certificate,
+            key,
+            revocation_list: None,
+            city: None,
+        };
         let credentials = Credentials::load(&files, &euclid).unwrap();
-        assert!(credentials.check_rights(Role::Auto, 100).is_ok() && credentials.check_rights(Role::Cav, 255).is_ok());
+        assert!(
+            credentials.check_rights(Role::Auto, 100).is_ok()
+                && credentials.check_rights(Role::Cav, 255).is_ok()
+        );
         for (role, priority) in [(Role::Edge, 100), (Role::Auto, 101)] {
-            let error = credentials.check_rights(role, priority).unwrap_err().to_string();
-            let named = [role_name(role), &priority.to_string(), "ecod:role=auto;priority=100", "pki issue euclid"];
+            let error = credentials
+                .check_rights(role, priority)
+                .unwrap_err()
+                .to_string();
+            let named = [
+                role_name(role),
+                &priority.to_string(),
+                "ecod:role=auto;priority=100",
+                "pki issue euclid",
+            ];
             assert!(named.iter().all(|part| error.contains(part)), "{error}");
         }
         let observer = Credentials::load(&files, &NodeName::from_static("euclid--top")).unwrap();
-        assert!(observer.check_rights(Role::Auto, 0).is_err(), "an observer never leads");
+        assert!(
+            observer.check_rights(Role::Auto, 0).is_err(),
+            "an observer never leads"
+        );
     }
 }

@@ -57,14 +57,22 @@ impl EvidenceSigner {
     /// Signer of the node with these certificates.
     pub fn new(cell: NodeName, credentials: Arc<Credentials>) -> Self {
         let loaded = credentials.current();
-        Self { cell, credentials, loaded, known: BTreeMap::new() }
+        Self {
+            cell,
+            credentials,
+            loaded,
+            known: BTreeMap::new(),
+        }
     }
 
     /// Signs a share of the node's own counts. `None` if the system gives no random numbers.
     pub fn sign(&self, share: LedgerShare) -> Option<LedgerShare> {
         let loaded = self.credentials.current();
         let signature = BASE64.encode(loaded.sign(&share.signed_bytes(&self.cell)).ok()?);
-        let signed = Some(LedgerSignature { certificate: BASE64.encode(loaded.certificate()), signature });
+        let signed = Some(LedgerSignature {
+            certificate: BASE64.encode(loaded.certificate()),
+            signature,
+        });
         Some(LedgerShare { signed, ..share })
     }
 
@@ -96,7 +104,9 @@ impl EvidenceSigner {
     pub fn verify(&mut self, share: &LedgerShare) -> Result<(), EvidenceError> {
         let signatory = self.signatory(share)?;
         // Before the certificate begins, this machine's clock is wrong.
-        let since_epoch = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        let since_epoch = SystemTime::now()
+            .duration_since(SystemTime::UNIX_EPOCH)
+            .unwrap_or_default();
         if Duration::from_micros(signatory.subject.expires().micros()) < since_epoch {
             return Err(EvidenceError::Certificate);
         }
@@ -117,11 +127,26 @@ impl EvidenceSigner {
         self.signatory(share).is_ok()
     }
 
-    fn verify_signature(&self, share: &LedgerShare, signatory: &Signatory) -> Result<(), EvidenceError> {
-        let signature = share.signed.as_ref().and_then(|signed| BASE64.decode(&signed.signature).ok());
+    fn verify_signature(
+        &self,
+        share: &LedgerShare,
+        signatory: &Signatory,
+    ) -> Result<(), EvidenceError> {
+        let signature = share
+            .signed
+            .as_ref()
+            .and_then(|signed| BASE64.decode(&signed.signature).ok());
         let signature = signature.ok_or(EvidenceError::Signature)?;
-        let is_signed = is_signed_with(&signatory.public_key, &share.signed_bytes(&self.cell), &signature);
-        if is_signed { Ok(()) } else { Err(EvidenceError::Signature) }
+        let is_signed = is_signed_with(
+            &signatory.public_key,
+            &share.signed_bytes(&self.cell),
+            &signature,
+        );
+        if is_signed {
+            Ok(())
+        } else {
+            Err(EvidenceError::Signature)
+        }
     }
 
     fn known(&mut self, certificate: &str) -> Option<Signatory> {
@@ -129,17 +154,28 @@ impl EvidenceSigner {
             if self.known.len() >= MAX_KNOWN {
                 self.known.clear();
             }
-            self.known.insert(certificate.to_owned(), signatory(certificate, &self.loaded));
+            self.known
+                .insert(certificate.to_owned(), signatory(certificate, &self.loaded));
         }
         self.known.get(certificate).cloned().flatten()
     }
 
     /// The aggregator whose counts a share has, by the certificate beside them.
     fn signatory(&mut self, share: &LedgerShare) -> Result<Signatory, EvidenceError> {
-        let certificate = &share.signed.as_ref().ok_or(EvidenceError::Unsigned)?.certificate;
+        let certificate = &share
+            .signed
+            .as_ref()
+            .ok_or(EvidenceError::Unsigned)?
+            .certificate;
         let signatory = self.known(certificate).ok_or(EvidenceError::Certificate)?;
-        let is_aggregator = share.lane().is_some_and(|lane| lane.leader == *signatory.subject.name());
-        if is_aggregator && signatory.subject.may_serve() { Ok(signatory) } else { Err(EvidenceError::Signatory) }
+        let is_aggregator = share
+            .lane()
+            .is_some_and(|lane| lane.leader == *signatory.subject.name());
+        if is_aggregator && signatory.subject.may_serve() {
+            Ok(signatory)
+        } else {
+            Err(EvidenceError::Signatory)
+        }
     }
 }
 
@@ -149,8 +185,14 @@ fn signatory(certificate: &str, loaded: &LoadedCredentials) -> Option<Signatory>
     let certificate = CertificateDer::from(BASE64.decode(certificate).ok()?);
     let subject = loaded.subject_of(&certificate).ok()?;
     let (_, parsed) = X509Certificate::from_der(&certificate).ok()?;
-    loaded.clients.verify_client_cert(&certificate, &[], began(&certificate)?).ok()?;
-    Some(Signatory { subject, public_key: parsed.public_key().subject_public_key.data.to_vec() })
+    loaded
+        .clients
+        .verify_client_cert(&certificate, &[], began(&certificate)?)
+        .ok()?;
+    Some(Signatory {
+        subject,
+        public_key: parsed.public_key().subject_public_key.data.to_vec(),
+    })
 }
 
 #[cfg(test)]
@@ -171,12 +213,27 @@ mod tests {
         NodeName::new(name).unwrap()
     }
 
-    fn signer(authority: &mut Authority, node: &str, role: Role, valid: Duration, now: Timestamp) -> EvidenceSigner {
+    fn signer(
+        authority: &mut Authority,
+        node: &str,
+        role: Role,
+        valid: Duration,
+        now: Timestamp,
+    ) -> EvidenceSigner {
         authority.issue(&name(node), role, valid, now).unwrap();
         let (certificate, key) = authority.files_of(&name(node));
         let (ca, list) = (authority.ca(), authority.revocation_list());
-        let files = TlsConfig { ca, certificate, key, revocation_list: Some(list), city: None };
-        EvidenceSigner::new(name("lot"), Arc::new(Credentials::load(&files, &name(node)).unwrap()))
+        let files = TlsConfig {
+            ca,
+            certificate,
+            key,
+            revocation_list: Some(list),
+            city: None,
+        };
+        EvidenceSigner::new(
+            name("lot"),
+            Arc::new(Credentials::load(&files, &name(node)).unwrap()),
+        )
     }
 
     fn authority() -> (TempDir, Authority) {
@@ -191,7 +248,14 @@ mod tests {
             schema: SCHEMA_VERSION,
             node: aggregator.clone(),
             epoch: None,
-            entries: vec![LedgerEntry { epoch: 1, aggregator, node, label, correct: 1, incorrect: 2 }],
+            entries: vec![LedgerEntry {
+                epoch: 1,
+                aggregator,
+                node,
+                label,
+                correct: 1,
+                incorrect: 2,
+            }],
             marks: Vec::new(),
             signed: None,
             reset_at_us: None,
@@ -207,23 +271,48 @@ mod tests {
         let cav = signer(&mut authority, "cav", Role::Cav, DAY, now);
         let signed = edge.sign(share("edge")).unwrap();
         assert_eq!(edge.verify(&signed), Ok(()));
-        let passed_on = LedgerShare { node: name("gauss"), epoch: Some(7), ..signed.clone() };
+        let passed_on = LedgerShare {
+            node: name("gauss"),
+            epoch: Some(7),
+            ..signed.clone()
+        };
         assert_eq!(edge.verify(&passed_on), Ok(()), "whoever passes it on");
 
         assert_eq!(edge.verify(&share("edge")), Err(EvidenceError::Unsigned));
-        assert_eq!(edge.verify(&gauss.sign(share("edge")).unwrap()), Err(EvidenceError::Signatory));
-        assert_eq!(edge.verify(&cav.sign(share("cav")).unwrap()), Err(EvidenceError::Signatory));
+        assert_eq!(
+            edge.verify(&gauss.sign(share("edge")).unwrap()),
+            Err(EvidenceError::Signatory)
+        );
+        assert_eq!(
+            edge.verify(&cav.sign(share("cav")).unwrap()),
+            Err(EvidenceError::Signatory)
+        );
         let mut changed = signed.clone();
         changed.entries[0].correct = 1_000_000_000;
         assert_eq!(edge.verify(&changed), Err(EvidenceError::Signature));
         let elsewhere = EvidenceSigner::new(name("other"), Arc::clone(&edge.credentials));
-        assert_eq!(edge.verify(&elsewhere.sign(share("edge")).unwrap()), Err(EvidenceError::Signature));
+        assert_eq!(
+            edge.verify(&elsewhere.sign(share("edge")).unwrap()),
+            Err(EvidenceError::Signature)
+        );
         let mut foreign = super::tests::authority();
         let stranger = signer(&mut foreign.1, "edge", Role::Edge, DAY, now);
-        assert_eq!(edge.verify(&stranger.sign(share("edge")).unwrap()), Err(EvidenceError::Certificate));
+        assert_eq!(
+            edge.verify(&stranger.sign(share("edge")).unwrap()),
+            Err(EvidenceError::Certificate)
+        );
         for (certificate, signature) in [("", ""), ("AAAA", "AAAA"), ("?", "?")] {
-            let signed = LedgerSignature { certificate: certificate.into(), signature: signature.into() };
-            assert!(edge.verify(&LedgerShare { signed: Some(signed), ..share("edge") }).is_err());
+            let signed = LedgerSignature {
+                certificate: certificate.into(),
+                signature: signature.into(),
+            };
+            assert!(
+                edge.verify(&LedgerShare {
+                    signed: Some(signed),
+                    ..share("edge")
+                })
+                .is_err()
+            );
         }
     }
 
@@ -231,7 +320,10 @@ mod tests {
     fn no_bit_of_a_signed_share_can_be_changed() {
         let (_directory, mut authority) = authority();
         let mut edge = signer(&mut authority, "edge", Role::Edge, DAY, clock::now());
-        let LedgerSignature { certificate, signature } = edge.sign(share("edge")).unwrap().signed.unwrap();
+        let LedgerSignature {
+            certificate,
+            signature,
+        } = edge.sign(share("edge")).unwrap().signed.unwrap();
         let [der, tag] = [&certificate, &signature].map(|text| BASE64.decode(text).unwrap());
         let flipped = |bytes: &[u8], bit: usize| {
             let mut bytes = bytes.to_vec();
@@ -239,16 +331,30 @@ mod tests {
             BASE64.encode(bytes)
         };
         for bit in 0..8 * tag.len() {
-            let signed = LedgerSignature { certificate: certificate.clone(), signature: flipped(&tag, bit) };
+            let signed = LedgerSignature {
+                certificate: certificate.clone(),
+                signature: flipped(&tag, bit),
+            };
             assert!(
-                edge.verify(&LedgerShare { signed: Some(signed), ..share("edge") }).is_err(),
+                edge.verify(&LedgerShare {
+                    signed: Some(signed),
+                    ..share("edge")
+                })
+                .is_err(),
                 "signature, bit {bit}"
             );
         }
         for bit in 0..8 * der.len() {
-            let signed = LedgerSignature { certificate: flipped(&der, bit), signature: signature.clone() };
+            let signed = LedgerSignature {
+                certificate: flipped(&der, bit),
+                signature: signature.clone(),
+            };
             assert!(
-                edge.verify(&LedgerShare { signed: Some(signed), ..share("edge") }).is_err(),
+                edge.verify(&LedgerShare {
+                    signed: Some(signed),
+                    ..share("edge")
+                })
+                .is_err(),
                 "certificate, bit {bit}"
             );
         }
@@ -261,12 +367,23 @@ mod tests {
         let mut edge = signer(&mut authority, "edge", Role::Edge, DAY, now);
         let gauss = signer(&mut authority, "gauss", Role::Auto, DAY, now);
         let old = signer(&mut authority, "old", Role::Auto, DAY, now - 2 * DAY);
-        let [from_gauss, from_old] = [gauss.sign(share("gauss")).unwrap(), old.sign(share("old")).unwrap()];
+        let [from_gauss, from_old] = [
+            gauss.sign(share("gauss")).unwrap(),
+            old.sign(share("old")).unwrap(),
+        ];
         assert!(edge.reload() || edge.verify(&from_gauss).is_ok());
         assert_eq!(edge.verify(&from_old), Err(EvidenceError::Certificate));
-        assert_eq!(edge.verify_again(&from_old), Ok(()), "what was taken in its time");
+        assert_eq!(
+            edge.verify_again(&from_old),
+            Ok(()),
+            "what was taken in its time"
+        );
         authority.revoke(&name("gauss"), now).unwrap();
-        assert_eq!(authority.revoke(&name("old"), now).unwrap(), 1, "one that has expired");
+        assert_eq!(
+            authority.revoke(&name("old"), now).unwrap(),
+            1,
+            "one that has expired"
+        );
         std::thread::sleep(Duration::from_millis(1100));
         assert!(edge.reload());
         for revoked in [&from_gauss, &from_old] {
@@ -274,7 +391,11 @@ mod tests {
         }
         let again = signer(&mut authority, "gauss", Role::Auto, DAY, now);
         std::thread::sleep(Duration::from_millis(1100));
-        assert_eq!(edge.verify(&again.sign(share("gauss")).unwrap()), Ok(()), "a new certificate, new evidence");
+        assert_eq!(
+            edge.verify(&again.sign(share("gauss")).unwrap()),
+            Ok(()),
+            "a new certificate, new evidence"
+        );
         assert!(!edge.is_trusted(&from_gauss));
         assert!(fs::exists(authority.revocation_list()).unwrap());
     }

@@ -42,13 +42,24 @@ impl CertificateSubject {
     /// # Errors
     /// [`InvalidCertificate`] when it names no node.
     pub fn of(certificate: &[u8]) -> Result<Self, InvalidCertificate> {
-        let (_, parsed) = X509Certificate::from_der(certificate).map_err(|_| InvalidCertificate::Malformed)?;
+        let (_, parsed) =
+            X509Certificate::from_der(certificate).map_err(|_| InvalidCertificate::Malformed)?;
         let mut names = parsed.subject().iter_common_name();
-        let (Some(name), None) = (names.next(), names.next()) else { return Err(InvalidCertificate::NoName) };
-        let name = name.as_str().ok().and_then(|name| NodeName::new(name).ok()).ok_or(InvalidCertificate::NoName)?;
+        let (Some(name), None) = (names.next(), names.next()) else {
+            return Err(InvalidCertificate::NoName);
+        };
+        let name = name
+            .as_str()
+            .ok()
+            .and_then(|name| NodeName::new(name).ok())
+            .ok_or(InvalidCertificate::NoName)?;
         let alternatives = parsed.subject_alternative_name().ok().flatten();
-        let alternatives = alternatives.map(|names| &names.value.general_names[..]).unwrap_or_default();
-        let may_serve = alternatives.iter().any(|name| matches!(name, GeneralName::DNSName(BROKER_NAME)));
+        let alternatives = alternatives
+            .map(|names| &names.value.general_names[..])
+            .unwrap_or_default();
+        let may_serve = alternatives
+            .iter()
+            .any(|name| matches!(name, GeneralName::DNSName(BROKER_NAME)));
         let rights = alternatives.iter().find_map(|name| match name {
             GeneralName::URI(uri) => uri.strip_prefix(RIGHTS_SCHEME),
             _ => None,
@@ -58,10 +69,20 @@ impl CertificateSubject {
             Some(rights) => parse_rights(rights).ok_or(InvalidCertificate::Rights)?,
             None => Rights::ALL,
         };
-        let time = |seconds: i64| Timestamp(0) + Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
+        let time =
+            |seconds: i64| Timestamp(0) + Duration::from_secs(u64::try_from(seconds).unwrap_or(0));
         let validity = parsed.validity();
-        let (begins, expires) = (time(validity.not_before.timestamp()), time(validity.not_after.timestamp()));
-        Ok(Self { name, may_serve, rights, begins, expires })
+        let (begins, expires) = (
+            time(validity.not_before.timestamp()),
+            time(validity.not_after.timestamp()),
+        );
+        Ok(Self {
+            name,
+            may_serve,
+            rights,
+            begins,
+            expires,
+        })
     }
 
     /// The node's name.
@@ -88,12 +109,20 @@ impl CertificateSubject {
     /// The same node as one that neither leads nor serves a broker.
     #[must_use]
     pub(super) fn without_rights(self) -> Self {
-        Self { may_serve: false, rights: Rights::NONE, ..self }
+        Self {
+            may_serve: false,
+            rights: Rights::NONE,
+            ..self
+        }
     }
 
     /// Rights of a node or observer that uses the certificate. An observer never leads.
     pub fn rights_of(&self, name: &NodeName) -> Rights {
-        if *name == self.name { self.rights } else { Rights::NONE }
+        if *name == self.name {
+            self.rights
+        } else {
+            Rights::NONE
+        }
     }
 
     /// End of the certificate's validity.
@@ -104,14 +133,23 @@ impl CertificateSubject {
     /// True if the node may have a client of this name: its own, or that of a part or an observer which shares its
     /// certificate. What parts see counts as their node's, so that one certificate is one vehicle.
     pub fn may_act_as(&self, name: &str) -> bool {
-        name.strip_prefix(self.name.as_str()).is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))
+        name.strip_prefix(self.name.as_str())
+            .is_some_and(|rest| rest.is_empty() || rest.starts_with(OBSERVER_MARK))
     }
 }
 
 /// The rights in a certificate, as its alternative name of kind URI.
 pub(super) fn rights_uri(rights: Rights) -> String {
-    let operator = if rights.may_describe { ";operator=yes" } else { "" };
-    format!("{RIGHTS_SCHEME}role={};priority={}{operator}", role_name(rights.role), rights.priority)
+    let operator = if rights.may_describe {
+        ";operator=yes"
+    } else {
+        ""
+    };
+    format!(
+        "{RIGHTS_SCHEME}role={};priority={}{operator}",
+        role_name(rights.role),
+        rights.priority
+    )
 }
 
 pub(super) fn role_name(role: Role) -> &'static str {
@@ -124,14 +162,21 @@ pub(super) fn role_name(role: Role) -> &'static str {
 
 /// Reads `role=auto;priority=100`; entries that later versions may add are ignored.
 fn parse_rights(text: &str) -> Option<Rights> {
-    let entry = |key: &str| text.split(';').find_map(|entry| entry.strip_prefix(key)?.strip_prefix('='));
+    let entry = |key: &str| {
+        text.split(';')
+            .find_map(|entry| entry.strip_prefix(key)?.strip_prefix('='))
+    };
     let role = match entry("role")? {
         "auto" => Role::Auto,
         "cav" => Role::Cav,
         "edge" => Role::Edge,
         _ => return None,
     };
-    Some(Rights { role, priority: entry("priority")?.parse().ok()?, may_describe: entry("operator") == Some("yes") })
+    Some(Rights {
+        role,
+        priority: entry("priority")?.parse().ok()?,
+        may_describe: entry("operator") == Some("yes"),
+    })
 }
 
 #[cfg(test)]
@@ -140,13 +185,28 @@ mod tests {
 
     #[test]
     fn rights_are_read_as_they_are_written_and_otherwise_not() {
-        let rights = Rights { priority: 7, ..Rights::from(Role::Auto) };
+        let rights = Rights {
+            priority: 7,
+            ..Rights::from(Role::Auto)
+        };
         assert_eq!(rights_uri(rights), "ecod:role=auto;priority=7");
-        assert_eq!(rights_uri(rights.of_operator()), "ecod:role=auto;priority=7;operator=yes");
-        assert_eq!(parse_rights("role=auto;priority=7;operator=yes"), Some(rights.of_operator()));
+        assert_eq!(
+            rights_uri(rights.of_operator()),
+            "ecod:role=auto;priority=7;operator=yes"
+        );
+        assert_eq!(
+            parse_rights("role=auto;priority=7;operator=yes"),
+            Some(rights.of_operator())
+        );
         assert_eq!(parse_rights("role=auto;priority=7"), Some(rights));
         assert_eq!(parse_rights("zone=3;priority=7;role=auto"), Some(rights));
-        for text in ["", "role=auto", "priority=7", "role=chief;priority=7", "role=auto;priority=256"] {
+        for text in [
+            "",
+            "role=auto",
+            "priority=7",
+            "role=chief;priority=7",
+            "role=auto;priority=256",
+        ] {
             assert_eq!(parse_rights(text), None, "{text}");
         }
     }
@@ -154,9 +214,13 @@ mod tests {
     /// The subject of a certificate for `edge` with these alternative names.
     fn subject(names: Vec<rcgen::SanType>) -> Result<CertificateSubject, InvalidCertificate> {
         let mut parameters = rcgen::CertificateParams::default();
-        parameters.distinguished_name.push(rcgen::DnType::CommonName, "edge");
+        parameters
+            .distinguished_name
+            .push(rcgen::DnType::CommonName, "edge");
         parameters.subject_alt_names = names;
-        let certificate = parameters.self_signed(&rcgen::KeyPair::generate().unwrap()).unwrap();
+        let certificate = parameters
+            .self_signed(&rcgen::KeyPair::generate().unwrap())
+            .unwrap();
         CertificateSubject::of(certificate.der())
     }
 
@@ -165,12 +229,40 @@ mod tests {
         let broker = || rcgen::SanType::DnsName(BROKER_NAME.try_into().unwrap());
         let uri = |text: &str| rcgen::SanType::URI(text.try_into().unwrap());
         assert_eq!(subject(vec![broker()]).unwrap().rights(), Rights::ALL);
-        assert_eq!(subject(vec![uri("https://example.org"), broker()]).unwrap().rights(), Rights::ALL);
-        assert_eq!(subject(Vec::new()).unwrap().rights(), Rights::NONE, "a vehicle's");
-        assert_eq!(subject(vec![uri("ecod:role=edge;priority=9")]).unwrap().rights(), Rights::NONE, "without a broker");
+        assert_eq!(
+            subject(vec![uri("https://example.org"), broker()])
+                .unwrap()
+                .rights(),
+            Rights::ALL
+        );
+        assert_eq!(
+            subject(Vec::new()).unwrap().rights(),
+            Rights::NONE,
+            "a vehicle's"
+        );
+        assert_eq!(
+            subject(vec![uri("ecod:role=edge;priority=9")])
+                .unwrap()
+                .rights(),
+            Rights::NONE,
+            "without a broker"
+        );
         let both = subject(vec![broker(), uri("ecod:role=auto;priority=9")]).unwrap();
-        assert_eq!(both.rights(), Rights { priority: 9, ..Rights::from(Role::Auto) });
-        assert_eq!(both.rights_of(&NodeName::from_static("edge--top")), Rights::NONE, "an observer's");
-        assert_eq!(subject(vec![broker(), uri("ecod:role=chief")]), Err(InvalidCertificate::Rights));
+        assert_eq!(
+            both.rights(),
+            Rights {
+                priority: 9,
+                ..Rights::from(Role::Auto)
+            }
+        );
+        assert_eq!(
+            both.rights_of(&NodeName::from_static("edge--top")),
+            Rights::NONE,
+            "an observer's"
+        );
+        assert_eq!(
+            subject(vec![broker(), uri("ecod:role=chief")]),
+            Err(InvalidCertificate::Rights)
+        );
     }
 }

@@ -54,8 +54,15 @@ const LOSS_PERCENT: u8 = 20;
 impl Disturbance {
     /// Any, as likely as every other.
     pub(super) fn draw(rng: &mut ChaCha8Rng, bridged: bool) -> Self {
-        let kinds = if bridged { KINDS.len() } else { KINDS.len() - 3 };
-        Self { kind: KINDS[rng.random_range(0..kinds)], seconds: rng.random_range(3..=12) }
+        let kinds = if bridged {
+            KINDS.len()
+        } else {
+            KINDS.len() - 3
+        };
+        Self {
+            kind: KINDS[rng.random_range(0..kinds)],
+            seconds: rng.random_range(3..=12),
+        }
     }
 
     /// Does it, waits, and undoes it.
@@ -69,7 +76,10 @@ impl Disturbance {
         match self.kind {
             Kind::KillEdge => kill(cell, &[EDGE], lasts).await,
             Kind::KillLeaderAndStandby => {
-                let victims: Vec<_> = [cell.leader()?].into_iter().chain(cell.standby().ok()).collect();
+                let victims: Vec<_> = [cell.leader()?]
+                    .into_iter()
+                    .chain(cell.standby().ok())
+                    .collect();
                 kill(cell, &victims, lasts).await
             }
             Kind::KillVehicles => {

@@ -20,10 +20,15 @@ impl Resources {
         let status = fs::read_to_string(format!("/proc/{process}/status"))?;
         let field = |name: &str| {
             let line = status.lines().find_map(|line| line.strip_prefix(name));
-            line.and_then(|rest| rest.split_whitespace().next()?.parse().ok()).with_context(|| format!("no {name}"))
+            line.and_then(|rest| rest.split_whitespace().next()?.parse().ok())
+                .with_context(|| format!("no {name}"))
         };
         let descriptors = fs::read_dir(format!("/proc/{process}/fd"))?.count() as u64;
-        Ok(Self { resident_kib: field("VmRSS:")?, descriptors, threads: field("Threads:")? })
+        Ok(Self {
+            resident_kib: field("VmRSS:")?,
+            descriptors,
+            threads: field("Threads:")?,
+        })
     }
 
     /// The larger of each.
@@ -39,7 +44,11 @@ impl Resources {
 impl Display for Resources {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let mib = self.resident_kib as f64 / 1024.0;
-        write!(f, "{mib:.1} MiB, {} descriptors, {} threads", self.descriptors, self.threads)
+        write!(
+            f,
+            "{mib:.1} MiB, {} descriptors, {} threads",
+            self.descriptors, self.threads
+        )
     }
 }
 
@@ -51,7 +60,11 @@ pub(super) struct Series(Vec<Resources>);
 const LEAST_MINUTES: usize = 9;
 
 /// Allowed growth from the middle third of a life to its last, beside a tenth.
-const ALLOWED: Resources = Resources { resident_kib: 2048, descriptors: 8, threads: 4 };
+const ALLOWED: Resources = Resources {
+    resident_kib: 2048,
+    descriptors: 8,
+    threads: 4,
+};
 
 impl Series {
     pub(super) fn push(&mut self, resources: Resources) {
@@ -72,7 +85,8 @@ impl Series {
         let (middle, last) = (&self.0[third..2 * third], &self.0[self.0.len() - third..]);
         let grows = |what: &str, of: fn(&Resources) -> u64| {
             let (before, after) = (median(middle, of), median(last, of));
-            (after > before + before / 10 + of(&ALLOWED)).then(|| format!("{what} {before} to {after}"))
+            (after > before + before / 10 + of(&ALLOWED))
+                .then(|| format!("{what} {before} to {after}"))
         };
         let found = [
             grows("resident KiB", |resources| resources.resident_kib),
@@ -99,25 +113,55 @@ mod tests {
     }
 
     fn resident(resident_kib: usize) -> Resources {
-        Resources { resident_kib: resident_kib as u64, descriptors: 40, threads: 12 }
+        Resources {
+            resident_kib: resident_kib as u64,
+            descriptors: 40,
+            threads: 12,
+        }
     }
 
     #[test]
     fn a_leak_is_seen_and_a_step_or_a_peak_is_not() {
         let leak = series(30, |minute| resident(20_000 + 600 * minute));
         assert_eq!(leak.growth().unwrap(), "resident KiB 29000 to 35000");
-        assert_eq!(series(30, |minute| resident(if minute < 5 { 20_000 } else { 40_000 })).growth(), None);
-        assert_eq!(series(30, |minute| resident(if minute == 25 { 90_000 } else { 20_000 })).growth(), None);
+        assert_eq!(
+            series(30, |minute| resident(if minute < 5 {
+                20_000
+            } else {
+                40_000
+            }))
+            .growth(),
+            None
+        );
+        assert_eq!(
+            series(30, |minute| resident(if minute == 25 {
+                90_000
+            } else {
+                20_000
+            }))
+            .growth(),
+            None
+        );
         let short = series(8, |minute| resident(20_000 * minute));
-        assert_eq!((short.is_telling(), short.growth()), (false, None), "too short a life");
+        assert_eq!(
+            (short.is_telling(), short.growth()),
+            (false, None),
+            "too short a life"
+        );
         assert!(leak.is_telling());
     }
 
     #[test]
     fn descriptors_and_threads_count_as_well() {
-        let leak = series(12, |minute| Resources { descriptors: 10 * minute as u64, ..resident(20_000) });
+        let leak = series(12, |minute| Resources {
+            descriptors: 10 * minute as u64,
+            ..resident(20_000)
+        });
         assert!(leak.growth().unwrap().starts_with("descriptors "));
-        let leak = series(12, |minute| Resources { threads: 10 * minute as u64, ..resident(20_000) });
+        let leak = series(12, |minute| Resources {
+            threads: 10 * minute as u64,
+            ..resident(20_000)
+        });
         assert!(leak.growth().unwrap().starts_with("threads "));
     }
 

@@ -39,13 +39,22 @@ pub(super) struct Intruder {
 
 impl Intruder {
     pub(super) fn new(brokers: Vec<SocketAddr>, gossips: Vec<SocketAddr>, seed: u64) -> Self {
-        Self { brokers, gossips, rng: ChaCha8Rng::seed_from_u64(seed), seq: 0 }
+        Self {
+            brokers,
+            gossips,
+            rng: ChaCha8Rng::seed_from_u64(seed),
+            seq: 0,
+        }
     }
 
     /// Sends many more reports than anyone may, to all brokers in turn.
     pub(super) async fn flood(&mut self, lasts: Duration) -> anyhow::Result<()> {
         let mut tasks = JoinSet::new();
-        let clients: Vec<_> = self.brokers.iter().map(|broker| connect(*broker, &mut tasks)).collect();
+        let clients: Vec<_> = self
+            .brokers
+            .iter()
+            .map(|broker| connect(*broker, &mut tasks))
+            .collect();
         let until = Instant::now() + lasts;
         let mut ticks = interval(FLOOD_TICK);
         while Instant::now() < until {
@@ -54,9 +63,14 @@ impl Intruder {
                 self.seq += 1;
                 let payload = encode(&report(self.seq)?, Encoding::Json);
                 // The first node is the edge, which all the rest of a flood is for.
-                let to = if self.seq.is_multiple_of(8) { self.rng.random_range(0..clients.len()) } else { 0 };
+                let to = if self.seq.is_multiple_of(8) {
+                    self.rng.random_range(0..clients.len())
+                } else {
+                    0
+                };
                 // A broker that is slow to take them has a full queue before it.
-                let _ = clients[to].try_publish(topic("detections"), QoS::AtMostOnce, false, payload);
+                let _ =
+                    clients[to].try_publish(topic("detections"), QoS::AtMostOnce, false, payload);
             }
         }
         Ok(())
@@ -64,25 +78,39 @@ impl Intruder {
 
     /// Sends what is no message to brokers, sockets and gossip.
     pub(super) async fn send_junk(&mut self, lasts: Duration) -> anyhow::Result<()> {
-        let udp = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).await.context("cannot bind a UDP socket")?;
+        let udp = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))
+            .await
+            .context("cannot bind a UDP socket")?;
         let mut tasks = JoinSet::new();
-        let clients: Vec<_> = self.brokers.iter().map(|broker| connect(*broker, &mut tasks)).collect();
+        let clients: Vec<_> = self
+            .brokers
+            .iter()
+            .map(|broker| connect(*broker, &mut tasks))
+            .collect();
         let until = Instant::now() + lasts;
         let mut ticks = interval(JUNK_TICK);
         while Instant::now() < until {
             ticks.tick().await;
             let (payload, bytes) = (self.junk()?, self.bytes(1200));
             let node = self.rng.random_range(0..clients.len());
-            let kind = ["detections", "vote_detections", "nodes", "ledger"][self.rng.random_range(0..4)];
+            let kind =
+                ["detections", "vote_detections", "nodes", "ledger"][self.rng.random_range(0..4)];
             let topic = match self.rng.random_range(0..4) {
                 0 => format!("ecod/v1/{CELL}/global_detections"),
                 1 => format!("ecod/v1/{CELL}/{kind}/edge"),
                 _ => topic(kind),
             };
             // A refused message is as good as sent.
-            let _ = clients[node].try_publish(topic, QoS::AtMostOnce, self.rng.random_ratio(1, 4), payload);
+            let _ = clients[node].try_publish(
+                topic,
+                QoS::AtMostOnce,
+                self.rng.random_ratio(1, 4),
+                payload,
+            );
             let _ = udp.send_to(&bytes, self.gossips[node]).await;
-            if let Ok(Ok(mut stream)) = timeout(JUNK_TICK, TcpStream::connect(self.brokers[node])).await {
+            if let Ok(Ok(mut stream)) =
+                timeout(JUNK_TICK, TcpStream::connect(self.brokers[node])).await
+            {
                 let _ = stream.write_all(&bytes).await;
             }
         }
@@ -100,7 +128,9 @@ impl Intruder {
                 whole.truncate(self.rng.random_range(0..whole.len()));
                 whole
             }
-            3 => String::from_utf8(whole)?.replace("0.9", "-1e999").into_bytes(),
+            3 => String::from_utf8(whole)?
+                .replace("0.9", "-1e999")
+                .into_bytes(),
             _ => {
                 let (term, now) = (self.rng.next_u64() >> 12, clock::now().micros());
                 let map = format!(
@@ -135,7 +165,10 @@ fn connect(broker: SocketAddr, tasks: &mut JoinSet<()>) -> AsyncClient {
 
 fn report(seq: u64) -> anyhow::Result<ObjectReport> {
     let objects = vec![PerceivedObject::new("car", 0.9, 6.0, 0.0); 10];
-    Ok(ObjectReport { objects, ..ObjectReport::new(NodeName::new(NAME)?, seq, clock::now()) })
+    Ok(ObjectReport {
+        objects,
+        ..ObjectReport::new(NodeName::new(NAME)?, seq, clock::now())
+    })
 }
 
 fn topic(kind: &str) -> String {

@@ -24,22 +24,44 @@ struct Judged {
 
 pub(super) fn run(arguments: &EvalArguments, text: &str) -> Result<(), Failure> {
     let path = &arguments.truth;
-    let truth = TrackTruth::parse(text).with_context(|| format!("truth {}", path.display())).map_err(Failure::usage)?;
+    let truth = TrackTruth::parse(text)
+        .with_context(|| format!("truth {}", path.display()))
+        .map_err(Failure::usage)?;
     judge_maps(arguments, TrackEvaluation::new(truth), None)
 }
 
 /// Judges by the truth in files of a benchmark: maps, or files of the same form.
 pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result<(), Failure> {
-    let EvalArguments { truth: path, input, frame_rate, config, .. } = arguments;
+    let EvalArguments {
+        truth: path,
+        input,
+        frame_rate,
+        config,
+        ..
+    } = arguments;
     let camera = files::camera(config.as_deref())?;
     let read = |path: &Path| files::read(format, path, camera.as_ref());
     let mut truth = read(path)?;
-    let said = if is_of_maps(input)? { None } else { Some(read(input)?) };
-    if let Some(said) = said.as_ref().filter(|said| said.len() > 1 || truth.len() > 1) {
+    let said = if is_of_maps(input)? {
+        None
+    } else {
+        Some(read(input)?)
+    };
+    if let Some(said) = said
+        .as_ref()
+        .filter(|said| said.len() > 1 || truth.len() > 1)
+    {
         // Part of the sequences may be judged.
         truth.retain(|sequence| said.iter().any(|other| other.name == sequence.name));
-        if let Some(other) = said.iter().find(|other| truth.iter().all(|sequence| sequence.name != other.name)) {
-            let what = format!("{} has no truth of the sequence {}", path.display(), other.name);
+        if let Some(other) = said
+            .iter()
+            .find(|other| truth.iter().all(|sequence| sequence.name != other.name))
+        {
+            let what = format!(
+                "{} has no truth of the sequence {}",
+                path.display(),
+                other.name
+            );
             return Err(Failure::usage(anyhow!(what)));
         }
     }
@@ -52,7 +74,9 @@ pub(super) fn run_files(arguments: &EvalArguments, format: FileFormat) -> Result
         }
     };
     let truth = TrackTruth::from_sequences(&truth, *frame_rate);
-    let truth = truth.with_context(|| format!("truth {}", path.display())).map_err(Failure::usage)?;
+    let truth = truth
+        .with_context(|| format!("truth {}", path.display()))
+        .map_err(Failure::usage)?;
     let mut evaluation = TrackEvaluation::new(truth);
     match said {
         None => judge_maps(arguments, evaluation, Some(sequences)),
@@ -72,7 +96,9 @@ fn is_of_maps(input: &Path) -> Result<bool, Failure> {
         return Ok(false);
     }
     let mut source = lines::open(input).map_err(Failure::usage)?;
-    let begin = source.fill_buf().with_context(|| format!("cannot read {}", input.display()))?;
+    let begin = source
+        .fill_buf()
+        .with_context(|| format!("cannot read {}", input.display()))?;
     Ok(begin.trim_ascii_start().starts_with(b"{"))
 }
 
@@ -95,7 +121,9 @@ fn judge_maps(
     }
     if let Some(sequences) = sequences.filter(|sequences| !sequences.contains(&mapped.len())) {
         let (sequences, mapped) = (sequences.end(), mapped.len());
-        let what = format!("{truth} has {sequences} sequences, and {input} maps of {mapped}: give truth of just these");
+        let what = format!(
+            "{truth} has {sequences} sequences, and {input} maps of {mapped}: give truth of just these"
+        );
         return Err(Failure::usage(anyhow!(what)));
     }
     print_scores(arguments, evaluation)
@@ -103,7 +131,9 @@ fn judge_maps(
 
 fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Result<(), Failure> {
     if arguments.reports.is_some() || (arguments.config.is_some() && arguments.format.is_none()) {
-        return Err(Failure::usage(anyhow!("--reports and --config are for a truth of locations")));
+        return Err(Failure::usage(anyhow!(
+            "--reports and --config are for a truth of locations"
+        )));
     }
     let scores = evaluation.result();
     if scores.frames_with_map == 0 {
@@ -117,7 +147,14 @@ fn print_scores(arguments: &EvalArguments, evaluation: TrackEvaluation) -> Resul
     if let Some(warning) = without_map(&scores) {
         eprintln!("{warning}");
     }
-    print!("{}", tables(&scores).iter().map(|rows| columns(rows)).collect::<Vec<_>>().join("\n"));
+    print!(
+        "{}",
+        tables(&scores)
+            .iter()
+            .map(|rows| columns(rows))
+            .collect::<Vec<_>>()
+            .join("\n")
+    );
     if let Some(out) = &arguments.out {
         write_json(out, &Judged { tracks: scores })?;
     }

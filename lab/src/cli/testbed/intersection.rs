@@ -21,15 +21,25 @@ const GENERATED: &str = "generated";
 
 pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failure> {
     let path = arguments.scenes.display();
-    let recording =
-        IntersectionRecording::from_json(text).with_context(|| format!("scenes {path}")).map_err(Failure::usage)?;
+    let recording = IntersectionRecording::from_json(text)
+        .with_context(|| format!("scenes {path}"))
+        .map_err(Failure::usage)?;
     if recording.objects.is_empty() || recording.frame_count() == 0 {
-        return Err(Failure::usage(anyhow::anyhow!("scenes {path}: nothing was recorded")));
+        return Err(Failure::usage(anyhow::anyhow!(
+            "scenes {path}: nothing was recorded"
+        )));
     }
-    let is_chosen = |name| arguments.scene.as_deref().is_none_or(|chosen| chosen == name);
+    let is_chosen = |name| {
+        arguments
+            .scene
+            .as_deref()
+            .is_none_or(|chosen| chosen == name)
+    };
     if !is_chosen(RECORDING) && !is_chosen(GENERATED) {
         let chosen = arguments.scene.as_deref().unwrap_or_default();
-        return Err(Failure::usage(anyhow::anyhow!("no scene {chosen:?}; there are {RECORDING}, {GENERATED}")));
+        return Err(Failure::usage(anyhow::anyhow!(
+            "no scene {chosen:?}; there are {RECORDING}, {GENERATED}"
+        )));
     }
     if let Some(out) = &arguments.out {
         check_writable(out)?;
@@ -41,7 +51,10 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
     if is_chosen(GENERATED) {
         // Losses of the recording are news, those of its copies are not.
         let generate = || generated(arguments, &recording);
-        results.extend(tracing::subscriber::with_default(NoSubscriber::new(), generate)?);
+        results.extend(tracing::subscriber::with_default(
+            NoSubscriber::new(),
+            generate,
+        )?);
     }
     print(&table(&results))?;
     if let Some(file) = &arguments.reports {
@@ -57,9 +70,11 @@ pub(super) fn run(arguments: &TestbedArguments, text: &str) -> Result<(), Failur
     // Generated scenes are harder than the recording: they are held to the bar only by themselves.
     let least = arguments.at_least.unwrap_or(0.0);
     match results.first() {
-        Some(scene) if scene.vote_accuracy_pct < least => {
-            Err(anyhow::anyhow!("scene {}: fewer than {least} % of the verdicts are right", scene.name).into())
-        }
+        Some(scene) if scene.vote_accuracy_pct < least => Err(anyhow::anyhow!(
+            "scene {}: fewer than {least} % of the verdicts are right",
+            scene.name
+        )
+        .into()),
         _ => Ok(()),
     }
 }
@@ -72,34 +87,73 @@ fn generated(
     let mut scenes = Vec::new();
     for number in 0..arguments.generated {
         let scene = confusion.scene(arguments.seed.wrapping_add(number), arguments.frames.into());
-        scenes.push(intersection::run(GENERATED, &scene).with_context(|| format!("generated scene {number}"))?);
+        scenes.push(
+            intersection::run(GENERATED, &scene)
+                .with_context(|| format!("generated scene {number}"))?,
+        );
     }
     Ok(IntersectionResult::mean(GENERATED, &scenes))
 }
 
 fn table(results: &[IntersectionResult]) -> String {
-    let header =
-        ["", "scenes", "verdicts", "VOTE %", "PACE %", "one answer %", "paper %", "majority %", "best alone %"];
+    let header = [
+        "",
+        "scenes",
+        "verdicts",
+        "VOTE %",
+        "PACE %",
+        "one answer %",
+        "paper %",
+        "majority %",
+        "best alone %",
+    ];
     let mut rows = vec![header.map(str::to_owned).to_vec()];
     for result in results {
-        let best = result.single_cav_accuracy_pct.values().copied().max_by(f64::total_cmp);
-        let alone = [result.vote_accuracy_pct, result.pace_accuracy_pct, result.answer_accuracy_pct];
+        let best = result
+            .single_cav_accuracy_pct
+            .values()
+            .copied()
+            .max_by(f64::total_cmp);
+        let alone = [
+            result.vote_accuracy_pct,
+            result.pace_accuracy_pct,
+            result.answer_accuracy_pct,
+        ];
         let others = [result.vote_paper_accuracy_pct, result.majority_accuracy_pct];
-        let shares = alone.into_iter().chain(others).map(Some).chain([best]).map(percent);
-        let counts = [result.name.clone(), result.scenes.to_string(), result.verdicts.to_string()];
+        let shares = alone
+            .into_iter()
+            .chain(others)
+            .map(Some)
+            .chain([best])
+            .map(percent);
+        let counts = [
+            result.name.clone(),
+            result.scenes.to_string(),
+            result.verdicts.to_string(),
+        ];
         rows.push(counts.into_iter().chain(shares).collect());
     }
     let mut text = columns(&rows);
     for result in results {
-        let alone = result.single_cav_accuracy_pct.iter().map(|(name, pct)| format!("{name} {pct:.1}"));
-        text += &format!("\n{} alone %: {}", result.name, alone.collect::<Vec<_>>().join(", "));
+        let alone = result
+            .single_cav_accuracy_pct
+            .iter()
+            .map(|(name, pct)| format!("{name} {pct:.1}"));
+        text += &format!(
+            "\n{} alone %: {}",
+            result.name,
+            alone.collect::<Vec<_>>().join(", ")
+        );
     }
     text.push('\n');
     for result in results {
         for verdict in &result.labels {
             let label = verdict.label.as_ref().map_or("-", Label::as_str);
             let mark = if verdict.right { "right" } else { "WRONG" };
-            text += &format!("frame {}  {}: {label}, {mark}\n", verdict.frame, verdict.landmark);
+            text += &format!(
+                "frame {}  {}: {label}, {mark}\n",
+                verdict.frame, verdict.landmark
+            );
         }
     }
     text

@@ -58,32 +58,70 @@ pub(super) fn frames(text: &str, has_camera: bool) -> anyhow::Result<ParsedFrame
         if text.trim_ascii_start().starts_with('[') {
             ("", parsed(text)?, None)
         } else {
-            let Dataset { images, categories, annotations } = parsed(text)?;
+            let Dataset {
+                images,
+                categories,
+                annotations,
+            } = parsed(text)?;
             for (place, image) in images.iter().enumerate() {
                 let frame = frame_number(image.id);
-                let frame = frame.with_context(|| format!("images[{place}].id: {} is out of bounds", image.id))?;
+                let frame = frame.with_context(|| {
+                    format!("images[{place}].id: {} is out of bounds", image.id)
+                })?;
                 frames.entry(frame).or_default();
             }
-            if let Some(place) = categories.iter().position(|category| !is_label(&category.name)) {
+            if let Some(place) = categories
+                .iter()
+                .position(|category| !is_label(&category.name))
+            {
                 bail!("categories[{place}].name: must be a text of 1 to {MAX_NAME_BYTES} bytes");
             }
-            ("annotations", annotations, Some(categories.into_iter().map(|c| (c.id, c.name)).collect()))
+            (
+                "annotations",
+                annotations,
+                Some(categories.into_iter().map(|c| (c.id, c.name)).collect()),
+            )
         };
-    for (place, annotation) in annotations.iter().enumerate().filter(|(_, annotation)| annotation.iscrowd == 0) {
+    for (place, annotation) in annotations
+        .iter()
+        .enumerate()
+        .filter(|(_, annotation)| annotation.iscrowd == 0)
+    {
         let at = |field: &str, fault: String| format!("{list}[{place}].{field}: {fault}");
-        let Annotation { image_id, category_id, bbox: [x_min, y_min, width, height], score, track_id, .. } =
-            *annotation;
-        let frame = frame_number(image_id).with_context(|| at("image_id", format!("{image_id} is out of bounds")))?;
+        let Annotation {
+            image_id,
+            category_id,
+            bbox: [x_min, y_min, width, height],
+            score,
+            track_id,
+            ..
+        } = *annotation;
+        let frame = frame_number(image_id)
+            .with_context(|| at("image_id", format!("{image_id} is out of bounds")))?;
         let label = match &categories {
             Some(categories) => categories.get(&category_id).cloned(),
-            None => usize::try_from(category_id).ok().and_then(labels::name).map(Label::new_static),
+            None => usize::try_from(category_id)
+                .ok()
+                .and_then(labels::name)
+                .map(Label::new_static),
         };
-        let label = label.with_context(|| at("category_id", format!("{category_id} is no known category")))?;
-        let image = BoundingBox { x_min, y_min, x_max: x_min + width, y_max: y_min + height };
+        let label = label
+            .with_context(|| at("category_id", format!("{category_id} is no known category")))?;
+        let image = BoundingBox {
+            x_min,
+            y_min,
+            x_max: x_min + width,
+            y_max: y_min + height,
+        };
         if !image.is_valid() {
             bail!(at("bbox", format!("{:?} is no box", annotation.bbox)));
         }
-        let object = ParsedObject { id: track_id, label, score, place: FilePlace::Image(image) };
+        let object = ParsedObject {
+            id: track_id,
+            label,
+            score,
+            place: FilePlace::Image(image),
+        };
         frames.entry(frame).or_default().push(object);
     }
     Ok(frames)
@@ -91,5 +129,7 @@ pub(super) fn frames(text: &str, has_camera: bool) -> anyhow::Result<ParsedFrame
 
 /// Names the path of what cannot be read.
 fn parsed<T: DeserializeOwned>(text: &str) -> anyhow::Result<T> {
-    Ok(serde_path_to_error::deserialize(&mut serde_json::Deserializer::from_str(text))?)
+    Ok(serde_path_to_error::deserialize(
+        &mut serde_json::Deserializer::from_str(text),
+    )?)
 }

@@ -16,19 +16,54 @@ const CLASSES: [&str; 3] = ["Pedestrian", "Car", "Cyclist"];
 
 pub(super) fn object(cells: &Cells) -> Result<Option<(u64, ParsedObject)>, LineError> {
     let frame = cells.frame()?;
-    let place = |x: usize| Ok(FilePlace::Ground(Point2::new(cells.number(x + 2, "z")?, -cells.number(x, "x")?)));
+    let place = |x: usize| {
+        Ok(FilePlace::Ground(Point2::new(
+            cells.number(x + 2, "z")?,
+            -cells.number(x, "x")?,
+        )))
+    };
     if cells.has_commas {
         let number = cells.integer(2, "type")?;
-        let label = usize::try_from(number - 1).ok().and_then(|place| CLASSES.get(place));
-        let unknown = || cells.error(2, "type", format!("{number} is none of 1 to {}", CLASSES.len()));
+        let label = usize::try_from(number - 1)
+            .ok()
+            .and_then(|place| CLASSES.get(place));
+        let unknown = || {
+            cells.error(
+                2,
+                "type",
+                format!("{number} is none of 1 to {}", CLASSES.len()),
+            )
+        };
         let label = Label::new_static(label.ok_or_else(unknown)?);
         let score = cells.number(7, "score")?;
-        return Ok(Some((frame, ParsedObject { id: None, label, score, place: place(11)? })));
+        return Ok(Some((
+            frame,
+            ParsedObject {
+                id: None,
+                label,
+                score,
+                place: place(11)?,
+            },
+        )));
     }
     let id = cells.integer(2, "track")?;
     let class = cells.text(3, "type")?;
-    let Some(label) = CLASSES.into_iter().find(|known| *known == class) else { return Ok(None) };
+    let Some(label) = CLASSES.into_iter().find(|known| *known == class) else {
+        return Ok(None);
+    };
     let has_score = cells.cells.len() > 17;
-    let score = if has_score { cells.number(18, "score")? } else { 1.0 };
-    Ok(Some((frame, ParsedObject { id: Some(id), label: Label::new_static(label), score, place: place(14)? })))
+    let score = if has_score {
+        cells.number(18, "score")?
+    } else {
+        1.0
+    };
+    Ok(Some((
+        frame,
+        ParsedObject {
+            id: Some(id),
+            label: Label::new_static(label),
+            score,
+            place: place(14)?,
+        },
+    )))
 }

@@ -10,13 +10,24 @@ use nalgebra::Point2;
 use super::{Cells, FilePlace, LineError, ParsedObject};
 
 /// Width and height in the image count from the left upper corner.
-pub(super) fn object(cells: &Cells, has_camera: bool) -> Result<Option<(u64, ParsedObject)>, LineError> {
+pub(super) fn object(
+    cells: &Cells,
+    has_camera: bool,
+) -> Result<Option<(u64, ParsedObject)>, LineError> {
     let frame = cells.frame()?;
     if frame == 0 {
-        return Err(cells.error(1, "frame", "0 is out of bounds, the first frame is 1".into()));
+        return Err(cells.error(
+            1,
+            "frame",
+            "0 is out of bounds, the first frame is 1".into(),
+        ));
     }
     if !cells.has_commas {
-        return Err(cells.error(1, "frame", "is not followed by a comma; files of MOTChallenge have commas".into()));
+        return Err(cells.error(
+            1,
+            "frame",
+            "is not followed by a comma; files of MOTChallenge have commas".into(),
+        ));
     }
     let id = Some(cells.integer(2, "track")?).filter(|id| *id >= 0);
     let score = cells.number(7, "score")?;
@@ -24,12 +35,18 @@ pub(super) fn object(cells: &Cells, has_camera: bool) -> Result<Option<(u64, Par
         Some(position) => FilePlace::Ground(position),
         None if has_camera => FilePlace::Image(image(cells)?),
         None => {
-            let fault = "is no position on the ground: give the camera of the boxes with --config".into();
+            let fault =
+                "is no position on the ground: give the camera of the boxes with --config".into();
             return Err(cells.error(8, "x", fault));
         }
     };
     let is_ignored = id.is_some() && score == 0.0;
-    let object = ParsedObject { id, label: Label::new_static("person"), score, place };
+    let object = ParsedObject {
+        id,
+        label: Label::new_static("person"),
+        score,
+        place,
+    };
     Ok((!is_ignored).then_some((frame, object)))
 }
 
@@ -49,5 +66,9 @@ fn image(cells: &Cells) -> Result<BoundingBox, LineError> {
         x_max: x_min + cells.number(5, "width")?,
         y_max: y_min + cells.number(6, "height")?,
     };
-    if image.is_valid() { Ok(image) } else { Err(cells.error(5, "width", "and height are of no box".into())) }
+    if image.is_valid() {
+        Ok(image)
+    } else {
+        Err(cells.error(5, "width", "and height are of no box".into()))
+    }
 }

@@ -25,7 +25,9 @@ impl StandingCamera {
     pub fn load(file: &Path) -> anyhow::Result<Self> {
         let config = NodeConfig::load(Some(file), &BTreeMap::<String, String>::new())?;
         let cameras: Vec<_> = config.all_cameras().collect();
-        let [camera] = cameras[..] else { bail!("has {} cameras, one is needed", cameras.len()) };
+        let [camera] = cameras[..] else {
+            bail!("has {} cameras, one is needed", cameras.len())
+        };
         if lens(camera)?.is_any_shape {
             bail!(
                 "keys `camera.optics.width_px` and `height_px` are missing: files of boxes do not say how large the image is"
@@ -40,12 +42,22 @@ impl StandingCamera {
 }
 
 /// The sequence with all objects that have a place.
-pub(super) fn placed(frames: ParsedFrames, camera: Option<&StandingCamera>, mut sequence: Sequence) -> Sequence {
+pub(super) fn placed(
+    frames: ParsedFrames,
+    camera: Option<&StandingCamera>,
+    mut sequence: Sequence,
+) -> Sequence {
     let mut camera = camera.cloned();
     for (number, objects) in frames {
         let mut placed = Vec::new();
         let (mut ids, mut boxes) = (Vec::new(), Vec::new());
-        for ParsedObject { id, label, score, place } in objects {
+        for ParsedObject {
+            id,
+            label,
+            score,
+            place,
+        } in objects
+        {
             match place {
                 FilePlace::Ground(position) => {
                     let perceived = PerceivedObject::new(label, score, position.x, position.y);
@@ -53,7 +65,12 @@ pub(super) fn placed(frames: ParsedFrames, camera: Option<&StandingCamera>, mut 
                 }
                 FilePlace::Image(bounding_box) => {
                     ids.push(id);
-                    boxes.push(Detection { label, confidence: score, bounding_box, corners: None });
+                    boxes.push(Detection {
+                        label,
+                        confidence: score,
+                        bounding_box,
+                        corners: None,
+                    });
                 }
             }
         }
@@ -61,10 +78,15 @@ pub(super) fn placed(frames: ParsedFrames, camera: Option<&StandingCamera>, mut 
             let report = perception.report(boxes, Timestamp::default());
             sequence.pose = report.pose;
             let ids = perception.reported().iter().map(|index| ids[*index]);
-            placed.extend(ids.zip(report.objects).map(|(id, perceived)| FileObject { id, perceived }));
+            placed.extend(
+                ids.zip(report.objects)
+                    .map(|(id, perceived)| FileObject { id, perceived }),
+            );
         }
         sequence.frames.insert(number, placed);
     }
-    sequence.discarded = camera.map(|StandingCamera(perception)| perception.discarded().clone()).unwrap_or_default();
+    sequence.discarded = camera
+        .map(|StandingCamera(perception)| perception.discarded().clone())
+        .unwrap_or_default();
     sequence
 }

@@ -8,15 +8,28 @@ use super::*;
 type Row<'a> = (u64, Option<i64>, &'a str, f64, f64, f64);
 
 fn positions(frames: &Frames) -> Vec<Row<'_>> {
-    let flat = frames.iter().flat_map(|(frame, objects)| objects.iter().map(move |object| (*frame, object)));
+    let flat = frames
+        .iter()
+        .flat_map(|(frame, objects)| objects.iter().map(move |object| (*frame, object)));
     flat.map(|(frame, FileObject { id, perceived })| {
-        (frame, *id, perceived.label.as_str(), perceived.confidence, perceived.x_m, perceived.y_m)
+        (
+            frame,
+            *id,
+            perceived.label.as_str(),
+            perceived.confidence,
+            perceived.x_m,
+            perceived.y_m,
+        )
     })
     .collect()
 }
 
 /// The sequence of a file with that text.
-fn read(format: FileFormat, text: &str, camera: Option<&StandingCamera>) -> anyhow::Result<Sequence> {
+fn read(
+    format: FileFormat,
+    text: &str,
+    camera: Option<&StandingCamera>,
+) -> anyhow::Result<Sequence> {
     let folder = TempDir::new()?;
     let file = folder.path().join("file");
     fs::write(&file, text)?;
@@ -47,7 +60,10 @@ fn kittis_labels_and_results_are_in_the_frame_of_the_vehicle() {
     let frames = read(FileFormat::Kitti, text, None).unwrap().frames;
     assert_eq!(
         positions(&frames),
-        [(0, Some(3), "Car", 1.0, 13.4, 4.5), (2, Some(3), "Car", 0.7, 14.0, 4.0)],
+        [
+            (0, Some(3), "Car", 1.0, 13.4, 4.5),
+            (2, Some(3), "Car", 0.7, 14.0, 4.0)
+        ],
         "left is positive, and classes that are not judged are left out"
     );
 }
@@ -61,7 +77,11 @@ fn scores_of_detectors_become_probabilities_in_the_same_order() {
     let frames = read(FileFormat::Kitti, &text, None).unwrap().frames;
     let found = positions(&frames);
     assert_eq!(found[0], (0, None, "Car", 0.5, 6.4, -2.9));
-    assert!((found[1].2, found[2].2) == ("Pedestrian", "Cyclist") && found[1].3 > 0.99 && found[2].3 < 0.5);
+    assert!(
+        (found[1].2, found[2].2) == ("Pedestrian", "Cyclist")
+            && found[1].3 > 0.99
+            && found[2].3 < 0.5
+    );
     let percent = line(0, 2, 97.0) + &line(1, 2, 98.0) + &line(2, 2, 40.0);
     let found = read(FileFormat::Kitti, &percent, None).unwrap().frames;
     let [first, second, third] = [0, 1, 2].map(|frame| found[&frame][0].perceived.confidence);
@@ -72,25 +92,78 @@ fn scores_of_detectors_become_probabilities_in_the_same_order() {
 fn positions_of_mot_challenge_are_those_on_the_ground() {
     let text = "\u{feff}1,-1,912,484,97,109,0.5,3.5,-2.25,0\n2,7,912,484,97,109,1,4,5,0\n2,8,912,484,97,109,0,4,5,0\n";
     let frames = read(FileFormat::Mot, text, None).unwrap().frames;
-    assert_eq!(positions(&frames), [(1, None, "person", 0.5, 3.5, -2.25), (2, Some(7), "person", 1.0, 4.0, 5.0)]);
+    assert_eq!(
+        positions(&frames),
+        [
+            (1, None, "person", 0.5, 3.5, -2.25),
+            (2, Some(7), "person", 1.0, 4.0, 5.0)
+        ]
+    );
 }
 
 #[test]
 fn line_and_field_of_what_cannot_be_read_are_named() {
     for (format, text, fault) in [
-        (FileFormat::Kitti, "\n0 3 Car 0 0", "line 2: column 16 (z): is missing, there are 5 columns"),
-        (FileFormat::Kitti, "-1 3 Car", "line 1: column 1 (frame): -1 is out of bounds"),
-        (FileFormat::Kitti, "0 x Car", "line 1: column 2 (track): \"x\" is no number"),
-        (FileFormat::Kitti, "0,9,1,2,3,4,5", "line 1: column 2 (type): 9 is none of 1 to 3"),
-        (FileFormat::Kitti, "0,2,1,2,3,4,nan,1,1,1,1,1,1", "line 1: column 7 (score): \"nan\" is no number"),
-        (FileFormat::Mot, "1.5,1,1,2,3,4,1,1,1,1", "line 1: column 1 (frame): 1.5 is no whole number"),
-        (FileFormat::Mot, "1,1,1,2,3,4,1,1,1", "line 1: column 8 (x): is no position on the ground"),
-        (FileFormat::Mot, "1,1,1,2,3,4,1,-1,-1,-1", "line 1: column 8 (x): is no position on the ground"),
-        (FileFormat::Mot, "0,1,10,10,20,40,1,5,6,0", "line 1: column 1 (frame): 0 is out of bounds"),
-        (FileFormat::Mot, "1 2 Van 0 0 -1.7 296.7 161.7", "line 1: column 1 (frame): is not followed by a comma"),
-        (FileFormat::Coco, "[]", "boxes in an image have no place on the ground: give their camera with --config"),
+        (
+            FileFormat::Kitti,
+            "\n0 3 Car 0 0",
+            "line 2: column 16 (z): is missing, there are 5 columns",
+        ),
+        (
+            FileFormat::Kitti,
+            "-1 3 Car",
+            "line 1: column 1 (frame): -1 is out of bounds",
+        ),
+        (
+            FileFormat::Kitti,
+            "0 x Car",
+            "line 1: column 2 (track): \"x\" is no number",
+        ),
+        (
+            FileFormat::Kitti,
+            "0,9,1,2,3,4,5",
+            "line 1: column 2 (type): 9 is none of 1 to 3",
+        ),
+        (
+            FileFormat::Kitti,
+            "0,2,1,2,3,4,nan,1,1,1,1,1,1",
+            "line 1: column 7 (score): \"nan\" is no number",
+        ),
+        (
+            FileFormat::Mot,
+            "1.5,1,1,2,3,4,1,1,1,1",
+            "line 1: column 1 (frame): 1.5 is no whole number",
+        ),
+        (
+            FileFormat::Mot,
+            "1,1,1,2,3,4,1,1,1",
+            "line 1: column 8 (x): is no position on the ground",
+        ),
+        (
+            FileFormat::Mot,
+            "1,1,1,2,3,4,1,-1,-1,-1",
+            "line 1: column 8 (x): is no position on the ground",
+        ),
+        (
+            FileFormat::Mot,
+            "0,1,10,10,20,40,1,5,6,0",
+            "line 1: column 1 (frame): 0 is out of bounds",
+        ),
+        (
+            FileFormat::Mot,
+            "1 2 Van 0 0 -1.7 296.7 161.7",
+            "line 1: column 1 (frame): is not followed by a comma",
+        ),
+        (
+            FileFormat::Coco,
+            "[]",
+            "boxes in an image have no place on the ground: give their camera with --config",
+        ),
     ] {
-        let said = read(format, text, None).unwrap_err().root_cause().to_string();
+        let said = read(format, text, None)
+            .unwrap_err()
+            .root_cause()
+            .to_string();
         assert!(said.starts_with(fault), "{text}: {said}");
     }
 }
@@ -103,7 +176,9 @@ fn boxes_of_coco_and_of_mot_challenge_are_placed_by_their_camera() {
          {{\"image_id\": 8, \"category_id\": 1, \"bbox\": {BOX_AT_12_15}, \"track_id\": 3}}, \
          {{\"image_id\": 8, \"category_id\": 1, \"bbox\": {BOX_AT_12_15}, \"iscrowd\": 1}}]}}"
     );
-    let results = format!("[{{\"image_id\": 8, \"category_id\": 3, \"bbox\": {BOX_AT_12_15}, \"score\": 0.5}}]");
+    let results = format!(
+        "[{{\"image_id\": 8, \"category_id\": 3, \"bbox\": {BOX_AT_12_15}, \"score\": 0.5}}]"
+    );
     let lines = "8,-1,540,450,20,50,0.5,-1,-1,-1\n9,-1,540,350,20,40,0.5\n".to_owned();
     for (format, text, id, label, score, first) in [
         (FileFormat::Coco, dataset, Some(3), "van", 1.0, 7),
@@ -111,17 +186,36 @@ fn boxes_of_coco_and_of_mot_challenge_are_placed_by_their_camera() {
         (FileFormat::Mot, lines, None, "person", 0.5, 1),
     ] {
         let sequence = read(format, &text, Some(&camera)).unwrap();
-        let [(frame, is, named, said, x_m, y_m)] = positions(&sequence.frames)[..] else { panic!("{sequence:?}") };
-        assert_eq!((sequence.first, frame, is, named, said), (first, 8, id, label, score));
+        let [(frame, is, named, said, x_m, y_m)] = positions(&sequence.frames)[..] else {
+            panic!("{sequence:?}")
+        };
+        assert_eq!(
+            (sequence.first, frame, is, named, said),
+            (first, 8, id, label, score)
+        );
         // The middle of an object is behind where it touches the ground.
-        assert!((x_m - 12.0).abs() < 0.5 && (15.0..17.5).contains(&y_m), "({x_m}, {y_m})");
+        assert!(
+            (x_m - 12.0).abs() < 0.5 && (15.0..17.5).contains(&y_m),
+            "({x_m}, {y_m})"
+        );
         assert!(sequence.frames[&8][0].perceived.covariance_m2.is_some());
         let node = NodeName::from_static("post");
         for report in sequence.reports(0, 10.0, &node, 8) {
-            assert_eq!((report.pose.map(|pose| pose.y_m), report.moving), (Some(-5.0), Some(false)));
+            assert_eq!(
+                (report.pose.map(|pose| pose.y_m), report.moving),
+                (Some(-5.0), Some(false))
+            );
         }
-        let above = if format == FileFormat::Mot { Some(&1) } else { None };
-        assert_eq!(sequence.discarded.get("above_horizon"), above, "the second box of the lines stands in the sky");
+        let above = if format == FileFormat::Mot {
+            Some(&1)
+        } else {
+            None
+        };
+        assert_eq!(
+            sequence.discarded.get("above_horizon"),
+            above,
+            "the second box of the lines stands in the sky"
+        );
     }
 }
 
@@ -129,17 +223,35 @@ fn boxes_of_coco_and_of_mot_challenge_are_placed_by_their_camera() {
 fn what_cannot_be_read_of_coco_is_named_by_its_path() {
     let camera = camera();
     for (text, fault) in [
-        (r#"[{"image_id": 1, "category_id": 3, "bbox": [1, 2, 3]}]"#, "[0].bbox: invalid length 3"),
-        (r#"[{"image_id": 1, "category_id": 3, "bbox": [1, 2, 0, 4]}]"#, "[0].bbox: [1.0, 2.0, 0.0, 4.0] is no box"),
-        (r#"[{"image_id": 1, "category_id": 12, "bbox": [1, 2, 3, 4]}]"#, "[0].category_id: 12 is no known category"),
-        (r#"[{"image_id": -1, "category_id": 3, "bbox": [1, 2, 3, 4]}]"#, "[0].image_id: -1 is out of bounds"),
-        (r#"{"images": [], "categories": [{"id": 1, "name": ""}], "annotations": []}"#, "categories[0].name:"),
+        (
+            r#"[{"image_id": 1, "category_id": 3, "bbox": [1, 2, 3]}]"#,
+            "[0].bbox: invalid length 3",
+        ),
+        (
+            r#"[{"image_id": 1, "category_id": 3, "bbox": [1, 2, 0, 4]}]"#,
+            "[0].bbox: [1.0, 2.0, 0.0, 4.0] is no box",
+        ),
+        (
+            r#"[{"image_id": 1, "category_id": 12, "bbox": [1, 2, 3, 4]}]"#,
+            "[0].category_id: 12 is no known category",
+        ),
+        (
+            r#"[{"image_id": -1, "category_id": 3, "bbox": [1, 2, 3, 4]}]"#,
+            "[0].image_id: -1 is out of bounds",
+        ),
+        (
+            r#"{"images": [], "categories": [{"id": 1, "name": ""}], "annotations": []}"#,
+            "categories[0].name:",
+        ),
         (
             r#"{"images": [], "categories": [], "annotations": [{"image_id": 1, "category_id": 3, "bbox": [1, 2, 3, 4]}]}"#,
             "annotations[0].category_id: 3 is no known category",
         ),
     ] {
-        let said = read(FileFormat::Coco, text, Some(&camera)).unwrap_err().root_cause().to_string();
+        let said = read(FileFormat::Coco, text, Some(&camera))
+            .unwrap_err()
+            .root_cause()
+            .to_string();
         assert!(said.starts_with(fault), "{text}: {said}");
     }
 }

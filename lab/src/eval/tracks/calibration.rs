@@ -46,22 +46,34 @@ pub struct ReliabilityBin {
 }
 
 pub(super) fn judge(frames: &[ScoredFrame]) -> ReliabilityBins {
-    let states_existence = frames.iter().flat_map(|frame| &frame.said).any(|said| said.existence.is_some());
+    let states_existence = frames
+        .iter()
+        .flat_map(|frame| &frame.said)
+        .any(|said| said.existence.is_some());
     ReliabilityBins {
         confidence: reliability(frames, CONFIDENCE_DISTANCE_M, |said| Some(said.score)),
-        existence: states_existence.then(|| reliability(frames, ZERO_DISTANCE_M, |said| said.existence)),
+        existence: states_existence
+            .then(|| reliability(frames, ZERO_DISTANCE_M, |said| said.existence)),
     }
 }
 
 /// Objects and true ones of the same label are matched one to one, so that the sum of their nearness is greatest.
-fn reliability(frames: &[ScoredFrame], limit_m: f64, stated: impl Fn(&SaidObject) -> Option<f64>) -> Reliability {
+fn reliability(
+    frames: &[ScoredFrame],
+    limit_m: f64,
+    stated: impl Fn(&SaidObject) -> Option<f64>,
+) -> Reliability {
     let mut sums = [(0u64, 0u64, 0.0); BINS];
     for frame in frames {
         let mut pairs = near_pairs(frame, limit_m);
         // One that is just within the limit is still worth a match.
-        pairs.iter_mut().for_each(|pair| pair.value = 2.0 - pair.value / limit_m);
+        pairs
+            .iter_mut()
+            .for_each(|pair| pair.value = 2.0 - pair.value / limit_m);
         let mut is_right = vec![false; frame.said.len()];
-        best(&pairs).iter().for_each(|pair| is_right[pair.said] = true);
+        best(&pairs)
+            .iter()
+            .for_each(|pair| is_right[pair.said] = true);
         for (said, is_right) in frame.said.iter().zip(is_right) {
             let Some(stated) = stated(said) else { continue };
             let (objects, right, sum) = &mut sums[((stated * BINS as f64) as usize).min(BINS - 1)];
@@ -69,12 +81,18 @@ fn reliability(frames: &[ScoredFrame], limit_m: f64, stated: impl Fn(&SaidObject
         }
     }
     let all: u64 = sums.iter().map(|(objects, ..)| objects).sum();
-    let error: f64 = sums.iter().map(|(_, right, sum)| (*right as f64 - sum).abs()).sum();
+    let error: f64 = sums
+        .iter()
+        .map(|(_, right, sum)| (*right as f64 - sum).abs())
+        .sum();
     let filled = sums.iter().filter(|(objects, ..)| *objects > 0);
     let bins = filled.map(|&(objects, right, sum)| ReliabilityBin {
         stated_pct: 100.0 * sum / objects as f64,
         right_pct: 100.0 * right as f64 / objects as f64,
         objects,
     });
-    Reliability { ece_pct: percent(error, all), bins: bins.collect() }
+    Reliability {
+        ece_pct: percent(error, all),
+        bins: bins.collect(),
+    }
 }

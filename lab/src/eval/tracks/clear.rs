@@ -51,7 +51,8 @@ pub(super) fn judge(frames: &[ScoredFrame]) -> Clear {
             let earlier = last.insert(truth, said);
             clear.id_switches += u64::from(earlier.is_some_and(|earlier| earlier != said));
             clear.fragments += u64::from(earlier.is_some() && !followed.contains_key(&truth));
-            clear.distance_sum_m += (frame.truth[pair.truth].position - frame.said[pair.said].position).norm();
+            clear.distance_sum_m +=
+                (frame.truth[pair.truth].position - frame.said[pair.said].position).norm();
         }
     }
     clear

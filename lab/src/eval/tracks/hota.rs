@@ -42,10 +42,16 @@ pub(super) fn judge(frames: &[ScoredFrame]) -> Hota {
     let mut at: Vec<AtThreshold> = TWENTIETHS.map(|_| AtThreshold::default()).collect();
     for (frame, pairs) in frames.iter().zip(&similar) {
         let ids = |pair: &MatchedPair| (frame.truth[pair.truth].id, frame.said[pair.said].id);
-        let worth: Vec<MatchedPair> =
-            pairs.iter().map(|pair| MatchedPair { value: pair.value * lives.overlap(ids(pair)), ..*pair }).collect();
+        let worth: Vec<MatchedPair> = pairs
+            .iter()
+            .map(|pair| MatchedPair {
+                value: pair.value * lives.overlap(ids(pair)),
+                ..*pair
+            })
+            .collect();
         for chosen in best(&worth) {
-            let distance = (frame.truth[chosen.truth].position - frame.said[chosen.said].position).norm();
+            let distance =
+                (frame.truth[chosen.truth].position - frame.said[chosen.said].position).norm();
             let similarity = 1.0 - distance / ZERO_DISTANCE_M;
             for (threshold, twentieths) in at.iter_mut().zip(TWENTIETHS) {
                 if similarity >= f64::from(twentieths) / 20.0 - f64::EPSILON {
@@ -56,14 +62,24 @@ pub(super) fn judge(frames: &[ScoredFrame]) -> Hota {
         }
     }
     let (objects, said): (f64, f64) = (lives.truth.values().sum(), lives.said.values().sum());
-    let all: Vec<Hota> = at.iter().map(|threshold| threshold.scores(&lives, objects, said)).collect();
+    let all: Vec<Hota> = at
+        .iter()
+        .map(|threshold| threshold.scores(&lives, objects, said))
+        .collect();
     let mean = |of: fn(&Hota) -> f64| all.iter().map(of).sum::<f64>() / all.len() as f64;
-    Hota { hota: mean(|s| s.hota), deta: mean(|s| s.deta), assa: mean(|s| s.assa), loca: mean(|s| s.loca) }
+    Hota {
+        hota: mean(|s| s.hota),
+        deta: mean(|s| s.deta),
+        assa: mean(|s| s.assa),
+        loca: mean(|s| s.loca),
+    }
 }
 
 fn similarities(frame: &ScoredFrame) -> Vec<MatchedPair> {
     let mut pairs = near_pairs(frame, ZERO_DISTANCE_M);
-    pairs.iter_mut().for_each(|pair| pair.value = 1.0 - pair.value / ZERO_DISTANCE_M);
+    pairs
+        .iter_mut()
+        .for_each(|pair| pair.value = 1.0 - pair.value / ZERO_DISTANCE_M);
     pairs
 }
 
@@ -71,7 +87,8 @@ impl Lives {
     fn of(frames: &[ScoredFrame], similar: &[Vec<MatchedPair>]) -> Self {
         let mut lives = Self::default();
         for (frame, pairs) in frames.iter().zip(similar) {
-            let (mut of_truth, mut of_said) = (vec![0.0; frame.truth.len()], vec![0.0; frame.said.len()]);
+            let (mut of_truth, mut of_said) =
+                (vec![0.0; frame.truth.len()], vec![0.0; frame.said.len()]);
             for pair in pairs {
                 of_truth[pair.truth] += pair.value;
                 of_said[pair.said] += pair.value;
@@ -81,8 +98,14 @@ impl Lives {
                 let ids = (frame.truth[pair.truth].id, frame.said[pair.said].id);
                 *lives.shared.entry(ids).or_default() += share;
             }
-            frame.truth.iter().for_each(|object| *lives.truth.entry(object.id).or_default() += 1.0);
-            frame.said.iter().for_each(|object| *lives.said.entry(object.id).or_default() += 1.0);
+            frame
+                .truth
+                .iter()
+                .for_each(|object| *lives.truth.entry(object.id).or_default() += 1.0);
+            frame
+                .said
+                .iter()
+                .for_each(|object| *lives.said.entry(object.id).or_default() += 1.0);
         }
         lives
     }
@@ -101,12 +124,24 @@ impl AtThreshold {
     fn scores(&self, lives: &Lives, objects: f64, said: f64) -> Hota {
         let matches: f64 = self.matches.values().sum();
         let deta = matches / (objects + said - matches).max(1.0);
-        let mut weighted: Vec<f64> =
-            self.matches.iter().map(|(ids, count)| count * lives.jaccard(*ids, *count)).collect();
+        let mut weighted: Vec<f64> = self
+            .matches
+            .iter()
+            .map(|(ids, count)| count * lives.jaccard(*ids, *count))
+            .collect();
         // Equal sums for equal input: the order of a hash table is not that of the input.
         weighted.sort_unstable_by(f64::total_cmp);
         let assa = weighted.iter().sum::<f64>() / matches.max(1.0);
-        let loca = if matches > 0.0 { self.similarity_sum / matches } else { 1.0 };
-        Hota { hota: (deta * assa).sqrt(), deta, assa, loca }
+        let loca = if matches > 0.0 {
+            self.similarity_sum / matches
+        } else {
+            1.0
+        };
+        Hota {
+            hota: (deta * assa).sqrt(),
+            deta,
+            assa,
+            loca,
+        }
     }
 }

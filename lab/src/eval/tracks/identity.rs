@@ -28,14 +28,26 @@ pub(super) fn judge(frames: &[ScoredFrame]) -> IdentityScore {
     let mut together: HashMap<(u32, u32), u64> = HashMap::new();
     for frame in frames {
         for pair in near_pairs(frame, MATCH_DISTANCE_M) {
-            *together.entry((frame.truth[pair.truth].id, frame.said[pair.said].id)).or_default() += 1;
+            *together
+                .entry((frame.truth[pair.truth].id, frame.said[pair.said].id))
+                .or_default() += 1;
         }
     }
     let mut pairs: Vec<MatchedPair> = together
         .into_iter()
-        .map(|((truth, said), count)| MatchedPair { truth: truth as usize, said: said as usize, value: count as f64 })
+        .map(|((truth, said), count)| MatchedPair {
+            truth: truth as usize,
+            said: said as usize,
+            value: count as f64,
+        })
         .collect();
     pairs.sort_unstable_by_key(|pair| (pair.truth, pair.said));
-    let all = frames.iter().map(|frame| (frame.truth.len() + frame.said.len()) as u64).sum();
-    IdentityScore { true_positives: best(&pairs).iter().map(|pair| pair.value as u64).sum(), all }
+    let all = frames
+        .iter()
+        .map(|frame| (frame.truth.len() + frame.said.len()) as u64)
+        .sum();
+    IdentityScore {
+        true_positives: best(&pairs).iter().map(|pair| pair.value as u64).sum(),
+        all,
+    }
 }

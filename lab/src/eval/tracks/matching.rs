@@ -23,9 +23,17 @@ pub(super) fn distance_m(truth: &TrueObject, said: &SaidObject, limit_m: f64) ->
 pub(super) fn near_pairs(frame: &ScoredFrame, limit_m: f64) -> Vec<MatchedPair> {
     let mut pairs = Vec::new();
     for (said, object) in frame.said.iter().enumerate() {
-        let of_said = frame.truth.iter().enumerate().filter_map(|(truth, candidate)| {
-            distance_m(candidate, object, limit_m).map(|value| MatchedPair { truth, said, value })
-        });
+        let of_said = frame
+            .truth
+            .iter()
+            .enumerate()
+            .filter_map(|(truth, candidate)| {
+                distance_m(candidate, object, limit_m).map(|value| MatchedPair {
+                    truth,
+                    said,
+                    value,
+                })
+            });
         pairs.extend(of_said);
     }
     pairs
@@ -33,7 +41,14 @@ pub(super) fn near_pairs(frame: &ScoredFrame, limit_m: f64) -> Vec<MatchedPair> 
 
 /// The one-to-one choice of pairs whose values have the greatest sum; pairs worth nothing are never chosen.
 pub(super) fn best(pairs: &[MatchedPair]) -> Vec<MatchedPair> {
-    assign(pairs.iter().copied().filter(|pair| pair.benefit() > 0).collect(), |_, _| None)
+    assign(
+        pairs
+            .iter()
+            .copied()
+            .filter(|pair| pair.benefit() > 0)
+            .collect(),
+        |_, _| None,
+    )
 }
 
 impl Candidate for MatchedPair {

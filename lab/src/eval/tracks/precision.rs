@@ -25,17 +25,25 @@ pub(super) struct BestF1 {
 }
 
 /// The average precisions in percent of every class of the truth; a class that is only said counts nowhere.
-pub(super) fn by_class(frames: &[ScoredFrame]) -> BTreeMap<Label, [Option<f64>; AP_DISTANCES_M.len()]> {
+pub(super) fn by_class(
+    frames: &[ScoredFrame],
+) -> BTreeMap<Label, [Option<f64>; AP_DISTANCES_M.len()]> {
     let mut objects: BTreeMap<Label, u64> = BTreeMap::new();
     for object in frames.iter().flat_map(|frame| &frame.truth) {
         *objects.entry(object.label.clone()).or_default() += 1;
     }
-    let mut classes: BTreeMap<Label, _> = objects.keys().map(|label| (label.clone(), [None; 4])).collect();
+    let mut classes: BTreeMap<Label, _> = objects
+        .keys()
+        .map(|label| (label.clone(), [None; 4]))
+        .collect();
     for (place, limit_m) in AP_DISTANCES_M.into_iter().enumerate() {
         let verdicts = verdicts(frames, limit_m);
         for (label, ap_pct) in &mut classes {
-            let of_class: Vec<RankedObject> =
-                verdicts.iter().filter(|verdict| verdict.label == label).copied().collect();
+            let of_class: Vec<RankedObject> = verdicts
+                .iter()
+                .filter(|verdict| verdict.label == label)
+                .copied()
+                .collect();
             ap_pct[place] = Some(100.0 * average_precision(&curve(of_class, objects[label])));
         }
     }
@@ -50,10 +58,14 @@ pub(super) fn best_f1(frames: &[ScoredFrame]) -> Option<BestF1> {
     }
     let f1 = |point: &Point| BestF1 {
         threshold: point.threshold,
-        f1: 2.0 * point.precision * point.recall / (point.precision + point.recall).max(f64::MIN_POSITIVE),
+        f1: 2.0 * point.precision * point.recall
+            / (point.precision + point.recall).max(f64::MIN_POSITIVE),
     };
     let points = curve(verdicts(frames, MATCH_DISTANCE_M), objects as u64);
-    points.iter().map(f1).reduce(|best, next| if next.f1 > best.f1 { next } else { best })
+    points
+        .iter()
+        .map(f1)
+        .reduce(|best, next| if next.f1 > best.f1 { next } else { best })
 }
 
 /// The greatest MODA in percent over all thresholds, at every distance; `None` if nothing is true.
@@ -99,7 +111,11 @@ fn verdicts(frames: &[ScoredFrame], limit_m: f64) -> Vec<RankedObject<'_>> {
                 taken[pair.truth] = true;
             }
             let object = &frame.said[said];
-            verdicts.push(RankedObject { label: &object.label, score: object.score, is_right: nearest.is_some() });
+            verdicts.push(RankedObject {
+                label: &object.label,
+                score: object.score,
+                is_right: nearest.is_some(),
+            });
         }
     }
     verdicts
@@ -125,7 +141,11 @@ fn average_precision(points: &[Point]) -> f64 {
     let (mut area, mut precision) = (0.0, 0.0);
     for (place, point) in points.iter().enumerate().rev() {
         precision = point.precision.max(precision);
-        let before = if place > 0 { points[place - 1].recall } else { 0.0 };
+        let before = if place > 0 {
+            points[place - 1].recall
+        } else {
+            0.0
+        };
         area += (point.recall - before) * precision;
     }
     area

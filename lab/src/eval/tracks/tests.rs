@@ -7,15 +7,28 @@ use super::matching::MatchedPair;
 use super::*;
 
 fn truth(id: u32, x: f64) -> TrueObject {
-    TrueObject { id, label: "car".into(), position: Point2::new(x, 0.0) }
+    TrueObject {
+        id,
+        label: "car".into(),
+        position: Point2::new(x, 0.0),
+    }
 }
 
 fn said(id: u32, x: f64, score: f64) -> SaidObject {
-    SaidObject { id, label: "car".into(), score, existence: None, position: Point2::new(x, 0.0) }
+    SaidObject {
+        id,
+        label: "car".into(),
+        score,
+        existence: None,
+        position: Point2::new(x, 0.0),
+    }
 }
 
 fn near(found: Option<f64>, expected: f64) {
-    assert!(found.is_some_and(|found| (found - expected).abs() < 1e-9), "{found:?} is not {expected}");
+    assert!(
+        found.is_some_and(|found| (found - expected).abs() < 1e-9),
+        "{found:?} is not {expected}"
+    );
 }
 
 #[test]
@@ -33,22 +46,45 @@ fn what_is_perfect_is_a_hundred_percent() {
         .for_each(|share| near(*share, 100.0));
     assert_eq!(scores.at_best_f1.threshold, 0.8);
     for at in [scores.at_best_f1, scores.at_default] {
-        let shares =
-            [at.moda_pct, at.modp_pct, at.mota_pct, at.idf1_pct, at.hota_pct, at.deta_pct, at.assa_pct, at.loca_pct];
+        let shares = [
+            at.moda_pct,
+            at.modp_pct,
+            at.mota_pct,
+            at.idf1_pct,
+            at.hota_pct,
+            at.deta_pct,
+            at.assa_pct,
+            at.loca_pct,
+        ];
         shares.into_iter().for_each(|share| near(share, 100.0));
-        assert_eq!((at.matches, at.false_alarms, at.misses, at.id_switches), (6, 0, 0, 0));
+        assert_eq!(
+            (at.matches, at.false_alarms, at.misses, at.id_switches),
+            (6, 0, 0, 0)
+        );
     }
 }
 
 #[test]
 fn nothing_said_is_nothing_found_and_nothing_true_is_not_judged() {
-    let silent = score(&[ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![] }]);
+    let silent = score(&[ScoredFrame {
+        truth: vec![truth(0, 0.0)],
+        said: vec![],
+    }]);
     assert_eq!((silent.ap_pct, silent.best_f1_pct), ([Some(0.0); 4], None));
     let at = silent.at_default;
-    assert_eq!((at.misses, at.moda_pct, at.mota_pct, at.modp_pct), (1, Some(0.0), Some(0.0), None));
+    assert_eq!(
+        (at.misses, at.moda_pct, at.mota_pct, at.modp_pct),
+        (1, Some(0.0), Some(0.0), None)
+    );
     assert_eq!((at.idf1_pct, at.hota_pct), (Some(0.0), Some(0.0)));
-    let empty = score(&[ScoredFrame { truth: vec![], said: vec![said(0, 0.0, 0.9)] }]);
-    assert_eq!((empty.ap_pct, empty.best_f1_pct, empty.at_default.hota_pct), ([None; 4], None, None));
+    let empty = score(&[ScoredFrame {
+        truth: vec![],
+        said: vec![said(0, 0.0, 0.9)],
+    }]);
+    assert_eq!(
+        (empty.ap_pct, empty.best_f1_pct, empty.at_default.hota_pct),
+        ([None; 4], None, None)
+    );
     assert_eq!(empty.at_default.false_alarms, 1);
 }
 
@@ -65,7 +101,10 @@ fn average_precision_is_that_worked_out_by_hand() {
     near(scores.ap_pct[1], 50.0);
     near(scores.ap_pct[2], 100.0 * (0.5 + 0.5 * 2.0 / 3.0));
     near(scores.best_f1_pct, 80.0);
-    scores.best_moda_pct.iter().for_each(|moda_pct| near(*moda_pct, 50.0));
+    scores
+        .best_moda_pct
+        .iter()
+        .for_each(|moda_pct| near(*moda_pct, 50.0));
     assert_eq!(scores.at_best_f1.threshold, 0.7);
     near(scores.at_best_f1.moda_pct, 50.0);
     near(scores.at_best_f1.modp_pct, 100.0 * (0.85 + 0.25) / 2.0);
@@ -79,7 +118,10 @@ fn equal_confidences_enter_together() {
         if wrong_first {
             said.reverse();
         }
-        ScoredFrame { truth: vec![truth(0, 0.0)], said }
+        ScoredFrame {
+            truth: vec![truth(0, 0.0)],
+            said,
+        }
     };
     let [one, other] = [false, true].map(|wrong_first| score(&[frame(wrong_first)]).ap_pct[0]);
     assert_eq!((one, other), (Some(50.0), Some(50.0)));
@@ -87,21 +129,29 @@ fn equal_confidences_enter_together() {
 
 #[test]
 fn another_label_is_another_object() {
-    let mut frame =
-        ScoredFrame { truth: vec![truth(0, 0.0), truth(1, 9.0)], said: vec![said(0, 0.0, 0.9), said(1, 9.0, 0.9)] };
+    let mut frame = ScoredFrame {
+        truth: vec![truth(0, 0.0), truth(1, 9.0)],
+        said: vec![said(0, 0.0, 0.9), said(1, 9.0, 0.9)],
+    };
     frame.truth[1].label = "person".into();
     let scores = score(&[frame]);
     assert_eq!(scores.class_ap_pct.len(), 2);
     near(scores.class_ap_pct[&Label::new_static("person")][3], 0.0);
     near(scores.class_ap_pct[&Label::new_static("car")][3], 50.0);
     near(scores.ap_pct[3], 25.0);
-    assert_eq!((scores.at_default.matches, scores.at_default.false_alarms), (1, 1));
+    assert_eq!(
+        (scores.at_default.matches, scores.at_default.false_alarms),
+        (1, 1)
+    );
 }
 
 /// One object over four frames, two with one identity and two with another.
 #[test]
 fn one_switch_costs_what_it_should() {
-    let frame = |id| ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![said(id, 0.0, 0.9)] };
+    let frame = |id| ScoredFrame {
+        truth: vec![truth(0, 0.0)],
+        said: vec![said(id, 0.0, 0.9)],
+    };
     let at = score(&[frame(1), frame(1), frame(2), frame(2)]).at_default;
     assert_eq!(at.id_switches, 1);
     near(at.moda_pct, 100.0);
@@ -120,9 +170,16 @@ fn an_object_that_is_found_again_is_a_fragment() {
         said: id.map_or_else(|| vec![said(9, 50.0, 0.9)], |id| vec![said(id, 0.0, 0.9)]),
     };
     let at = score(&[None, Some(1), None, Some(1), None, Some(2)].map(frame)).at_default;
-    assert_eq!((at.fragments, at.id_switches, at.misses, at.matches), (2, 1, 3, 3));
+    assert_eq!(
+        (at.fragments, at.id_switches, at.misses, at.matches),
+        (2, 1, 3, 3)
+    );
     let switched = score(&[Some(1), Some(2)].map(frame)).at_default;
-    assert_eq!((switched.fragments, switched.id_switches), (0, 1), "it was never missed");
+    assert_eq!(
+        (switched.fragments, switched.id_switches),
+        (0, 1),
+        "it was never missed"
+    );
 }
 
 /// Five objects said: 0.95 right, 0.9 and 1.0 where 1.0 is wrong, 0.55 wrong, 0.05 right.
@@ -139,17 +196,32 @@ fn calibration_is_that_worked_out_by_hand() {
             said(4, 21.0, 0.05),
         ],
     };
-    let ReliabilityBins { confidence, existence } = score(&[frame]).calibration;
+    let ReliabilityBins {
+        confidence,
+        existence,
+    } = score(&[frame]).calibration;
     assert_eq!(existence, None);
-    near(confidence.ece_pct, 100.0 * (3.0 * (0.95 - 2.0 / 3.0) + 0.55 + 0.95) / 5.0);
-    let bins: Vec<_> =
-        confidence.bins.iter().map(|bin| (bin.stated_pct.round(), bin.right_pct.round(), bin.objects)).collect();
+    near(
+        confidence.ece_pct,
+        100.0 * (3.0 * (0.95 - 2.0 / 3.0) + 0.55 + 0.95) / 5.0,
+    );
+    let bins: Vec<_> = confidence
+        .bins
+        .iter()
+        .map(|bin| (bin.stated_pct.round(), bin.right_pct.round(), bin.objects))
+        .collect();
     assert_eq!(bins, [(5.0, 100.0, 1), (55.0, 0.0, 1), (95.0, 67.0, 3)]);
 
     let mut exists = said(0, 3.0, 0.5);
     exists.existence = Some(1.0);
-    let frame = ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![exists, said(1, 50.0, 0.1)] };
-    let ReliabilityBins { confidence, existence } = score(&[frame]).calibration;
+    let frame = ScoredFrame {
+        truth: vec![truth(0, 0.0)],
+        said: vec![exists, said(1, 50.0, 0.1)],
+    };
+    let ReliabilityBins {
+        confidence,
+        existence,
+    } = score(&[frame]).calibration;
     near(confidence.ece_pct, 30.0);
     near(existence.unwrap().ece_pct, 0.0);
     assert_eq!(score(&[]).calibration.confidence.ece_pct, None);
@@ -159,9 +231,18 @@ fn calibration_is_that_worked_out_by_hand() {
 #[test]
 fn a_match_is_kept_while_it_is_near_enough() {
     let frames = [
-        ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![said(1, 0.0, 0.9)] },
-        ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![said(1, 1.9, 0.9), said(2, 0.1, 0.9)] },
-        ScoredFrame { truth: vec![truth(0, 0.0)], said: vec![said(1, 2.1, 0.9), said(2, 0.1, 0.9)] },
+        ScoredFrame {
+            truth: vec![truth(0, 0.0)],
+            said: vec![said(1, 0.0, 0.9)],
+        },
+        ScoredFrame {
+            truth: vec![truth(0, 0.0)],
+            said: vec![said(1, 1.9, 0.9), said(2, 0.1, 0.9)],
+        },
+        ScoredFrame {
+            truth: vec![truth(0, 0.0)],
+            said: vec![said(1, 2.1, 0.9), said(2, 0.1, 0.9)],
+        },
     ];
     let switches = |frames: &[ScoredFrame]| score(frames).at_default.id_switches;
     assert_eq!((switches(&frames[..2]), switches(&frames)), (0, 1));
@@ -179,16 +260,24 @@ fn the_matching_has_the_greatest_sum_however_many_contest() {
         pair(7, 9, 0.3), // more true than said
         pair(8, 20, 0.0),
     ];
-    let mut chosen: Vec<_> = matching::best(&pairs).iter().map(|pair| (pair.truth, pair.said)).collect();
+    let mut chosen: Vec<_> = matching::best(&pairs)
+        .iter()
+        .map(|pair| (pair.truth, pair.said))
+        .collect();
     chosen.sort_unstable();
     assert_eq!(chosen, [(0, 1), (1, 0), (6, 9)]);
 }
 
 fn map(at: u64, objects: &[(u128, f64)]) -> GlobalMap {
     let covariance = Covariance::isotropic(1.0);
-    let object = |&(id, x_m): &(u128, f64)| FusedObject::new(Uuid::from_u128(id), "car", 0.9, x_m, 0.0, covariance);
+    let object = |&(id, x_m): &(u128, f64)| {
+        FusedObject::new(Uuid::from_u128(id), "car", 0.9, x_m, 0.0, covariance)
+    };
     let epoch = Epoch::new(1, NodeName::from_static("edge"));
-    GlobalMap { objects: objects.iter().map(object).collect(), ..GlobalMap::new(&epoch, at, Timestamp(at)) }
+    GlobalMap {
+        objects: objects.iter().map(object).collect(),
+        ..GlobalMap::new(&epoch, at, Timestamp(at))
+    }
 }
 
 /// An object at ten metres a frame, judged by maps about the frames, with one lost.
@@ -199,11 +288,26 @@ fn a_frame_is_judged_by_the_nearest_map_at_the_time_of_the_map() {
         .collect();
     let truth = TrackTruth::parse(&serde_json::json!({ "frames": frames }).to_string()).unwrap();
     let mut evaluation = TrackEvaluation::new(truth);
-    for (at, x) in [(0, 0.0), (40, 99.0), (130, 13.0), (170, 17.0), (330, 33.0), (330, 33.5)] {
+    for (at, x) in [
+        (0, 0.0),
+        (40, 99.0),
+        (130, 13.0),
+        (170, 17.0),
+        (330, 33.0),
+        (330, 33.5),
+    ] {
         evaluation.map(&map(at, &[(7, x)]));
     }
     let scores = evaluation.result();
-    assert_eq!((scores.frames, scores.frames_with_map, scores.objects, scores.said), (6, 5, 6, 5));
+    assert_eq!(
+        (
+            scores.frames,
+            scores.frames_with_map,
+            scores.objects,
+            scores.said
+        ),
+        (6, 5, 6, 5)
+    );
     let at = scores.at_default;
     assert_eq!((at.matches, at.misses), (5, 1), "{scores:?}");
     near(at.motp_m, (0.5 + 0.5) / 5.0);

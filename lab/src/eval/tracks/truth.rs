@@ -104,31 +104,64 @@ impl TrackTruth {
         let mut source = serde_json::Deserializer::from_str(trimmed(text));
         let fields: Fields = serde_path_to_error::deserialize(&mut source)
             .map_err(|error| form(error.path().to_string(), error.into_inner().to_string()))?;
-        source.end().map_err(|error| form("the end", error.to_string()))?;
-        let mut ids = Ids { has_identities: true, ..Ids::default() };
+        source
+            .end()
+            .map_err(|error| form("the end", error.to_string()))?;
+        let mut ids = Ids {
+            has_identities: true,
+            ..Ids::default()
+        };
         let mut frames: Vec<TrueFrame> = Vec::with_capacity(fields.frames.len());
         for (number, frame) in fields.frames.into_iter().enumerate() {
             let place = format!("frames[{number}]");
             if frames.last().is_some_and(|before| before.at >= frame.t_us) {
-                return Err(form(format!("{place}.t_us"), "is not after the frame before"));
+                return Err(form(
+                    format!("{place}.t_us"),
+                    "is not after the frame before",
+                ));
             }
-            frames.push(TrueFrame { at: frame.t_us, objects: objects(frame.objects, &place, &mut ids)? });
+            frames.push(TrueFrame {
+                at: frame.t_us,
+                objects: objects(frame.objects, &place, &mut ids)?,
+            });
         }
         let Ids { has_identities, .. } = ids;
-        if frames.is_empty() { Err(TrackTruthError::Empty) } else { Ok(Self { frames, has_identities }) }
+        if frames.is_empty() {
+            Err(TrackTruthError::Empty)
+        } else {
+            Ok(Self {
+                frames,
+                has_identities,
+            })
+        }
     }
 
     /// The truth in files of a benchmark, with an empty frame for each that a file leaves out.
     ///
     /// # Errors
     /// Naming sequence and frame where an identity occurs twice, or when there is no object at all.
-    pub fn from_sequences(sequences: &[Sequence], frame_rate_hz: f64) -> Result<Self, TrackTruthError> {
-        let mut ids = Ids { has_identities: true, ..Ids::default() };
+    pub fn from_sequences(
+        sequences: &[Sequence],
+        frame_rate_hz: f64,
+    ) -> Result<Self, TrackTruthError> {
+        let mut ids = Ids {
+            has_identities: true,
+            ..Ids::default()
+        };
         let mut frames = Vec::new();
         for (number, sequence) in sequences.iter().enumerate() {
-            let last = sequence.frames.keys().last().copied().unwrap_or(sequence.first);
+            let last = sequence
+                .frames
+                .keys()
+                .last()
+                .copied()
+                .unwrap_or(sequence.first);
             for frame in sequence.first..=last {
-                let objects = sequence.frames.get(&frame).map(Vec::as_slice).unwrap_or_default();
+                let objects = sequence
+                    .frames
+                    .get(&frame)
+                    .map(Vec::as_slice)
+                    .unwrap_or_default();
                 let fields = objects.iter().map(|object| ObjectFields {
                     id: object.id.map(|id| Id::Text(format!("{number}/{id}"))),
                     label: object.perceived.label.to_string(),
@@ -137,13 +170,19 @@ impl TrackTruth {
                 });
                 let place = format!("sequence {}, frame {frame}", sequence.name);
                 let objects = self::objects(fields.collect(), &place, &mut ids)?;
-                frames.push(TrueFrame { at: time_of(number, frame, frame_rate_hz), objects });
+                frames.push(TrueFrame {
+                    at: time_of(number, frame, frame_rate_hz),
+                    objects,
+                });
             }
         }
         if ids.next == 0 {
             Err(TrackTruthError::Empty)
         } else {
-            Ok(Self { frames, has_identities: ids.has_identities })
+            Ok(Self {
+                frames,
+                has_identities: ids.has_identities,
+            })
         }
     }
 
@@ -159,24 +198,40 @@ impl TrackTruth {
 
     /// The median time between frames.
     pub(super) fn period_us(&self) -> u64 {
-        let mut steps: Vec<u64> =
-            self.frames.windows(2).map(|pair| pair[1].at.micros() - pair[0].at.micros()).collect();
+        let mut steps: Vec<u64> = self
+            .frames
+            .windows(2)
+            .map(|pair| pair[1].at.micros() - pair[0].at.micros())
+            .collect();
         steps.sort_unstable();
-        steps.get(steps.len() / 2).copied().unwrap_or(USUAL_PERIOD_US)
+        steps
+            .get(steps.len() / 2)
+            .copied()
+            .unwrap_or(USUAL_PERIOD_US)
     }
 
     /// The objects of a frame, where they were at a time near it: on a straight line to the frame before or after.
     pub(super) fn at(&self, number: usize, time: Timestamp) -> Vec<TrueObject> {
         let frame = &self.frames[number];
         let ahead = time.micros_from(frame.at);
-        let other = if ahead < 0 { number.checked_sub(1) } else { Some(number + 1) };
+        let other = if ahead < 0 {
+            number.checked_sub(1)
+        } else {
+            Some(number + 1)
+        };
         let mut objects = frame.objects.clone();
-        let Some(other) = other.and_then(|other| self.frames.get(other)).filter(|_| ahead != 0) else {
+        let Some(other) = other
+            .and_then(|other| self.frames.get(other))
+            .filter(|_| ahead != 0)
+        else {
             return objects;
         };
         let share = ahead as f64 / other.at.micros_from(frame.at) as f64;
-        let places: HashMap<u32, Point2<f64>> =
-            other.objects.iter().map(|object| (object.id, object.position)).collect();
+        let places: HashMap<u32, Point2<f64>> = other
+            .objects
+            .iter()
+            .map(|object| (object.id, object.position))
+            .collect();
         for object in &mut objects {
             if let Some(place) = places.get(&object.id) {
                 object.position += (place - object.position) * share;
@@ -209,19 +264,39 @@ impl Ids {
     }
 }
 
-fn objects(fields: Vec<ObjectFields>, place: &str, ids: &mut Ids) -> Result<Vec<TrueObject>, TrackTruthError> {
+fn objects(
+    fields: Vec<ObjectFields>,
+    place: &str,
+    ids: &mut Ids,
+) -> Result<Vec<TrueObject>, TrackTruthError> {
     let mut in_frame = HashSet::new();
     let mut objects = Vec::with_capacity(fields.len());
-    for (number, ObjectFields { id, label, x_m, y_m }) in fields.into_iter().enumerate() {
+    for (
+        number,
+        ObjectFields {
+            id,
+            label,
+            x_m,
+            y_m,
+        },
+    ) in fields.into_iter().enumerate()
+    {
         let place = |field: &str| format!("{place}.objects[{number}].{field}");
         if !(1..=MAX_NAME_BYTES).contains(&label.len()) {
-            return Err(form(place("label"), format!("is not 1 to {MAX_NAME_BYTES} bytes long")));
+            return Err(form(
+                place("label"),
+                format!("is not 1 to {MAX_NAME_BYTES} bytes long"),
+            ));
         }
         let id = ids.number(id);
         if !in_frame.insert(id) {
             return Err(form(place("id"), "is in this frame already"));
         }
-        objects.push(TrueObject { id, label: Label::new(label), position: Point2::new(x_m, y_m) });
+        objects.push(TrueObject {
+            id,
+            label: Label::new(label),
+            position: Point2::new(x_m, y_m),
+        });
     }
     Ok(objects)
 }
@@ -231,7 +306,10 @@ fn trimmed(text: &str) -> &str {
 }
 
 fn form(place: impl Into<String>, reason: impl Into<String>) -> TrackTruthError {
-    TrackTruthError::Form { place: place.into(), reason: reason.into() }
+    TrackTruthError::Form {
+        place: place.into(),
+        reason: reason.into(),
+    }
 }
 
 #[cfg(test)]
@@ -245,32 +323,71 @@ mod tests {
             {\"t_us\": 200, \"objects\": [{\"id\": \"b\", \"label\": \"car\", \"x_m\": 0, \"y_m\": 0},
                 {\"id\": 7, \"label\": \"car\", \"x_m\": 3.0, \"y_m\": 2.0}]}]}";
         assert!(TrackTruth::is_in(text) && TrackTruth::is_in(r#"{"frames": []}"#));
-        for other in
-            [r#"{"a": "cup"}"#, r#"{"frames": ["vase", "cup"]}"#, r#"{"frames": [{"from_us": 0, "label": "x"}]}"#]
-        {
+        for other in [
+            r#"{"a": "cup"}"#,
+            r#"{"frames": ["vase", "cup"]}"#,
+            r#"{"frames": [{"from_us": 0, "label": "x"}]}"#,
+        ] {
             assert!(!TrackTruth::is_in(other), "{other}");
         }
         let truth = TrackTruth::parse(text).unwrap();
         assert_eq!((truth.frames().len(), truth.period_us()), (2, 100));
-        let place = |number, at| truth.at(number, Timestamp(at)).iter().find(|o| o.id == 0).unwrap().position.x;
-        assert_eq!([place(0, 100), place(0, 125), place(1, 175), place(1, 200)], [1.0, 1.5, 2.5, 3.0]);
-        assert_eq!([place(0, 75), place(1, 250)], [1.0, 3.0], "nothing is known beyond the ends");
+        let place = |number, at| {
+            truth
+                .at(number, Timestamp(at))
+                .iter()
+                .find(|o| o.id == 0)
+                .unwrap()
+                .position
+                .x
+        };
+        assert_eq!(
+            [place(0, 100), place(0, 125), place(1, 175), place(1, 200)],
+            [1.0, 1.5, 2.5, 3.0]
+        );
+        assert_eq!(
+            [place(0, 75), place(1, 250)],
+            [1.0, 3.0],
+            "nothing is known beyond the ends"
+        );
     }
 
     #[test]
     fn what_cannot_be_read_is_named() {
-        let object =
-            |rest: &str| format!(r#"{{"frames": [{{"t_us": 1, "objects": [{{"id": 1, "label": "car", {rest}}}]}}]}}"#);
+        let object = |rest: &str| {
+            format!(
+                r#"{{"frames": [{{"t_us": 1, "objects": [{{"id": 1, "label": "car", {rest}}}]}}]}}"#
+            )
+        };
         for (text, part) in [
             ("{}".to_owned(), "missing field `frames`"),
             (r#"{"frames": []}"#.to_owned(), "no frame"),
-            (r#"{"frames": [{"t_us": -1, "objects": []}]}"#.to_owned(), "frames[0].t_us"),
-            (r#"{"frames": [{"t_us": 1, "objects": []}, {"t_us": 1, "objects": []}]}"#.to_owned(), "frames[1].t_us"),
+            (
+                r#"{"frames": [{"t_us": -1, "objects": []}]}"#.to_owned(),
+                "frames[0].t_us",
+            ),
+            (
+                r#"{"frames": [{"t_us": 1, "objects": []}, {"t_us": 1, "objects": []}]}"#
+                    .to_owned(),
+                "frames[1].t_us",
+            ),
             (object(r#""x_m": 1"#), "missing field `y_m`"),
-            (object(r#""x_m": "east", "y_m": 0"#), "frames[0].objects[0].x_m"),
-            (object(r#""x_m": 0, "y_m": 0}, {"id": 1, "label": "car", "x_m": 0, "y_m": 0"#), "frames[0].objects[1].id"),
-            (object(r#""x_m": 0, "y_m": 0}, {"id": 1.5, "label": "car", "x_m": 0, "y_m": 0"#), "whole number"),
-            (object(r#""x_m": 0, "y_m": 0}, {"id": 2, "label": "", "x_m": 0, "y_m": 0"#), "objects[1].label"),
+            (
+                object(r#""x_m": "east", "y_m": 0"#),
+                "frames[0].objects[0].x_m",
+            ),
+            (
+                object(r#""x_m": 0, "y_m": 0}, {"id": 1, "label": "car", "x_m": 0, "y_m": 0"#),
+                "frames[0].objects[1].id",
+            ),
+            (
+                object(r#""x_m": 0, "y_m": 0}, {"id": 1.5, "label": "car", "x_m": 0, "y_m": 0"#),
+                "whole number",
+            ),
+            (
+                object(r#""x_m": 0, "y_m": 0}, {"id": 2, "label": "", "x_m": 0, "y_m": 0"#),
+                "objects[1].label",
+            ),
             (object(r#""x_m": 0, "y_m": 0"#) + "}", "trailing"),
         ] {
             let error = TrackTruth::parse(&text).unwrap_err().to_string();

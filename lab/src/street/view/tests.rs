@@ -29,20 +29,34 @@ fn optics() -> Intrinsics {
     Intrinsics::with_square_pixels(640, 480, 80f64.to_radians())
 }
 
-fn camera([x_m, y_m, heading_deg]: [f64; 3], [height_m, pitch_deg, roll_deg]: [f64; 3]) -> StreetCamera {
+fn camera(
+    [x_m, y_m, heading_deg]: [f64; 3],
+    [height_m, pitch_deg, roll_deg]: [f64; 3],
+) -> StreetCamera {
     let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
     StreetCamera {
         name: NodeName::from_static("camera"),
         carrier: Carrier::Mast(Pose::new(x_m, y_m, heading_deg.to_radians())),
-        mount: Mount { height_m: Some(height_m), pitch_rad, roll_rad, ..Mount::default() },
+        mount: Mount {
+            height_m: Some(height_m),
+            pitch_rad,
+            roll_rad,
+            ..Mount::default()
+        },
     }
 }
 
 /// Boxes of a minute, around the pixels that change with a body alone. Bodies that others hide, even in part, or that the
 /// image's edge cuts are left out.
 fn minute(street: &Street, camera: &StreetCamera, bodies: &[StreetBody]) -> Vec<Vec<BoundingBox>> {
-    let view = StreetView { optics: optics(), ..StreetView::new(street).unwrap() };
-    let only = |bodies| Street { bodies, cameras: Vec::new() };
+    let view = StreetView {
+        optics: optics(),
+        ..StreetView::new(street).unwrap()
+    };
+    let only = |bodies| Street {
+        bodies,
+        cameras: Vec::new(),
+    };
     let bare = view.render(&only(Vec::new()), camera, 0.0).unwrap();
     let sight = StreetSight::new(street.pose(camera, 0.0), &camera.mount);
     let frame = |frame: u32| {
@@ -51,7 +65,9 @@ fn minute(street: &Street, camera: &StreetCamera, bodies: &[StreetBody]) -> Vec<
         let seen = bodies.iter().filter_map(|body| {
             let foot = optics().project(&sight.point(&body.route.at(at_s).position, 0.0))?;
             (0.0..640.0).contains(&foot.x).then_some(())?;
-            let alone = view.render(&only(vec![body.clone()]), camera, at_s).unwrap();
+            let alone = view
+                .render(&only(vec![body.clone()]), camera, at_s)
+                .unwrap();
             whole_box(&alone, &bare, &full)
         });
         seen.collect()
@@ -64,19 +80,28 @@ fn noisy(bounds: &BoundingBox, dice: &mut ChaCha8Rng) -> BoundingBox {
     let sigma_px = 1.5 + 0.02 * bounds.height();
     let [x_min, y_min, x_max, y_max] = [bounds.x_min, bounds.y_min, bounds.x_max, bounds.y_max]
         .map(|edge| edge + sigma_px * dice.sample::<f64, _>(StandardNormal));
-    BoundingBox { x_min, y_min, x_max, y_max }
+    BoundingBox {
+        x_min,
+        y_min,
+        x_max,
+        y_max,
+    }
 }
 
 /// The box of the pixels in which `alone` differs from `bare`. None if `full` hides some of them, or one is at the edge.
 fn whole_box(alone: &Mat, bare: &Mat, full: &Mat) -> Option<BoundingBox> {
-    let [alone_px, bare_px, full_px] = [alone, bare, full].map(|image| image.data_bytes().unwrap().chunks_exact(3));
+    let [alone_px, bare_px, full_px] =
+        [alone, bare, full].map(|image| image.data_bytes().unwrap().chunks_exact(3));
     let mut pixels = Vec::new();
     for (number, ((alone_px, bare_px), full_px)) in alone_px.zip(bare_px).zip(full_px).enumerate() {
         if alone_px != bare_px {
             if alone_px != full_px {
                 return None;
             }
-            let (row, column) = (number / alone.cols() as usize, number % alone.cols() as usize);
+            let (row, column) = (
+                number / alone.cols() as usize,
+                number % alone.cols() as usize,
+            );
             pixels.push(Point2::new(column as f64, row as f64));
         }
     }
@@ -84,7 +109,11 @@ fn whole_box(alone: &Mat, bare: &Mat, full: &Mat) -> Option<BoundingBox> {
     let (width, height) = (f64::from(alone.cols()), f64::from(alone.rows()));
     let (x_max, y_max) = (bounds.x_max + 1.0, bounds.y_max + 1.0);
     let is_whole = bounds.x_min > 0.0 && bounds.y_min > 0.0 && x_max < width && y_max < height;
-    (is_whole && bounds.height() >= MIN_BOX_PX).then_some(BoundingBox { x_max, y_max, ..bounds })
+    (is_whole && bounds.height() >= MIN_BOX_PX).then_some(BoundingBox {
+        x_max,
+        y_max,
+        ..bounds
+    })
 }
 
 /// Places and mounts of cameras: masts, and cars that are parked.
@@ -103,21 +132,40 @@ fn people_in_rendered_pictures_give_pitch_within_a_degree_and_height_within_eigh
     let of_people = |body: &&StreetBody| body.label.as_deref() == Some("person");
     let people: Vec<_> = street.bodies.iter().filter(of_people).cloned().collect();
     let sizes = ObjectSizes::default();
-    let size = ObjectSize { height_m: PERSON_M, relative_sigma: 0.02, ..*sizes.of("person").unwrap() };
+    let size = ObjectSize {
+        height_m: PERSON_M,
+        relative_sigma: 0.02,
+        ..*sizes.of("person").unwrap()
+    };
     let mut failures = Vec::new();
     for (place, [height_m, pitch_deg, roll_deg]) in CAMERAS {
-        let frames = minute(&street, &camera(place, [height_m, pitch_deg, roll_deg]), &people);
+        let frames = minute(
+            &street,
+            &camera(place, [height_m, pitch_deg, roll_deg]),
+            &people,
+        );
         let boxes: usize = frames.iter().map(Vec::len).sum();
         for seed in 0..3 {
             let mut dice = ChaCha8Rng::seed_from_u64(seed);
-            let frames: Vec<Vec<_>> =
-                frames.iter().map(|frame| frame.iter().map(|bounds| noisy(bounds, &mut dice)).collect()).collect();
+            let frames: Vec<Vec<_>> = frames
+                .iter()
+                .map(|frame| {
+                    frame
+                        .iter()
+                        .map(|bounds| noisy(bounds, &mut dice))
+                        .collect()
+                })
+                .collect();
             let told = format!("{height_m} m, {pitch_deg}°, {roll_deg}°, {boxes} boxes");
             let found = fit_mount(&frames, &size, 3.0, &optics(), &Mount::default());
-            let MountEstimate { mount, .. } = found.unwrap_or_else(|error| panic!("{told}: {error}"));
+            let MountEstimate { mount, .. } =
+                found.unwrap_or_else(|error| panic!("{told}: {error}"));
             let pitch_off_deg = mount.pitch_rad.to_degrees() - pitch_deg;
             let height_off = mount.height_m.unwrap() / height_m - 1.0;
-            let told = format!("{told}: pitch {pitch_off_deg:+.2}°, height {:+.1} %", 100.0 * height_off);
+            let told = format!(
+                "{told}: pitch {pitch_off_deg:+.2}°, height {:+.1} %",
+                100.0 * height_off
+            );
             println!("{told}");
             if pitch_off_deg.abs() > 1.0 || height_off.abs() > 0.08 {
                 failures.push(told);

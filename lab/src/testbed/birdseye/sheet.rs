@@ -39,24 +39,42 @@ impl Sheet {
 
     /// A sheet that holds every placard and vehicle of a scene.
     pub(super) fn around(scene: &Scene) -> Self {
-        let spots = scene.spots.iter().flat_map(|spot| spot.empty.into_iter().chain([spot.occupied]));
-        let places: Vec<Point2<f64>> = spots.chain(scene.cavs.iter().map(|cav| cav.pose.position)).collect();
+        let spots = scene
+            .spots
+            .iter()
+            .flat_map(|spot| spot.empty.into_iter().chain([spot.occupied]));
+        let places: Vec<Point2<f64>> = spots
+            .chain(scene.cavs.iter().map(|cav| cav.pose.position))
+            .collect();
         let first = places.first().copied().unwrap_or_default();
-        let (low, high) = places.iter().fold((first, first), |(low, high), place| (low.inf(place), high.sup(place)));
-        let lacking = (high - low).map(|side| (Self::MIN_M / 2.0 - Self::PADDING_M - side / 2.0).max(0.0));
+        let (low, high) = places.iter().fold((first, first), |(low, high), place| {
+            (low.inf(place), high.sup(place))
+        });
+        let lacking =
+            (high - low).map(|side| (Self::MIN_M / 2.0 - Self::PADDING_M - side / 2.0).max(0.0));
         let room = lacking.add_scalar(Self::PADDING_M);
         let (low, high) = (low - room, high + room + Vector2::new(Self::NAMES_M, 0.0));
-        Self { low, high, px_per_m: Self::FRAME_PX / (high - low).max() }
+        Self {
+            low,
+            high,
+            px_per_m: Self::FRAME_PX / (high - low).max(),
+        }
     }
 
     /// Width and height of the picture in pixels.
     pub(super) fn size(&self) -> (f64, f64) {
-        (self.right() + Self::RIGHT_PX, self.bottom() + Self::BOTTOM_PX)
+        (
+            self.right() + Self::RIGHT_PX,
+            self.bottom() + Self::BOTTOM_PX,
+        )
     }
 
     /// A place of the world in pixels.
     pub(super) fn at(&self, place: &Point2<f64>) -> (f64, f64) {
-        (self.left() + self.length(place.x - self.low.x), self.top() + self.length(self.high.y - place.y))
+        (
+            self.left() + self.length(place.x - self.low.x),
+            self.top() + self.length(self.high.y - place.y),
+        )
     }
 
     /// Metres in pixels.
@@ -66,7 +84,8 @@ impl Sheet {
 
     /// True if a place lies inside the frame.
     pub(super) fn holds(&self, place: &Point2<f64>) -> bool {
-        (self.low.x..=self.high.x).contains(&place.x) && (self.low.y..=self.high.y).contains(&place.y)
+        (self.low.x..=self.high.x).contains(&place.x)
+            && (self.low.y..=self.high.y).contains(&place.y)
     }
 
     pub(super) fn left(&self) -> f64 {
@@ -103,7 +122,8 @@ impl Sheet {
         for inches in ticks(self.low.x, self.high.x, step) {
             let x = left + self.length(inches * METRES_PER_INCH - self.low.x);
             grid = grid.add(line(x, top, x, bottom));
-            numbers = numbers.add(text(x, bottom + 16.0, &inches.to_string()).set("text-anchor", "middle"));
+            numbers = numbers
+                .add(text(x, bottom + 16.0, &inches.to_string()).set("text-anchor", "middle"));
         }
         for inches in ticks(self.low.y, self.high.y, step) {
             let y = bottom - self.length(inches * METRES_PER_INCH - self.low.y);
@@ -118,12 +138,19 @@ impl Sheet {
     fn tick_in(&self) -> f64 {
         let least = 40.0 / self.length(METRES_PER_INCH);
         let power = 10f64.powf(least.log10().floor());
-        [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|step| *step >= least).unwrap_or(least)
+        [1.0, 2.0, 5.0, 10.0]
+            .map(|factor| factor * power)
+            .into_iter()
+            .find(|step| *step >= least)
+            .unwrap_or(least)
     }
 }
 
 /// Multiples of `step` inches between two places in metres.
 fn ticks(low_m: f64, high_m: f64, step: f64) -> impl Iterator<Item = f64> {
-    let (first, last) = ((low_m / METRES_PER_INCH / step).ceil(), (high_m / METRES_PER_INCH / step).floor());
+    let (first, last) = (
+        (low_m / METRES_PER_INCH / step).ceil(),
+        (high_m / METRES_PER_INCH / step).floor(),
+    );
     (first as i64..=last as i64).map(move |index| index as f64 * step)
 }

@@ -9,7 +9,10 @@ const SETUP2: &str = include_str!("../../../../examples/testbed/pace_setup2.json
 /// A map that reads the truth, but for the given spots.
 fn map(testbed: &Testbed, scene: &Scene, otherwise: &[(&str, Option<&str>)]) -> GlobalMap {
     let state = |spot: &Spot| {
-        let label = spot.truth.clone().unwrap_or_else(|| testbed.placard.empty_text.clone());
+        let label = spot
+            .truth
+            .clone()
+            .unwrap_or_else(|| testbed.placard.empty_text.clone());
         let changed = otherwise.iter().find(|(id, _)| *id == spot.id);
         LandmarkState {
             id: spot.id.clone(),
@@ -24,13 +27,20 @@ fn map(testbed: &Testbed, scene: &Scene, otherwise: &[(&str, Option<&str>)]) -> 
     };
     let epoch = Epoch::new(1, NodeName::from_static("edge"));
     let landmarks = scene.spots.iter().map(state).collect();
-    GlobalMap { landmarks, ..GlobalMap::new(&epoch, 1, Timestamp(0)) }
+    GlobalMap {
+        landmarks,
+        ..GlobalMap::new(&epoch, 1, Timestamp(0))
+    }
 }
 
 fn texts(svg: &str) -> Vec<String> {
     let document = roxmltree::Document::parse(svg).unwrap();
-    let texts = document.descendants().filter(|node| node.has_tag_name(("http://www.w3.org/2000/svg", "text")));
-    texts.filter_map(|node| Some(node.text()?.trim().to_owned())).collect()
+    let texts = document
+        .descendants()
+        .filter(|node| node.has_tag_name(("http://www.w3.org/2000/svg", "text")));
+    texts
+        .filter_map(|node| Some(node.text()?.trim().to_owned()))
+        .collect()
 }
 
 #[test]
@@ -39,17 +49,34 @@ fn a_picture_tells_truth_agreement_and_share() {
         let testbed = Testbed::from_json(setup).unwrap();
         assert_eq!(testbed.scenes.len(), count);
         for scene in &testbed.scenes {
-            let map = map(&testbed, scene, &[("slot-1", Some("WRONG")), ("slot-2", None)]);
+            let map = map(
+                &testbed,
+                scene,
+                &[("slot-1", Some("WRONG")), ("slot-2", None)],
+            );
             let svg = birdseye(&testbed, scene, &[], Some(&map)).unwrap();
             let texts = texts(&svg);
-            assert!(texts.contains(&scene.name) && texts.contains(&"WRONG".to_owned()), "{texts:?}");
-            assert!(texts.contains(&"6 of 8 spots right (75.0 %)".to_owned()), "{texts:?}");
+            assert!(
+                texts.contains(&scene.name) && texts.contains(&"WRONG".to_owned()),
+                "{texts:?}"
+            );
+            assert!(
+                texts.contains(&"6 of 8 spots right (75.0 %)".to_owned()),
+                "{texts:?}"
+            );
             for spot in &scene.spots {
                 let truth = spot.truth.as_ref().map_or("EMPTY", |label| label.as_str());
-                assert!(texts.iter().any(|text| text == truth), "{truth} in {texts:?}");
+                assert!(
+                    texts.iter().any(|text| text == truth),
+                    "{truth} in {texts:?}"
+                );
             }
             for cav in &scene.cavs {
-                assert!(texts.iter().any(|text| text == cav.name.as_str()), "{}", cav.name);
+                assert!(
+                    texts.iter().any(|text| text == cav.name.as_str()),
+                    "{}",
+                    cav.name
+                );
             }
         }
     }
@@ -59,13 +86,19 @@ fn a_picture_tells_truth_agreement_and_share() {
 fn labels_from_the_network_stay_text() {
     let testbed = Testbed::from_json(SETUP1).unwrap();
     let scene = &testbed.scenes[0];
-    let nasty =
-        [("slot-0", Some("<script>")), ("slot-1", Some("a&\"'\u{0}\u{1b}\u{ffff}")), ("slot-3", Some("</text><"))];
+    let nasty = [
+        ("slot-0", Some("<script>")),
+        ("slot-1", Some("a&\"'\u{0}\u{1b}\u{ffff}")),
+        ("slot-3", Some("</text><")),
+    ];
     let svg = birdseye(&testbed, scene, &[], Some(&map(&testbed, scene, &nasty))).unwrap();
     assert!(!svg.contains("<script"));
     let texts = texts(&svg);
     for expected in ["<script>", "a&\"'\u{fffd}\u{fffd}\u{fffd}", "</text><"] {
-        assert!(texts.iter().any(|text| text == expected), "{expected} in {texts:?}");
+        assert!(
+            texts.iter().any(|text| text == expected),
+            "{expected} in {texts:?}"
+        );
     }
 }
 
@@ -98,9 +131,16 @@ fn every_detection_is_drawn_or_counted() {
     let cav = &scene.cavs[0];
     let bare = birdseye(&testbed, scene, &[], None).unwrap();
     let seen = |place| (cav.name.clone(), place);
-    let detections = [seen(scene.spots[0].occupied), seen(scene.spots[1].occupied), seen(Point2::new(100.0, 0.0))];
+    let detections = [
+        seen(scene.spots[0].occupied),
+        seen(scene.spots[1].occupied),
+        seen(Point2::new(100.0, 0.0)),
+    ];
     let svg = birdseye(&testbed, scene, &detections, None).unwrap();
-    assert_eq!(svg.matches("<circle").count() - bare.matches("<circle").count(), 2);
+    assert_eq!(
+        svg.matches("<circle").count() - bare.matches("<circle").count(),
+        2
+    );
     assert!(texts(&svg).contains(&"1 seen outside the frame".to_owned()));
 }
 
@@ -110,13 +150,22 @@ fn detections_that_cannot_be_drawn_are_refused() {
     let scene = &testbed.scenes[0];
     let stranger = NodeName::from_static("stranger");
     let error = birdseye(&testbed, scene, &[(stranger, Point2::origin())], None).unwrap_err();
-    assert_eq!(error.to_string(), "scene setup1-lot1 has no vehicle stranger, which a detection names");
+    assert_eq!(
+        error.to_string(),
+        "scene setup1-lot1 has no vehicle stranger, which a detection names"
+    );
     let nowhere = (scene.cavs[0].name.clone(), Point2::new(0.0, f64::NAN));
-    assert!(matches!(birdseye(&testbed, scene, &[nowhere], None), Err(BirdseyeError::Detection { .. })));
+    assert!(matches!(
+        birdseye(&testbed, scene, &[nowhere], None),
+        Err(BirdseyeError::Detection { .. })
+    ));
     let mut map = map(&testbed, scene, &[]);
     map.landmarks[2].x_m = f64::INFINITY;
     let landmark = scene.spots[2].id.clone();
-    assert_eq!(birdseye(&testbed, scene, &[], Some(&map)), Err(BirdseyeError::Landmark { landmark }));
+    assert_eq!(
+        birdseye(&testbed, scene, &[], Some(&map)),
+        Err(BirdseyeError::Landmark { landmark })
+    );
 }
 
 #[test]

@@ -28,20 +28,37 @@ const FLOOR: Light = [104.0, 110.0, 114.0];
 const WALL: Light = [150.0, 158.0, 160.0];
 
 /// View of the camera at `pose`, mounted as told, as 8-bit BGR.
-pub(super) fn still(testbed: &Testbed, cards: &[Card], pose: &Pose, mount: &Mount) -> Result<Mat, RenderError> {
+pub(super) fn still(
+    testbed: &Testbed,
+    cards: &[Card],
+    pose: &Pose,
+    mount: &Mount,
+) -> Result<Mat, RenderError> {
     let camera = &testbed.camera.intrinsics;
     let view = RenderView::new(camera, pose, mount, &testbed.placard);
-    let faces = cards.iter().map(|card| Face::new(card, &view)).collect::<Result<Vec<_>, _>>()?;
+    let faces = cards
+        .iter()
+        .map(|card| Face::new(card, &view))
+        .collect::<Result<Vec<_>, _>>()?;
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut light = vec![[0f32; 3]; width * height];
     for row in 0..height * SAMPLES {
         let middle = view.to_level * camera.ray(&Point2::new(camera.cx, centre(row)));
         let right = Vector3::from(view.to_level.column(0));
-        let on_row: Vec<&Face> = faces.iter().filter(|face| face.rows.contains(&(row / SAMPLES))).collect();
+        let on_row: Vec<&Face> = faces
+            .iter()
+            .filter(|face| face.rows.contains(&(row / SAMPLES)))
+            .collect();
         for column in 0..width * SAMPLES {
             let x = column / SAMPLES;
             let ray = middle + right * ((centre(column) - camera.cx) / camera.fx);
-            let light_here = view.light(&ray, on_row.iter().copied().filter(|face| face.columns.contains(&x)));
+            let light_here = view.light(
+                &ray,
+                on_row
+                    .iter()
+                    .copied()
+                    .filter(|face| face.columns.contains(&x)),
+            );
             for (sum, light) in light[row / SAMPLES * width + x].iter_mut().zip(light_here) {
                 *sum += light;
             }
@@ -49,8 +66,11 @@ pub(super) fn still(testbed: &Testbed, cards: &[Card], pose: &Pose, mount: &Moun
     }
     let error = RenderError::at("allocating a view");
     let (rows, columns) = (camera.height.cast_signed(), camera.width.cast_signed());
-    let mut image = Mat::new_rows_cols_with_default(rows, columns, CV_8UC3, Scalar::default()).map_err(error)?;
-    let pixels = image.data_typed_mut::<Vec3b>().map_err(RenderError::at("filling a view"))?;
+    let mut image = Mat::new_rows_cols_with_default(rows, columns, CV_8UC3, Scalar::default())
+        .map_err(error)?;
+    let pixels = image
+        .data_typed_mut::<Vec3b>()
+        .map_err(RenderError::at("filling a view"))?;
     let weight = 1.0 / (SAMPLES * SAMPLES) as f32;
     for (pixel, sum) in pixels.iter_mut().zip(light) {
         pixel.0 = sum.map(|sum| (sum * weight).round() as u8);
@@ -77,11 +97,22 @@ struct Face<'a> {
 
 impl<'a> Face<'a> {
     fn new(card: &'a Card, view: &RenderView) -> Result<Self, RenderError> {
-        let code = QrCode::with_error_correction_level(card.text.as_bytes(), EcLevel::M)
-            .map_err(|source| RenderError::Text { text: card.text.clone(), source })?;
+        let code = QrCode::with_error_correction_level(card.text.as_bytes(), EcLevel::M).map_err(
+            |source| RenderError::Text {
+                text: card.text.clone(),
+                source,
+            },
+        )?;
         let [columns, rows] = view.bounds(card);
         let facing = Vector2::new(card.facing_rad.cos(), card.facing_rad.sin());
-        Ok(Self { card, side: code.width(), modules: code.into_colors(), facing, columns, rows })
+        Ok(Self {
+            card,
+            side: code.width(),
+            modules: code.into_colors(),
+            facing,
+            columns,
+            rows,
+        })
     }
 
     /// True if ink is printed at a point, in metres to the right of and above the middle of the code.
@@ -120,27 +151,58 @@ struct Meeting<'a> {
 
 impl<'a> RenderView<'a> {
     /// A camera without a height is as high as the middle of the codes.
-    fn new(intrinsics: &'a Intrinsics, pose: &'a Pose, mount: &Mount, placard: &'a Placard) -> Self {
-        let top_m = mount.height_m.map_or(placard.card_width_m / 2.0, |height_m| placard.card_height_m - height_m);
+    fn new(
+        intrinsics: &'a Intrinsics,
+        pose: &'a Pose,
+        mount: &Mount,
+        placard: &'a Placard,
+    ) -> Self {
+        let top_m = mount
+            .height_m
+            .map_or(placard.card_width_m / 2.0, |height_m| {
+                placard.card_height_m - height_m
+            });
         let bottom_m = top_m - placard.card_height_m;
-        Self { intrinsics, placard, pose, to_level: mount.to_level(), top_m, bottom_m }
+        Self {
+            intrinsics,
+            placard,
+            pose,
+            to_level: mount.to_level(),
+            top_m,
+            bottom_m,
+        }
     }
 
     /// Columns and rows that a card may be in; all if a corner of it is behind the camera.
     fn bounds(&self, card: &Card) -> [Range<usize>; 2] {
-        let along = Vector2::new(-card.facing_rad.sin(), card.facing_rad.cos()) * (self.placard.card_width_m / 2.0);
+        let along = Vector2::new(-card.facing_rad.sin(), card.facing_rad.cos())
+            * (self.placard.card_width_m / 2.0);
         let ends = [card.position + along, card.position - along];
-        let corners = ends.iter().flat_map(|end| [(end, self.top_m), (end, self.bottom_m)]);
+        let corners = ends
+            .iter()
+            .flat_map(|end| [(end, self.top_m), (end, self.bottom_m)]);
         let pixel = |(end, up_m): (&Point2<f64>, f64)| {
             let (range_m, bearing_rad) = self.pose.range_bearing(end);
-            let level = Vector3::new(range_m * bearing_rad.cos(), range_m * bearing_rad.sin(), up_m);
-            self.intrinsics.project(&Point3::from(self.to_level.transpose() * level))
+            let level = Vector3::new(
+                range_m * bearing_rad.cos(),
+                range_m * bearing_rad.sin(),
+                up_m,
+            );
+            self.intrinsics
+                .project(&Point3::from(self.to_level.transpose() * level))
         };
-        let size = [self.intrinsics.width as usize, self.intrinsics.height as usize];
-        let Some(corners) = corners.map(pixel).collect::<Option<Vec<_>>>() else { return size.map(|size| 0..size) };
+        let size = [
+            self.intrinsics.width as usize,
+            self.intrinsics.height as usize,
+        ];
+        let Some(corners) = corners.map(pixel).collect::<Option<Vec<_>>>() else {
+            return size.map(|size| 0..size);
+        };
         let range = |axis: usize| {
             let values = corners.iter().map(|corner| corner[axis]);
-            let (low, high) = values.fold((f64::INFINITY, 0f64), |(low, high), at| (low.min(at), high.max(at)));
+            let (low, high) = values.fold((f64::INFINITY, 0f64), |(low, high), at| {
+                (low.min(at), high.max(at))
+            });
             (low - 1.0).max(0.0) as usize..((high + 2.0) as usize).min(size[axis])
         };
         [range(0), range(1)]
@@ -155,12 +217,21 @@ impl<'a> RenderView<'a> {
             // Of two cards at one place, the later hides the earlier: a plate its sign.
             nearest = self
                 .meet(face, &sight, ray.z)
-                .filter(|met| nearest.as_ref().is_none_or(|nearest| met.depth_m <= nearest.depth_m))
+                .filter(|met| {
+                    nearest
+                        .as_ref()
+                        .is_none_or(|nearest| met.depth_m <= nearest.depth_m)
+                })
                 .or(nearest);
         }
-        let Some(met) = nearest else { return self.surroundings(ray, &sight) };
+        let Some(met) = nearest else {
+            return self.surroundings(ray, &sight);
+        };
         let code_m = self.top_m - self.placard.card_width_m / 2.0;
-        let ink = met.front && met.face.is_ink(met.right_m, met.up_m - code_m, self.placard);
+        let ink = met.front
+            && met
+                .face
+                .is_ink(met.right_m, met.up_m - code_m, self.placard);
         let colour = match (ink, met.front) {
             (true, _) => INK,
             (false, true) => PAPER,
@@ -179,7 +250,13 @@ impl<'a> RenderView<'a> {
         let is_met = depth_m >= NEAR_M
             && right_m.abs() <= self.placard.card_width_m / 2.0
             && (self.bottom_m..=self.top_m).contains(&up_m);
-        is_met.then_some(Meeting { face, depth_m, right_m, up_m, front: approach < 0.0 })
+        is_met.then_some(Meeting {
+            face,
+            depth_m,
+            right_m,
+            up_m,
+            front: approach < 0.0,
+        })
     }
 
     fn surroundings(&self, ray: &Vector3<f64>, sight: &Vector2<f64>) -> Light {

@@ -43,8 +43,14 @@ impl Sensor {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let gradient = [0; 2].map(|_| rng.random_range(-GRADIENT..=GRADIENT));
         let row_values = 3 * still.cols().unsigned_abs() as usize;
-        let noise = (0..NOISE_BANK.max(4 * row_values)).map(|_| StandardNormal.sample(&mut rng)).collect();
-        Self { seed, gradient, noise }
+        let noise = (0..NOISE_BANK.max(4 * row_values))
+            .map(|_| StandardNormal.sample(&mut rng))
+            .collect();
+        Self {
+            seed,
+            gradient,
+            noise,
+        }
     }
 
     /// The view as the camera takes it at frame `index`.
@@ -59,15 +65,23 @@ impl Sensor {
 
     /// Uneven light and noise, in place.
     fn develop(&self, frame: &mut Mat, rng: &mut ChaCha8Rng) -> Result<(), RenderError> {
-        let (columns, rows) = (frame.cols().unsigned_abs() as usize, frame.rows().unsigned_abs() as usize);
+        let (columns, rows) = (
+            frame.cols().unsigned_abs() as usize,
+            frame.rows().unsigned_abs() as usize,
+        );
         let exposure = 1.0 + EXPOSURE * normal(rng);
         let sigma = rng.random_range(NOISE[0]..=NOISE[1]) as f32;
-        let across: Vec<f32> = (0..3 * columns).map(|value| gain(value / 3, columns, self.gradient[0])).collect();
-        let values = frame.data_bytes_mut().map_err(RenderError::at("reading a frame"))?;
+        let across: Vec<f32> = (0..3 * columns)
+            .map(|value| gain(value / 3, columns, self.gradient[0]))
+            .collect();
+        let values = frame
+            .data_bytes_mut()
+            .map_err(RenderError::at("reading a frame"))?;
         for (row, values) in values.chunks_exact_mut(3 * columns).enumerate() {
             let light = exposure as f32 * gain(row, rows, self.gradient[1]);
             let start = rng.random_range(0..self.noise.len() - values.len());
-            for ((value, across), noise) in values.iter_mut().zip(&across).zip(&self.noise[start..]) {
+            for ((value, across), noise) in values.iter_mut().zip(&across).zip(&self.noise[start..])
+            {
                 *value = (f32::from(*value) * light * across + sigma * noise + 0.5) as u8;
             }
         }
@@ -78,15 +92,27 @@ impl Sensor {
 /// A small shift and rotation about the middle of the image.
 fn shake(still: &Mat, rng: &mut ChaCha8Rng) -> Result<Mat, RenderError> {
     let error = || RenderError::at("shaking a view");
-    let middle = Point2f::new((still.cols() - 1) as f32 / 2.0, (still.rows() - 1) as f32 / 2.0);
-    let mut motion = get_rotation_matrix_2d(middle, ROTATION_DEG * normal(rng), 1.0).map_err(error())?;
+    let middle = Point2f::new(
+        (still.cols() - 1) as f32 / 2.0,
+        (still.rows() - 1) as f32 / 2.0,
+    );
+    let mut motion =
+        get_rotation_matrix_2d(middle, ROTATION_DEG * normal(rng), 1.0).map_err(error())?;
     for row in 0..2 {
         *motion.at_2d_mut::<f64>(row, 2).map_err(error())? += SHIFT_PX * normal(rng);
     }
     let size = Size::new(still.cols(), still.rows());
     let mut shaken = Mat::default();
-    warp_affine(still, &mut shaken, &motion, size, INTER_LINEAR, BORDER_REPLICATE, Scalar::default())
-        .map_err(error())?;
+    warp_affine(
+        still,
+        &mut shaken,
+        &motion,
+        size,
+        INTER_LINEAR,
+        BORDER_REPLICATE,
+        Scalar::default(),
+    )
+    .map_err(error())?;
     Ok(shaken)
 }
 
@@ -98,8 +124,15 @@ fn blur(image: &Mat, rng: &mut ChaCha8Rng) -> Result<Mat, RenderError> {
         (defocus * defocus + motion * motion / 12.0).sqrt()
     });
     let mut blurred = Mat::default();
-    gaussian_blur(image, &mut blurred, Size::default(), sigma[0], sigma[1], BORDER_REPLICATE)
-        .map_err(RenderError::at("blurring a view"))?;
+    gaussian_blur(
+        image,
+        &mut blurred,
+        Size::default(),
+        sigma[0],
+        sigma[1],
+        BORDER_REPLICATE,
+    )
+    .map_err(RenderError::at("blurring a view"))?;
     Ok(blurred)
 }
 

@@ -26,13 +26,19 @@ fn lot(x_in: f64, yaw_deg: f64, before: &str) -> Testbed {
 
 fn still(testbed: &Testbed) -> Mat {
     let scene = &testbed.scenes[0];
-    TestbedCamera::new(testbed, scene, &scene.cavs[0], 1).unwrap().still().clone()
+    TestbedCamera::new(testbed, scene, &scene.cavs[0], 1)
+        .unwrap()
+        .still()
+        .clone()
 }
 
 /// Where the values cross half of the way between both ends.
 fn edge(values: &[f64]) -> f64 {
     let half = (values[0] + values[values.len() - 1]) / 2.0;
-    let at = values.windows(2).position(|pair| (pair[0] > half) != (pair[1] > half)).unwrap();
+    let at = values
+        .windows(2)
+        .position(|pair| (pair[0] > half) != (pair[1] > half))
+        .unwrap();
     at as f64 + (half - values[at]) / (values[at + 1] - values[at]) + 0.5
 }
 
@@ -49,32 +55,58 @@ fn the_corners_of_a_code_are_where_the_pinhole_camera_puts_them() {
         for (right, up) in [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0)] {
             let project = |right_m: f64, up_m: f64| {
                 let (sin, cos) = card.facing_rad.sin_cos();
-                let (x, y) = (card.position.x - sin * right_m, card.position.y + cos * right_m);
-                camera.project(&nalgebra::Point3::new(-y, -up_m, x)).unwrap()
+                let (x, y) = (
+                    card.position.x - sin * right_m,
+                    card.position.y + cos * right_m,
+                );
+                camera
+                    .project(&nalgebra::Point3::new(-y, -up_m, x))
+                    .unwrap()
             };
             let module_m = half_m * 2.0 / 21.0;
             let side = project(right * half_m, up * (half_m - 3.5 * module_m));
             let first = side.x as usize - 2;
-            let values: Vec<_> = (first..first + 5).map(|x| gray(&image, x, side.y as usize)).collect();
+            let values: Vec<_> = (first..first + 5)
+                .map(|x| gray(&image, x, side.y as usize))
+                .collect();
             let error = first as f64 + edge(&values) - side.x;
-            assert!(error.abs() < 0.3, "side at {side} with yaw {yaw_deg}: off by {error}");
+            assert!(
+                error.abs() < 0.3,
+                "side at {side} with yaw {yaw_deg}: off by {error}"
+            );
             let end = project(right * (half_m - 3.5 * module_m), up * half_m);
             let first = end.y as usize - 2;
-            let values: Vec<_> = (first..first + 5).map(|y| gray(&image, end.x as usize, y)).collect();
+            let values: Vec<_> = (first..first + 5)
+                .map(|y| gray(&image, end.x as usize, y))
+                .collect();
             let error = first as f64 + edge(&values) - end.y;
-            assert!(error.abs() < 0.3, "end at {end} with yaw {yaw_deg}: off by {error}");
+            assert!(
+                error.abs() < 0.3,
+                "end at {end} with yaw {yaw_deg}: off by {error}"
+            );
         }
     }
 }
 
 #[test]
 fn a_nearer_placard_hides_a_farther_one() {
-    let before = r#", {"id": 1, "occupied_placard": [8, 0.5], "empty_placard": null, "truth": "NEAR"}"#;
+    let before =
+        r#", {"id": 1, "occupied_placard": [8, 0.5], "empty_placard": null, "truth": "NEAR"}"#;
     let (one, two) = (lot(16.0, 180.0, ""), lot(16.0, 180.0, before));
     let scene = &two.scenes[0];
-    assert!(two.sighting(scene, &scene.cavs[0], &scene.spots[0]).is_none());
+    assert!(
+        two.sighting(scene, &scene.cavs[0], &scene.spots[0])
+            .is_none()
+    );
     let alone = r#", {"id": 1, "occupied_placard": [8, 0.5], "empty_placard": [11.5, 0.5], "truth": "NEAR"}"#;
-    assert!(one.sighting(&one.scenes[0], &one.scenes[0].cavs[0], &one.scenes[0].spots[0]).is_some());
+    assert!(
+        one.sighting(
+            &one.scenes[0],
+            &one.scenes[0].cavs[0],
+            &one.scenes[0].spots[0]
+        )
+        .is_some()
+    );
     let (first, second) = (still(&two), still(&lot(16.0, 210.0, alone)));
     // The nearer card covers both what is behind it and how that is turned.
     let near = &two.cards(scene)[2];
@@ -89,7 +121,10 @@ fn a_nearer_placard_hides_a_farther_one() {
 fn the_back_of_a_placard_shows_no_code() {
     let image = still(&lot(16.0, 0.0, ""));
     let values: Vec<_> = (262..312).map(|x| gray(&image, x, 240)).collect();
-    assert!(values.windows(2).all(|pair| pair[0] == pair[1]), "plain cardboard: {values:?}");
+    assert!(
+        values.windows(2).all(|pair| pair[0] == pair[1]),
+        "plain cardboard: {values:?}"
+    );
 }
 
 #[test]
@@ -122,7 +157,10 @@ fn odd_scenes_are_rendered_nevertheless() {
         );
         let testbed = Testbed::from_json(&text).unwrap();
         let scene = &testbed.scenes[0];
-        let frame = TestbedCamera::new(&testbed, scene, &scene.cavs[0], 0).unwrap().frame(u64::MAX).unwrap();
+        let frame = TestbedCamera::new(&testbed, scene, &scene.cavs[0], 0)
+            .unwrap()
+            .frame(u64::MAX)
+            .unwrap();
         assert_eq!((frame.cols(), frame.rows()), (width, height));
     }
 }

@@ -55,12 +55,21 @@ impl<'a> ConfusionModel<'a> {
         for (cav, frames) in recording.frames.iter().enumerate() {
             for detections in frames {
                 clutter[cav].push(Vec::new());
-                views.iter_mut().for_each(|of_object| of_object[cav].0.push(Vec::new()));
+                views
+                    .iter_mut()
+                    .for_each(|of_object| of_object[cav].0.push(Vec::new()));
                 for detection in detections {
                     let object = object_of(recording, cav, detection);
-                    match object.and_then(|object| Some((object, glimpse(recording, cav, object, detection)?))) {
-                        Some((object, glimpse)) => views[object][cav].0.last_mut().map(|frame| frame.push(glimpse)),
-                        None => clutter[cav].last_mut().map(|frame| frame.push(detection.clone())),
+                    match object.and_then(|object| {
+                        Some((object, glimpse(recording, cav, object, detection)?))
+                    }) {
+                        Some((object, glimpse)) => views[object][cav]
+                            .0
+                            .last_mut()
+                            .map(|frame| frame.push(glimpse)),
+                        None => clutter[cav]
+                            .last_mut()
+                            .map(|frame| frame.push(detection.clone())),
                     };
                 }
             }
@@ -68,18 +77,25 @@ impl<'a> ConfusionModel<'a> {
         for (object, of_object) in recording.objects.iter().zip(&mut views) {
             let mut poses = recording.cavs.iter().map(|cav| &cav.pose);
             of_object.retain(|view| {
-                let in_view = poses.next().is_some_and(|pose| sight(&recording.intrinsics, pose, object).is_some());
+                let in_view = poses
+                    .next()
+                    .is_some_and(|pose| sight(&recording.intrinsics, pose, object).is_some());
                 !view.0.is_empty() && (in_view || view.0.iter().any(|frame| !frame.is_empty()))
             });
         }
-        Self { recording, views, clutter }
+        Self {
+            recording,
+            views,
+            clutter,
+        }
     }
 
     /// A scene of `frames` frames; equal seeds give equal scenes.
     pub fn scene(&self, seed: u64, frames: usize) -> IntersectionRecording {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut scene = self.recording.clone();
-        let mut places: Vec<Point2<f64>> = scene.objects.iter().map(|object| object.position).collect();
+        let mut places: Vec<Point2<f64>> =
+            scene.objects.iter().map(|object| object.position).collect();
         places.shuffle(&mut rng);
         for (object, place) in scene.objects.iter_mut().zip(places) {
             object.position = place + moved(&mut rng);
@@ -88,7 +104,9 @@ impl<'a> ConfusionModel<'a> {
             cav.pose.position += moved(&mut rng);
             cav.pose.heading_rad += rng.random_range(TURNED_RAD);
         }
-        scene.frames = (0..scene.cavs.len()).map(|cav| self.watch(&scene, cav, frames, &mut rng)).collect();
+        scene.frames = (0..scene.cavs.len())
+            .map(|cav| self.watch(&scene, cav, frames, &mut rng))
+            .collect();
         scene
     }
 
@@ -125,20 +143,37 @@ fn sight(camera: &Intrinsics, pose: &Pose, object: &KnownObject) -> Option<(f64,
 }
 
 /// The object that a vehicle takes a detection for.
-fn object_of(recording: &IntersectionRecording, cav: usize, detection: &Detection) -> Option<usize> {
+fn object_of(
+    recording: &IntersectionRecording,
+    cav: usize,
+    detection: &Detection,
+) -> Option<usize> {
     let alone = IntersectionRecording {
         cavs: vec![recording.cavs[cav].clone()],
         frames: vec![vec![vec![detection.clone()]]],
         ..recording.clone()
     };
-    let id = reports(&alone).into_iter().flat_map(|report| report.objects).next()?.landmark?;
+    let id = reports(&alone)
+        .into_iter()
+        .flat_map(|report| report.objects)
+        .next()?
+        .landmark?;
     recording.objects.iter().position(|object| object.id == id)
 }
 
-fn glimpse(recording: &IntersectionRecording, cav: usize, object: usize, detection: &Detection) -> Option<Glimpse> {
-    let (range_m, bearing_rad) = recording.cavs[cav].pose.range_bearing(&recording.objects[object].position);
+fn glimpse(
+    recording: &IntersectionRecording,
+    cav: usize,
+    object: usize,
+    detection: &Detection,
+) -> Option<Glimpse> {
+    let (range_m, bearing_rad) = recording.cavs[cav]
+        .pose
+        .range_bearing(&recording.objects[object].position);
     let forward_m = range_m * bearing_rad.cos();
-    let found_rad = recording.intrinsics.bearing(detection.bounding_box.center().x);
+    let found_rad = recording
+        .intrinsics
+        .bearing(detection.bounding_box.center().x);
     (forward_m > 0.0).then(|| Glimpse {
         detection: detection.clone(),
         forward_m,
@@ -153,7 +188,10 @@ impl Glimpse {
         let scale = self.forward_m / forward_m;
         let x = camera.cx - camera.fx * (bearing_rad + self.bearing_error_rad).tan();
         let y = camera.cy + (recorded.center().y - camera.cy) * scale;
-        let (half_width, half_height) = (recorded.width() * scale / 2.0, recorded.height() * scale / 2.0);
+        let (half_width, half_height) = (
+            recorded.width() * scale / 2.0,
+            recorded.height() * scale / 2.0,
+        );
         let bounding_box = BoundingBox {
             x_min: x - half_width,
             y_min: (y - half_height).max(0.0),
@@ -161,7 +199,10 @@ impl Glimpse {
             y_max: (y + half_height).min(f64::from(camera.height)),
         };
         let in_image = (0.0..=f64::from(camera.width)).contains(&x) && bounding_box.is_valid();
-        in_image.then(|| Detection { bounding_box, ..self.detection.clone() })
+        in_image.then(|| Detection {
+            bounding_box,
+            ..self.detection.clone()
+        })
     }
 }
 

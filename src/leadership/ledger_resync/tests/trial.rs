@@ -13,18 +13,33 @@ fn what_a_claimant_says_while_a_starting_node_follows_it_goes_no_further_and_is_
             euclid.lead(3);
             euclid.resync.step_down();
         }
-        let forged = sign(vec![share("gauss", Some(8), vec![slander(8, "gauss", MAX_FIRST_VOTES)])]);
+        let forged = sign(vec![share(
+            "gauss",
+            Some(8),
+            vec![slander(8, "gauss", MAX_FIRST_VOTES)],
+        )]);
         let mut sent = euclid.merge(&forged[0], 0).unwrap().shares;
         sent.extend(euclid.wait_until(11_000));
         edge.lead(9);
-        edge.leadership = Leadership { position: Position::Leading, ..following(9, "edge") };
+        edge.leadership = Leadership {
+            position: Position::Leading,
+            ..following(9, "edge")
+        };
         euclid.leadership = following(9, "edge");
         let honest = sign(edge.record(9, "euclid"));
-        sent.extend(honest.iter().flat_map(|share| euclid.merge(share, 11_000).unwrap().shares));
+        sent.extend(
+            honest
+                .iter()
+                .flat_map(|share| euclid.merge(share, 11_000).unwrap().shares),
+        );
         sent.extend(euclid.wait_until(60_000));
         sent.extend(euclid.resync.snapshot(&euclid.ledger));
         edge.hear(&sent);
-        assert_eq!((edge.incorrect("gauss"), euclid.incorrect("gauss")), (0, 0), "has led: {has_led}");
+        assert_eq!(
+            (edge.incorrect("gauss"), euclid.incorrect("gauss")),
+            (0, 0),
+            "has led: {has_led}"
+        );
         assert_eq!(euclid.ledger.totals(), edge.ledger.totals());
     }
 }
@@ -33,15 +48,32 @@ fn what_a_claimant_says_while_a_starting_node_follows_it_goes_no_further_and_is_
 #[test]
 fn a_claimant_adds_nothing_to_an_earlier_leadership_of_its_own() {
     let mut euclid = signing("euclid", 5, "gauss");
-    euclid.hear(&sign(vec![share("gauss", Some(5), vec![slander(5, "gauss", 3)])]));
+    euclid.hear(&sign(vec![share(
+        "gauss",
+        Some(5),
+        vec![slander(5, "gauss", 3)],
+    )]));
     euclid.wait_until(30_000);
     euclid.leadership = following(7, "edge");
     euclid.wait_until(60_000);
     euclid.leadership = following(8, "gauss");
-    euclid.merge(&sign(vec![share("gauss", Some(8), vec![slander(5, "gauss", 1000)])])[0], 60_000).unwrap();
+    euclid
+        .merge(
+            &sign(vec![share(
+                "gauss",
+                Some(8),
+                vec![slander(5, "gauss", 1000)],
+            )])[0],
+            60_000,
+        )
+        .unwrap();
     euclid.leadership = following(9, "edge");
     euclid.wait_until(90_000);
-    assert_eq!(euclid.incorrect("gauss"), 3, "what it counted when it led stays");
+    assert_eq!(
+        euclid.incorrect("gauss"),
+        3,
+        "what it counted when it led stays"
+    );
 }
 
 /// The edge box is back after some seconds: what was counted meanwhile is not lost, also by those who forgot it.
@@ -57,13 +89,18 @@ fn a_short_leadership_counts_at_once_where_it_was_handed_on_and_later_at_all() {
     hopper.wait_until(4000);
     gauss.resync.step_down();
     edge.lead(9);
-    edge.leadership = Leadership { position: Position::Leading, ..following(9, "edge") };
+    edge.leadership = Leadership {
+        position: Position::Leading,
+        ..following(9, "edge")
+    };
     (hopper.leadership, gauss.leadership) = (following(9, "edge"), following(9, "edge"));
     assert_eq!(edge.vehicles(), ["euclid"], "it goes on from there");
     assert_eq!(hopper.vehicles(), ["euclid"]);
     for at_s in (5..=40).step_by(5) {
         let shares = sign(edge.wait_until(at_s * 1000));
-        shares.iter().for_each(|share| drop(hopper.merge(share, at_s * 1000).unwrap()));
+        shares
+            .iter()
+            .for_each(|share| drop(hopper.merge(share, at_s * 1000).unwrap()));
     }
     assert_eq!(hopper.ledger.totals(), gauss.ledger.totals());
 }

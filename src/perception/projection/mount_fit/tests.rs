@@ -15,7 +15,13 @@ fn camera() -> Intrinsics {
 
 fn mounted(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
     let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
-    Mount { height_m: Some(height_m), pitch_rad, roll_rad, forward_m: 0.5, ..Mount::default() }
+    Mount {
+        height_m: Some(height_m),
+        pitch_rad,
+        roll_rad,
+        forward_m: 0.5,
+        ..Mount::default()
+    }
 }
 
 struct Dice(ChaCha8Rng);
@@ -47,15 +53,31 @@ fn body(height_m: f64, at: Point2<f64>, heading_rad: f64, step_m: f64) -> Vec<Po
         let on_ground = at + turn * Vector2::new(ahead_m, aside_m);
         Point3::new(on_ground.x, on_ground.y, up_m)
     };
-    let around = (0..12).map(|n| f64::from(n) / 12.0 * TAU).flat_map(|angle| {
-        let (sin, cos) = angle.sin_cos();
-        let head = [-0.5f64, 0.0, 0.5]
-            .map(|tilt| point(0.1 * cos * tilt.cos(), 0.08 * sin * tilt.cos(), height_m - 0.12 + 0.12 * tilt.sin()));
-        head.into_iter().chain([point(0.12 * cos, 0.23 * sin, 0.82 * height_m)])
-    });
-    let foot = |ahead_m: f64, aside_m: f64| [point(ahead_m - 0.08, aside_m, 0.0), point(ahead_m + 0.18, aside_m, 0.0)];
+    let around = (0..12)
+        .map(|n| f64::from(n) / 12.0 * TAU)
+        .flat_map(|angle| {
+            let (sin, cos) = angle.sin_cos();
+            let head = [-0.5f64, 0.0, 0.5].map(|tilt| {
+                point(
+                    0.1 * cos * tilt.cos(),
+                    0.08 * sin * tilt.cos(),
+                    height_m - 0.12 + 0.12 * tilt.sin(),
+                )
+            });
+            head.into_iter()
+                .chain([point(0.12 * cos, 0.23 * sin, 0.82 * height_m)])
+        });
+    let foot = |ahead_m: f64, aside_m: f64| {
+        [
+            point(ahead_m - 0.08, aside_m, 0.0),
+            point(ahead_m + 0.18, aside_m, 0.0),
+        ]
+    };
     let feet = [foot(step_m / 2.0, 0.1), foot(-step_m / 2.0, -0.1)];
-    around.chain(feet.into_iter().flatten()).chain([point(0.0, 0.0, height_m)]).collect()
+    around
+        .chain(feet.into_iter().flatten())
+        .chain([point(0.0, 0.0, height_m)])
+        .collect()
 }
 
 /// Boxes of a minute, five frames a second: people cross the place before the camera, one every three seconds. A detector's
@@ -66,23 +88,44 @@ fn minute(mount: &Mount, reach_m: f64, seed: u64) -> Vec<Vec<BoundingBox>> {
     let mut frames = vec![Vec::new(); 300];
     for person in 0..15 {
         let (height_m, heading_rad) = (dice.body_height(), dice.between(0.0, TAU));
-        let middle = Point2::new(dice.between(0.25, 0.8) * reach_m, dice.between(-0.3, 0.3) * reach_m);
+        let middle = Point2::new(
+            dice.between(0.25, 0.8) * reach_m,
+            dice.between(-0.3, 0.3) * reach_m,
+        );
         for frame in 0..60 {
-            let (ahead_m, step_m) = (f64::from(frame - 30) * 0.26, 0.7 * f64::sin(f64::from(frame) * 1.3).abs());
+            let (ahead_m, step_m) = (
+                f64::from(frame - 30) * 0.26,
+                0.7 * f64::sin(f64::from(frame) * 1.3).abs(),
+            );
             let at = middle + Rotation2::new(heading_rad) * Vector2::new(ahead_m, 0.0);
             let to_pixel = |point: Point3<f64>| {
-                camera().project(&Point3::from(to_camera * (point.coords - Vector3::z() * mount.height_m?)))
+                camera().project(&Point3::from(
+                    to_camera * (point.coords - Vector3::z() * mount.height_m?),
+                ))
             };
-            let pixels: Option<Vec<_>> = body(height_m, at, heading_rad, step_m).into_iter().map(to_pixel).collect();
-            let Some(mut bounds) = pixels.map(|pixels| BoundingBox::around(&pixels)) else { continue };
+            let pixels: Option<Vec<_>> = body(height_m, at, heading_rad, step_m)
+                .into_iter()
+                .map(to_pixel)
+                .collect();
+            let Some(mut bounds) = pixels.map(|pixels| BoundingBox::around(&pixels)) else {
+                continue;
+            };
             let sigma_px = 1.5 + 0.02 * bounds.height();
             if dice.between(0.0, 1.0) < 0.1 {
                 bounds.y_max -= dice.between(0.2, 0.5) * bounds.height();
             }
-            for edge in [&mut bounds.x_min, &mut bounds.y_min, &mut bounds.x_max, &mut bounds.y_max] {
+            for edge in [
+                &mut bounds.x_min,
+                &mut bounds.y_min,
+                &mut bounds.x_max,
+                &mut bounds.y_max,
+            ] {
                 *edge = dice.normal(*edge, sigma_px);
             }
-            let is_whole = bounds.x_min > 2.0 && bounds.y_min > 2.0 && bounds.x_max < 1278.0 && bounds.y_max < 718.0;
+            let is_whole = bounds.x_min > 2.0
+                && bounds.y_min > 2.0
+                && bounds.x_max < 1278.0
+                && bounds.y_max < 718.0;
             if is_whole && bounds.height() > 30.0 {
                 frames[(person * 16 + frame as usize) % 300].push(bounds);
             }
@@ -113,14 +156,25 @@ fn a_minute_of_walking_people_gives_pitch_within_a_degree_and_height_within_eigh
                 size.of("person").unwrap(),
                 3.0,
                 &camera(),
-                &Mount { forward_m: 0.5, ..Mount::default() },
+                &Mount {
+                    forward_m: 0.5,
+                    ..Mount::default()
+                },
             );
-            let Ok(MountEstimate { mount, pitch_sigma_rad, roll_sigma_rad, height_sigma_m }) = found else {
+            let Ok(MountEstimate {
+                mount,
+                pitch_sigma_rad,
+                roll_sigma_rad,
+                height_sigma_m,
+            }) = found
+            else {
                 failures.push(format!("{real:?}: {found:?}"));
                 continue;
             };
-            let (pitch_off_deg, roll_off_deg) =
-                ((mount.pitch_rad - real.pitch_rad).to_degrees(), (mount.roll_rad - real.roll_rad).to_degrees());
+            let (pitch_off_deg, roll_off_deg) = (
+                (mount.pitch_rad - real.pitch_rad).to_degrees(),
+                (mount.roll_rad - real.roll_rad).to_degrees(),
+            );
             let height_off = mount.height_m.unwrap() / height_m - 1.0;
             println!(
                 "{height_m} m, {pitch_deg}°, {roll_deg}°, {boxes} boxes: pitch {pitch_off_deg:+.2}° ± {:.2}°, roll {roll_off_deg:+.2}° \
@@ -143,16 +197,31 @@ fn a_minute_of_walking_people_gives_pitch_within_a_degree_and_height_within_eigh
 fn people_who_stay_at_one_distance_do_not_tell_the_pitch() {
     let mut dice = Dice(ChaCha8Rng::seed_from_u64(3));
     let standing = |dice: &mut Dice| {
-        let [x_min, y_min, x_max, y_max] = [600.0, 300.0, 650.0, 460.0].map(|edge| dice.normal(edge, 3.0));
-        vec![BoundingBox { x_min, y_min, x_max, y_max }]
+        let [x_min, y_min, x_max, y_max] =
+            [600.0, 300.0, 650.0, 460.0].map(|edge| dice.normal(edge, 3.0));
+        vec![BoundingBox {
+            x_min,
+            y_min,
+            x_max,
+            y_max,
+        }]
     };
     let mut frames: Vec<_> = (0..60).map(|_| standing(&mut dice)).collect();
     let fit = |frames: &[Vec<BoundingBox>]| {
         let size = ObjectSizes::default();
-        fit_mount(frames, size.of("person").unwrap(), 3.0, &camera(), &Mount::default())
+        fit_mount(
+            frames,
+            size.of("person").unwrap(),
+            3.0,
+            &camera(),
+            &Mount::default(),
+        )
     };
     let open = fit(&frames);
-    assert!(matches!(open, Err(MountFitError::OneDistance(ratio)) if ratio > 1.0), "{open:?}");
+    assert!(
+        matches!(open, Err(MountFitError::OneDistance(ratio)) if ratio > 1.0),
+        "{open:?}"
+    );
     frames.truncate(30);
     assert_eq!(fit(&frames), Err(MountFitError::TooFewBoxes(30)));
 }

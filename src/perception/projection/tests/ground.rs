@@ -21,29 +21,72 @@ fn camera() -> Intrinsics {
 
 fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
     let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
-    Mount { height_m: Some(height_m), pitch_rad, roll_rad, ..Mount::default() }
+    Mount {
+        height_m: Some(height_m),
+        pitch_rad,
+        roll_rad,
+        ..Mount::default()
+    }
 }
 
 /// Objects that a camera of this height meets.
 fn kinds(height_m: f64) -> Vec<(&'static str, ObjectSize)> {
     let kind = |label, width_m, length_m, height_m, relative_sigma| {
-        (label, ObjectSize { width_m, length_m: Some(length_m), height_m, relative_sigma })
+        (
+            label,
+            ObjectSize {
+                width_m,
+                length_m: Some(length_m),
+                height_m,
+                relative_sigma,
+            },
+        )
     };
     if height_m < 1.0 {
-        return vec![kind("cup", 0.08, 0.08, 0.1, 0.1), kind("bottle", 0.07, 0.07, 0.25, 0.1)];
+        return vec![
+            kind("cup", 0.08, 0.08, 0.1, 0.1),
+            kind("bottle", 0.07, 0.07, 0.25, 0.1),
+        ];
     }
-    vec![kind("person", 0.5, 0.3, 1.7, 0.06), kind("bicycle", 0.6, 1.7, 1.1, 0.1), kind("car", 1.8, 4.5, 1.5, 0.06)]
+    vec![
+        kind("person", 0.5, 0.3, 1.7, 0.06),
+        kind("bicycle", 0.6, 1.7, 1.1, 0.1),
+        kind("car", 1.8, 4.5, 1.5, 0.06),
+    ]
 }
 
 fn projection(ranging: Ranging, mount: Mount, config: &ProjectionConfig) -> Projection {
-    let labels = kinds(mount.height_m.unwrap_or(1.2)).into_iter().map(|(label, size)| (label.into(), size)).collect();
-    let sizes = ObjectSizes { labels, ..ObjectSizes::default() };
-    Projection::new(ProjectionConfig { ranging, sizes, ..config.clone() }, camera(), mount)
+    let labels = kinds(mount.height_m.unwrap_or(1.2))
+        .into_iter()
+        .map(|(label, size)| (label.into(), size))
+        .collect();
+    let sizes = ObjectSizes {
+        labels,
+        ..ObjectSizes::default()
+    };
+    Projection::new(
+        ProjectionConfig {
+            ranging,
+            sizes,
+            ..config.clone()
+        },
+        camera(),
+        mount,
+    )
 }
 
 /// The box around an upright cuboid on the ground, as far as it is in the image; `None` if its foot is not.
-fn seen(label: &str, size: &ObjectSize, at: Point2<f64>, yaw_rad: f64, mount: &Mount) -> Option<Detection> {
-    let (half_width, half_length) = (size.width_m / 2.0, size.length_m.unwrap_or(size.width_m) / 2.0);
+fn seen(
+    label: &str,
+    size: &ObjectSize,
+    at: Point2<f64>,
+    yaw_rad: f64,
+    mount: &Mount,
+) -> Option<Detection> {
+    let (half_width, half_length) = (
+        size.width_m / 2.0,
+        size.length_m.unwrap_or(size.width_m) / 2.0,
+    );
     let (turn, to_camera) = (Rotation2::new(yaw_rad), mount.to_level().transpose());
     let mut corners = Vec::new();
     for (along, across) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
@@ -53,21 +96,46 @@ fn seen(label: &str, size: &ObjectSize, at: Point2<f64>, yaw_rad: f64, mount: &M
             corners.push(camera().project(&Point3::from(to_camera * level))?);
         }
     }
-    let mut visible: Vec<Point2<f64>> = corners.iter().copied().filter(|corner| corner.y >= 0.0).collect();
-    for (above, below) in corners.iter().flat_map(|a| corners.iter().map(move |b| (a, b))) {
+    let mut visible: Vec<Point2<f64>> = corners
+        .iter()
+        .copied()
+        .filter(|corner| corner.y >= 0.0)
+        .collect();
+    for (above, below) in corners
+        .iter()
+        .flat_map(|a| corners.iter().map(move |b| (a, b)))
+    {
         if above.y < 0.0 && below.y >= 0.0 {
             visible.push(above + (below - above) * (above.y / (above.y - below.y)));
         }
     }
     let bounding_box = BoundingBox::around(&visible);
-    let BoundingBox { x_min, x_max, y_max, .. } = bounding_box;
+    let BoundingBox {
+        x_min,
+        x_max,
+        y_max,
+        ..
+    } = bounding_box;
     let is_in_image = x_min > 1.0 && x_max < 1279.0 && y_max < 718.0 && bounding_box.height() > 8.0;
-    is_in_image.then(|| Detection { bounding_box, ..detection_of(label) })
+    is_in_image.then(|| Detection {
+        bounding_box,
+        ..detection_of(label)
+    })
 }
 
 fn detection_of(label: &str) -> Detection {
-    let bounding_box = BoundingBox { x_min: 0.0, y_min: 0.0, x_max: 0.0, y_max: 0.0 };
-    Detection { label: label.into(), confidence: 0.9, bounding_box, corners: None }
+    let bounding_box = BoundingBox {
+        x_min: 0.0,
+        y_min: 0.0,
+        x_max: 0.0,
+        y_max: 0.0,
+    };
+    Detection {
+        label: label.into(),
+        confidence: 0.9,
+        bounding_box,
+        corners: None,
+    }
 }
 
 /// Random kinds of objects at random places in view, with their true places.
@@ -78,7 +146,10 @@ struct Street {
 
 impl Street {
     fn new(height_m: f64) -> Self {
-        Self { dice: ChaCha8Rng::seed_from_u64(20), height_m }
+        Self {
+            dice: ChaCha8Rng::seed_from_u64(20),
+            height_m,
+        }
     }
 
     fn normal(&mut self) -> f64 {
@@ -93,7 +164,12 @@ impl Street {
             let (label, kind) = &kinds[self.dice.random_range(0..kinds.len())];
             let grown = 1.0 + spread * kind.relative_sigma * self.normal();
             let [width_m, height_m] = [kind.width_m, kind.height_m].map(|side| side * grown);
-            let size = ObjectSize { width_m, height_m, length_m: kind.length_m.map(|side| side * grown), ..*kind };
+            let size = ObjectSize {
+                width_m,
+                height_m,
+                length_m: kind.length_m.map(|side| side * grown),
+                ..*kind
+            };
             let range_m = self.height_m * self.dice.random_range(0.8..max_range);
             let bearing_rad = self.dice.random_range(-0.6..0.6);
             let yaw_rad = self.dice.random_range(0.0..PI);
@@ -101,7 +177,10 @@ impl Street {
             if range_m < 2.0 * (size.width_m + size.length_m.unwrap()) {
                 continue;
             }
-            let at = Point2::new(range_m * f64::cos(bearing_rad), range_m * f64::sin(bearing_rad));
+            let at = Point2::new(
+                range_m * f64::cos(bearing_rad),
+                range_m * f64::sin(bearing_rad),
+            );
             if let Some(detection) = seen(label, &size, at, yaw_rad, mount) {
                 return (detection, at);
             }
@@ -116,12 +195,19 @@ fn median(mut values: Vec<f64>) -> f64 {
 
 #[test]
 fn boxes_in_whole_pixels_are_placed_within_two_percent_of_the_range_at_any_height_and_pitch() {
-    for (height_m, ranging) in HEIGHTS_M.into_iter().flat_map(|h| [(h, Ranging::Ground), (h, Ranging::Auto)]) {
+    for (height_m, ranging) in HEIGHTS_M
+        .into_iter()
+        .flat_map(|h| [(h, Ranging::Ground), (h, Ranging::Auto)])
+    {
         for pitch_deg in PITCHES_DEG {
             for roll_deg in [0.0, 6.0] {
-                let (mount, mut street) = (mount(height_m, pitch_deg, roll_deg), Street::new(height_m));
-                let config =
-                    ProjectionConfig { pixel_sigma_px: 0.5, tilt_sigma_rad: 1e-4, ..ProjectionConfig::default() };
+                let (mount, mut street) =
+                    (mount(height_m, pitch_deg, roll_deg), Street::new(height_m));
+                let config = ProjectionConfig {
+                    pixel_sigma_px: 0.5,
+                    tilt_sigma_rad: 1e-4,
+                    ..ProjectionConfig::default()
+                };
                 let projection = projection(ranging, mount, &config);
                 let mut errors = Vec::new();
                 for _ in 0..400 {
@@ -131,18 +217,29 @@ fn boxes_in_whole_pixels_are_placed_within_two_percent_of_the_range_at_any_heigh
                         *edge = edge.round();
                     }
                     let cut = projection.cut(&detection);
-                    let placed = projection.place(&detection, cut, None, &Pose::new(0.0, 0.0, 0.0)).unwrap();
+                    let placed = projection
+                        .place(&detection, cut, None, &Pose::new(0.0, 0.0, 0.0))
+                        .unwrap();
                     errors.push(offset_m(&placed, at) / at.coords.norm());
                 }
                 let error = median(errors);
-                assert!(error <= 0.02, "{ranging:?} at {height_m} m, {pitch_deg}°, {roll_deg}°: {error:.4}");
+                assert!(
+                    error <= 0.02,
+                    "{ranging:?} at {height_m} m, {pitch_deg}°, {roll_deg}°: {error:.4}"
+                );
             }
         }
     }
 }
 
 /// The share of places within their ellipse of 95 %, where every error is as large as the configuration says.
-fn coverage(ranging: Ranging, height_m: f64, pitch_deg: f64, tilt_sigma_rad: f64, max_range: f64) -> f64 {
+fn coverage(
+    ranging: Ranging,
+    height_m: f64,
+    pitch_deg: f64,
+    tilt_sigma_rad: f64,
+    max_range: f64,
+) -> f64 {
     let mut street = Street::new(height_m);
     let stated = mount(height_m, pitch_deg, 0.0);
     let config = ProjectionConfig {
@@ -159,30 +256,59 @@ fn coverage(ranging: Ranging, height_m: f64, pitch_deg: f64, tilt_sigma_rad: f64
         let mut real = stated;
         real.pitch_rad += off(tilt_sigma_rad);
         real.roll_rad += off(tilt_sigma_rad);
-        real.height_m = real.height_m.map(|height_m| height_m + off(config.height_sigma_m));
-        let pose = Pose::new(off(config.position_sigma_m), off(config.position_sigma_m), off(config.heading_sigma_rad));
+        real.height_m = real
+            .height_m
+            .map(|height_m| height_m + off(config.height_sigma_m));
+        let pose = Pose::new(
+            off(config.position_sigma_m),
+            off(config.position_sigma_m),
+            off(config.heading_sigma_rad),
+        );
         let (mut detection, at) = street.next(&real, 1.0, max_range);
         let cut = projection.cut(&detection);
         let b = &mut detection.bounding_box;
         for edge in [&mut b.x_min, &mut b.y_min, &mut b.x_max, &mut b.y_max] {
             *edge += config.pixel_sigma_px * street.normal();
         }
-        let Ok(placed) = projection.place(&detection, cut, None, &pose) else { continue };
+        let Ok(placed) = projection.place(&detection, cut, None, &pose) else {
+            continue;
+        };
         let offset = Vector2::new(placed.x_m, placed.y_m) - at.coords;
         all += 1;
-        covered += usize::from(placed.covariance().unwrap().mahalanobis_squared(&offset, 0.0) <= CHI_SQUARED_95);
+        covered += usize::from(
+            placed
+                .covariance()
+                .unwrap()
+                .mahalanobis_squared(&offset, 0.0)
+                <= CHI_SQUARED_95,
+        );
     }
-    assert!(all > 2400, "{ranging:?} at {height_m} m, {pitch_deg}°: {all} of 3000 have a place");
+    assert!(
+        all > 2400,
+        "{ranging:?} at {height_m} m, {pitch_deg}°: {all} of 3000 have a place"
+    );
     f64::from(u32::try_from(covered).unwrap()) / f64::from(all)
 }
 
 #[test]
-fn the_stated_covariance_holds_95_percent_of_the_errors_with_and_without_a_degree_of_unknown_pitch() {
-    for (height_m, ranging) in HEIGHTS_M.into_iter().flat_map(|h| [(h, Ranging::Ground), (h, Ranging::Auto)]) {
+fn the_stated_covariance_holds_95_percent_of_the_errors_with_and_without_a_degree_of_unknown_pitch()
+{
+    for (height_m, ranging) in HEIGHTS_M
+        .into_iter()
+        .flat_map(|h| [(h, Ranging::Ground), (h, Ranging::Auto)])
+    {
         for (tilt_deg, max_range) in [(0.1, 20.0), (1.0, 12.0)] {
             for pitch_deg in [0.0, 20.0, 45.0] {
-                let share = coverage(ranging, height_m, pitch_deg, f64::to_radians(tilt_deg), max_range);
-                println!("{ranging:?} at {height_m} m, {pitch_deg}°, tilt ± {tilt_deg}°: {share:.3}");
+                let share = coverage(
+                    ranging,
+                    height_m,
+                    pitch_deg,
+                    f64::to_radians(tilt_deg),
+                    max_range,
+                );
+                println!(
+                    "{ranging:?} at {height_m} m, {pitch_deg}°, tilt ± {tilt_deg}°: {share:.3}"
+                );
                 assert!(
                     (share - 0.95).abs() <= 0.03,
                     "{ranging:?} at {height_m} m, {pitch_deg}°, {tilt_deg}°: {share}"
@@ -199,7 +325,12 @@ fn person_ahead(range_m: f64, mount: &Mount) -> Detection {
 }
 
 fn range_m(projection: &Projection, detection: &Detection) -> Result<f64, ProjectionError> {
-    let placed = projection.place(detection, projection.cut(detection), None, &Pose::new(0.0, 0.0, 0.0))?;
+    let placed = projection.place(
+        detection,
+        projection.cut(detection),
+        None,
+        &Pose::new(0.0, 0.0, 0.0),
+    )?;
     Ok(placed.x_m.hypot(placed.y_m))
 }
 
@@ -209,22 +340,58 @@ fn a_person_cut_by_the_lower_or_the_upper_edge_is_still_placed() {
     let both = projection(Ranging::Auto, mount, &ProjectionConfig::default());
     let whole = person_ahead(6.0, &mount);
     for (name, bounds, tolerance_m) in [
-        ("no feet", BoundingBox { y_max: 720.0, ..whole.bounding_box }, 1.0),
-        ("no head", BoundingBox { y_min: 0.0, ..whole.bounding_box }, 0.3),
+        (
+            "no feet",
+            BoundingBox {
+                y_max: 720.0,
+                ..whole.bounding_box
+            },
+            1.0,
+        ),
+        (
+            "no head",
+            BoundingBox {
+                y_min: 0.0,
+                ..whole.bounding_box
+            },
+            0.3,
+        ),
     ] {
-        let cut = Detection { bounding_box: bounds, ..whole.clone() };
+        let cut = Detection {
+            bounding_box: bounds,
+            ..whole.clone()
+        };
         let found = range_m(&both, &cut).unwrap();
         assert!((found - 6.0).abs() < tolerance_m, "{name}: {found}");
     }
-    let neither = BoundingBox { y_min: 0.0, y_max: 720.0, ..whole.bounding_box };
-    let neither = Detection { bounding_box: neither, ..whole.clone() };
+    let neither = BoundingBox {
+        y_min: 0.0,
+        y_max: 720.0,
+        ..whole.bounding_box
+    };
+    let neither = Detection {
+        bounding_box: neither,
+        ..whole.clone()
+    };
     let by_width = range_m(&both, &neither).unwrap();
     assert!((by_width - 6.0).abs() < 1.5, "{by_width}");
-    let nothing = BoundingBox { x_min: 0.0, ..neither.bounding_box };
-    let nothing = Detection { bounding_box: nothing, ..neither };
+    let nothing = BoundingBox {
+        x_min: 0.0,
+        ..neither.bounding_box
+    };
+    let nothing = Detection {
+        bounding_box: nothing,
+        ..neither
+    };
     assert_eq!(range_m(&both, &nothing).unwrap_err().as_str(), "clipped");
     let ground = projection(Ranging::Ground, mount, &ProjectionConfig::default());
-    let no_feet = Detection { bounding_box: BoundingBox { y_max: 720.0, ..whole.bounding_box }, ..whole };
+    let no_feet = Detection {
+        bounding_box: BoundingBox {
+            y_max: 720.0,
+            ..whole.bounding_box
+        },
+        ..whole
+    };
     assert_eq!(range_m(&ground, &no_feet).unwrap_err().as_str(), "clipped");
 }
 
@@ -236,29 +403,51 @@ fn a_foot_at_or_above_the_horizon_has_no_place_on_the_ground_but_one_by_its_heig
     let height_px = person.bounding_box.height();
     for above_px in [2.0, 12.0] {
         let y_max = horizon_px - above_px;
-        let bounding_box = BoundingBox { y_min: y_max - height_px, y_max, ..person.bounding_box };
-        let raised = Detection { bounding_box, ..person.clone() };
+        let bounding_box = BoundingBox {
+            y_min: y_max - height_px,
+            y_max,
+            ..person.bounding_box
+        };
+        let raised = Detection {
+            bounding_box,
+            ..person.clone()
+        };
         let ground = projection(Ranging::Ground, mount, &ProjectionConfig::default());
-        assert_eq!(range_m(&ground, &raised).unwrap_err().as_str(), "above_horizon");
+        assert_eq!(
+            range_m(&ground, &raised).unwrap_err().as_str(),
+            "above_horizon"
+        );
         let both = projection(Ranging::Auto, mount, &ProjectionConfig::default());
         let found = range_m(&both, &raised).unwrap();
         assert!((found - 9.0).abs() < 0.9, "{found}");
     }
-    let unknown = Detection { label: "QR1".into(), ..person_ahead(9.0, &mount) };
+    let unknown = Detection {
+        label: "QR1".into(),
+        ..person_ahead(9.0, &mount)
+    };
     let ground = projection(Ranging::Ground, mount, &ProjectionConfig::default());
-    assert!((range_m(&ground, &unknown).unwrap() - 9.0).abs() < 0.3, "the ground needs no size");
+    assert!(
+        (range_m(&ground, &unknown).unwrap() - 9.0).abs() < 0.3,
+        "the ground needs no size"
+    );
 }
 
 #[test]
 fn a_person_on_a_platform_is_placed_by_its_height_and_a_bump_costs_little() {
     let mount = mount(1.2, 5.0, 0.0);
-    let config = ProjectionConfig { tilt_sigma_rad: 0.005, ..ProjectionConfig::default() };
+    let config = ProjectionConfig {
+        tilt_sigma_rad: 0.005,
+        ..ProjectionConfig::default()
+    };
     let both = projection(Ranging::Auto, mount, &config);
     let ground = projection(Ranging::Ground, mount, &config);
     let (label, size) = kinds(1.2)[0];
     for (raised_m, ground_error_m) in [(0.6, 4.0), (0.05, 0.2)] {
         // Seen from as much lower.
-        let lower = Mount { height_m: Some(1.2 - raised_m), ..mount };
+        let lower = Mount {
+            height_m: Some(1.2 - raised_m),
+            ..mount
+        };
         let detection = seen(label, &size, Point2::new(6.0, 0.0), 0.4, &lower).unwrap();
         assert!(range_m(&ground, &detection).unwrap() > 6.0 + ground_error_m);
         let found = range_m(&both, &detection).unwrap();
@@ -273,18 +462,23 @@ fn without_a_height_or_with_corners_nothing_changes() {
     let by_height = projection(Ranging::BoxHeight, Mount::default(), &config);
     let person = person_ahead(6.0, &mount(1.2, 5.0, 0.0));
     let pose = Pose::new(1.0, 2.0, 0.3);
-    let place = |projection: &Projection| projection.place(&person, projection.cut(&person), None, &pose);
+    let place =
+        |projection: &Projection| projection.place(&person, projection.cut(&person), None, &pose);
     assert_eq!(place(&level), place(&by_height));
     let target = Point3::new(0.3, 0.2, 4.0);
     let posed = projection(Ranging::Auto, mount(1.2, 0.0, 0.0), &config);
     let corners = projection(Ranging::Corners, Mount::default(), &config);
-    let place = |projection: &Projection| projection.place(&person, Cut::default(), Some(&target), &pose);
+    let place =
+        |projection: &Projection| projection.place(&person, Cut::default(), Some(&target), &pose);
     assert_eq!(place(&posed), place(&corners));
 }
 
 #[test]
 fn a_tilted_camera_of_unknown_height_ranges_upright_objects_and_corners_alike() {
-    let tilted = Mount { height_m: None, ..mount(1.2, 8.0, 5.0) };
+    let tilted = Mount {
+        height_m: None,
+        ..mount(1.2, 8.0, 5.0)
+    };
     let (label, size) = kinds(1.2)[0];
     let at = Point2::new(6.0, -0.5);
     let detection = seen(label, &size, at, 0.0, &mount(1.2, 8.0, 5.0)).unwrap();
@@ -294,21 +488,38 @@ fn a_tilted_camera_of_unknown_height_ranges_upright_objects_and_corners_alike() 
     let level = Vector3::new(at.x, at.y, -0.4);
     let target = Point3::from(tilted.to_level().transpose() * level);
     let corners = projection(Ranging::Corners, tilted, &ProjectionConfig::default());
-    let placed = corners.place(&detection, Cut::default(), Some(&target), &Pose::new(0.0, 0.0, 0.0)).unwrap();
+    let placed = corners
+        .place(
+            &detection,
+            Cut::default(),
+            Some(&target),
+            &Pose::new(0.0, 0.0, 0.0),
+        )
+        .unwrap();
     assert!(offset_m(&placed, at) < 1e-9);
 }
 
 /// The angle that a minute of the street tells, a box each half second, through a camera that is mounted otherwise than said.
 fn told_rad(mounted: &Mount, said: Mount) -> Option<f64> {
     let mut street = Street::new(said.height_m.unwrap());
-    let projection =
-        projection(Ranging::Auto, said, &ProjectionConfig { pixel_sigma_px: 2.0, ..ProjectionConfig::default() });
+    let projection = projection(
+        Ranging::Auto,
+        said,
+        &ProjectionConfig {
+            pixel_sigma_px: 2.0,
+            ..ProjectionConfig::default()
+        },
+    );
     let (mut check, mut told) = (MountCheck::default(), None);
     for half_seconds in 0..120 {
         let (mut detection, _) = street.next(mounted, 1.0, 10.0);
         detection.bounding_box.y_max += 2.0 * street.normal();
         let boxes = [(&detection, projection.cut(&detection))];
-        told = check.take(boxes, Timestamp::default() + Duration::from_millis(500 * half_seconds), &projection);
+        told = check.take(
+            boxes,
+            Timestamp::default() + Duration::from_millis(500 * half_seconds),
+            &projection,
+        );
     }
     told
 }
@@ -327,7 +538,10 @@ fn a_camera_that_has_turned_is_told_by_its_angle_and_one_within_its_errors_is_no
         }
         for turned_deg in [-1.5, 0.0, 1.5] {
             let off_rad = told_rad(&mount(height_m, pitch_deg - turned_deg, 1.5), said);
-            assert_eq!(off_rad, None, "{height_m} m, {pitch_deg}° turned by {turned_deg}°");
+            assert_eq!(
+                off_rad, None,
+                "{height_m} m, {pitch_deg}° turned by {turned_deg}°"
+            );
         }
     }
 }
@@ -338,19 +552,37 @@ fn a_camera_that_has_turned_is_told_in_a_crowd_too() {
     let (mut street, mut check, mut told) = (Street::new(1.5), MountCheck::default(), None);
     let projection = projection(Ranging::Auto, said, &ProjectionConfig::default());
     for half_seconds in 0..40 {
-        let crowd: Vec<_> = (0..20).map(|_| street.next(&mounted, 1.0, 10.0).0).collect();
-        let boxes = crowd.iter().map(|detection| (detection, projection.cut(detection)));
-        told = check.take(boxes, Timestamp::default() + Duration::from_millis(500 * half_seconds), &projection);
+        let crowd: Vec<_> = (0..20)
+            .map(|_| street.next(&mounted, 1.0, 10.0).0)
+            .collect();
+        let boxes = crowd
+            .iter()
+            .map(|detection| (detection, projection.cut(detection)));
+        told = check.take(
+            boxes,
+            Timestamp::default() + Duration::from_millis(500 * half_seconds),
+            &projection,
+        );
     }
     let off_deg = told.map(f64::to_degrees);
-    assert!(off_deg.is_some_and(|off_deg| (off_deg - 6.0).abs() < 1.0), "{off_deg:?}");
+    assert!(
+        off_deg.is_some_and(|off_deg| (off_deg - 6.0).abs() < 1.0),
+        "{off_deg:?}"
+    );
 }
 
 #[test]
 fn what_hangs_is_no_sign_of_a_camera_that_has_turned() {
-    let projection = projection(Ranging::Auto, mount(1.5, 0.0, 0.0), &ProjectionConfig::default());
+    let projection = projection(
+        Ranging::Auto,
+        mount(1.5, 0.0, 0.0),
+        &ProjectionConfig::default(),
+    );
     let lamp = ObjectSizes::default().of("traffic light").copied().unwrap();
-    let above = Mount { height_m: Some(1.5 - 4.0), ..Mount::default() };
+    let above = Mount {
+        height_m: Some(1.5 - 4.0),
+        ..Mount::default()
+    };
     let mut check = MountCheck::default();
     for seconds in 0..60u32 {
         let at = Point2::new(16.0 + f64::from(seconds % 8), 1.0);
@@ -366,10 +598,16 @@ fn what_hangs_is_no_sign_of_a_camera_that_has_turned() {
 
 #[test]
 fn things_above_the_ground_at_one_distance_are_no_sign_of_a_camera_that_has_turned() {
-    let projection = projection(Ranging::Auto, mount(1.2, 0.0, 0.0), &ProjectionConfig::default());
+    let projection = projection(
+        Ranging::Auto,
+        mount(1.2, 0.0, 0.0),
+        &ProjectionConfig::default(),
+    );
     let mut check = MountCheck::default();
-    let hanging =
-        Detection { bounding_box: moved(&person_ahead(8.0, &mount(1.2, 0.0, 0.0)), -80.0), ..detection_of("person") };
+    let hanging = Detection {
+        bounding_box: moved(&person_ahead(8.0, &mount(1.2, 0.0, 0.0)), -80.0),
+        ..detection_of("person")
+    };
     for seconds in 0..60u32 {
         let told = check.take(
             [(&hanging, Cut::default())],
@@ -381,6 +619,16 @@ fn things_above_the_ground_at_one_distance_are_no_sign_of_a_camera_that_has_turn
 }
 
 fn moved(detection: &Detection, down_px: f64) -> BoundingBox {
-    let BoundingBox { x_min, y_min, x_max, y_max } = detection.bounding_box;
-    BoundingBox { x_min, y_min: y_min + down_px, x_max, y_max: y_max + down_px }
+    let BoundingBox {
+        x_min,
+        y_min,
+        x_max,
+        y_max,
+    } = detection.bounding_box;
+    BoundingBox {
+        x_min,
+        y_min: y_min + down_px,
+        x_max,
+        y_max: y_max + down_px,
+    }
 }

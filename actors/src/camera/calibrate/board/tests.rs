@@ -10,7 +10,12 @@ use qrcode::{Color, QrCode};
 use super::*;
 
 fn lens() -> Lens {
-    Lens::ideal(Intrinsics::from_field_of_view(1280, 720, 70f64.to_radians(), 43f64.to_radians()))
+    Lens::ideal(Intrinsics::from_field_of_view(
+        1280,
+        720,
+        70f64.to_radians(),
+        43f64.to_radians(),
+    ))
 }
 
 const SIDE_MM: f64 = 400.0;
@@ -20,12 +25,21 @@ const DRAWN_PX: i32 = 24;
 /// Dark squares on white, with a rim of four.
 fn flat(side: i32, is_dark: impl Fn(i32, i32) -> bool) -> Mat {
     let whole = (side + 8) * DRAWN_PX;
-    let mut image = Mat::new_rows_cols_with_default(whole, whole, CV_8UC1, Scalar::all(235.0)).unwrap();
+    let mut image =
+        Mat::new_rows_cols_with_default(whole, whole, CV_8UC1, Scalar::all(235.0)).unwrap();
     for (row, column) in (0..side).flat_map(|row| (0..side).map(move |column| (row, column))) {
         if is_dark(row, column) {
             let at = Point::new((column + 4) * DRAWN_PX, (row + 4) * DRAWN_PX);
             let square = Rect::from_point_size(at, Size::new(DRAWN_PX, DRAWN_PX));
-            imgproc::rectangle(&mut image, square, Scalar::all(25.0), imgproc::FILLED, imgproc::LINE_8, 0).unwrap();
+            imgproc::rectangle(
+                &mut image,
+                square,
+                Scalar::all(25.0),
+                imgproc::FILLED,
+                imgproc::LINE_8,
+                0,
+            )
+            .unwrap();
         }
     }
     image
@@ -34,11 +48,23 @@ fn flat(side: i32, is_dark: impl Fn(i32, i32) -> bool) -> Mat {
 fn code(text: &str) -> (Mat, f64) {
     let code = QrCode::new(text).unwrap();
     let (side, modules) = (code.width() as i32, code.to_colors());
-    (flat(side, |row, column| modules[(row * side + column) as usize] == Color::Dark), f64::from(side))
+    (
+        flat(side, |row, column| {
+            modules[(row * side + column) as usize] == Color::Dark
+        }),
+        f64::from(side),
+    )
 }
 
 /// A drawing of `side` squares of `square_m` that lies `ahead_m` before a camera, turned by `yaw_rad`, slightly out of focus.
-fn photograph(drawing: &Mat, side: f64, square_m: f64, ahead_m: f64, yaw_rad: f64, mount: &Mount) -> Mat {
+fn photograph(
+    drawing: &Mat,
+    side: f64,
+    square_m: f64,
+    ahead_m: f64,
+    yaw_rad: f64,
+    mount: &Mount,
+) -> Mat {
     let posed = PosedCamera::new(Pose::new(0.0, 0.0, 0.0), mount, lens().intrinsics);
     let middle = Pose::new(ahead_m, 0.1, yaw_rad);
     let half = (side / 2.0 + 4.0) * square_m;
@@ -51,12 +77,23 @@ fn photograph(drawing: &Mat, side: f64, square_m: f64, ahead_m: f64, yaw_rad: f6
         .map(|pixel| Point2f::new(pixel.x as f32 - 0.5, pixel.y as f32 - 0.5))
         .collect();
     let drawn = [(0.0, 0.0), (whole, 0.0), (whole, whole), (0.0, whole)];
-    let drawn: Vector<Point2f> = drawn.iter().map(|&(x, y)| Point2f::new(x as f32 - 0.5, y as f32 - 0.5)).collect();
+    let drawn: Vector<Point2f> = drawn
+        .iter()
+        .map(|&(x, y)| Point2f::new(x as f32 - 0.5, y as f32 - 0.5))
+        .collect();
     let to_image = calib3d::find_homography_def(&drawn, &seen, &mut Mat::default()).unwrap();
     let mut image = Mat::default();
     let (size, ground) = (Size::new(1280, 720), Scalar::all(120.0));
-    imgproc::warp_perspective(drawing, &mut image, &to_image, size, imgproc::INTER_AREA, BORDER_CONSTANT, ground)
-        .unwrap();
+    imgproc::warp_perspective(
+        drawing,
+        &mut image,
+        &to_image,
+        size,
+        imgproc::INTER_AREA,
+        BORDER_CONSTANT,
+        ground,
+    )
+    .unwrap();
     let mut blurred = Mat::default();
     imgproc::gaussian_blur_def(&image, &mut blurred, Size::new(5, 5), 0.8).unwrap();
     blurred
@@ -64,25 +101,56 @@ fn photograph(drawing: &Mat, side: f64, square_m: f64, ahead_m: f64, yaw_rad: f6
 
 fn mount(height_m: f64, pitch_deg: f64, roll_deg: f64) -> Mount {
     let (pitch_rad, roll_rad) = (pitch_deg.to_radians(), roll_deg.to_radians());
-    Mount { height_m: Some(height_m), pitch_rad, roll_rad, ..Mount::default() }
+    Mount {
+        height_m: Some(height_m),
+        pitch_rad,
+        roll_rad,
+        ..Mount::default()
+    }
 }
 
 #[track_caller]
 fn is_near(found: &Mount, real: &Mount) {
-    let tilt_deg = [found.pitch_rad - real.pitch_rad, found.roll_rad - real.roll_rad].map(|off| off.to_degrees().abs());
+    let tilt_deg = [
+        found.pitch_rad - real.pitch_rad,
+        found.roll_rad - real.roll_rad,
+    ]
+    .map(|off| off.to_degrees().abs());
     let height = found.height_m.unwrap() / real.height_m.unwrap() - 1.0;
-    println!("pitch {:.2}°, roll {:.2}°, height {:.2} %", tilt_deg[0], tilt_deg[1], 100.0 * height);
-    assert!(tilt_deg[0] < 0.5 && tilt_deg[1] < 0.5 && height.abs() < 0.01, "{found:?} {real:?}");
+    println!(
+        "pitch {:.2}°, roll {:.2}°, height {:.2} %",
+        tilt_deg[0],
+        tilt_deg[1],
+        100.0 * height
+    );
+    assert!(
+        tilt_deg[0] < 0.5 && tilt_deg[1] < 0.5 && height.abs() < 0.01,
+        "{found:?} {real:?}"
+    );
 }
 
 #[test]
 fn a_qr_code_on_the_ground_gives_height_and_tilt() {
     let (drawing, modules) = code("ecod");
-    for (real, ahead_m, yaw_rad) in
-        [(mount(1.3, 25.0, 0.0), 2.2, 0.3), (mount(1.3, 25.0, -4.0), 2.4, -0.4), (mount(2.0, 40.0, 5.0), 2.0, 0.1)]
-    {
-        let photograph = photograph(&drawing, modules, SIDE_MM / 1000.0 / modules, ahead_m, yaw_rad, &real);
-        let fit = fit_board(&photograph, &GroundBoard::QrCode { side_mm: SIDE_MM }, &lens()).unwrap();
+    for (real, ahead_m, yaw_rad) in [
+        (mount(1.3, 25.0, 0.0), 2.2, 0.3),
+        (mount(1.3, 25.0, -4.0), 2.4, -0.4),
+        (mount(2.0, 40.0, 5.0), 2.0, 0.1),
+    ] {
+        let photograph = photograph(
+            &drawing,
+            modules,
+            SIDE_MM / 1000.0 / modules,
+            ahead_m,
+            yaw_rad,
+            &real,
+        );
+        let fit = fit_board(
+            &photograph,
+            &GroundBoard::QrCode { side_mm: SIDE_MM },
+            &lens(),
+        )
+        .unwrap();
         is_near(&fit.estimate.mount, &real);
     }
 }
@@ -90,10 +158,20 @@ fn a_qr_code_on_the_ground_gives_height_and_tilt() {
 #[test]
 fn a_chessboard_on_the_ground_gives_height_and_tilt() {
     let drawing = flat(8, |row, column| row < 7 && (row + column) % 2 == 0);
-    let board = GroundBoard::Chessboard(Chessboard { columns: 7, rows: 6, square_mm: 60.0 });
+    let board = GroundBoard::Chessboard(Chessboard {
+        columns: 7,
+        rows: 6,
+        square_mm: 60.0,
+    });
     for (real, yaw_rad) in [(mount(1.3, 25.0, -4.0), 0.3), (mount(1.8, 30.0, 3.0), 2.0)] {
         let photograph = photograph(&drawing, 8.0, 0.06, 2.4, yaw_rad, &real);
-        is_near(&fit_board(&photograph, &board, &lens()).unwrap().estimate.mount, &real);
+        is_near(
+            &fit_board(&photograph, &board, &lens())
+                .unwrap()
+                .estimate
+                .mount,
+            &real,
+        );
     }
 }
 
@@ -101,14 +179,27 @@ fn a_chessboard_on_the_ground_gives_height_and_tilt() {
 fn a_photograph_without_the_board_or_with_two_is_told_so() {
     let qr_code = GroundBoard::QrCode { side_mm: SIDE_MM };
     let blank = Mat::new_rows_cols_with_default(720, 1280, CV_8UC1, Scalar::all(90.0)).unwrap();
-    let none = fit_board(&blank, &qr_code, &lens()).unwrap_err().to_string();
+    let none = fit_board(&blank, &qr_code, &lens())
+        .unwrap_err()
+        .to_string();
     assert!(none.contains("no QR code was found"), "{none}");
     let ((left, modules), (right, _)) = (code("left"), code("rite"));
     let (mut row, mut both) = (Mat::default(), Mat::default());
     hconcat(&Vector::<Mat>::from_iter([left, right]), &mut row).unwrap();
-    let white = Mat::new_size_with_default(row.size().unwrap(), CV_8UC1, Scalar::all(235.0)).unwrap();
+    let white =
+        Mat::new_size_with_default(row.size().unwrap(), CV_8UC1, Scalar::all(235.0)).unwrap();
     vconcat(&Vector::<Mat>::from_iter([row, white]), &mut both).unwrap();
-    let both = photograph(&both, 2.0 * modules + 8.0, 0.02, 2.4, 0.0, &mount(1.3, 25.0, 0.0));
+    let both = photograph(
+        &both,
+        2.0 * modules + 8.0,
+        0.02,
+        2.4,
+        0.0,
+        &mount(1.3, 25.0, 0.0),
+    );
     let several = fit_board(&both, &qr_code, &lens());
-    assert!(matches!(several, Err(BoardError::SeveralCodes(2))), "{several:?}");
+    assert!(
+        matches!(several, Err(BoardError::SeveralCodes(2))),
+        "{several:?}"
+    );
 }

@@ -20,8 +20,14 @@ impl Anchor {
     /// The box for the network's four outputs ty, tx, th, tw.
     pub(super) fn decode(&self, offsets: &[f32]) -> BoundingBox {
         let [ty, tx, th, tw] = std::array::from_fn(|i| f64::from(offsets[i]));
-        let (center_x, center_y) = (self.center_x + tx / 10.0 * self.width, self.center_y + ty / 10.0 * self.height);
-        let (half_width, half_height) = (self.width * (tw / 5.0).exp() / 2.0, self.height * (th / 5.0).exp() / 2.0);
+        let (center_x, center_y) = (
+            self.center_x + tx / 10.0 * self.width,
+            self.center_y + ty / 10.0 * self.height,
+        );
+        let (half_width, half_height) = (
+            self.width * (tw / 5.0).exp() / 2.0,
+            self.height * (th / 5.0).exp() / 2.0,
+        );
         BoundingBox {
             x_min: center_x - half_width,
             y_min: center_y - half_height,
@@ -37,7 +43,8 @@ pub(super) fn all() -> Vec<Anchor> {
     for (map, cells) in MAPS.into_iter().enumerate() {
         let shapes = shapes(map);
         let center = |index: u16| (f64::from(index) + 0.5) / f64::from(cells);
-        for (row, column) in (0..cells).flat_map(|row| (0..cells).map(move |column| (row, column))) {
+        for (row, column) in (0..cells).flat_map(|row| (0..cells).map(move |column| (row, column)))
+        {
             anchors.extend(shapes.iter().map(|&(scale, ratio)| Anchor {
                 center_x: center(column),
                 center_y: center(row),
@@ -56,5 +63,12 @@ fn shapes(map: usize) -> Vec<(f64, f64)> {
         return vec![(0.1, 1.0), (scale, 2.0), (scale, 0.5)];
     }
     let mean = (scale * SCALES[map + 1]).sqrt();
-    vec![(scale, 1.0), (scale, 2.0), (scale, 0.5), (scale, 3.0), (scale, 1.0 / 3.0), (mean, 1.0)]
+    vec![
+        (scale, 1.0),
+        (scale, 2.0),
+        (scale, 0.5),
+        (scale, 3.0),
+        (scale, 1.0 / 3.0),
+        (mean, 1.0),
+    ]
 }

@@ -7,12 +7,19 @@ pub(in super::super) const IDS: usize = 90;
 
 /// Every class in use with its id.
 pub(in super::super) fn all() -> impl Iterator<Item = (usize, &'static str)> {
-    NAMES.iter().enumerate().map(|(index, name)| (index + 1, *name)).filter(|(_, name)| !name.is_empty())
+    NAMES
+        .iter()
+        .enumerate()
+        .map(|(index, name)| (index + 1, *name))
+        .filter(|(_, name)| !name.is_empty())
 }
 
 /// Name of the class with that id, if it is in use.
 pub fn name(id: usize) -> Option<&'static str> {
-    NAMES.get(id.checked_sub(1)?).copied().filter(|name| !name.is_empty())
+    NAMES
+        .get(id.checked_sub(1)?)
+        .copied()
+        .filter(|name| !name.is_empty())
 }
 
 #[rustfmt::skip]

@@ -27,20 +27,49 @@ impl Edges {
             Self::Corners => (a, b, c, d),
             Self::RowFirst => (b, a, d, c),
         };
-        BoundingBox { x_min: x_min * scale_x, y_min: y_min * scale_y, x_max: x_max * scale_x, y_max: y_max * scale_y }
+        BoundingBox {
+            x_min: x_min * scale_x,
+            y_min: y_min * scale_y,
+            x_max: x_max * scale_x,
+            y_max: y_max * scale_y,
+        }
     }
 }
 
 impl Head {
     /// Boxes with a score of `least` or more, in pixels of the network's input.
-    pub(super) fn decode(&self, outputs: &[NamedTensor], input: ImageSize, least: f32) -> Vec<ScoredBox> {
+    pub(super) fn decode(
+        &self,
+        outputs: &[NamedTensor],
+        input: ImageSize,
+        least: f32,
+    ) -> Vec<ScoredBox> {
         let values = |output: usize| outputs.get(output).map_or(&[][..], |output| &output.values);
-        let width = |output: usize| outputs.get(output).and_then(|o| o.shape.last()).map_or(1, |last| (*last).max(1));
-        let (pixels, shares) = ((1.0, 1.0), (f64::from(input.width), f64::from(input.height)));
-        let best = |scores: &[f32]| scores.iter().copied().enumerate().max_by(|a, b| a.1.total_cmp(&b.1));
-        let found = |(class, score): (usize, f32), edges: Edges, numbers: [f32; 4], scale: (f64, f64)| {
-            (score >= least).then(|| ScoredBox { class, score, bounds: edges.bounds(numbers, scale) })
+        let width = |output: usize| {
+            outputs
+                .get(output)
+                .and_then(|o| o.shape.last())
+                .map_or(1, |last| (*last).max(1))
         };
+        let (pixels, shares) = (
+            (1.0, 1.0),
+            (f64::from(input.width), f64::from(input.height)),
+        );
+        let best = |scores: &[f32]| {
+            scores
+                .iter()
+                .copied()
+                .enumerate()
+                .max_by(|a, b| a.1.total_cmp(&b.1))
+        };
+        let found =
+            |(class, score): (usize, f32), edges: Edges, numbers: [f32; 4], scale: (f64, f64)| {
+                (score >= least).then(|| ScoredBox {
+                    class,
+                    score,
+                    bounds: edges.bounds(numbers, scale),
+                })
+            };
         match self.layout {
             Layout::Objectness(output) => values(output)
                 .chunks_exact(width(output))
@@ -55,13 +84,24 @@ impl Head {
                     let (class, score) = best(row.get(5..)?)?;
                     let [x, y, width, height] = four(row)?;
                     let numbers = [x + column, y + line, width.exp(), height.exp()];
-                    found((class, score * row[4]), Edges::Centre, numbers, (stride, stride))
+                    found(
+                        (class, score * row[4]),
+                        Edges::Centre,
+                        numbers,
+                        (stride, stride),
+                    )
                 })
                 .collect(),
             Layout::Columns(output) => {
                 let (values, count) = (values(output), width(output));
-                let row = |index: usize| values.chunks_exact(count).map(|column| column[index]).collect::<Vec<f32>>();
-                let decoded = |row: Vec<f32>| found(best(row.get(4..)?)?, Edges::Centre, four(&row)?, pixels);
+                let row = |index: usize| {
+                    values
+                        .chunks_exact(count)
+                        .map(|column| column[index])
+                        .collect::<Vec<f32>>()
+                };
+                let decoded =
+                    |row: Vec<f32>| found(best(row.get(4..)?)?, Edges::Centre, four(&row)?, pixels);
                 (0..count).filter_map(|index| decoded(row(index))).collect()
             }
             Layout::Rows(output) => values(output)
@@ -70,15 +110,24 @@ impl Head {
                 .collect(),
             Layout::Picked(output) => {
                 let is_rtdetr = self.family == Family::Rtdetr;
-                let (edges, scale) = if is_rtdetr { (Edges::Centre, shares) } else { (Edges::Corners, pixels) };
+                let (edges, scale) = if is_rtdetr {
+                    (Edges::Centre, shares)
+                } else {
+                    (Edges::Corners, pixels)
+                };
                 let rows = values(output).chunks_exact(6);
-                rows.filter_map(|row| found((row[5] as usize, row[4]), edges, four(row)?, scale)).collect()
+                rows.filter_map(|row| found((row[5] as usize, row[4]), edges, four(row)?, scale))
+                    .collect()
             }
             Layout::Queries { boxes, logits } => values(boxes)
                 .chunks_exact(4)
                 .zip(values(logits).chunks_exact(width(logits)))
                 .filter_map(|(row, logits)| {
-                    let best = if self.family == Family::Detr { softmax(logits)? } else { sigmoid(best(logits)?) };
+                    let best = if self.family == Family::Detr {
+                        softmax(logits)?
+                    } else {
+                        sigmoid(best(logits)?)
+                    };
                     found(best, Edges::Centre, four(row)?, shares)
                 })
                 .collect(),
@@ -90,12 +139,24 @@ impl Head {
                     found((class + 1, score), Edges::Corners, four(row)?, shares)
                 })
                 .collect(),
-            Layout::Listed { boxes, scores, classes } => {
-                let (edges, scale) =
-                    if self.is_tensorflow { (Edges::RowFirst, shares) } else { (Edges::Corners, pixels) };
-                let lists = values(boxes).chunks_exact(4).zip(values(scores)).zip(values(classes));
+            Layout::Listed {
+                boxes,
+                scores,
+                classes,
+            } => {
+                let (edges, scale) = if self.is_tensorflow {
+                    (Edges::RowFirst, shares)
+                } else {
+                    (Edges::Corners, pixels)
+                };
+                let lists = values(boxes)
+                    .chunks_exact(4)
+                    .zip(values(scores))
+                    .zip(values(classes));
                 lists
-                    .filter_map(|((row, score), class)| found((*class as usize, *score), edges, four(row)?, scale))
+                    .filter_map(|((row, score), class)| {
+                        found((*class as usize, *score), edges, four(row)?, scale)
+                    })
                     .collect()
             }
         }
@@ -110,7 +171,9 @@ fn four(row: &[f32]) -> Option<[f32; 4]> {
 fn cells(input: ImageSize) -> impl Iterator<Item = (f32, f32, f64)> {
     STRIDES.into_iter().flat_map(move |stride| {
         let (columns, lines) = (input.width / stride, input.height / stride);
-        (0..lines).flat_map(move |line| (0..columns).map(move |column| (column as f32, line as f32, f64::from(stride))))
+        (0..lines).flat_map(move |line| {
+            (0..columns).map(move |column| (column as f32, line as f32, f64::from(stride)))
+        })
     })
 }
 
@@ -123,6 +186,10 @@ fn softmax(logits: &[f32]) -> Option<(usize, f32)> {
     let most = logits.iter().copied().max_by(f32::total_cmp)?;
     let sum: f32 = logits.iter().map(|logit| (logit - most).exp()).sum();
     let (_, classes) = logits.split_last()?;
-    let (class, logit) = classes.iter().copied().enumerate().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let (class, logit) = classes
+        .iter()
+        .copied()
+        .enumerate()
+        .max_by(|a, b| a.1.total_cmp(&b.1))?;
     Some((class, (logit - most).exp() / sum))
 }

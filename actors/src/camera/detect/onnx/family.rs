@@ -51,7 +51,9 @@ impl Normalization {
             Self::Raw => [(1.0, 0.0); 3],
             Self::Unit => [(1.0 / 255.0, 0.0); 3],
             Self::Signed => [(1.0 / 127.5, -1.0); 3],
-            Self::Imagenet => std::array::from_fn(|c| (1.0 / (255.0 * SIGMA[c]), -MEAN[c] / SIGMA[c])),
+            Self::Imagenet => {
+                std::array::from_fn(|c| (1.0 / (255.0 * SIGMA[c]), -MEAN[c] / SIGMA[c]))
+            }
         }
     }
 }
@@ -74,7 +76,11 @@ pub(super) enum Layout {
     /// `[1, boxes, 4]` and `[1, boxes, 1 + classes]`: corners in shares, scores with the background first.
     Priors { boxes: usize, scores: usize },
     /// `[…, boxes, 4]`, `[…, boxes]` and `[…, boxes]`: corners, score, class.
-    Listed { boxes: usize, scores: usize, classes: usize },
+    Listed {
+        boxes: usize,
+        scores: usize,
+        classes: usize,
+    },
 }
 
 /// Family and layout of a network.
@@ -102,8 +108,17 @@ impl Head {
     /// The family and layout that the outputs fit; none if they fit none, or another than the configured family.
     pub(super) fn find(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<Self> {
         let (family, layout) = by_names(clues, outputs).or_else(|| by_shape(clues, outputs))?;
-        let is_tensorflow = outputs.iter().any(|output| output.name.starts_with("detection_boxes"));
-        clues.told.is_none_or(|told| told == family).then_some(Self { family, layout, is_tensorflow })
+        let is_tensorflow = outputs
+            .iter()
+            .any(|output| output.name.starts_with("detection_boxes"));
+        clues
+            .told
+            .is_none_or(|told| told == family)
+            .then_some(Self {
+                family,
+                layout,
+                is_tensorflow,
+            })
     }
 
     /// Numbers of the classes.
@@ -118,22 +133,37 @@ impl Head {
             Layout::Picked(_) | Layout::Listed { .. } => None,
         };
         let has_none_last = self.family == Family::Detr;
-        Classes { scores, first: usize::from(self.family == Family::Ssd), has_none_last }
+        Classes {
+            scores,
+            first: usize::from(self.family == Family::Ssd),
+            has_none_last,
+        }
     }
 
     /// True if the network has turned the cells of YOLOX into pixels itself, for which [`Layout::Cells`] does not hold.
     pub(super) fn is_in_pixels(&self, outputs: &[NamedTensor], input: ImageSize) -> bool {
-        let Layout::Cells(output) = self.layout else { return false };
+        let Layout::Cells(output) = self.layout else {
+            return false;
+        };
         let row = outputs[output].shape[2];
         // Centres are within a few cells of their own; in pixels they reach the right edge.
-        outputs[output].values.chunks_exact(row).any(|row| row[0] > (input.width / STRIDES[0]) as f32)
+        outputs[output]
+            .values
+            .chunks_exact(row)
+            .any(|row| row[0] > (input.width / STRIDES[0]) as f32)
     }
 
     /// True if one object has several boxes.
     pub(super) fn needs_suppression(&self) -> bool {
         match self.layout {
-            Layout::Objectness(_) | Layout::Cells(_) | Layout::Columns(_) | Layout::Priors { .. } => true,
-            Layout::Rows(_) | Layout::Picked(_) | Layout::Queries { .. } | Layout::Listed { .. } => false,
+            Layout::Objectness(_)
+            | Layout::Cells(_)
+            | Layout::Columns(_)
+            | Layout::Priors { .. } => true,
+            Layout::Rows(_)
+            | Layout::Picked(_)
+            | Layout::Queries { .. }
+            | Layout::Listed { .. } => false,
         }
     }
 
@@ -181,25 +211,44 @@ fn cells(input: ImageSize, stride: u32) -> usize {
 /// Networks with an output for boxes and others for their classes.
 fn by_names(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layout)> {
     let find = |words: &[&str], rank: std::ops::RangeInclusive<usize>| {
-        outputs.iter().position(|o| rank.contains(&o.shape.len()) && words.iter().any(|word| o.name.contains(word)))
+        outputs.iter().position(|o| {
+            rank.contains(&o.shape.len()) && words.iter().any(|word| o.name.contains(word))
+        })
     };
-    let boxes = find(&["box", "dets"], 2..=3).filter(|boxes| outputs[*boxes].shape.last() == Some(&4))?;
+    let boxes =
+        find(&["box", "dets"], 2..=3).filter(|boxes| outputs[*boxes].shape.last() == Some(&4))?;
     let count = outputs[boxes].shape[outputs[boxes].shape.len() - 2];
     let is_list = |at: &usize| outputs[*at].shape.last() == Some(&count);
     let is_table = |at: &usize| matches!(outputs[*at].shape[..], [_, rows, _] if rows == count);
     if let Some(logits) = find(&["logits"], 3..=3).filter(is_table) {
         let is_detr = count == DETR_QUERIES || outputs[logits].shape[2] == DETR_COCO_LOGITS;
-        let found = clues.told.unwrap_or(if is_detr { Family::Detr } else { Family::Rtdetr });
+        let found = clues.told.unwrap_or(if is_detr {
+            Family::Detr
+        } else {
+            Family::Rtdetr
+        });
         let fits = matches!(found, Family::Detr | Family::Rtdetr | Family::Rfdetr);
         return fits.then_some((found, Layout::Queries { boxes, logits }));
     }
     if let Some(logits) = find(&["labels"], 3..=3).filter(is_table) {
         return Some((Family::Rfdetr, Layout::Queries { boxes, logits }));
     }
-    let lists = [["scores", "scores"], ["labels", "classes"]].map(|words| find(&words, 1..=2).filter(is_list));
+    let lists = [["scores", "scores"], ["labels", "classes"]]
+        .map(|words| find(&words, 1..=2).filter(is_list));
     if let [Some(scores), Some(classes)] = lists {
-        let family = if clues.scales_boxes { Family::Rtdetr } else { Family::Ssd };
-        return Some((family, Layout::Listed { boxes, scores, classes }));
+        let family = if clues.scales_boxes {
+            Family::Rtdetr
+        } else {
+            Family::Ssd
+        };
+        return Some((
+            family,
+            Layout::Listed {
+                boxes,
+                scores,
+                classes,
+            },
+        ));
     }
     let scores = find(&["scores"], 3..=3).filter(is_table)?;
     Some((Family::Ssd, Layout::Priors { boxes, scores }))
@@ -208,18 +257,25 @@ fn by_names(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layou
 /// Networks with one output, beside the grids that early exports of YOLOv5 also had.
 fn by_shape(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layout)> {
     let (main, others) = outputs.split_first()?;
-    let [1, rows, columns] = main.shape[..] else { return None };
+    let [1, rows, columns] = main.shape[..] else {
+        return None;
+    };
     if others.iter().any(|other| other.shape.len() != 5) {
         return None;
     }
-    let fine: usize = STRIDES.iter().map(|stride| cells(clues.input, *stride)).sum();
+    let fine: usize = STRIDES
+        .iter()
+        .map(|stride| cells(clues.input, *stride))
+        .sum();
     let grids = [fine, fine + cells(clues.input, COARSE_STRIDE)];
     let description = clues.description.to_ascii_lowercase().replace('-', "");
     match clues.told {
         Some(Family::Rtdetr) => rtdetr(columns),
         None if description.contains("rtdetr") => rtdetr(columns),
         Some(Family::Yolov5) if columns > 5 => Some((Family::Yolov5, Layout::Objectness(0))),
-        Some(Family::Yolov8) if columns != 6 && rows > 4 => Some((Family::Yolov8, Layout::Columns(0))),
+        Some(Family::Yolov8) if columns != 6 && rows > 4 => {
+            Some((Family::Yolov8, Layout::Columns(0)))
+        }
         _ if rows == fine && columns > 5 => Some((Family::Yolox, Layout::Cells(0))),
         _ if grids.iter().any(|cells| rows == 3 * cells) && columns > 5 => {
             Some((Family::Yolov5, Layout::Objectness(0)))
@@ -231,6 +287,10 @@ fn by_shape(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layou
 }
 
 fn rtdetr(columns: usize) -> Option<(Family, Layout)> {
-    let layout = if columns == 6 { Layout::Picked(0) } else { Layout::Rows(0) };
+    let layout = if columns == 6 {
+        Layout::Picked(0)
+    } else {
+        Layout::Rows(0)
+    };
     (columns > 4).then_some((Family::Rtdetr, layout))
 }

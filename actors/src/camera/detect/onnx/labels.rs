@@ -18,25 +18,35 @@ pub(super) struct Classes {
 impl Classes {
     /// Count of classes, if the network shows it.
     pub(super) fn count(&self) -> Option<usize> {
-        self.scores?.checked_sub(self.first + usize::from(self.has_none_last))
+        self.scores?
+            .checked_sub(self.first + usize::from(self.has_none_last))
     }
 
     /// The label of each number. `names` are the classes in order; without them, the classes must be COCO's.
     ///
     /// # Errors
     /// The count of classes when it differs from that of the names, or when it is not COCO's.
-    pub(super) fn labels(&self, names: Option<&[String]>) -> Result<Vec<Option<Label>>, Option<usize>> {
+    pub(super) fn labels(
+        &self,
+        names: Option<&[String]>,
+    ) -> Result<Vec<Option<Label>>, Option<usize>> {
         let count = self.count();
         let in_order = |names: &mut dyn Iterator<Item = Label>| {
-            std::iter::repeat_n(None, self.first).chain(names.map(Some)).collect()
+            std::iter::repeat_n(None, self.first)
+                .chain(names.map(Some))
+                .collect()
         };
         match (names, count) {
             (Some(names), Some(count)) if names.len() != count => Err(Some(count)),
             (Some(names), _) => Ok(in_order(&mut names.iter().map(Label::from))),
             (None, Some(80)) => Ok(in_order(&mut coco::all().map(|(_, name)| name.into()))),
-            (None, None) if self.first == 0 => Ok(in_order(&mut coco::all().map(|(_, name)| name.into()))),
+            (None, None) if self.first == 0 => {
+                Ok(in_order(&mut coco::all().map(|(_, name)| name.into())))
+            }
             // The 91 ids of COCO with 0, which is either the background or not in use.
-            (None, None | Some(coco::IDS | coco::CLASSES)) => Ok((0..coco::CLASSES).map(by_id).collect()),
+            (None, None | Some(coco::IDS | coco::CLASSES)) => {
+                Ok((0..coco::CLASSES).map(by_id).collect())
+            }
             (None, count) => Err(count),
         }
     }
@@ -48,9 +58,16 @@ fn by_id(id: usize) -> Option<Label> {
 
 /// The names in a file: one on each line, without empty lines and without a background before the others.
 pub(super) fn read(text: &str) -> Vec<String> {
-    let mut names: Vec<String> =
-        text.lines().map(str::trim).filter(|line| !line.is_empty()).map(str::to_owned).collect();
-    if names.first().is_some_and(|name| name.trim_matches('_').eq_ignore_ascii_case("background")) {
+    let mut names: Vec<String> = text
+        .lines()
+        .map(str::trim)
+        .filter(|line| !line.is_empty())
+        .map(str::to_owned)
+        .collect();
+    if names
+        .first()
+        .is_some_and(|name| name.trim_matches('_').eq_ignore_ascii_case("background"))
+    {
         names.remove(0);
     }
     names
@@ -76,5 +93,8 @@ pub(super) fn parse(text: &str) -> Vec<String> {
 
 /// The first name that cannot be a label.
 pub(super) fn first_unusable(names: &[String]) -> Option<&str> {
-    names.iter().map(String::as_str).find(|name| !is_label(name))
+    names
+        .iter()
+        .map(String::as_str)
+        .find(|name| !is_label(name))
 }

@@ -43,10 +43,18 @@ impl Network {
     /// # Errors
     /// [`OnnxError`] when the file cannot be read or run, takes something else than an image, or another size.
     pub(super) fn load(path: &Path, told: Option<ImageSize>) -> Result<Self, OnnxError> {
-        bounded_file::open(path).map_err(|source| OnnxError::Unreadable { path: path.to_owned(), source })?;
-        let model = Model::load_file(path)
-            .map_err(|error| OnnxError::NotRunnable { path: path.to_owned(), reason: error.to_string() })?;
-        let refused = || OnnxError::UnknownInputs { path: path.to_owned(), inputs: inputs(&model) };
+        bounded_file::open(path).map_err(|source| OnnxError::Unreadable {
+            path: path.to_owned(),
+            source,
+        })?;
+        let model = Model::load_file(path).map_err(|error| OnnxError::NotRunnable {
+            path: path.to_owned(),
+            reason: error.to_string(),
+        })?;
+        let refused = || OnnxError::UnknownInputs {
+            path: path.to_owned(),
+            inputs: inputs(&model),
+        };
         let (image, scaled_to) = match model.input_ids() {
             [image] => (*image, None),
             [image, second] if is_size(&model, *second) => (*image, Some(*second)),
@@ -57,31 +65,63 @@ impl Network {
         if !is_bytes && kind.is_some_and(|kind| kind != ValueType::Tensor(DataType::Float)) {
             return Err(refused());
         }
-        let dimensions = model.node_info(image).and_then(|node| node.shape()).ok_or_else(refused)?;
+        let dimensions = model
+            .node_info(image)
+            .and_then(|node| node.shape())
+            .ok_or_else(refused)?;
         let fixed = |dimension: &Dimension| match dimension {
             Dimension::Fixed(length) => u32::try_from(*length).ok(),
             Dimension::Symbolic(_) => None,
         };
         let lengths: Vec<Option<u32>> = dimensions.iter().map(fixed).collect();
         let (has_channels_last, [height, width]) = match lengths[..] {
-            [Some(3), height, width] | [Some(1) | None, Some(3), height, width] => (false, [height, width]),
-            [height, width, Some(3)] | [Some(1) | None, height, width, Some(3)] => (true, [height, width]),
+            [Some(3), height, width] | [Some(1) | None, Some(3), height, width] => {
+                (false, [height, width])
+            }
+            [height, width, Some(3)] | [Some(1) | None, height, width, Some(3)] => {
+                (true, [height, width])
+            }
             [Some(1) | None, None, height, width] => (false, [height, width]),
             _ => return Err(refused()),
         };
-        let size = match (width.zip(height).map(|(width, height)| ImageSize { width, height }), told) {
+        let size = match (
+            width
+                .zip(height)
+                .map(|(width, height)| ImageSize { width, height }),
+            told,
+        ) {
             (Some(taken), Some(told)) if taken != told => {
-                return Err(OnnxError::OtherSize { path: path.to_owned(), taken, told });
+                return Err(OnnxError::OtherSize {
+                    path: path.to_owned(),
+                    taken,
+                    told,
+                });
             }
             (taken, told) => {
-                let said = || said_size(&model).ok_or_else(|| OnnxError::AnySize { path: path.to_owned() });
+                let said = || {
+                    said_size(&model).ok_or_else(|| OnnxError::AnySize {
+                        path: path.to_owned(),
+                    })
+                };
                 taken.or(told).map_or_else(said, Ok)?
             }
         };
         let [height, width] = [size.height as usize, size.width as usize];
-        let image_shape = if has_channels_last { [height, width, 3] } else { [3, height, width] };
+        let image_shape = if has_channels_last {
+            [height, width, 3]
+        } else {
+            [3, height, width]
+        };
         let shape = [&vec![1; lengths.len() - 3], &image_shape[..]].concat();
-        Ok(Self { image, shape, size, is_bytes, has_channels_last, scaled_to, model })
+        Ok(Self {
+            image,
+            shape,
+            size,
+            is_bytes,
+            has_channels_last,
+            scaled_to,
+            model,
+        })
     }
 
     /// Size of the image that the network takes.
@@ -118,14 +158,32 @@ impl Network {
         let mut inputs = vec![(self.image, image.into())];
         if let Some(node) = self.scaled_to {
             let ImageSize { width, height } = self.size;
-            inputs
-                .push((node, Value::from(Tensor::<i32>::from_data(&[1, 2], vec![width as i32, height as i32])).into()));
+            inputs.push((
+                node,
+                Value::from(Tensor::<i32>::from_data(
+                    &[1, 2],
+                    vec![width as i32, height as i32],
+                ))
+                .into(),
+            ));
         }
         let nodes = self.model.output_ids();
-        let values = self.model.run(inputs, nodes, None).map_err(|error| error.to_string())?;
-        let name =
-            |node: &NodeId| self.model.node_info(*node).and_then(|info| info.name()).unwrap_or_default().to_owned();
-        Ok(nodes.iter().zip(values).map(|(node, value)| output(name(node), &value)).collect())
+        let values = self
+            .model
+            .run(inputs, nodes, None)
+            .map_err(|error| error.to_string())?;
+        let name = |node: &NodeId| {
+            self.model
+                .node_info(*node)
+                .and_then(|info| info.name())
+                .unwrap_or_default()
+                .to_owned()
+        };
+        Ok(nodes
+            .iter()
+            .zip(values)
+            .map(|(node, value)| output(name(node), &value))
+            .collect())
     }
 }
 
@@ -137,7 +195,11 @@ fn output(name: String, value: &Value) -> NamedTensor {
         Value::Int32Tensor(tensor) => tensor.iter().map(|value| *value as f32).collect(),
         _ => Vec::new(),
     };
-    NamedTensor { name, shape, values }
+    NamedTensor {
+        name,
+        shape,
+        values,
+    }
 }
 
 /// The size that the exporter wrote: `imgsz` of Ultralytics, `[height, width]`.
@@ -153,21 +215,38 @@ fn said_size(model: &Model) -> Option<ImageSize> {
 fn is_size(model: &Model, node: NodeId) -> bool {
     model.node_info(node).is_some_and(|info| {
         info.dtype() == Some(ValueType::Tensor(DataType::Int32))
-            && info.shape().is_some_and(|shape| matches!(&shape[..], [_, Dimension::Fixed(2)]))
+            && info
+                .shape()
+                .is_some_and(|shape| matches!(&shape[..], [_, Dimension::Fixed(2)]))
     })
 }
 
 /// Names, types and shapes of a model's inputs.
 fn inputs(model: &Model) -> String {
     let input = |node: &NodeId| {
-        let Some(info) = model.node_info(*node) else { return "?".to_owned() };
-        let kind = info.dtype().map_or_else(|| "?".to_owned(), |kind| kind.to_string());
+        let Some(info) = model.node_info(*node) else {
+            return "?".to_owned();
+        };
+        let kind = info
+            .dtype()
+            .map_or_else(|| "?".to_owned(), |kind| kind.to_string());
         let length = |dimension: &Dimension| match dimension {
             Dimension::Fixed(length) => length.to_string(),
             Dimension::Symbolic(name) => name.clone(),
         };
-        let shape = info.shape().map(|shape| shape.iter().map(length).collect::<Vec<_>>().join(", "));
-        format!("{} {kind} [{}]", info.name().unwrap_or("?"), shape.unwrap_or_else(|| "?".to_owned()))
+        let shape = info
+            .shape()
+            .map(|shape| shape.iter().map(length).collect::<Vec<_>>().join(", "));
+        format!(
+            "{} {kind} [{}]",
+            info.name().unwrap_or("?"),
+            shape.unwrap_or_else(|| "?".to_owned())
+        )
     };
-    model.input_ids().iter().map(input).collect::<Vec<_>>().join("; ")
+    model
+        .input_ids()
+        .iter()
+        .map(input)
+        .collect::<Vec<_>>()
+        .join("; ")
 }

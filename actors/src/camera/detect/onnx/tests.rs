@@ -10,22 +10,38 @@ use super::*;
 use crate::camera::image_codec;
 
 fn path(name: &str) -> PathBuf {
-    PathBuf::from(format!("{}/tests/data/onnx/{name}", env!("CARGO_MANIFEST_DIR")))
+    PathBuf::from(format!(
+        "{}/tests/data/onnx/{name}",
+        env!("CARGO_MANIFEST_DIR")
+    ))
 }
 
 fn config(model: &str) -> OnnxConfig {
-    toml::from_str(&format!("model = {:?}\nthreshold = 0.5", path(&format!("{model}.onnx")))).unwrap()
+    toml::from_str(&format!(
+        "model = {:?}\nthreshold = 0.5",
+        path(&format!("{model}.onnx"))
+    ))
+    .unwrap()
 }
 
 /// The configuration with the labels where the model has none.
 fn labelled(model: &str) -> OnnxConfig {
-    let has_names = ["yolov5", "yolov8", "rtdetr_rows"].iter().any(|named| model.starts_with(named));
-    OnnxConfig { labels: (!has_names).then(|| path("labels.txt")), ..config(model) }
+    let has_names = ["yolov5", "yolov8", "rtdetr_rows"]
+        .iter()
+        .any(|named| model.starts_with(named));
+    OnnxConfig {
+        labels: (!has_names).then(|| path("labels.txt")),
+        ..config(model)
+    }
 }
 
 fn frame() -> CameraFrame {
     let image = image_codec::read(&path("frame.png")).unwrap();
-    CameraFrame { image, captured_at: Timestamp(0), seq: 7 }
+    CameraFrame {
+        image,
+        captured_at: Timestamp(0),
+        seq: 7,
+    }
 }
 
 fn refusal(config: OnnxConfig) -> String {
@@ -46,7 +62,10 @@ impl Expected {
         let edges = [b.x_min, b.y_min, b.x_max, b.y_max];
         self.label == found.label
             && (self.score - found.confidence).abs() < 1e-3
-            && edges.iter().zip(self.r#box).all(|(edge, expected)| (edge - expected).abs() < 0.02)
+            && edges
+                .iter()
+                .zip(self.r#box)
+                .all(|(edge, expected)| (edge - expected).abs() < 0.02)
     }
 }
 
@@ -59,66 +78,133 @@ fn every_family_is_recognised_and_finds_what_an_independent_decoder_finds() {
     let expected = expected();
     assert_eq!(expected.len(), 13);
     for (model, expected) in expected {
-        let mut detector = OnnxDetector::new(labelled(&model)).unwrap_or_else(|error| panic!("{model}: {error}"));
+        let mut detector =
+            OnnxDetector::new(labelled(&model)).unwrap_or_else(|error| panic!("{model}: {error}"));
         let found = detector.detect(&frame()).unwrap();
         assert_eq!(found.len(), expected.len(), "{model}: {found:?}");
         for object in &expected {
-            assert!(found.iter().any(|found| object.is(found)), "{model}: {object:?} is not in {found:?}");
+            assert!(
+                found.iter().any(|found| object.is(found)),
+                "{model}: {object:?} is not in {found:?}"
+            );
         }
     }
 }
 
 #[test]
 fn a_family_may_be_told_and_must_then_fit() {
-    for (model, family) in [("yolov5", Family::Yolov5), ("yolov8_nms", Family::Yolov8), ("detr", Family::Detr)] {
-        OnnxDetector::new(OnnxConfig { family: Some(family), ..labelled(model) }).unwrap();
+    for (model, family) in [
+        ("yolov5", Family::Yolov5),
+        ("yolov8_nms", Family::Yolov8),
+        ("detr", Family::Detr),
+    ] {
+        OnnxDetector::new(OnnxConfig {
+            family: Some(family),
+            ..labelled(model)
+        })
+        .unwrap();
     }
-    let error = refusal(OnnxConfig { family: Some(Family::Yolox), ..config("yolov8") });
-    assert!(error.contains("output0 [1, 7, 84] for an image of 64x64, which are not those of yolox"), "{error}");
+    let error = refusal(OnnxConfig {
+        family: Some(Family::Yolox),
+        ..config("yolov8")
+    });
+    assert!(
+        error.contains("output0 [1, 7, 84] for an image of 64x64, which are not those of yolox"),
+        "{error}"
+    );
 }
 
 #[test]
 fn a_label_has_its_own_threshold() {
-    let all = OnnxDetector::new(labelled("yolov5")).unwrap().detect(&frame()).unwrap();
+    let all = OnnxDetector::new(labelled("yolov5"))
+        .unwrap()
+        .detect(&frame())
+        .unwrap();
     let thresholds = BTreeMap::from([("person".to_owned(), 1.0)]);
-    let others = OnnxDetector::new(OnnxConfig { thresholds, ..labelled("yolov5") }).unwrap().detect(&frame()).unwrap();
+    let others = OnnxDetector::new(OnnxConfig {
+        thresholds,
+        ..labelled("yolov5")
+    })
+    .unwrap()
+    .detect(&frame())
+    .unwrap();
     assert!(all.iter().any(|found| found.label == "person") && !others.is_empty());
-    assert_eq!(others, all.into_iter().filter(|found| found.label != "person").collect::<Vec<_>>());
+    assert_eq!(
+        others,
+        all.into_iter()
+            .filter(|found| found.label != "person")
+            .collect::<Vec<_>>()
+    );
 }
 
 #[test]
 fn outputs_of_no_family_are_printed() {
     let error = refusal(config("yolov8_segments"));
-    for part in ["output0 [1, 39, 84]; output1 [1, 32, 4, 4]", "64x64", "any known family", "docs/cameras.md"] {
+    for part in [
+        "output0 [1, 39, 84]; output1 [1, 32, 4, 4]",
+        "64x64",
+        "any known family",
+        "docs/cameras.md",
+    ] {
         assert!(error.contains(part), "{error}");
     }
 }
 
 #[test]
 fn yolox_in_pixels_is_refused() {
-    let error = refusal(OnnxConfig { labels: Some(path("labels.txt")), ..config("yolox_in_pixels") });
-    assert!(error.contains("export it without `--decode_in_inference`"), "{error}");
+    let error = refusal(OnnxConfig {
+        labels: Some(path("labels.txt")),
+        ..config("yolox_in_pixels")
+    });
+    assert!(
+        error.contains("export it without `--decode_in_inference`"),
+        "{error}"
+    );
 }
 
 #[test]
 fn files_that_cannot_be_used_are_named() {
     let missing = refusal(config("no_such"));
-    assert!(missing.contains("cannot read") && missing.contains("no_such.onnx"), "{missing}");
+    assert!(
+        missing.contains("cannot read") && missing.contains("no_such.onnx"),
+        "{missing}"
+    );
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), b"this is not a network").unwrap();
-    let junk = refusal(OnnxConfig { model: file.path().to_owned(), ..config("yolov8") });
-    assert!(junk.contains("cannot be run") && junk.contains("export it to onnx"), "{junk}");
-    let no_labels = refusal(OnnxConfig { labels: Some("no/labels.txt".into()), ..config("yolov8") });
+    let junk = refusal(OnnxConfig {
+        model: file.path().to_owned(),
+        ..config("yolov8")
+    });
+    assert!(
+        junk.contains("cannot be run") && junk.contains("export it to onnx"),
+        "{junk}"
+    );
+    let no_labels = refusal(OnnxConfig {
+        labels: Some("no/labels.txt".into()),
+        ..config("yolov8")
+    });
     assert!(no_labels.contains("no/labels.txt"), "{no_labels}");
 }
 
 #[test]
 fn the_size_of_the_input_is_the_model_s() {
-    let told = refusal(OnnxConfig { input_px: Some([96, 64]), ..config("yolov8") });
-    assert!(told.contains("takes images of 64x64, not 96x64: remove `input_px`"), "{told}");
+    let told = refusal(OnnxConfig {
+        input_px: Some([96, 64]),
+        ..config("yolov8")
+    });
+    assert!(
+        told.contains("takes images of 64x64, not 96x64: remove `input_px`"),
+        "{told}"
+    );
     // Its grids are for 64x64, whatever its shape says.
-    let refused = refusal(OnnxConfig { input_px: Some([96, 64]), ..config("yolov8_dynamic") });
-    assert!(refused.contains("fails with an image of 96x64") && refused.contains("multiples of 32"), "{refused}");
+    let refused = refusal(OnnxConfig {
+        input_px: Some([96, 64]),
+        ..config("yolov8_dynamic")
+    });
+    assert!(
+        refused.contains("fails with an image of 96x64") && refused.contains("multiples of 32"),
+        "{refused}"
+    );
 }
 
 #[test]
@@ -127,17 +213,38 @@ fn labels_must_be_as_many_as_classes() {
     std::fs::write(file.path(), "one\ntwo\n").unwrap();
     let labels = Some(file.path().to_owned());
     for model in ["yolov8", "yolox", "ssd", "rtdetr", "rfdetr"] {
-        let error = refusal(OnnxConfig { labels: labels.clone(), ..config(model) });
-        assert!(error.contains("2 labels in") && error.contains("the model has 3 classes"), "{model}: {error}");
+        let error = refusal(OnnxConfig {
+            labels: labels.clone(),
+            ..config(model)
+        });
+        assert!(
+            error.contains("2 labels in") && error.contains("the model has 3 classes"),
+            "{model}: {error}"
+        );
     }
     let none = refusal(config("yolox"));
-    assert!(none.contains("3 classes without names: set `labels`"), "{none}");
+    assert!(
+        none.contains("3 classes without names: set `labels`"),
+        "{none}"
+    );
     let thresholds = BTreeMap::from([("persn".to_owned(), 0.5)]);
-    let unknown = refusal(OnnxConfig { thresholds, ..config("yolov8") });
-    assert!(unknown.contains("`thresholds` names \"persn\", but the labels"), "{unknown}");
-    assert!(unknown.contains("person, traffic light, it's a \"car\""), "{unknown}");
+    let unknown = refusal(OnnxConfig {
+        thresholds,
+        ..config("yolov8")
+    });
+    assert!(
+        unknown.contains("`thresholds` names \"persn\", but the labels"),
+        "{unknown}"
+    );
+    assert!(
+        unknown.contains("person, traffic light, it's a \"car\""),
+        "{unknown}"
+    );
     std::fs::write(file.path(), "one\ntwo\nthr\u{7}ee\n").unwrap();
-    let bad = refusal(OnnxConfig { labels, ..config("yolov8") });
+    let bad = refusal(OnnxConfig {
+        labels,
+        ..config("yolov8")
+    });
     assert!(bad.contains(r#"label "thr\u{7}ee""#), "{bad}");
 }
 
@@ -145,25 +252,45 @@ fn labels_must_be_as_many_as_classes() {
 fn a_class_without_a_label_is_an_error_of_the_frame() {
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), "one\n").unwrap();
-    let config = OnnxConfig { labels: Some(file.path().to_owned()), ..config("ssd_torchvision") };
-    let error = OnnxDetector::new(config).unwrap().detect(&frame()).expect_err("class 2 or 3").to_string();
-    assert!(error.contains("there are 1 labels: list all of its classes in `labels`"), "{error}");
+    let config = OnnxConfig {
+        labels: Some(file.path().to_owned()),
+        ..config("ssd_torchvision")
+    };
+    let error = OnnxDetector::new(config)
+        .unwrap()
+        .detect(&frame())
+        .expect_err("class 2 or 3")
+        .to_string();
+    assert!(
+        error.contains("there are 1 labels: list all of its classes in `labels`"),
+        "{error}"
+    );
 }
 
 #[test]
 fn names_are_read_from_files_and_metadata() {
-    assert_eq!(labels::parse(r#"{0: 'person', 1: "it's", 2: 'a \'b\''}"#), ["person", "it's", "a 'b'"]);
+    assert_eq!(
+        labels::parse(r#"{0: 'person', 1: "it's", 2: 'a \'b\''}"#),
+        ["person", "it's", "a 'b'"]
+    );
     assert_eq!(labels::parse("['a', 'b']"), ["a", "b"]);
     assert_eq!(labels::parse(r#"{"0": "a", "1": "b"}"#), ["a", "b"]);
     assert_eq!(labels::parse("{0: 'open"), ["open"]);
-    assert_eq!(labels::read("BACKGROUND\r\n aeroplane \n\nbicycle"), ["aeroplane", "bicycle"]);
+    assert_eq!(
+        labels::read("BACKGROUND\r\n aeroplane \n\nbicycle"),
+        ["aeroplane", "bicycle"]
+    );
     assert_eq!(labels::read("__background__\ncat"), ["cat"]);
 }
 
 #[test]
 fn coco_s_classes_have_labels_however_a_family_numbers_them() {
     let label = |scores, first, has_none_last, class: usize| {
-        let classes = labels::Classes { scores, first, has_none_last };
+        let classes = labels::Classes {
+            scores,
+            first,
+            has_none_last,
+        };
         classes.labels(None).unwrap()[class].clone()
     };
     assert_eq!(label(Some(80), 0, false, 79).unwrap(), "toothbrush");
@@ -173,39 +300,80 @@ fn coco_s_classes_have_labels_however_a_family_numbers_them() {
     assert_eq!(label(Some(92), 0, true, 90).unwrap(), "toothbrush");
     assert_eq!(label(None, 1, false, 90).unwrap(), "toothbrush");
     assert_eq!(label(None, 0, false, 79).unwrap(), "toothbrush");
-    assert_eq!(label(Some(92), 0, true, 12), None, "an id that is not in use");
+    assert_eq!(
+        label(Some(92), 0, true, 12),
+        None,
+        "an id that is not in use"
+    );
 }
 
 #[test]
 fn a_letterbox_keeps_shapes_and_brings_boxes_back() {
-    let input = ImageSize { width: 640, height: 480 };
-    let whole = BoundingBox { x_min: 0.0, y_min: 0.0, x_max: 1920.0, y_max: 1080.0 };
+    let input = ImageSize {
+        width: 640,
+        height: 480,
+    };
+    let whole = BoundingBox {
+        x_min: 0.0,
+        y_min: 0.0,
+        x_max: 1920.0,
+        y_max: 1080.0,
+    };
     for (fit, placed) in [
         (letterbox::Fit::Centred, [0.0, 60.0, 640.0, 420.0]),
         (letterbox::Fit::TopLeft, [0.0, 0.0, 640.0, 360.0]),
         (letterbox::Fit::Stretched, [0.0, 0.0, 640.0, 480.0]),
     ] {
         let [x_min, y_min, x_max, y_max] = placed;
-        let back = Letterbox::new(fit, ImageSize { width: 1920, height: 1080 }, input).to_image(&BoundingBox {
+        let back = Letterbox::new(
+            fit,
+            ImageSize {
+                width: 1920,
+                height: 1080,
+            },
+            input,
+        )
+        .to_image(&BoundingBox {
             x_min,
             y_min,
             x_max,
             y_max,
         });
-        assert!(back.intersection_over_union(&whole) > 1.0 - 1e-9, "{fit:?}: {back:?}");
+        assert!(
+            back.intersection_over_union(&whole) > 1.0 - 1e-9,
+            "{fit:?}: {back:?}"
+        );
     }
 }
 
 #[test]
 fn frames_of_any_shape_give_boxes_inside_them() {
     for model in ["yolov5", "yolox", "ssd", "rtdetr"] {
-        let mut detector = OnnxDetector::new(OnnxConfig { threshold: 0.01, ..labelled(model) }).unwrap();
+        let mut detector = OnnxDetector::new(OnnxConfig {
+            threshold: 0.01,
+            ..labelled(model)
+        })
+        .unwrap();
         for (width, height) in [(1, 1), (2000, 3), (3, 2000), (64, 64)] {
-            let image = Mat::new_rows_cols_with_default(height, width, CV_8UC3, Scalar::all(255.0)).unwrap();
-            for found in detector.detect(&CameraFrame { image, captured_at: Timestamp(0), seq: 1 }).unwrap() {
+            let image = Mat::new_rows_cols_with_default(height, width, CV_8UC3, Scalar::all(255.0))
+                .unwrap();
+            for found in detector
+                .detect(&CameraFrame {
+                    image,
+                    captured_at: Timestamp(0),
+                    seq: 1,
+                })
+                .unwrap()
+            {
                 let b = found.bounding_box;
-                assert!(b.is_valid() && b.x_min >= 0.0 && b.y_min >= 0.0, "{model}: {b:?}");
-                assert!(b.x_max <= f64::from(width) && b.y_max <= f64::from(height), "{model}: {b:?}");
+                assert!(
+                    b.is_valid() && b.x_min >= 0.0 && b.y_min >= 0.0,
+                    "{model}: {b:?}"
+                );
+                assert!(
+                    b.x_max <= f64::from(width) && b.y_max <= f64::from(height),
+                    "{model}: {b:?}"
+                );
             }
         }
     }
@@ -225,25 +393,50 @@ fn yolox_finds_in_photographs_what_onnx_runtime_finds_with_the_same_weights() {
     let file = |key| PathBuf::from(std::env::var_os(key).expect(key));
     let expected = std::fs::read_to_string(file("YOLOX_PHOTOS")).unwrap();
     let expected: BTreeMap<String, Vec<Photographed>> = serde_json::from_str(&expected).unwrap();
-    assert!(expected.len() == 3 && expected.values().all(|objects| !objects.is_empty()), "{expected:?}");
-    let names: Vec<_> = crate::camera::detect::coco::labels::all().map(|(_, name)| name).collect();
-    let mut detector = OnnxDetector::new(OnnxConfig { threshold: 0.3, ..OnnxConfig::of(file("YOLOX_MODEL")) }).unwrap();
+    assert!(
+        expected.len() == 3 && expected.values().all(|objects| !objects.is_empty()),
+        "{expected:?}"
+    );
+    let names: Vec<_> = crate::camera::detect::coco::labels::all()
+        .map(|(_, name)| name)
+        .collect();
+    let mut detector = OnnxDetector::new(OnnxConfig {
+        threshold: 0.3,
+        ..OnnxConfig::of(file("YOLOX_MODEL"))
+    })
+    .unwrap();
     for (name, expected) in expected {
         let photograph = path(&format!("../photos/{name}.jpg"));
         let image = image_codec::read(&photograph).unwrap();
         let found = detector.detect(&CameraFrame { image, ..frame() }).unwrap();
         assert_eq!(found.len(), expected.len(), "{name}: {found:?}");
-        for Photographed { class, score, r#box } in expected {
+        for Photographed {
+            class,
+            score,
+            r#box,
+        } in expected
+        {
             let same = found.iter().find(|found| found.label == names[class]);
-            let Detection { confidence, bounding_box: b, .. } = same.unwrap_or_else(|| panic!("{name}: {found:?}"));
+            let Detection {
+                confidence,
+                bounding_box: b,
+                ..
+            } = same.unwrap_or_else(|| panic!("{name}: {found:?}"));
             let edges = [b.x_min, b.y_min, b.x_max, b.y_max];
-            let off_px = edges.iter().zip(r#box).map(|(edge, expected)| (edge - expected).abs()).fold(0.0, f64::max);
+            let off_px = edges
+                .iter()
+                .zip(r#box)
+                .map(|(edge, expected)| (edge - expected).abs())
+                .fold(0.0, f64::max);
             println!(
                 "{name}: {} {confidence:.4}, off by {:.5}, box by {off_px:.3} px",
                 names[class],
                 confidence - score
             );
-            assert!((confidence - score).abs() < 0.01 && off_px < 0.5, "{name}: {same:?} at {edges:?}");
+            assert!(
+                (confidence - score).abs() < 0.01 && off_px < 0.5,
+                "{name}: {same:?} at {edges:?}"
+            );
         }
     }
 }

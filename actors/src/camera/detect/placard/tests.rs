@@ -1,7 +1,9 @@
 use ecod::model::time::Timestamp;
 use ecod::perception::camera::Intrinsics;
 use nalgebra::{Point3, Rotation3, Vector3};
-use opencv::core::{BORDER_TRANSPARENT, CV_8U, CV_16SC1, CV_16UC1, Point2f, Rect, add, randn, set_rng_seed};
+use opencv::core::{
+    BORDER_TRANSPARENT, CV_8U, CV_16SC1, CV_16UC1, Point2f, Rect, add, randn, set_rng_seed,
+};
 use qrcode::{Color, EcLevel, QrCode};
 
 use super::*;
@@ -25,13 +27,23 @@ impl Scene {
     }
 
     /// Draws a code with its quiet zone and says where its corners are.
-    fn put(&mut self, code: &QrCode, range_in: f64, bearing_deg: f64, yaw_deg: f64) -> [Point2<f64>; 4] {
+    fn put(
+        &mut self,
+        code: &QrCode,
+        range_in: f64,
+        bearing_deg: f64,
+        yaw_deg: f64,
+    ) -> [Point2<f64>; 4] {
         let middle = Rotation3::from_euler_angles(0.0, bearing_deg.to_radians(), 0.0)
             * Point3::new(0.0, 0.004, range_in * INCH_M);
         let turn = Rotation3::from_euler_angles(0.0, (bearing_deg + yaw_deg).to_radians(), 0.0);
         let half = SIDE_M / 2.0;
-        let corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
-            .map(|(right, down)| camera().project(&(middle + turn * Vector3::new(right, down, 0.0))).unwrap());
+        let corners =
+            [(-half, -half), (half, -half), (half, half), (-half, half)].map(|(right, down)| {
+                camera()
+                    .project(&(middle + turn * Vector3::new(right, down, 0.0)))
+                    .unwrap()
+            });
         self.warp(&flat(code), code.width() as f64, &corners);
         corners
     }
@@ -39,13 +51,27 @@ impl Scene {
     fn warp(&mut self, flat: &Mat, modules: f64, corners: &[Point2<f64>; 4]) {
         let point = |x: f64, y: f64| Point2f::new((x - 0.5) as f32, (y - 0.5) as f32);
         let (low, high) = (4.0 * MODULE, (4.0 + modules) * MODULE);
-        let from: Vector<Point2f> =
-            [(low, low), (high, low), (high, high), (low, high)].into_iter().map(|(x, y)| point(x, y)).collect();
-        let to: Vector<Point2f> = corners.iter().map(|c| point(c.x * FINE, c.y * FINE)).collect();
+        let from: Vector<Point2f> = [(low, low), (high, low), (high, high), (low, high)]
+            .into_iter()
+            .map(|(x, y)| point(x, y))
+            .collect();
+        let to: Vector<Point2f> = corners
+            .iter()
+            .map(|c| point(c.x * FINE, c.y * FINE))
+            .collect();
         let warp = imgproc::get_perspective_transform_def(&from, &to).unwrap();
         let size = self.0.size().unwrap();
         let (area, transparent) = (imgproc::INTER_AREA, BORDER_TRANSPARENT);
-        imgproc::warp_perspective(flat, &mut self.0, &warp, size, area, transparent, Scalar::default()).unwrap();
+        imgproc::warp_perspective(
+            flat,
+            &mut self.0,
+            &warp,
+            size,
+            area,
+            transparent,
+            Scalar::default(),
+        )
+        .unwrap();
     }
 
     /// The picture that a camera makes of it: blur of 0.7 and noise of 5 gray levels, both standard deviations.
@@ -54,7 +80,8 @@ impl Scene {
         let size = Size::new(640, 480);
         imgproc::resize(&self.0, &mut small, size, 0.0, 0.0, imgproc::INTER_AREA).unwrap();
         imgproc::gaussian_blur_def(&small, &mut blurred, Size::default(), 0.7).unwrap();
-        let mut noise = Mat::new_rows_cols_with_default(480, 640, CV_16SC1, Scalar::all(0.0)).unwrap();
+        let mut noise =
+            Mat::new_rows_cols_with_default(480, 640, CV_16SC1, Scalar::all(0.0)).unwrap();
         set_rng_seed(1).unwrap();
         randn(&mut noise, &Scalar::all(0.0), &Scalar::all(5.0)).unwrap();
         add(&blurred, &noise, &mut image, &Mat::default(), CV_8U).unwrap();
@@ -68,11 +95,20 @@ const MODULE: f64 = 16.0;
 fn flat(code: &QrCode) -> Mat {
     let (modules, module) = (code.width() as i32, MODULE as i32);
     let side = (modules + 8) * module;
-    let mut flat = Mat::new_rows_cols_with_default(side, side, CV_8UC1, Scalar::all(230.0)).unwrap();
+    let mut flat =
+        Mat::new_rows_cols_with_default(side, side, CV_8UC1, Scalar::all(230.0)).unwrap();
     for (x, y) in (0..modules).flat_map(|y| (0..modules).map(move |x| (x, y))) {
         if code[(x as usize, y as usize)] == Color::Dark {
             let module = Rect::new((x + 4) * module, (y + 4) * module, module, module);
-            imgproc::rectangle(&mut flat, module, Scalar::all(25.0), imgproc::FILLED, imgproc::LINE_8, 0).unwrap();
+            imgproc::rectangle(
+                &mut flat,
+                module,
+                Scalar::all(25.0),
+                imgproc::FILLED,
+                imgproc::LINE_8,
+                0,
+            )
+            .unwrap();
         }
     }
     flat
@@ -83,20 +119,35 @@ fn code(text: impl AsRef<[u8]>) -> QrCode {
 }
 
 fn frame(image: Mat) -> CameraFrame {
-    CameraFrame { image, captured_at: Timestamp::default(), seq: 7 }
+    CameraFrame {
+        image,
+        captured_at: Timestamp::default(),
+        seq: 7,
+    }
 }
 
 fn detect(frame: &CameraFrame) -> Vec<Detection> {
-    PlacardDetector::new(PlacardConfig::default()).detect(frame).unwrap()
+    PlacardDetector::new(PlacardConfig::default())
+        .detect(frame)
+        .unwrap()
 }
 
 #[test]
 fn a_placard_is_read_near_and_far_and_at_a_slant() {
-    for (range_in, yaw_deg) in [(8.0, 0.0), (8.0, 63.0), (13.5, 30.0), (13.5, -60.0), (20.0, 0.0), (20.0, 40.0)] {
+    for (range_in, yaw_deg) in [
+        (8.0, 0.0),
+        (8.0, 63.0),
+        (13.5, 30.0),
+        (13.5, -60.0),
+        (20.0, 0.0),
+        (20.0, 40.0),
+    ] {
         let mut scene = Scene::empty();
         let corners = scene.put(&code("7ABC123"), range_in, 8.0, yaw_deg);
         let found = detect(&scene.seen());
-        let [detection] = &found[..] else { panic!("{range_in} in, {yaw_deg}°: {found:?}") };
+        let [detection] = &found[..] else {
+            panic!("{range_in} in, {yaw_deg}°: {found:?}")
+        };
         assert_eq!(detection.label, "7ABC123");
         assert!((0.5..=0.99).contains(&detection.confidence));
         let found = detection.corners.unwrap();
@@ -104,11 +155,17 @@ fn a_placard_is_read_near_and_far_and_at_a_slant() {
         // The decoder guesses the lower right corner, which has no finder pattern.
         for (corner, allowed_modules) in [(0, 0.5), (1, 0.5), (2, 1.5), (3, 0.5)] {
             let error = nalgebra::distance(&found[corner], &corners[corner]) / module_px;
-            assert!(error <= allowed_modules, "{range_in} in, {yaw_deg}°: corner {corner} is {error} modules off");
+            assert!(
+                error <= allowed_modules,
+                "{range_in} in, {yaw_deg}°: corner {corner} is {error} modules off"
+            );
         }
         let at = locate_target(&found, SIDE_M, &camera()).unwrap();
         let error_in = at.coords.norm() / INCH_M - range_in;
-        assert!(error_in.abs() < 0.04 * range_in, "{range_in} in, {yaw_deg}°: {error_in} in off");
+        assert!(
+            error_in.abs() < 0.04 * range_in,
+            "{range_in} in, {yaw_deg}°: {error_in} in off"
+        );
     }
 }
 
@@ -133,7 +190,12 @@ fn the_same_text_at_two_places_is_two_placards() {
     assert_eq!(found.len(), 2, "{found:?}");
     for (detection, corners) in found.iter().zip([left, right]) {
         assert_eq!(detection.label, "EMPTY");
-        assert!(detection.bounding_box.intersection_over_union(&BoundingBox::around(&corners)) > 0.8);
+        assert!(
+            detection
+                .bounding_box
+                .intersection_over_union(&BoundingBox::around(&corners))
+                > 0.8
+        );
     }
 }
 
@@ -142,7 +204,10 @@ fn no_more_codes_are_read_than_asked_for() {
     let mut scene = Scene::empty();
     scene.put(&code("A"), 12.0, -12.0, 0.0);
     scene.put(&code("B"), 12.0, 12.0, 0.0);
-    let mut one = PlacardDetector::new(PlacardConfig { max_codes: 1, ..PlacardConfig::default() });
+    let mut one = PlacardDetector::new(PlacardConfig {
+        max_codes: 1,
+        ..PlacardConfig::default()
+    });
     assert_eq!(one.detect(&scene.seen()).unwrap().len(), 1);
 }
 
@@ -162,12 +227,21 @@ fn color_frames_are_read_as_well() {
 
 #[test]
 fn texts_that_are_no_label_are_left_out_without_disturbing_others() {
-    for odd in [&b"\xff\xfe\x80abc"[..], b"two\nlines", b"nul\0", &[b'x'; 65]] {
+    for odd in [
+        &b"\xff\xfe\x80abc"[..],
+        b"two\nlines",
+        b"nul\0",
+        &[b'x'; 65],
+    ] {
         let mut scene = Scene::empty();
         scene.put(&code(odd), 7.0, -12.0, 0.0);
         scene.put(&code("SLOT-3"), 10.0, 15.0, 0.0);
         let found = detect(&scene.seen());
-        assert_eq!(found.iter().map(|d| d.label.as_str()).collect::<Vec<_>>(), ["SLOT-3"], "{odd:?}");
+        assert_eq!(
+            found.iter().map(|d| d.label.as_str()).collect::<Vec<_>>(),
+            ["SLOT-3"],
+            "{odd:?}"
+        );
     }
 }
 
@@ -175,19 +249,45 @@ fn texts_that_are_no_label_are_left_out_without_disturbing_others() {
 fn images_without_8_bit_pixels_are_refused() {
     let deep = Mat::new_rows_cols_with_default(48, 64, CV_16UC1, Scalar::all(0.0)).unwrap();
     for image in [Mat::default(), deep] {
-        let error = PlacardDetector::new(PlacardConfig::default()).detect(&frame(image)).unwrap_err();
-        assert!(matches!(error, DetectError::UnusableImage { seq: 7, .. }), "{error}");
+        let error = PlacardDetector::new(PlacardConfig::default())
+            .detect(&frame(image))
+            .unwrap_err();
+        assert!(
+            matches!(error, DetectError::UnusableImage { seq: 7, .. }),
+            "{error}"
+        );
     }
 }
 
 #[test]
 fn configurations_that_cannot_work_are_refused() {
     PlacardConfig::default().validate().unwrap();
-    let pass = |stretch_x| Pass { stretch_x, stretch_y: 1.0 };
+    let pass = |stretch_x| Pass {
+        stretch_x,
+        stretch_y: 1.0,
+    };
     for (config, key) in [
-        (PlacardConfig { passes: vec![], ..PlacardConfig::default() }, "passes"),
-        (PlacardConfig { passes: vec![pass(1.0), pass(f64::NAN)], ..PlacardConfig::default() }, "passes.1.stretch_x"),
-        (PlacardConfig { max_codes: 0, ..PlacardConfig::default() }, "max_codes"),
+        (
+            PlacardConfig {
+                passes: vec![],
+                ..PlacardConfig::default()
+            },
+            "passes",
+        ),
+        (
+            PlacardConfig {
+                passes: vec![pass(1.0), pass(f64::NAN)],
+                ..PlacardConfig::default()
+            },
+            "passes.1.stretch_x",
+        ),
+        (
+            PlacardConfig {
+                max_codes: 0,
+                ..PlacardConfig::default()
+            },
+            "max_codes",
+        ),
     ] {
         assert_eq!(config.validate().unwrap_err().key, key);
     }

@@ -20,14 +20,29 @@ struct Script(VecDeque<Step>);
 impl FrameSource for Script {
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError> {
         match self.0.pop_front() {
-            Some(Step::CameraFrame) => Ok(CameraFrame { image: Mat::default(), captured_at: Timestamp(0), seq: 0 }),
-            Some(Step::Fail) => Err(FrameError::Lost { origin: "script".into(), reason: "unplugged".into() }),
-            Some(Step::Spoil) => Err(FrameError::Unusable { origin: "script".into(), reason: "torn".into() }),
+            Some(Step::CameraFrame) => Ok(CameraFrame {
+                image: Mat::default(),
+                captured_at: Timestamp(0),
+                seq: 0,
+            }),
+            Some(Step::Fail) => Err(FrameError::Lost {
+                origin: "script".into(),
+                reason: "unplugged".into(),
+            }),
+            Some(Step::Spoil) => Err(FrameError::Unusable {
+                origin: "script".into(),
+                reason: "torn".into(),
+            }),
             Some(Step::Block(until)) => {
                 let _ = until.recv();
-                Err(FrameError::Lost { origin: "script".into(), reason: "came back late".into() })
+                Err(FrameError::Lost {
+                    origin: "script".into(),
+                    reason: "came back late".into(),
+                })
             }
-            None => Err(FrameError::Ended { origin: "script".into() }),
+            None => Err(FrameError::Ended {
+                origin: "script".into(),
+            }),
         }
     }
 }
@@ -35,26 +50,45 @@ impl FrameSource for Script {
 /// A source that follows one script per opening; `None` fails to open.
 fn scripted(openings: Vec<Option<Vec<Step>>>) -> Opener {
     let openings = Mutex::new(VecDeque::from(openings));
-    Arc::new(move || match openings.lock().unwrap().pop_front().flatten() {
-        Some(steps) => Ok(Box::new(Script(steps.into())) as Box<dyn FrameSource>),
-        None => Err(FrameError::Open { origin: "script".into(), reason: "not there".into() }),
-    })
+    Arc::new(
+        move || match openings.lock().unwrap().pop_front().flatten() {
+            Some(steps) => Ok(Box::new(Script(steps.into())) as Box<dyn FrameSource>),
+            None => Err(FrameError::Open {
+                origin: "script".into(),
+                reason: "not there".into(),
+            }),
+        },
+    )
 }
 
 fn hasty() -> CaptureConfig {
-    CaptureConfig { stall_timeout_s: 20.0, retry_min_s: 0.001, retry_max_s: 0.01 }
+    CaptureConfig {
+        stall_timeout_s: 20.0,
+        retry_min_s: 0.001,
+        retry_max_s: 0.01,
+    }
 }
 
 async fn wait_for(capture: &Capture, wanted: impl Fn(&CaptureStatus) -> bool) {
     let mut status = capture.status();
     let waiting = status.wait_for(|status| wanted(status));
-    tokio::time::timeout(Duration::from_secs(20), waiting).await.expect("in time").expect("capture is there");
+    tokio::time::timeout(Duration::from_secs(20), waiting)
+        .await
+        .expect("in time")
+        .expect("capture is there");
 }
 
 #[tokio::test]
 async fn a_source_that_fails_twice_works_the_third_time() {
-    let capture =
-        Capture::start(scripted(vec![None, Some(vec![Step::Fail]), Some(vec![Step::CameraFrame])]), hasty()).unwrap();
+    let capture = Capture::start(
+        scripted(vec![
+            None,
+            Some(vec![Step::Fail]),
+            Some(vec![Step::CameraFrame]),
+        ]),
+        hasty(),
+    )
+    .unwrap();
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
     assert!(capture.next_frame().await.is_none(), "it ended");
     assert_eq!(*capture.status().borrow(), CaptureStatus::Ended);
@@ -65,17 +99,29 @@ async fn an_unusable_frame_is_counted_and_costs_no_new_opening() {
     let openings = vec![Some(vec![Step::Spoil, Step::CameraFrame, Step::Spoil])];
     let capture = Capture::start(scripted(openings), hasty()).unwrap();
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
-    assert!(capture.next_frame().await.is_none(), "it ended and was not opened again");
+    assert!(
+        capture.next_frame().await.is_none(),
+        "it ended and was not opened again"
+    );
     assert_eq!(capture.unusable(), 2);
 }
 
 #[tokio::test]
 async fn a_failure_is_reported_with_its_reason() {
-    let config = CaptureConfig { retry_min_s: 60.0, retry_max_s: 60.0, ..hasty() };
+    let config = CaptureConfig {
+        retry_min_s: 60.0,
+        retry_max_s: 60.0,
+        ..hasty()
+    };
     let capture = Capture::start(scripted(vec![]), config).unwrap();
     wait_for(&capture, |status| match status {
-        CaptureStatus::Failed { error, failures: 1, retry_after } => {
-            error.to_string() == "cannot open script: not there" && *retry_after == Duration::from_secs(60)
+        CaptureStatus::Failed {
+            error,
+            failures: 1,
+            retry_after,
+        } => {
+            error.to_string() == "cannot open script: not there"
+                && *retry_after == Duration::from_secs(60)
         }
         _ => false,
     })
@@ -85,22 +131,51 @@ async fn a_failure_is_reported_with_its_reason() {
 #[tokio::test]
 async fn a_blocked_source_counts_as_stalled_and_is_opened_again() {
     let (release, blocked) = mpsc::channel();
-    let config = CaptureConfig { stall_timeout_s: 1.0, retry_min_s: 0.2, retry_max_s: 0.2 };
-    let openings = vec![Some(vec![Step::CameraFrame, Step::Block(blocked)]), Some(vec![Step::CameraFrame])];
+    let config = CaptureConfig {
+        stall_timeout_s: 1.0,
+        retry_min_s: 0.2,
+        retry_max_s: 0.2,
+    };
+    let openings = vec![
+        Some(vec![Step::CameraFrame, Step::Block(blocked)]),
+        Some(vec![Step::CameraFrame]),
+    ];
     let capture = Capture::start(scripted(openings), config).unwrap();
     assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(0));
-    wait_for(&capture, |status| matches!(status, CaptureStatus::Failed { error: FrameError::Stalled(_), .. })).await;
-    assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(1), "numbered on across openings");
+    wait_for(&capture, |status| {
+        matches!(
+            status,
+            CaptureStatus::Failed {
+                error: FrameError::Stalled(_),
+                ..
+            }
+        )
+    })
+    .await;
+    assert_eq!(
+        capture.next_frame().await.map(|frame| frame.seq),
+        Some(1),
+        "numbered on across openings"
+    );
     drop(release);
 }
 
 #[tokio::test]
 async fn frames_that_nobody_took_in_time_are_skipped_and_counted() {
-    let openings =
-        vec![Some(vec![Step::CameraFrame, Step::CameraFrame, Step::CameraFrame, Step::CameraFrame, Step::CameraFrame])];
+    let openings = vec![Some(vec![
+        Step::CameraFrame,
+        Step::CameraFrame,
+        Step::CameraFrame,
+        Step::CameraFrame,
+        Step::CameraFrame,
+    ])];
     let capture = Capture::start(scripted(openings), hasty()).unwrap();
     wait_for(&capture, |status| *status == CaptureStatus::Ended).await;
-    assert_eq!(capture.next_frame().await.map(|frame| frame.seq), Some(4), "the latest");
+    assert_eq!(
+        capture.next_frame().await.map(|frame| frame.seq),
+        Some(4),
+        "the latest"
+    );
     assert_eq!(capture.skipped(), 4);
 }
 
@@ -111,20 +186,40 @@ async fn a_dropped_capture_lets_go_of_its_source() {
         let held = Arc::clone(&held);
         Arc::new(move || {
             let _held = &held;
-            Err(FrameError::Open { origin: "script".into(), reason: "not there".into() })
+            Err(FrameError::Open {
+                origin: "script".into(),
+                reason: "not there".into(),
+            })
         })
     };
-    let capture = Capture::start(opener, CaptureConfig { retry_min_s: 60.0, retry_max_s: 60.0, ..hasty() }).unwrap();
-    wait_for(&capture, |status| matches!(status, CaptureStatus::Failed { .. })).await;
+    let capture = Capture::start(
+        opener,
+        CaptureConfig {
+            retry_min_s: 60.0,
+            retry_max_s: 60.0,
+            ..hasty()
+        },
+    )
+    .unwrap();
+    wait_for(&capture, |status| {
+        matches!(status, CaptureStatus::Failed { .. })
+    })
+    .await;
     let mut status = capture.status();
     drop(capture);
     let gone = async { while status.changed().await.is_ok() {} };
-    tokio::time::timeout(Duration::from_secs(20), gone).await.expect("the keeper ends although it was waiting");
+    tokio::time::timeout(Duration::from_secs(20), gone)
+        .await
+        .expect("the keeper ends although it was waiting");
 }
 
 #[test]
 fn the_wait_doubles_up_to_its_bound() {
-    let config = CaptureConfig { retry_min_s: 0.5, retry_max_s: 3.0, ..hasty() };
+    let config = CaptureConfig {
+        retry_min_s: 0.5,
+        retry_max_s: 3.0,
+        ..hasty()
+    };
     let waits = [1, 2, 3, 4, 1000].map(|failures| config.retry_after(failures).as_secs_f64());
     assert_eq!(waits, [0.5, 1.0, 2.0, 3.0, 3.0]);
 }

@@ -30,7 +30,10 @@ enum Way {
 /// The conversions, the preferred first: OpenCV's order.
 const CONVERSIONS: [PixelConversion; 11] = {
     const fn of(fourcc: &[u8; 4], way: Way) -> PixelConversion {
-        PixelConversion { fourcc: *fourcc, way }
+        PixelConversion {
+            fourcc: *fourcc,
+            way,
+        }
     }
     [
         of(b"BGR3", Way::Same),
@@ -58,7 +61,9 @@ impl PixelConversion {
 
     /// The preferred one of the formats that a camera offers.
     pub(super) fn choose(offered: &[PixelFormat]) -> Option<Self> {
-        CONVERSIONS.into_iter().find(|conversion| offered.contains(&conversion.format()))
+        CONVERSIONS
+            .into_iter()
+            .find(|conversion| offered.contains(&conversion.format()))
     }
 
     pub(super) fn format(self) -> PixelFormat {
@@ -81,18 +86,39 @@ impl FrameLayout {
     pub(super) fn new(conversion: PixelConversion, chosen: &PixFormat) -> Result<Self, String> {
         let (got, wanted) = (chosen.pixel_format(), conversion.format());
         if got != wanted {
-            return Err(format!("it has the format {wanted} and gives {got}: another program may use it"));
+            return Err(format!(
+                "it has the format {wanted} and gives {got}: another program may use it"
+            ));
         }
-        Self::of(conversion.way, [chosen.width(), chosen.height()], chosen.bytes_per_line())
+        Self::of(
+            conversion.way,
+            [chosen.width(), chosen.height()],
+            chosen.bytes_per_line(),
+        )
     }
 
     fn of(way: Way, [width, height]: [u32; 2], bytes_per_line: u32) -> Result<Self, String> {
-        let unfit =
-            || format!("its pictures of {width}x{height} pixels with {bytes_per_line} bytes in a row cannot be read");
+        let unfit = || {
+            format!(
+                "its pictures of {width}x{height} pixels with {bytes_per_line} bytes in a row cannot be read"
+            )
+        };
         let [width, height] = [width, height].map(|side| i32::try_from(side).map_err(|_| unfit()));
-        let (layout, pixel) = (Self { way, width: width?, height: height?, stride: 0 }, way.bytes_of_pixel());
+        let (layout, pixel) = (
+            Self {
+                way,
+                width: width?,
+                height: height?,
+                stride: 0,
+            },
+            way.bytes_of_pixel(),
+        );
         let row = layout.width as usize * pixel;
-        let stride = if bytes_per_line == 0 { row } else { bytes_per_line as usize };
+        let stride = if bytes_per_line == 0 {
+            row
+        } else {
+            bytes_per_line as usize
+        };
         if way != Way::Jpeg && (stride < row || stride % pixel != 0) {
             return Err(unfit());
         }
@@ -103,11 +129,18 @@ impl FrameLayout {
     pub(super) fn to_bgr(self, buffer: &[u8]) -> Result<Mat, String> {
         if self.way == Way::Jpeg {
             let (start, rest) = buffer.split_at(buffer.len().min(2));
-            return image_codec::decode(&[start, MOTION_JPEG, rest].concat()).map_err(|error| error.to_string());
+            return image_codec::decode(&[start, MOTION_JPEG, rest].concat())
+                .map_err(|error| error.to_string());
         }
-        let rows = if matches!(self.way, Way::Planar(_)) { self.height / 2 * 3 } else { self.height };
+        let rows = if matches!(self.way, Way::Planar(_)) {
+            self.height / 2 * 3
+        } else {
+            self.height
+        };
         let length = rows as usize * self.stride;
-        let bytes = buffer.get(..length).ok_or_else(|| format!("{} of {length} bytes", buffer.len()))?;
+        let bytes = buffer
+            .get(..length)
+            .ok_or_else(|| format!("{} of {length} bytes", buffer.len()))?;
         self.convert(rows, bytes).map_err(|error| error.message)
     }
 
@@ -120,7 +153,9 @@ impl FrameLayout {
         };
         let mut bgr = Mat::default();
         match self.way {
-            Way::Packed(_, code) | Way::Planar(code) => imgproc::cvt_color_def(&pixels, &mut bgr, code)?,
+            Way::Packed(_, code) | Way::Planar(code) => {
+                imgproc::cvt_color_def(&pixels, &mut bgr, code)?
+            }
             Way::Same | Way::Jpeg => pixels.copy_to(&mut bgr)?,
         }
         if columns == self.width {

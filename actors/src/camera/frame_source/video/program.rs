@@ -42,13 +42,23 @@ fn serve() -> anyhow::Result<()> {
     thread::spawn(end_with_input);
     let mut video = match Video::open(&source, timeout) {
         Ok(video) => video,
-        Err(error) => return Ok(protocol::write_line(&mut output, &VideoMessage::Failed(error))?),
+        Err(error) => {
+            return Ok(protocol::write_line(
+                &mut output,
+                &VideoMessage::Failed(error),
+            )?);
+        }
     };
     protocol::write_line(&mut output, &VideoMessage::Opened)?;
     loop {
         match video.next_frame() {
             Ok(frame) => write_frame(&mut output, &frame)?,
-            Err(error) => return Ok(protocol::write_line(&mut output, &VideoMessage::Failed(error))?),
+            Err(error) => {
+                return Ok(protocol::write_line(
+                    &mut output,
+                    &VideoMessage::Failed(error),
+                )?);
+            }
         }
     }
 }
@@ -69,9 +79,16 @@ fn end_with_input() {
 }
 
 fn write_frame(output: &mut File, frame: &CameraFrame) -> anyhow::Result<()> {
-    let CameraFrame { image, captured_at, .. } = frame;
+    let CameraFrame {
+        image, captured_at, ..
+    } = frame;
     let since_boot = clock::since_boot().saturating_sub(clock::now().since(*captured_at));
-    let header = ImageHeader { rows: image.rows(), columns: image.cols(), kind: image.typ(), since_boot };
+    let header = ImageHeader {
+        rows: image.rows(),
+        columns: image.cols(),
+        kind: image.typ(),
+        since_boot,
+    };
     protocol::write_line(output, &VideoMessage::Frame(header))?;
     Ok(output.write_all(image.data_bytes()?)?)
 }
@@ -103,22 +120,32 @@ impl Video {
             SourceConfig::Gstreamer { pipeline } => Self::pipeline(pipeline, origin),
             SourceConfig::Url { url } => Self::url(url, origin, timeout),
             SourceConfig::Video { path, looping } => Self::file(path, origin, *looping),
-            SourceConfig::V4l2 { .. } | SourceConfig::Images { .. } => {
-                Err(FrameError::Open { origin, reason: "the node reads it itself".into() })
-            }
+            SourceConfig::V4l2 { .. } | SourceConfig::Images { .. } => Err(FrameError::Open {
+                origin,
+                reason: "the node reads it itself".into(),
+            }),
         }
     }
 
     fn pipeline(pipeline: &str, origin: String) -> Result<Self, FrameError> {
         if let Some(element) = elements(pipeline).find(|element| is_missing(element)) {
-            let reason = format!("GStreamer has no element `{element}` here: install the package that has it");
+            let reason = format!(
+                "GStreamer has no element `{element}` here: install the package that has it"
+            );
             return Err(FrameError::Open { origin, reason });
         }
-        let opened = Self::live(origin, || VideoCapture::from_file(pipeline, videoio::CAP_GSTREAMER));
+        let opened = Self::live(origin, || {
+            VideoCapture::from_file(pipeline, videoio::CAP_GSTREAMER)
+        });
         opened.map_err(|error| match error {
-            FrameError::Open { origin, reason } if Command::new(INSPECTOR).arg("--version").output().is_err() => {
+            FrameError::Open { origin, reason }
+                if Command::new(INSPECTOR).arg("--version").output().is_err() =>
+            {
                 let remedy = "install gstreamer1.0-tools, so that a missing element is named";
-                FrameError::Open { origin, reason: format!("{reason}; {remedy}") }
+                FrameError::Open {
+                    origin,
+                    reason: format!("{reason}; {remedy}"),
+                }
             }
             error => error,
         })
@@ -127,35 +154,68 @@ impl Video {
     /// A network camera with a timeout for opening it and for each frame.
     fn url(url: &str, origin: String, timeout: Duration) -> Result<Self, FrameError> {
         let timeout_ms = i32::try_from(timeout.as_millis()).unwrap_or(i32::MAX);
-        let properties = [videoio::CAP_PROP_OPEN_TIMEOUT_MSEC, videoio::CAP_PROP_READ_TIMEOUT_MSEC];
-        let timeouts: Vec<i32> = properties.into_iter().flat_map(|property| [property, timeout_ms]).collect();
+        let properties = [
+            videoio::CAP_PROP_OPEN_TIMEOUT_MSEC,
+            videoio::CAP_PROP_READ_TIMEOUT_MSEC,
+        ];
+        let timeouts: Vec<i32> = properties
+            .into_iter()
+            .flat_map(|property| [property, timeout_ms])
+            .collect();
         Self::live(origin, || {
-            VideoCapture::from_file_with_params(url, videoio::CAP_FFMPEG, &Vector::from_slice(&timeouts))
+            VideoCapture::from_file_with_params(
+                url,
+                videoio::CAP_FFMPEG,
+                &Vector::from_slice(&timeouts),
+            )
         })
     }
 
     fn file(path: &Path, origin: String, looping: bool) -> Result<Self, FrameError> {
         readable(path, &origin)?;
         let mut video = Self::live(origin, || VideoCapture::from_file(path, videoio::CAP_ANY))?;
-        let fps = video.capture.get(videoio::CAP_PROP_FPS).ok().filter(|fps| PLAUSIBLE_FPS.contains(fps));
-        video.playback = Some(Playback { pace: FramePacer::new(fps.unwrap_or(FALLBACK_FPS)), looping });
+        let fps = video
+            .capture
+            .get(videoio::CAP_PROP_FPS)
+            .ok()
+            .filter(|fps| PLAUSIBLE_FPS.contains(fps));
+        video.playback = Some(Playback {
+            pace: FramePacer::new(fps.unwrap_or(FALLBACK_FPS)),
+            looping,
+        });
         Ok(video)
     }
 
-    fn live(origin: String, open: impl FnOnce() -> opencv::Result<VideoCapture>) -> Result<Self, FrameError> {
-        let failed = |reason: String| FrameError::Open { origin: origin.clone(), reason };
+    fn live(
+        origin: String,
+        open: impl FnOnce() -> opencv::Result<VideoCapture>,
+    ) -> Result<Self, FrameError> {
+        let failed = |reason: String| FrameError::Open {
+            origin: origin.clone(),
+            reason,
+        };
         let capture = open().map_err(|e| failed(e.message))?;
         if !capture.is_opened().map_err(|e| failed(e.message))? {
-            return Err(failed("opencv finds no video there: see whether a player shows it".into()));
+            return Err(failed(
+                "opencv finds no video there: see whether a player shows it".into(),
+            ));
         }
-        Ok(Self { origin, capture, playback: None, seq: 0 })
+        Ok(Self {
+            origin,
+            capture,
+            playback: None,
+            seq: 0,
+        })
     }
 
     /// The next image, if there is one.
     fn read(&mut self) -> Result<Option<Mat>, FrameError> {
         let mut image = Mat::default();
         let read = self.capture.read(&mut image);
-        let read = read.map_err(|e| FrameError::Lost { origin: self.origin.clone(), reason: e.message })?;
+        let read = read.map_err(|e| FrameError::Lost {
+            origin: self.origin.clone(),
+            reason: e.message,
+        })?;
         Ok((read && !image.empty()).then_some(image))
     }
 }
@@ -168,15 +228,25 @@ impl FrameSource for Video {
         let mut image = self.read()?;
         if image.is_none() && self.playback.as_ref().is_some_and(|p| p.looping) && self.seq > 0 {
             let reopened = VideoCapture::from_file(&self.origin, videoio::CAP_ANY);
-            self.capture = reopened.map_err(|e| FrameError::Lost { origin: self.origin.clone(), reason: e.message })?;
+            self.capture = reopened.map_err(|e| FrameError::Lost {
+                origin: self.origin.clone(),
+                reason: e.message,
+            })?;
             image = self.read()?;
         }
         let origin = || self.origin.clone();
         let image = image.ok_or_else(|| match self.playback {
             Some(_) => FrameError::Ended { origin: origin() },
-            None => FrameError::Lost { origin: origin(), reason: "no further frame".into() },
+            None => FrameError::Lost {
+                origin: origin(),
+                reason: "no further frame".into(),
+            },
         })?;
-        let frame = CameraFrame { image, captured_at: clock::now(), seq: self.seq };
+        let frame = CameraFrame {
+            image,
+            captured_at: clock::now(),
+            seq: self.seq,
+        };
         self.seq += 1;
         Ok(frame)
     }
@@ -187,7 +257,10 @@ fn elements(pipeline: &str) -> impl Iterator<Item = &str> {
     pipeline
         .split('!')
         .filter_map(|part| part.split_whitespace().next())
-        .filter(|word| word.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-'))
+        .filter(|word| {
+            word.bytes()
+                .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-')
+        })
 }
 
 /// GStreamer's program that knows its elements.
@@ -201,10 +274,15 @@ fn is_missing(element: &str) -> bool {
 
 /// The operating system's error for a missing or forbidden file, since OpenCV reports none.
 fn readable(path: &Path, origin: &str) -> Result<(), FrameError> {
-    let failed = |e: std::io::Error| FrameError::Open { origin: origin.to_owned(), reason: e.to_string() };
+    let failed = |e: std::io::Error| FrameError::Open {
+        origin: origin.to_owned(),
+        reason: e.to_string(),
+    };
     let file = File::open(path).map_err(failed)?;
     if file.metadata().map_err(failed)?.is_dir() {
-        return Err(failed(std::io::Error::other("it is a directory: for images use kind `images`, or `--images`")));
+        return Err(failed(std::io::Error::other(
+            "it is a directory: for images use kind `images`, or `--images`",
+        )));
     }
     Ok(())
 }
@@ -215,8 +293,10 @@ mod tests {
 
     #[test]
     fn the_elements_of_a_pipeline_are_told_from_caps_and_properties() {
-        let pipeline =
-            "libcamerasrc camera-name=x ! video/x-raw,width=640 ! videoconvert ! tee name=t ! appsink drop=true";
-        assert_eq!(elements(pipeline).collect::<Vec<_>>(), ["libcamerasrc", "videoconvert", "tee", "appsink"]);
+        let pipeline = "libcamerasrc camera-name=x ! video/x-raw,width=640 ! videoconvert ! tee name=t ! appsink drop=true";
+        assert_eq!(
+            elements(pipeline).collect::<Vec<_>>(),
+            ["libcamerasrc", "videoconvert", "tee", "appsink"]
+        );
     }
 }

@@ -82,14 +82,34 @@ const LINE_LOOP: u8 = 2;
 const ROWS_PER_LINE: f64 = 240.0;
 const ROWS_PER_TEXT: f64 = 30.0;
 
-const BOX: Color = Color { r: 1.0, g: 0.75, b: 0.1, a: 1.0 };
-const CLEAR: Color = Color { r: 0.0, g: 0.0, b: 0.0, a: 0.0 };
-const SHADE: Color = Color { r: 0.0, g: 0.0, b: 0.0, a: 0.6 };
+const BOX: Color = Color {
+    r: 1.0,
+    g: 0.75,
+    b: 0.1,
+    a: 1.0,
+};
+const CLEAR: Color = Color {
+    r: 0.0,
+    g: 0.0,
+    b: 0.0,
+    a: 0.0,
+};
+const SHADE: Color = Color {
+    r: 0.0,
+    g: 0.0,
+    b: 0.0,
+    a: 0.6,
+};
 
 impl CompressedImage {
     pub(crate) fn of(picture: &CapturedPicture) -> Self {
         let data = BASE64_STANDARD.encode(&picture.jpeg);
-        Self { timestamp: picture.captured_at.into(), frame_id: optical_frame(&picture.reporter), data, format: "jpeg" }
+        Self {
+            timestamp: picture.captured_at.into(),
+            frame_id: optical_frame(&picture.reporter),
+            data,
+            format: "jpeg",
+        }
     }
 }
 
@@ -118,7 +138,12 @@ impl ImageAnnotations {
         let (timestamp, rows) = (Time::from(picture.captured_at), f64::from(picture.height));
         let outline = |detection: &Detection| {
             let b = &detection.bounding_box;
-            let corners = [(b.x_min, b.y_min), (b.x_max, b.y_min), (b.x_max, b.y_max), (b.x_min, b.y_max)];
+            let corners = [
+                (b.x_min, b.y_min),
+                (b.x_max, b.y_min),
+                (b.x_max, b.y_max),
+                (b.x_min, b.y_max),
+            ];
             PointsAnnotation {
                 timestamp,
                 kind: LINE_LOOP,
@@ -131,14 +156,24 @@ impl ImageAnnotations {
         };
         let text = |detection: &Detection| TextAnnotation {
             timestamp,
-            position: PicturePoint { x: detection.bounding_box.x_min, y: detection.bounding_box.y_min },
+            position: PicturePoint {
+                x: detection.bounding_box.x_min,
+                y: detection.bounding_box.y_min,
+            },
             text: format!("{} {:.0} %", detection.label, detection.confidence * 100.0),
             font_size: (rows / ROWS_PER_TEXT).max(8.0),
             text_color: BOX,
             background_color: SHADE,
         };
         let detections = &picture.detections;
-        let (points, texts) = (detections.iter().map(outline).collect(), detections.iter().map(text).collect());
-        Self { circles: [], points, texts }
+        let (points, texts) = (
+            detections.iter().map(outline).collect(),
+            detections.iter().map(text).collect(),
+        );
+        Self {
+            circles: [],
+            points,
+            texts,
+        }
     }
 }

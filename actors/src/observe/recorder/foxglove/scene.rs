@@ -146,12 +146,40 @@ const LINE_LOOP: u8 = 1;
 const TEXT_PX: f64 = 14.0;
 const LINE_PX: f64 = 2.0;
 
-const FUSED_COLOR: Color = Color { r: 0.10, g: 0.55, b: 0.35, a: 0.9 };
-const EMPTY_COLOR: Color = Color { r: 0.55, g: 0.55, b: 0.55, a: 0.35 };
-const DETECTED_COLOR: Color = Color { r: 0.90, g: 0.55, b: 0.10, a: 0.6 };
-const VEHICLE_COLOR: Color = Color { r: 0.15, g: 0.40, b: 0.80, a: 1.0 };
-const VIEW_COLOR: Color = Color { a: 0.5, ..VEHICLE_COLOR };
-const TEXT_COLOR: Color = Color { r: 1.0, g: 1.0, b: 1.0, a: 1.0 };
+const FUSED_COLOR: Color = Color {
+    r: 0.10,
+    g: 0.55,
+    b: 0.35,
+    a: 0.9,
+};
+const EMPTY_COLOR: Color = Color {
+    r: 0.55,
+    g: 0.55,
+    b: 0.55,
+    a: 0.35,
+};
+const DETECTED_COLOR: Color = Color {
+    r: 0.90,
+    g: 0.55,
+    b: 0.10,
+    a: 0.6,
+};
+const VEHICLE_COLOR: Color = Color {
+    r: 0.15,
+    g: 0.40,
+    b: 0.80,
+    a: 1.0,
+};
+const VIEW_COLOR: Color = Color {
+    a: 0.5,
+    ..VEHICLE_COLOR
+};
+const TEXT_COLOR: Color = Color {
+    r: 1.0,
+    g: 1.0,
+    b: 1.0,
+    a: 1.0,
+};
 
 /// Sizes of a cell's drawings and the facing of its known locations.
 #[derive(Debug, Clone, PartialEq)]
@@ -163,25 +191,42 @@ pub(crate) struct SceneStyle {
 impl SceneStyle {
     /// The style of a cell with these known locations.
     pub(crate) fn of(landmarks: &[LandmarkConfig]) -> Self {
-        let distance_m = |a: &LandmarkConfig, b: &LandmarkConfig| (a.x_m - b.x_m).hypot(a.y_m - b.y_m);
+        let distance_m =
+            |a: &LandmarkConfig, b: &LandmarkConfig| (a.x_m - b.x_m).hypot(a.y_m - b.y_m);
         let nearest_m = |at: &LandmarkConfig| {
-            let others = landmarks.iter().filter(|other| other.id != at.id).map(|other| distance_m(at, other));
+            let others = landmarks
+                .iter()
+                .filter(|other| other.id != at.id)
+                .map(|other| distance_m(at, other));
             others.min_by(f64::total_cmp)
         };
-        let mut spacings: Vec<_> = landmarks.iter().take(MAX_SPACINGS).filter_map(nearest_m).collect();
+        let mut spacings: Vec<_> = landmarks
+            .iter()
+            .take(MAX_SPACINGS)
+            .filter_map(nearest_m)
+            .collect();
         spacings.sort_by(f64::total_cmp);
         let [least_m, most_m] = OBJECT_BOUNDS_M;
         let usual_m = spacings.get(spacings.len() / 2);
-        let object_m = usual_m.map_or(OBJECT_M, |spacing_m| (SPACING_SHARE * spacing_m).clamp(least_m, most_m));
+        let object_m = usual_m.map_or(OBJECT_M, |spacing_m| {
+            (SPACING_SHARE * spacing_m).clamp(least_m, most_m)
+        });
         let facing = |at: &LandmarkConfig| Some((at.id.clone(), at.facing_deg?.to_radians()));
-        Self { object_m, facing_rad: landmarks.iter().filter_map(facing).collect() }
+        Self {
+            object_m,
+            facing_rad: landmarks.iter().filter_map(facing).collect(),
+        }
     }
 
     /// Known locations with their labels and facing, and tracked objects with the ellipses of their positions.
     pub(crate) fn map(&self, map: &GlobalMap) -> SceneUpdate {
         let landmarks = map.landmarks.iter().map(|landmark| {
             let pose = plane_pose(landmark.x_m, landmark.y_m, 0.0);
-            let color = if landmark.label.is_some() { FUSED_COLOR } else { EMPTY_COLOR };
+            let color = if landmark.label.is_some() {
+                FUSED_COLOR
+            } else {
+                EMPTY_COLOR
+            };
             let text = match &landmark.label {
                 Some(label) => format!("{} {label}", landmark.id),
                 None => landmark.id.to_string(),
@@ -192,16 +237,21 @@ impl SceneStyle {
                 .note("confidence", landmark.confidence.to_string())
                 .note("contributors", listed(&landmark.contributors));
             match self.facing_rad.get(&landmark.id) {
-                Some(facing) => {
-                    entity.arrow(plane_pose(landmark.x_m, landmark.y_m, *facing), FACING * self.object_m, color)
-                }
+                Some(facing) => entity.arrow(
+                    plane_pose(landmark.x_m, landmark.y_m, *facing),
+                    FACING * self.object_m,
+                    color,
+                ),
                 None => entity,
             }
         });
         let objects = map.objects.iter().map(|object| {
             let pose = plane_pose(object.x_m, object.y_m, object.heading_rad.unwrap_or(0.0));
             let existence = object.existence.unwrap_or(1.0);
-            let color = Color { a: FUSED_COLOR.a * existence, ..FUSED_COLOR };
+            let color = Color {
+                a: FUSED_COLOR.a * existence,
+                ..FUSED_COLOR
+            };
             let entity = SceneEntity::new(map.fused_at_us, format!("object/{}", object.id));
             let (entity, height_m) = match object.size_m {
                 Some(size_m) => (entity.block(pose, size_m, color), MAX_HEIGHT_M),
@@ -209,9 +259,18 @@ impl SceneStyle {
             };
             let is_likely = object.confidence >= LIKELY;
             let position = [object.x_m, object.y_m];
-            let entity = if is_likely { entity.ellipse(position, &object.covariance(), color) } else { entity };
+            let entity = if is_likely {
+                entity.ellipse(position, &object.covariance(), color)
+            } else {
+                entity
+            };
             entity
-                .text(pose, height_m + TEXT * self.object_m, object.label.to_string(), existence.max(MIN_TEXT_OPACITY))
+                .text(
+                    pose,
+                    height_m + TEXT * self.object_m,
+                    object.label.to_string(),
+                    existence.max(MIN_TEXT_OPACITY),
+                )
                 .note("confidence", object.confidence.to_string())
                 .note("contributors", listed(&object.contributors))
         });
@@ -224,10 +283,16 @@ impl SceneStyle {
         let vehicle = report.pose.map(|pose| self.vehicle_entity(node, &pose, at));
         let objects = report.objects.iter().enumerate().map(|(number, object)| {
             let entity = SceneEntity::new(at, format!("detection/{node}/{number}"))
-                .ball(plane_pose(object.x_m, object.y_m, 0.0), DETECTED * self.object_m, DETECTED_COLOR)
+                .ball(
+                    plane_pose(object.x_m, object.y_m, 0.0),
+                    DETECTED * self.object_m,
+                    DETECTED_COLOR,
+                )
                 .note("label", object.label.to_string());
             match object.covariance() {
-                Some(covariance) => entity.ellipse([object.x_m, object.y_m], &covariance, DETECTED_COLOR),
+                Some(covariance) => {
+                    entity.ellipse([object.x_m, object.y_m], &covariance, DETECTED_COLOR)
+                }
                 None => entity,
             }
         });
@@ -235,7 +300,12 @@ impl SceneStyle {
     }
 
     /// A vehicle with the field of view that it states.
-    pub(crate) fn vehicle(&self, node: &NodeName, pose: &WirePose, report: &ObjectReport) -> SceneEntity {
+    pub(crate) fn vehicle(
+        &self,
+        node: &NodeName,
+        pose: &WirePose,
+        report: &ObjectReport,
+    ) -> SceneEntity {
         let entity = self.vehicle_entity(node, pose, report.captured_at_us);
         match report.view {
             Some(view) => entity.view(pose, view),
@@ -247,7 +317,12 @@ impl SceneStyle {
         let pose = camera_pose(pose);
         let entity = SceneEntity::new(at, format!("vehicle/{node}"));
         let length_m = VEHICLE * self.object_m;
-        entity.arrow(pose, length_m, VEHICLE_COLOR).text(pose, TEXT * self.object_m, node.to_string(), 1.0)
+        entity.arrow(pose, length_m, VEHICLE_COLOR).text(
+            pose,
+            TEXT * self.object_m,
+            node.to_string(),
+            1.0,
+        )
     }
 }
 
@@ -257,14 +332,27 @@ const MAX_SPACINGS: usize = 256;
 impl SceneUpdate {
     /// All that a topic shows; what it showed before goes, so that nothing stays where it no longer is.
     pub(crate) fn new(at: Timestamp, entities: impl Iterator<Item = SceneEntity>) -> Self {
-        let all = SceneDeletion { timestamp: at.into(), kind: DELETE_ALL, id: String::new() };
-        Self { deletions: [all], entities: entities.collect() }
+        let all = SceneDeletion {
+            timestamp: at.into(),
+            kind: DELETE_ALL,
+            id: String::new(),
+        };
+        Self {
+            deletions: [all],
+            entities: entities.collect(),
+        }
     }
 }
 
 impl SceneEntity {
     fn new(at: Timestamp, id: String) -> Self {
-        Self { timestamp: at.into(), frame_id: MAP, id, lifetime: LIFETIME, ..Self::default() }
+        Self {
+            timestamp: at.into(),
+            frame_id: MAP,
+            id,
+            lifetime: LIFETIME,
+            ..Self::default()
+        }
     }
 
     fn arrow(mut self, pose: FoxglovePose, length_m: f64, color: Color) -> Self {
@@ -280,26 +368,55 @@ impl SceneEntity {
     }
 
     fn ball(mut self, pose: FoxglovePose, diameter_m: f64, color: Color) -> Self {
-        self.spheres.push(SceneSolid { pose, size: Vector3 { x: diameter_m, y: diameter_m, z: diameter_m }, color });
+        self.spheres.push(SceneSolid {
+            pose,
+            size: Vector3 {
+                x: diameter_m,
+                y: diameter_m,
+                z: diameter_m,
+            },
+            color,
+        });
         self
     }
 
     /// A box of this length and width that stands on the ground.
     fn block(mut self, pose: FoxglovePose, [length_m, width_m]: [f64; 2], color: Color) -> Self {
-        let size = Vector3 { x: length_m, y: width_m, z: width_m.min(MAX_HEIGHT_M) };
-        let position = Vector3 { z: size.z / 2.0, ..pose.position };
-        self.cubes.push(SceneSolid { pose: FoxglovePose { position, ..pose }, size, color });
+        let size = Vector3 {
+            x: length_m,
+            y: width_m,
+            z: width_m.min(MAX_HEIGHT_M),
+        };
+        let position = Vector3 {
+            z: size.z / 2.0,
+            ..pose.position
+        };
+        self.cubes.push(SceneSolid {
+            pose: FoxglovePose { position, ..pose },
+            size,
+            color,
+        });
         self
     }
 
     /// The area on the ground that has the position with a probability of 95 %.
     fn ellipse(mut self, [x_m, y_m]: [f64; 2], covariance: &Covariance, color: Color) -> Self {
-        let SymmetricEigen { eigenvalues, eigenvectors } = covariance.matrix().symmetric_eigen();
+        let SymmetricEigen {
+            eigenvalues,
+            eigenvectors,
+        } = covariance.matrix().symmetric_eigen();
         let axis = eigenvectors.column(0);
-        let [x, y] = [eigenvalues[0], eigenvalues[1]].map(|variance| 2.0 * SIGMAS_95 * variance.max(0.0).sqrt());
+        let [x, y] = [eigenvalues[0], eigenvalues[1]]
+            .map(|variance| 2.0 * SIGMAS_95 * variance.max(0.0).sqrt());
         let pose = plane_pose(x_m, y_m, axis.y.atan2(axis.x));
         let (size, color) = (Vector3 { x, y, z: 0.01 }, Color { a: 0.2, ..color });
-        self.cylinders.push(Cylinder { pose, size, bottom_scale: 1.0, top_scale: 1.0, color });
+        self.cylinders.push(Cylinder {
+            pose,
+            size,
+            bottom_scale: 1.0,
+            top_scale: 1.0,
+            color,
+        });
         self
     }
 
@@ -309,11 +426,18 @@ impl SceneEntity {
         let steps = (view.angle_rad.min(TAU) / ARC_STEP_RAD).ceil().max(1.0);
         let on_arc = |step: f64| {
             let (sin, cos) = (-half_rad + 2.0 * half_rad * step / steps).sin_cos();
-            Vector3 { x: view.range_m * cos, y: view.range_m * sin, z: 0.0 }
+            Vector3 {
+                x: view.range_m * cos,
+                y: view.range_m * sin,
+                z: 0.0,
+            }
         };
         let is_all_around = view.angle_rad > TAU - ARC_STEP_RAD;
         let apex = (!is_all_around).then(Vector3::default);
-        let points = apex.into_iter().chain((0..=steps as u32).map(|step| on_arc(f64::from(step)))).collect();
+        let points = apex
+            .into_iter()
+            .chain((0..=steps as u32).map(|step| on_arc(f64::from(step))))
+            .collect();
         self.lines.push(Line {
             kind: LINE_LOOP,
             pose: plane_pose(pose.x_m, pose.y_m, pose.heading_rad),
@@ -329,10 +453,23 @@ impl SceneEntity {
 
     /// A text above a place, of this opacity; it is drawn on black.
     fn text(mut self, pose: FoxglovePose, above_m: f64, text: String, opacity: f64) -> Self {
-        let position = Vector3 { z: pose.position.z + above_m, ..pose.position };
+        let position = Vector3 {
+            z: pose.position.z + above_m,
+            ..pose.position
+        };
         let (pose, font_size) = (FoxglovePose { position, ..pose }, TEXT_PX);
-        let color = Color { a: opacity, ..TEXT_COLOR };
-        self.texts.push(FoxgloveText { pose, billboard: true, font_size, scale_invariant: true, color, text });
+        let color = Color {
+            a: opacity,
+            ..TEXT_COLOR
+        };
+        self.texts.push(FoxgloveText {
+            pose,
+            billboard: true,
+            font_size,
+            scale_invariant: true,
+            color,
+            text,
+        });
         self
     }
 
@@ -343,7 +480,11 @@ impl SceneEntity {
 }
 
 fn listed(nodes: &[NodeName]) -> String {
-    nodes.iter().map(NodeName::as_str).collect::<Vec<_>>().join(" ")
+    nodes
+        .iter()
+        .map(NodeName::as_str)
+        .collect::<Vec<_>>()
+        .join(" ")
 }
 
 #[cfg(test)]
@@ -357,13 +498,16 @@ mod tests {
     use super::*;
 
     fn places(spacing_m: f64) -> Vec<LandmarkConfig> {
-        let place = |number: u8| LandmarkConfig::at(format!("p{number}"), f64::from(number) * spacing_m, 0.0);
+        let place = |number: u8| {
+            LandmarkConfig::at(format!("p{number}"), f64::from(number) * spacing_m, 0.0)
+        };
         (0..4).map(place).collect()
     }
 
     #[test]
     fn drawings_are_as_large_as_the_scene_allows() {
-        let diameters = [0.05, 0.2, 2.5, 300.0].map(|spacing_m| SceneStyle::of(&places(spacing_m)).object_m);
+        let diameters =
+            [0.05, 0.2, 2.5, 300.0].map(|spacing_m| SceneStyle::of(&places(spacing_m)).object_m);
         for (is, expected) in diameters.iter().zip([0.02, 0.08, 1.0, 1.0]) {
             assert!((is - expected).abs() < 1e-12, "{diameters:?}");
         }
@@ -373,13 +517,24 @@ mod tests {
     #[test]
     fn an_ellipse_has_its_long_axis_where_the_position_is_least_certain() {
         let covariance = Covariance::along_bearing(0.5, 2.0, 0.5);
-        let entity = SceneEntity::new(Timestamp(1), String::new()).ellipse([3.0, 4.0], &covariance, FUSED_COLOR);
+        let entity = SceneEntity::new(Timestamp(1), String::new()).ellipse(
+            [3.0, 4.0],
+            &covariance,
+            FUSED_COLOR,
+        );
         let Cylinder { pose, size, .. } = &entity.cylinders[0];
         assert_eq!((pose.position.x, pose.position.y), (3.0, 4.0));
         let (long, short) = (size.x.max(size.y), size.x.min(size.y));
-        assert!((long - 4.0 * SIGMAS_95).abs() < 1e-9 && (short - SIGMAS_95).abs() < 1e-9, "{size:?}");
+        assert!(
+            (long - 4.0 * SIGMAS_95).abs() < 1e-9 && (short - SIGMAS_95).abs() < 1e-9,
+            "{size:?}"
+        );
         let heading_rad = 2.0 * pose.orientation.z.atan2(pose.orientation.w);
-        let long_rad = if size.x > size.y { heading_rad } else { heading_rad + FRAC_PI_2 };
+        let long_rad = if size.x > size.y {
+            heading_rad
+        } else {
+            heading_rad + FRAC_PI_2
+        };
         assert!((long_rad - 0.5).sin().abs() < 1e-9, "{long_rad}");
     }
 
@@ -388,14 +543,34 @@ mod tests {
         let pose = WirePose::new(1.0, 2.0, 0.3);
         let line = |angle_rad| {
             let entity = SceneEntity::new(Timestamp(1), String::new());
-            entity.view(&pose, FieldOfView { range_m: 10.0, angle_rad }).lines.remove(0)
+            entity
+                .view(
+                    &pose,
+                    FieldOfView {
+                        range_m: 10.0,
+                        angle_rad,
+                    },
+                )
+                .lines
+                .remove(0)
         };
         let sector = line(1.0);
         assert_eq!((sector.points[0].x, sector.points[0].y), (0.0, 0.0));
-        let bearings: Vec<_> = sector.points[1..].iter().map(|point| point.y.atan2(point.x)).collect();
-        assert!((bearings[0] + 0.5).abs() < 1e-9 && (bearings[bearings.len() - 1] - 0.5).abs() < 1e-9, "{bearings:?}");
+        let bearings: Vec<_> = sector.points[1..]
+            .iter()
+            .map(|point| point.y.atan2(point.x))
+            .collect();
+        assert!(
+            (bearings[0] + 0.5).abs() < 1e-9 && (bearings[bearings.len() - 1] - 0.5).abs() < 1e-9,
+            "{bearings:?}"
+        );
         let circle = line(f64::from(TAU as f32));
-        assert!(circle.points.iter().all(|point| (point.x.hypot(point.y) - 10.0).abs() < 1e-9));
+        assert!(
+            circle
+                .points
+                .iter()
+                .all(|point| (point.x.hypot(point.y) - 10.0).abs() < 1e-9)
+        );
     }
 
     #[test]
@@ -403,8 +578,19 @@ mod tests {
         let mut landmarks = places(1.0);
         landmarks[1].facing_deg = Some(90.0);
         let style = SceneStyle::of(&landmarks);
-        let car = FusedObject::new(Uuid::nil(), "car", 0.9, 5.0, 6.0, Covariance::isotropic(0.3));
-        let car = FusedObject { size_m: Some([4.0, 1.8]), heading_rad: Some(1.0), ..car };
+        let car = FusedObject::new(
+            Uuid::nil(),
+            "car",
+            0.9,
+            5.0,
+            6.0,
+            Covariance::isotropic(0.3),
+        );
+        let car = FusedObject {
+            size_m: Some([4.0, 1.8]),
+            heading_rad: Some(1.0),
+            ..car
+        };
         let state = |id: &str| LandmarkState {
             id: id.into(),
             label: None,
@@ -417,20 +603,64 @@ mod tests {
         };
         let epoch = Epoch::new(1, NodeName::from_static("edge"));
         let landmarks = vec![state("p0"), state("p1")];
-        let map = GlobalMap { landmarks, ..GlobalMap::new(&epoch, 1, Timestamp(1)) };
-        let mut lost = FusedObject::new(Uuid::max(), "car", 0.06, 9.0, 9.0, Covariance::isotropic(20.0));
+        let map = GlobalMap {
+            landmarks,
+            ..GlobalMap::new(&epoch, 1, Timestamp(1))
+        };
+        let mut lost = FusedObject::new(
+            Uuid::max(),
+            "car",
+            0.06,
+            9.0,
+            9.0,
+            Covariance::isotropic(20.0),
+        );
         lost.existence = Some(0.06);
-        let unplaced = FusedObject { confidence: 0.41, existence: Some(0.78), ..lost.clone() };
-        let map = GlobalMap { objects: vec![car, lost, unplaced], ..map };
-        let SceneUpdate { deletions, entities } = style.map(&map);
-        assert_eq!(deletions[0].kind, DELETE_ALL, "what left the map is not shown on");
-        assert_eq!(entities.iter().map(|entity| entity.cylinders.len()).collect::<Vec<_>>(), [0, 0, 1, 0, 0]);
-        assert!(entities[3].spheres[0].color.a < 0.1 && entities[3].texts[0].color.a == MIN_TEXT_OPACITY);
-        assert!(entities[2].texts[0].pose.position.z > 1.5, "above the block");
-        assert_eq!(entities.iter().map(|entity| entity.arrows.len()).collect::<Vec<_>>(), [0, 1, 0, 0, 0]);
+        let unplaced = FusedObject {
+            confidence: 0.41,
+            existence: Some(0.78),
+            ..lost.clone()
+        };
+        let map = GlobalMap {
+            objects: vec![car, lost, unplaced],
+            ..map
+        };
+        let SceneUpdate {
+            deletions,
+            entities,
+        } = style.map(&map);
+        assert_eq!(
+            deletions[0].kind, DELETE_ALL,
+            "what left the map is not shown on"
+        );
+        assert_eq!(
+            entities
+                .iter()
+                .map(|entity| entity.cylinders.len())
+                .collect::<Vec<_>>(),
+            [0, 0, 1, 0, 0]
+        );
+        assert!(
+            entities[3].spheres[0].color.a < 0.1
+                && entities[3].texts[0].color.a == MIN_TEXT_OPACITY
+        );
+        assert!(
+            entities[2].texts[0].pose.position.z > 1.5,
+            "above the block"
+        );
+        assert_eq!(
+            entities
+                .iter()
+                .map(|entity| entity.arrows.len())
+                .collect::<Vec<_>>(),
+            [0, 1, 0, 0, 0]
+        );
         let facing = entities[1].arrows[0].pose.orientation;
         assert!((2.0 * facing.z.atan2(facing.w) - FRAC_PI_2).abs() < 1e-9);
         let block = &entities[2].cubes[0];
-        assert_eq!((block.size.x, block.size.y, block.pose.position.z), (4.0, 1.8, 0.75));
+        assert_eq!(
+            (block.size.x, block.size.y, block.pose.position.z),
+            (4.0, 1.8, 0.75)
+        );
     }
 }

@@ -28,7 +28,8 @@ use rmqtt::types::Publish;
 
 use super::refusals::RefusalReason;
 use super::{
-    DESCRIPTION_INTERVAL, Door, DoorRefusal, DoorSetup, DoorState, MAX_NODELESS, PART_RETENTION, Publication, lock,
+    DESCRIPTION_INTERVAL, Door, DoorRefusal, DoorSetup, DoorState, MAX_NODELESS, PART_RETENTION,
+    Publication, lock,
 };
 use crate::platform::clock;
 use crate::telemetry::counters::{Event, ShedReason};
@@ -72,8 +73,14 @@ impl TopicPlace {
 
 impl Door {
     /// True if a client is a program beside the node, and not a node's link.
-    pub(in crate::transport::broker) fn is_program(&self, principal: &Principal, client_id: &str) -> bool {
-        let Some(DoorState { setup, .. }) = self.0.as_deref() else { return false };
+    pub(in crate::transport::broker) fn is_program(
+        &self,
+        principal: &Principal,
+        client_id: &str,
+    ) -> bool {
+        let Some(DoorState { setup, .. }) = self.0.as_deref() else {
+            return false;
+        };
         if client_id == setup.gateway_id {
             return false;
         }
@@ -90,8 +97,14 @@ impl Door {
     }
 
     /// True if a program may leave a last will on this topic.
-    pub(in crate::transport::broker) fn allows_will(&self, principal: &Principal, topic: &str) -> bool {
-        self.0.as_deref().is_some_and(|door| door.may_say(principal, topic).is_ok())
+    pub(in crate::transport::broker) fn allows_will(
+        &self,
+        principal: &Principal,
+        topic: &str,
+    ) -> bool {
+        self.0
+            .as_deref()
+            .is_some_and(|door| door.may_say(principal, topic).is_ok())
     }
 
     /// Takes a program's message.
@@ -101,7 +114,9 @@ impl Door {
         (place, topic): (TopicPlace, &str),
         publish: &Publish,
     ) -> Result<(), DoorRefusal> {
-        let Some(door) = self.0.as_deref() else { return Ok(()) };
+        let Some(door) = self.0.as_deref() else {
+            return Ok(());
+        };
         match place {
             TopicPlace::Cell if publish.retain => door.take_nodeless(topic, &publish.payload),
             TopicPlace::Cell => Ok(()),
@@ -114,36 +129,60 @@ impl Door {
     }
 
     /// Counts and shows a refusal.
-    pub(in crate::transport::broker) fn note_refusal(&self, client_id: &str, topic: &str, refusal: &DoorRefusal) {
-        let Some(door) = self.0.as_deref() else { return };
+    pub(in crate::transport::broker) fn note_refusal(
+        &self,
+        client_id: &str,
+        topic: &str,
+        refusal: &DoorRefusal,
+    ) {
+        let Some(door) = self.0.as_deref() else {
+            return;
+        };
         let setup = &door.setup;
         // A client that connects anew stays the same.
         let named = client_id.rsplit_once('-').filter(|(_, run)| is_run(run));
         let client = named.map_or(client_id, |(name, _)| name);
         match refusal.reason {
             RefusalReason::Throttled => setup.counters.shed(ShedReason::ReportThrottled, client),
-            RefusalReason::Rejected(reason) => setup.counters.reject_report(reason, client, || refusal.text.clone()),
+            RefusalReason::Rejected(reason) => setup
+                .counters
+                .reject_report(reason, client, || refusal.text.clone()),
         }
         if refusal.reason == RefusalReason::Rejected(RejectReason::NotPermitted) {
             setup.counters.count(Event::ClientDenied);
         }
-        tracing::debug!(client, topic, text = refusal.text, "program's message refused");
+        tracing::debug!(
+            client,
+            topic,
+            text = refusal.text,
+            "program's message refused"
+        );
         let status = lock(&door.refusals).note(&setup.node, (client, topic), refusal, clock::now());
         if let Some(status) = status {
             let topic = setup.topics.clients(&setup.node);
-            door.retain(Publication { topic, payload: status.into(), retain: true });
+            door.retain(Publication {
+                topic,
+                payload: status.into(),
+                retain: true,
+            });
         }
     }
 
     /// The place for what a program publishes.
     fn place_of(&self, principal: &Principal, topic: &str) -> TopicPlace {
-        let Some(door) = self.0.as_deref() else { return TopicPlace::Cell };
+        let Some(door) = self.0.as_deref() else {
+            return TopicPlace::Cell;
+        };
         match door.setup.topics.parse(topic) {
-            Some(Topic::Detections(name) | Topic::VoteDetections(name)) if door.is_nodeless(principal, &name) => {
+            Some(Topic::Detections(name) | Topic::VoteDetections(name))
+                if door.is_nodeless(principal, &name) =>
+            {
                 TopicPlace::Cell
             }
             Some(Topic::Nodes(name)) if door.is_nodeless_name(principal, &name) => TopicPlace::Cell,
-            Some(Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Cell) => TopicPlace::Inbound,
+            Some(Topic::Detections(_) | Topic::VoteDetections(_) | Topic::Cell) => {
+                TopicPlace::Inbound
+            }
             _ => TopicPlace::Door,
         }
     }
@@ -157,30 +196,51 @@ impl DoorState {
 
     fn is_nodeless_name(&self, principal: &Principal, name: &NodeName) -> bool {
         let (setup, vehicle) = (&self.setup, name.vehicle());
-        principal.identity.is_none() && vehicle != setup.node && setup.serves_nodes && !(setup.is_member)(&vehicle)
+        principal.identity.is_none()
+            && vehicle != setup.node
+            && setup.serves_nodes
+            && !(setup.is_member)(&vehicle)
     }
 
     fn may_say(&self, principal: &Principal, topic: &str) -> Result<(), DoorRefusal> {
         let node = &self.setup.node;
         match self.setup.topics.parse(topic) {
-            Some(Topic::Nodes(name)) if name.vehicle() == *node && name != *node && self.is_own(principal) => Ok(()),
+            Some(Topic::Nodes(name))
+                if name.vehicle() == *node && name != *node && self.is_own(principal) =>
+            {
+                Ok(())
+            }
             None if principal.identity.is_none() => Ok(()),
-            None if self.is_own(principal) && topic.starts_with(&self.setup.topics.cpm("")) => Ok(()),
+            None if self.is_own(principal) && topic.starts_with(&self.setup.topics.cpm("")) => {
+                Ok(())
+            }
             _ => Err(DoorRefusal::not_permitted(format!(
                 "programs do not publish {topic}; reports go to detections/{node}--<part> and vote_detections/{node}--<part>"
             ))),
         }
     }
 
-    fn take_report(&self, principal: &Principal, topic: &str, payload: &Bytes) -> Result<(), DoorRefusal> {
+    fn take_report(
+        &self,
+        principal: &Principal,
+        topic: &str,
+        payload: &Bytes,
+    ) -> Result<(), DoorRefusal> {
         let setup = &self.setup;
         let (kind, name) = match setup.topics.parse(topic) {
             Some(Topic::Detections(name)) => (ReportKind::Detections, name),
             Some(Topic::VoteDetections(name)) => (ReportKind::VoteDetections, name),
-            _ => return Err(DoorRefusal::not_permitted(format!("{topic} is no topic for reports"))),
+            _ => {
+                return Err(DoorRefusal::not_permitted(format!(
+                    "{topic} is no topic for reports"
+                )));
+            }
         };
         let node = &setup.node;
-        if name.vehicle() != *node || !self.is_own(principal) || (name != *node && (setup.is_member)(&name)) {
+        if name.vehicle() != *node
+            || !self.is_own(principal)
+            || (name != *node && (setup.is_member)(&name))
+        {
             return Err(DoorRefusal::not_permitted(format!(
                 "this is the door of {node}: its programs report as {node} or {node}--<part>, not as {name}"
             )));
@@ -189,8 +249,9 @@ impl DoorState {
         let throttle = self.throttles.get(kind as usize);
         if throttle.is_some_and(|throttle| !lock(throttle).allow(now)) {
             let most = setup.max_report_hz / 2;
-            let text =
-                format!("the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz");
+            let text = format!(
+                "the programs of {node} report more than {most} times a second, half of mqtt.max_report_hz"
+            );
             return Err(DoorRefusal::new(RefusalReason::Throttled, text));
         }
         let report = decode_report(payload, &name, &setup.limits).map_err(|reason| {
@@ -201,11 +262,18 @@ impl DoorState {
         })?;
         if !(setup.fuses)(kind) {
             let text = format!("the cell does not use {topic}: `fusion.algorithms` leaves it out");
-            return Err(DoorRefusal::new(RefusalReason::Rejected(RejectReason::NotFused), text));
+            return Err(DoorRefusal::new(
+                RefusalReason::Rejected(RejectReason::NotFused),
+                text,
+            ));
         }
         if !self.admits_part(&name, now) {
-            let text = format!("{node} has {MAX_PARTS} parts that report, and {name} would be one more");
-            return Err(DoorRefusal::new(RefusalReason::Rejected(RejectReason::TooManyVehicles), text));
+            let text =
+                format!("{node} has {MAX_PARTS} parts that report, and {name} would be one more");
+            return Err(DoorRefusal::new(
+                RefusalReason::Rejected(RejectReason::TooManyVehicles),
+                text,
+            ));
         }
         (setup.report)(kind, Arc::new(report));
         Ok(())
@@ -213,7 +281,10 @@ impl DoorState {
 
     /// True if the certificate, where there are any, is the node's.
     fn is_own(&self, principal: &Principal) -> bool {
-        principal.identity.as_ref().is_none_or(|identity| *identity.name() == self.setup.node)
+        principal
+            .identity
+            .as_ref()
+            .is_none_or(|identity| *identity.name() == self.setup.node)
     }
 
     /// True if the aggregator has room for this part of the node, too.
@@ -234,15 +305,18 @@ impl DoorState {
 
     /// Bounds the vehicles without a node whose statuses are retained; an empty status ends one's.
     fn take_nodeless(&self, topic: &str, payload: &Bytes) -> Result<(), DoorRefusal> {
-        let Some(Topic::Nodes(name)) = self.setup.topics.parse(topic) else { return Ok(()) };
+        let Some(Topic::Nodes(name)) = self.setup.topics.parse(topic) else {
+            return Ok(());
+        };
         let mut names = lock(&self.nodeless);
         if payload.is_empty() {
             names.remove(&name);
         } else if names.len() < MAX_NODELESS {
             names.insert(name);
         } else if !names.contains(&name) {
-            let text =
-                format!("{MAX_NODELESS} vehicles without a node have a retained status here, and {name} has no room");
+            let text = format!(
+                "{MAX_NODELESS} vehicles without a node have a retained status here, and {name} has no room"
+            );
             return Err(DoorRefusal::not_permitted(text));
         }
         Ok(())
@@ -252,15 +326,22 @@ impl DoorState {
     fn take_description(&self, principal: &Principal, payload: &Bytes) -> Result<(), DoorRefusal> {
         let DoorSetup { node, limits, .. } = &self.setup;
         if !principal.is_of(node) {
-            let text = format!("only programs on the machine of {node}, or with its certificate, set the description");
+            let text = format!(
+                "only programs on the machine of {node}, or with its certificate, set the description"
+            );
             return Err(DoorRefusal::not_permitted(text));
         }
         if !lock(&self.descriptions).allow(clock::now()) {
-            let text = format!("{node} takes no more than one description in {} s", DESCRIPTION_INTERVAL.as_secs());
+            let text = format!(
+                "{node} takes no more than one description in {} s",
+                DESCRIPTION_INTERVAL.as_secs()
+            );
             return Err(DoorRefusal::new(RefusalReason::Throttled, text));
         }
-        let malformed = |text: String| DoorRefusal::new(RefusalReason::Rejected(RejectReason::Malformed), text);
-        let request: CellDescription = decode(payload, limits).map_err(|reason| malformed(reason.to_string()))?;
+        let malformed =
+            |text: String| DoorRefusal::new(RefusalReason::Rejected(RejectReason::Malformed), text);
+        let request: CellDescription =
+            decode(payload, limits).map_err(|reason| malformed(reason.to_string()))?;
         (self.setup.describe)(request.text).map_err(malformed)
     }
 
@@ -298,8 +379,8 @@ impl DoorHooks {
     /// Registers the hooks, after those that charge messages.
     pub(in crate::transport::broker) async fn install(self, context: &ServerContext) {
         use Type::{
-            ClientSubscribe, MessageDelivered, MessagePublish, SessionSubscribed, SessionTerminated,
-            SessionUnsubscribed,
+            ClientSubscribe, MessageDelivered, MessagePublish, SessionSubscribed,
+            SessionTerminated, SessionUnsubscribed,
         };
         if self.door.0.is_none() {
             return;
@@ -322,21 +403,31 @@ impl DoorHooks {
     /// logged in: its last will is still to come.
     fn program(&self, session: &Session) -> Option<Principal> {
         let principal = self.principals.principal(session.id.remote_addr);
-        let principal = principal.unwrap_or_else(|| Principal::new(None, Ipv4Addr::LOCALHOST.into(), false));
-        self.door.is_program(&principal, &session.id.client_id).then_some(principal)
+        let principal =
+            principal.unwrap_or_else(|| Principal::new(None, Ipv4Addr::LOCALHOST.into(), false));
+        self.door
+            .is_program(&principal, &session.id.client_id)
+            .then_some(principal)
     }
 }
 
 #[async_trait]
 impl Handler for DoorHooks {
     async fn hook(&self, parameter: &Parameter, before: Option<HookResult>) -> ReturnType {
-        let Some(door) = self.door.0.as_deref() else { return (true, before) };
+        let Some(door) = self.door.0.as_deref() else {
+            return (true, before);
+        };
         match parameter {
-            Parameter::ClientSubscribe(session, subscribe) if self.program(session).is_some() => {
-                (true, Some(HookResult::TopicFilter(Some(TopicPlace::Door.topic(&subscribe.topic_filter).into()))))
-            }
+            Parameter::ClientSubscribe(session, subscribe) if self.program(session).is_some() => (
+                true,
+                Some(HookResult::TopicFilter(Some(
+                    TopicPlace::Door.topic(&subscribe.topic_filter).into(),
+                ))),
+            ),
             Parameter::MessagePublish(Some(session), _, publish) => {
-                let Some(principal) = self.program(session) else { return (true, before) };
+                let Some(principal) = self.program(session) else {
+                    return (true, before);
+                };
                 let mut moved = match before {
                     Some(HookResult::Publish(charged)) => charged,
                     _ => (*publish).clone(),
@@ -346,7 +437,9 @@ impl Handler for DoorHooks {
                 (true, Some(HookResult::Publish(moved)))
             }
             Parameter::MessageDelivered(_, _, publish) => {
-                let (TopicPlace::Door, topic) = TopicPlace::of(&publish.topic) else { return (true, before) };
+                let (TopicPlace::Door, topic) = TopicPlace::of(&publish.topic) else {
+                    return (true, before);
+                };
                 let mut shown = (*publish).clone();
                 shown.topic = topic.to_owned().into();
                 (true, Some(HookResult::Publish(shown)))
@@ -363,12 +456,17 @@ impl Handler for DoorHooks {
             }
             Parameter::SessionUnsubscribed(session, unsubscribe) => {
                 door.change_filters(|filters| {
-                    filters.remove(&(session.id.client_id.clone(), unsubscribe.topic_filter.clone()));
+                    filters.remove(&(
+                        session.id.client_id.clone(),
+                        unsubscribe.topic_filter.clone(),
+                    ));
                 });
                 (true, before)
             }
             Parameter::SessionTerminated(session, _) => {
-                door.change_filters(|filters| filters.retain(|(client, _), _| *client != session.id.client_id));
+                door.change_filters(|filters| {
+                    filters.retain(|(client, _), _| *client != session.id.client_id)
+                });
                 (true, before)
             }
             _ => (true, before),

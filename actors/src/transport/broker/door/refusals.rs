@@ -31,7 +31,10 @@ const MAX_TEXT: usize = 500;
 
 impl DoorRefusal {
     pub(super) fn new(reason: RefusalReason, text: impl AsRef<str>) -> Self {
-        Self { reason, text: plain_text(text.as_ref(), MAX_TEXT) }
+        Self {
+            reason,
+            text: plain_text(text.as_ref(), MAX_TEXT),
+        }
     }
 
     pub(in crate::transport::broker) fn not_permitted(text: impl AsRef<str>) -> Self {
@@ -45,7 +48,11 @@ impl DoorRefusal {
             RefusalReason::Rejected(RejectReason::NotPermitted) => PublishAckReason::NotAuthorized,
             RefusalReason::Rejected(_) => PublishAckReason::PayloadFormatInvalid,
         };
-        PublishAclResult(PublishResult::reason_code(code, Some(self.text.as_str().into()), false))
+        PublishAclResult(PublishResult::reason_code(
+            code,
+            Some(self.text.as_str().into()),
+            false,
+        ))
     }
 }
 
@@ -89,20 +96,43 @@ impl Refusals {
         let has_room = self.known.len() < MAX_SHOWN;
         let is_first = !self.known.contains_key(&key);
         if is_first && !has_room {
-            let oldest = self.known.iter().min_by_key(|(_, (_, at))| *at).map(|(key, _)| key.clone());
+            let oldest = self
+                .known
+                .iter()
+                .min_by_key(|(_, (_, at))| *at)
+                .map(|(key, _)| key.clone());
             oldest.and_then(|oldest| self.known.remove(&oldest));
         }
         let reason = refusal.reason.as_str().to_owned();
-        let empty = || ClientRefusal { client, reason, topic: String::new(), text: String::new(), times: 0 };
+        let empty = || ClientRefusal {
+            client,
+            reason,
+            topic: String::new(),
+            text: String::new(),
+            times: 0,
+        };
         let (refused, at) = self.known.entry(key).or_insert_with(|| (empty(), now));
         refused.times += 1;
         (refused.topic, refused.text, *at) = (topic.to_owned(), refusal.text.clone(), now);
-        if !(is_first && has_room) && self.shown_at.is_some_and(|shown_at| now.since(shown_at) < SHOW_INTERVAL) {
+        if !(is_first && has_room)
+            && self
+                .shown_at
+                .is_some_and(|shown_at| now.since(shown_at) < SHOW_INTERVAL)
+        {
             return None;
         }
         self.shown_at = Some(now);
-        let refused = self.known.values().map(|(refusal, _)| refusal.clone()).collect();
-        serde_json::to_vec(&ClientRefusals { schema: SCHEMA_VERSION, node: node.clone(), refused }).ok()
+        let refused = self
+            .known
+            .values()
+            .map(|(refusal, _)| refusal.clone())
+            .collect();
+        serde_json::to_vec(&ClientRefusals {
+            schema: SCHEMA_VERSION,
+            node: node.clone(),
+            refused,
+        })
+        .ok()
     }
 }
 
@@ -111,24 +141,53 @@ mod tests {
     use super::*;
 
     fn shown(refusals: &mut Refusals, client: &str, at_s: u64) -> Option<Vec<String>> {
-        let (node, refusal) = (NodeName::from_static("euclid"), DoorRefusal::not_permitted("no"));
-        let status = refusals.note(&node, (client, "detections/gauss"), &refusal, Timestamp(at_s * 1_000_000))?;
+        let (node, refusal) = (
+            NodeName::from_static("euclid"),
+            DoorRefusal::not_permitted("no"),
+        );
+        let status = refusals.note(
+            &node,
+            (client, "detections/gauss"),
+            &refusal,
+            Timestamp(at_s * 1_000_000),
+        )?;
         let status: ClientRefusals = serde_json::from_slice(&status).unwrap();
-        Some(status.refused.into_iter().map(|refusal| refusal.client).collect())
+        Some(
+            status
+                .refused
+                .into_iter()
+                .map(|refusal| refusal.client)
+                .collect(),
+        )
     }
 
     #[test]
     fn who_misbehaves_now_is_shown_however_many_did_before() {
         let mut refusals = Refusals::default();
         for n in 0..MAX_SHOWN {
-            assert!(shown(&mut refusals, &format!("cron-{n:02}"), n as u64).is_some(), "the first of each at once");
+            assert!(
+                shown(&mut refusals, &format!("cron-{n:02}"), n as u64).is_some(),
+                "the first of each at once"
+            );
         }
-        assert_eq!(shown(&mut refusals, "cron-00", 31), None, "more of the same wait");
+        assert_eq!(
+            shown(&mut refusals, "cron-00", 31),
+            None,
+            "more of the same wait"
+        );
         let clients = shown(&mut refusals, "planner", 33).unwrap();
         assert_eq!(clients.len(), MAX_SHOWN);
-        assert!(clients.iter().any(|client| client == "planner") && clients.iter().any(|client| client == "cron-00"));
-        assert!(!clients.iter().any(|client| client == "cron-01"), "the one refused longest ago gives way");
-        let quick = (0..100).filter(|n| shown(&mut refusals, &format!("flood-{n}"), 34).is_some()).count();
+        assert!(
+            clients.iter().any(|client| client == "planner")
+                && clients.iter().any(|client| client == "cron-00")
+        );
+        assert!(
+            !clients.iter().any(|client| client == "cron-01"),
+            "the one refused longest ago gives way"
+        );
+        let quick = (0..100)
+            .filter(|n| shown(&mut refusals, &format!("flood-{n}"), 34).is_some())
+            .count();
         assert!(quick <= 1, "names without number: {quick} statuses at once");
     }
 
@@ -136,7 +195,11 @@ mod tests {
     fn what_a_program_sent_is_not_quoted_at_length() {
         let refusal = DoorRefusal::not_permitted("é".repeat(100_000));
         assert_eq!(refusal.text.len(), MAX_TEXT);
-        assert_eq!(DoorRefusal::not_permitted("named\0\n").text, "named  ", "MQTT forbids the first");
+        assert_eq!(
+            DoorRefusal::not_permitted("named\0\n").text,
+            "named  ",
+            "MQTT forbids the first"
+        );
         let mut refusals = Refusals::default();
         let clients = shown(&mut refusals, &"x".repeat(60_000), 0).unwrap();
         assert_eq!(clients[0].len(), MAX_CLIENT);

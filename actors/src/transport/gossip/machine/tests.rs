@@ -72,7 +72,13 @@ impl Cell {
         self.start_as(node, name, (key, None), run);
     }
 
-    fn start_as(&mut self, node: usize, name: &str, (key, identity): (&str, Option<Identity>), run: u64) {
+    fn start_as(
+        &mut self,
+        node: usize,
+        name: &str,
+        (key, identity): (&str, Option<Identity>),
+        run: u64,
+    ) {
         let own = NodeId {
             name: NodeName::new(name).unwrap(),
             run,
@@ -85,9 +91,26 @@ impl Cell {
         self.rng.fill(&mut session);
         let cell = NodeName::from_static("lot-1");
         let (key, seed) = (CellKey::new(key, &cell), self.rng.random());
-        let setup = GossipSetup { own, cell, key, session, identity, secret: [7; 32], seed, counters: Arc::default() };
+        let setup = GossipSetup {
+            own,
+            cell,
+            key,
+            session,
+            identity,
+            secret: [7; 32],
+            seed,
+            counters: Arc::default(),
+        };
         let machine = GossipMachine::new(setup, &MembershipConfig::default(), self.now);
-        self.nodes.insert(node, Node { machine, events: Vec::new(), troubles: BTreeSet::new(), stopped: false });
+        self.nodes.insert(
+            node,
+            Node {
+                machine,
+                events: Vec::new(),
+                troubles: BTreeSet::new(),
+                stopped: false,
+            },
+        );
     }
 
     fn run(&mut self, ms: u64) {
@@ -95,11 +118,17 @@ impl Cell {
             self.now = self.now + Duration::from_millis(1);
             let (now, arrived): (_, Vec<_>) = (self.now, self.take_arrived());
             for (_, from, to, frame) in arrived {
-                let Some(node) = self.nodes.get_mut(&index(to)) else { continue };
+                let Some(node) = self.nodes.get_mut(&index(to)) else {
+                    continue;
+                };
                 node.machine.receive(&frame, from, now);
             }
             for node in self.nodes.values_mut().filter(|node| !node.stopped) {
-                if node.machine.next_deadline().is_some_and(|deadline| deadline <= now) {
+                if node
+                    .machine
+                    .next_deadline()
+                    .is_some_and(|deadline| deadline <= now)
+                {
                     node.machine.tick(now);
                 }
             }
@@ -108,9 +137,11 @@ impl Cell {
     }
 
     fn take_arrived(&mut self) -> Vec<(Timestamp, SocketAddr, SocketAddr, Vec<u8>)> {
-        let stopped = |to: &SocketAddr| self.nodes.get(&index(*to)).is_some_and(|node| node.stopped);
-        let (arrived, later) =
-            std::mem::take(&mut self.under_way).into_iter().partition(|(at, _, to, _)| *at <= self.now && !stopped(to));
+        let stopped =
+            |to: &SocketAddr| self.nodes.get(&index(*to)).is_some_and(|node| node.stopped);
+        let (arrived, later) = std::mem::take(&mut self.under_way)
+            .into_iter()
+            .partition(|(at, _, to, _)| *at <= self.now && !stopped(to));
         self.under_way = later;
         arrived
     }
@@ -139,19 +170,29 @@ impl Cell {
             let cut = self.island.contains(&from) != self.island.contains(&index(to));
             if !cut && !self.rng.random_ratio(self.loss_percent, 100) {
                 let delay = Duration::from_micros(self.rng.random_range(100..3000));
-                self.under_way.push((self.now + delay, address(from), to, frame));
+                self.under_way
+                    .push((self.now + delay, address(from), to, frame));
             }
         }
     }
 
     fn sees(&self, node: usize) -> BTreeSet<String> {
-        self.nodes[&node].machine.members().iter().map(|member| member.name.to_string()).collect()
+        self.nodes[&node]
+            .machine
+            .members()
+            .iter()
+            .map(|member| member.name.to_string())
+            .collect()
     }
 
     fn assert_complete(&self) {
         for node in self.nodes.keys() {
-            let others: BTreeSet<_> =
-                self.nodes.keys().filter(|other| *other != node).map(|other| name(*other)).collect();
+            let others: BTreeSet<_> = self
+                .nodes
+                .keys()
+                .filter(|other| *other != node)
+                .map(|other| name(*other))
+                .collect();
             assert_eq!(self.sees(*node), others, "as seen by {node}");
         }
     }
@@ -189,7 +230,10 @@ fn nodes_find_each_other_by_multicast() {
     let cell = Cell::of(8);
     cell.assert_complete();
     let member = &cell.nodes[&1].machine.members()[0];
-    assert_eq!((member.gossip, member.broker), (address(2), Some(SocketAddr::from(([10, 0, 0, 2], 1883)))));
+    assert_eq!(
+        (member.gossip, member.broker),
+        (address(2), Some(SocketAddr::from(([10, 0, 0, 2], 1883))))
+    );
 }
 
 #[test]
@@ -197,7 +241,11 @@ fn nodes_find_each_other_by_one_seed_whoever_starts_first() {
     let mut cell = Cell::new(false);
     for node in 2..=5 {
         cell.start(node, &name(node));
-        cell.nodes.get_mut(&node).unwrap().machine.set_seeds(vec![address(1)]);
+        cell.nodes
+            .get_mut(&node)
+            .unwrap()
+            .machine
+            .set_seeds(vec![address(1)]);
     }
     cell.run(1000);
     assert!(cell.sees(2).is_empty());
@@ -212,7 +260,11 @@ fn a_seed_that_returns_hears_of_its_cell_before_it_leads_on_its_own() {
         let mut cell = Cell::seeded(false, seed);
         (1..=4).for_each(|node| cell.start(node, &name(node)));
         for node in 2..=4 {
-            cell.nodes.get_mut(&node).unwrap().machine.set_seeds(vec![address(1)]);
+            cell.nodes
+                .get_mut(&node)
+                .unwrap()
+                .machine
+                .set_seeds(vec![address(1)]);
         }
         cell.run(3000);
         cell.assert_complete();
@@ -243,9 +295,18 @@ fn a_dead_node_is_given_up_by_all_and_nobody_else_is() {
     cell.run(1500);
     cell.assert_complete();
     for node in cell.nodes.values() {
-        let downs: Vec<_> = node.events.iter().filter(|event| matches!(event, MembershipEvent::Down { .. })).collect();
+        let downs: Vec<_> = node
+            .events
+            .iter()
+            .filter(|event| matches!(event, MembershipEvent::Down { .. }))
+            .collect();
         assert_eq!(downs, [&MembershipEvent::Down { name: node_name(3) }]);
-        assert!(!node.events.iter().any(|event| matches!(event, MembershipEvent::Alive { .. })));
+        assert!(
+            !node
+                .events
+                .iter()
+                .any(|event| matches!(event, MembershipEvent::Alive { .. }))
+        );
     }
 }
 
@@ -257,7 +318,11 @@ fn a_node_that_leaves_is_gone_at_once() {
     cell.deliver();
     cell.nodes.get_mut(&2).unwrap().stopped = true;
     cell.run(150);
-    assert!([1, 3, 4].iter().all(|node| !cell.sees(*node).contains("node-2")));
+    assert!(
+        [1, 3, 4]
+            .iter()
+            .all(|node| !cell.sees(*node).contains("node-2"))
+    );
     assert_eq!(cell.nodes[&2].machine.next_deadline(), None);
 }
 
@@ -271,8 +336,11 @@ fn a_stopped_node_comes_back_and_blames_nobody() {
     cell.nodes.get_mut(&4).unwrap().stopped = false;
     cell.run(2000);
     cell.assert_complete();
-    let blamed =
-        cell.nodes.values().flat_map(|node| &node.events).any(|event| matches!(event, MembershipEvent::Down { .. }));
+    let blamed = cell
+        .nodes
+        .values()
+        .flat_map(|node| &node.events)
+        .any(|event| matches!(event, MembershipEvent::Down { .. }));
     assert!(!blamed);
 }
 
@@ -285,7 +353,11 @@ fn a_restarted_node_replaces_its_older_run_even_with_its_clock_set_back() {
         cell.run(3000);
         cell.assert_complete();
         for node in [1, 3, 4] {
-            let member = cell.nodes[&node].machine.members().into_iter().find(|member| member.name == node_name(2));
+            let member = cell.nodes[&node]
+                .machine
+                .members()
+                .into_iter()
+                .find(|member| member.name == node_name(2));
             assert_eq!(member.unwrap().run, run, "as seen by {node}");
         }
     }
@@ -296,13 +368,21 @@ fn a_quick_restart_is_news_and_no_death() {
     let mut cell = Cell::new(false);
     for node in 1..=8 {
         cell.start(node, &name(node));
-        cell.nodes.get_mut(&node).unwrap().machine.set_seeds(vec![address(1)]);
+        cell.nodes
+            .get_mut(&node)
+            .unwrap()
+            .machine
+            .set_seeds(vec![address(1)]);
     }
     cell.run(5000);
     cell.assert_complete();
     cell.forget_events();
     cell.start(5, "node-5");
-    cell.nodes.get_mut(&5).unwrap().machine.set_seeds(vec![address(1)]);
+    cell.nodes
+        .get_mut(&5)
+        .unwrap()
+        .machine
+        .set_seeds(vec![address(1)]);
     cell.run(3000);
     cell.assert_complete();
     for (node, Node { events, .. }) in cell.nodes.iter().filter(|(node, _)| **node != 5) {
@@ -320,28 +400,59 @@ fn of_two_running_nodes_with_one_name_the_first_is_heard_and_the_second_gives_up
     cell.start(9, "node-2");
     let sent = cell.sent;
     cell.run(8000);
-    assert!((cell.sent - sent) / 5 / 8 < 100, "{} frames", cell.sent - sent);
+    assert!(
+        (cell.sent - sent) / 5 / 8 < 100,
+        "{} frames",
+        cell.sent - sent
+    );
     let second = &cell.nodes[&9];
-    assert!(second.events.contains(&MembershipEvent::Excluded) && second.machine.members().is_empty());
+    assert!(
+        second.events.contains(&MembershipEvent::Excluded) && second.machine.members().is_empty()
+    );
     let now = cell.now;
     cell.nodes.get_mut(&9).unwrap().machine.leave(now);
     cell.run(3000);
     for node in [1, 3, 4] {
-        let member = cell.nodes[&node].machine.members().into_iter().find(|member| member.name == node_name(2));
+        let member = cell.nodes[&node]
+            .machine
+            .members()
+            .into_iter()
+            .find(|member| member.name == node_name(2));
         assert_eq!(member.unwrap().gossip, address(2), "as seen by {node}");
-        let Node { events, troubles, .. } = &cell.nodes[&node];
+        let Node {
+            events, troubles, ..
+        } = &cell.nodes[&node];
         assert!(events.is_empty(), "{events:?}");
-        assert!(troubles.contains(&("node-2".into(), TroubleKind::NameTaken)), "{node} reports it");
+        assert!(
+            troubles.contains(&("node-2".into(), TroubleKind::NameTaken)),
+            "{node} reports it"
+        );
     }
-    assert_eq!(cell.nodes[&2].machine.members().len(), 3, "the first one notices nothing else");
+    assert_eq!(
+        cell.nodes[&2].machine.members().len(),
+        3,
+        "the first one notices nothing else"
+    );
 }
 
 /// Asserts that node 9 has given up the name of node 1, which it alone was told of, and that node 1 has named it.
 fn assert_second_gave_up(cell: &Cell) {
     let (first, second) = (&cell.nodes[&1], &cell.nodes[&9]);
-    assert!(second.events.contains(&MembershipEvent::Excluded), "{:?}", second.events);
-    assert!(!first.events.contains(&MembershipEvent::Excluded), "{:?}", first.events);
-    assert!(first.troubles.contains(&(name(1), TroubleKind::NameTaken)), "{:?}", first.troubles);
+    assert!(
+        second.events.contains(&MembershipEvent::Excluded),
+        "{:?}",
+        second.events
+    );
+    assert!(
+        !first.events.contains(&MembershipEvent::Excluded),
+        "{:?}",
+        first.events
+    );
+    assert!(
+        first.troubles.contains(&(name(1), TroubleKind::NameTaken)),
+        "{:?}",
+        first.troubles
+    );
 }
 
 #[test]
@@ -354,7 +465,11 @@ fn a_second_node_whose_only_seed_is_the_first_gives_up() {
         }
         cell.run(8000);
         cell.start(9, &name(1));
-        cell.nodes.get_mut(&9).unwrap().machine.set_seeds(vec![address(1)]);
+        cell.nodes
+            .get_mut(&9)
+            .unwrap()
+            .machine
+            .set_seeds(vec![address(1)]);
         cell.run(8000);
         assert_second_gave_up(&cell);
         assert_eq!(cell.nodes[&1].machine.members().len(), others);
@@ -370,7 +485,11 @@ fn of_two_lone_nodes_of_a_name_that_meet_late_the_later_one_gives_up() {
     cell.start(9, &name(1));
     cell.run(8000);
     for (node, seed) in [(1, 9), (9, 1)] {
-        cell.nodes.get_mut(&node).unwrap().machine.set_seeds(vec![address(seed)]);
+        cell.nodes
+            .get_mut(&node)
+            .unwrap()
+            .machine
+            .set_seeds(vec![address(seed)]);
     }
     cell.run(10_000);
     assert_second_gave_up(&cell);
@@ -383,7 +502,11 @@ fn a_node_that_returns_at_another_address_has_its_name_as_soon_as_its_former_run
     cell.start(9, "node-2");
     cell.run(3000);
     for node in [1, 3, 4] {
-        let member = cell.nodes[&node].machine.members().into_iter().find(|member| member.name == node_name(2));
+        let member = cell.nodes[&node]
+            .machine
+            .members()
+            .into_iter()
+            .find(|member| member.name == node_name(2));
         assert_eq!(member.unwrap().gossip, address(9), "as seen by {node}");
     }
     assert_eq!(cell.nodes[&9].machine.members().len(), 3);
@@ -399,9 +522,14 @@ fn datagrams_arrive_with_their_sender() {
     sender.send(&NodeName::from_static("nobody"), b"lost", now);
     cell.run(10);
     assert!(cell.nodes[&2].events.is_empty());
-    let [MembershipEvent::Received { from, payload, .. }] = &cell.nodes[&3].events[..] else { panic!("nothing came") };
+    let [MembershipEvent::Received { from, payload, .. }] = &cell.nodes[&3].events[..] else {
+        panic!("nothing came")
+    };
     assert_eq!((from, &payload[..]), (&node_name(1), &[42; 1200][..]));
-    assert_eq!(cell.nodes[&1].machine.counters.get(FrameEvent::NoSession), 1);
+    assert_eq!(
+        cell.nodes[&1].machine.counters.get(FrameEvent::NoSession),
+        1
+    );
 }
 
 #[test]
@@ -412,15 +540,23 @@ fn two_nodes_hear_each_other_as_often_as_the_network_lets_them_though_the_gossip
     for _ in 0..1200 {
         for (from, to) in [(1, 2), (2, 1)] {
             let now = cell.now;
-            cell.nodes.get_mut(&from).unwrap().machine.send(&node_name(to), b"beat", now);
+            cell.nodes
+                .get_mut(&from)
+                .unwrap()
+                .machine
+                .send(&node_name(to), b"beat", now);
         }
         cell.run(50);
     }
-    let count = |node: &Node, is: fn(&MembershipEvent) -> bool| node.events.iter().filter(|event| is(event)).count();
+    let count = |node: &Node, is: fn(&MembershipEvent) -> bool| {
+        node.events.iter().filter(|event| is(event)).count()
+    };
     let mut given_up = 0;
     for node in cell.nodes.values() {
         given_up += count(node, |event| matches!(event, MembershipEvent::Down { .. }));
-        let heard = count(node, |event| matches!(event, MembershipEvent::Received { .. }));
+        let heard = count(node, |event| {
+            matches!(event, MembershipEvent::Received { .. })
+        });
         assert!(heard > 900, "{heard} of 1200");
     }
     assert!(given_up > 2, "{given_up} times: too few to show anything");
@@ -434,7 +570,11 @@ fn nothing_is_sent_to_one_that_went_out_of_range_long_ago() {
         cell.run(wait_ms);
         let (now, machine) = (cell.now, &mut cell.nodes.get_mut(&1).unwrap().machine);
         machine.send(&node_name(2), b"beat", now);
-        assert_eq!(machine.counters.get(FrameEvent::NoSession), left_out, "after {wait_ms} ms more");
+        assert_eq!(
+            machine.counters.get(FrameEvent::NoSession),
+            left_out,
+            "after {wait_ms} ms more"
+        );
     }
 }
 
@@ -470,11 +610,17 @@ fn a_node_that_no_seed_answers_says_which_and_does_not_take_itself_for_one() {
     cell.start_at(2, "node-2", "another passphrase", 5);
     let seeds = vec![address(1), address(2)];
     for node in [1, 2] {
-        cell.nodes.get_mut(&node).unwrap().machine.set_seeds(seeds.clone());
+        cell.nodes
+            .get_mut(&node)
+            .unwrap()
+            .machine
+            .set_seeds(seeds.clone());
     }
     let silent = |cell: &Cell, node: usize| -> Vec<String> {
         let told = cell.nodes[&node].troubles.iter();
-        told.filter(|(_, kind)| *kind == TroubleKind::SeedSilent).map(|(about, _)| about.clone()).collect()
+        told.filter(|(_, kind)| *kind == TroubleKind::SeedSilent)
+            .map(|(about, _)| about.clone())
+            .collect()
     };
     cell.run(5000);
     assert_eq!(silent(&cell, 2), [""; 0], "they may still be starting");
@@ -484,7 +630,16 @@ fn a_node_that_no_seed_answers_says_which_and_does_not_take_itself_for_one() {
     let mut whole = Cell::new(false);
     whole.start(1, "node-1");
     whole.start(2, "node-2");
-    whole.nodes.get_mut(&2).unwrap().machine.set_seeds(vec![address(1), address(9)]);
+    whole
+        .nodes
+        .get_mut(&2)
+        .unwrap()
+        .machine
+        .set_seeds(vec![address(1), address(9)]);
     whole.run(25_000);
-    assert_eq!(silent(&whole, 2), [""; 0], "a cell does without one that is not there");
+    assert_eq!(
+        silent(&whole, 2),
+        [""; 0],
+        "a cell does without one that is not there"
+    );
 }

@@ -8,8 +8,12 @@ use ecod::model::time::Timestamp;
 use super::peers::PeerSession;
 use super::{Arrival, FrameContent, KnownMember, Sessions, decode, decode_first, encode};
 use crate::transport::gossip::counters::FrameEvent;
-use crate::transport::gossip::frame::{FrameHeader, FrameKind, Handshake, Hello, Introduction, NameClaim};
-use crate::transport::gossip::handshake::{Attestation, Proven, Side, SignedMessage, Transcript, agree};
+use crate::transport::gossip::frame::{
+    FrameHeader, FrameKind, Handshake, Hello, Introduction, NameClaim,
+};
+use crate::transport::gossip::handshake::{
+    Attestation, Proven, Side, SignedMessage, Transcript, agree,
+};
 use crate::transport::gossip::key::{Cookie, SessionId};
 use crate::transport::gossip::node_id::NodeId;
 use crate::transport::gossip::replay_window::ReplayWindow;
@@ -33,17 +37,30 @@ impl Sessions {
         arrival: &Arrival<'_>,
     ) -> Result<FrameContent, FrameEvent> {
         let is_accepted = self.peers.speaker_id(&hello.name) == Some(head.sender);
-        let is_there = self.peers.get(&head.sender).is_some_and(|peer| peer.address == arrival.from);
+        let is_there = self
+            .peers
+            .get(&head.sender)
+            .is_some_and(|peer| peer.address == arrival.from);
         let is_alive = || (arrival.known)(&hello.name).is_some_and(|known| known.alive);
         if !wants_session && is_accepted && is_there && is_alive() {
             return Ok(FrameContent::Nothing);
         }
-        if !self.challenges.allow(&head.sender, arrival.from, arrival.now) {
+        if !self
+            .challenges
+            .allow(&head.sender, arrival.from, arrival.now)
+        {
             return Err(FrameEvent::Throttled);
         }
-        let cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
-        let challenge = Handshake::Challenge { cookie, name: arrival.own.name.clone() };
-        Ok(FrameContent::Answer(self.handshake(&head.sender, &challenge)))
+        let cookie = self
+            .cookies
+            .issue(&head.sender, arrival.from, slot(arrival.now));
+        let challenge = Handshake::Challenge {
+            cookie,
+            name: arrival.own.name.clone(),
+        };
+        Ok(FrameContent::Answer(
+            self.handshake(&head.sender, &challenge),
+        ))
     }
 
     /// Takes a step of the handshake.
@@ -54,42 +71,86 @@ impl Sessions {
         arrival: &Arrival<'_>,
     ) -> Result<FrameContent, FrameEvent> {
         let (message, attestation) = decode_first::<Handshake>(body)?;
-        let signed = body.get(..body.len() - attestation.len()).unwrap_or_default();
+        let signed = body
+            .get(..body.len() - attestation.len())
+            .unwrap_or_default();
         match message {
             Handshake::Challenge { cookie, name } => {
                 if !self.proofs.allow(&head.sender, arrival.from, arrival.now) {
                     return Err(FrameEvent::Throttled);
                 }
                 let claim = match (arrival.known)(&name) {
-                    Some(KnownMember { life, alive: false, .. }) => NameClaim::After(life),
-                    Some(_) if self.is_heard_elsewhere(head, &name, arrival.from) => NameClaim::Taken,
+                    Some(KnownMember {
+                        life, alive: false, ..
+                    }) => NameClaim::After(life),
+                    Some(_) if self.is_heard_elsewhere(head, &name, arrival.from) => {
+                        NameClaim::Taken
+                    }
                     _ => NameClaim::Free,
                 };
-                let introduction = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
-                let own_cookie = self.cookies.issue(&head.sender, arrival.from, slot(arrival.now));
-                let proof = Handshake::Proof { echo: cookie, cookie: own_cookie, introduction };
+                let introduction = Introduction {
+                    id: arrival.own.clone(),
+                    seen_at: arrival.from,
+                    claim,
+                };
+                let own_cookie = self
+                    .cookies
+                    .issue(&head.sender, arrival.from, slot(arrival.now));
+                let proof = Handshake::Proof {
+                    echo: cookie,
+                    cookie: own_cookie,
+                    introduction,
+                };
                 if self.prove_certificates() {
-                    let frame = self.prove(&head.sender, &proof, (cookie, arrival.from), &name, arrival.now);
+                    let frame = self.prove(
+                        &head.sender,
+                        &proof,
+                        (cookie, arrival.from),
+                        &name,
+                        arrival.now,
+                    );
                     return Ok(frame.map_or(FrameContent::Nothing, FrameContent::Answer));
                 }
                 Ok(FrameContent::Answer(self.handshake(&head.sender, &proof)))
             }
-            Handshake::Proof { echo, cookie, introduction } => {
+            Handshake::Proof {
+                echo,
+                cookie,
+                introduction,
+            } => {
                 self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
                 if !self.prove_certificates() {
                     let is_namesake = introduction.id.name == arrival.own.name;
-                    let admission = Admission { proven: None, keys: None, is_proof: true };
+                    let admission = Admission {
+                        proven: None,
+                        keys: None,
+                        is_proof: true,
+                    };
                     let claim = match is_namesake {
                         true => NameClaim::Taken,
                         false => self.admit(head, &introduction.id, admission, arrival)?,
                     };
-                    let answer = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
-                    let accept = Handshake::Accept { echo: cookie, introduction: answer };
+                    let answer = Introduction {
+                        id: arrival.own.clone(),
+                        seen_at: arrival.from,
+                        claim,
+                    };
+                    let accept = Handshake::Accept {
+                        echo: cookie,
+                        introduction: answer,
+                    };
                     let answer = Some(self.handshake(&head.sender, &accept));
                     if is_namesake {
-                        return Ok(FrameContent::Namesake { id: introduction.id, answer });
+                        return Ok(FrameContent::Namesake {
+                            id: introduction.id,
+                            answer,
+                        });
                     }
-                    return Ok(FrameContent::Met { introduction, answer, speaks: claim != NameClaim::Taken });
+                    return Ok(FrameContent::Met {
+                        introduction,
+                        answer,
+                        speaks: claim != NameClaim::Taken,
+                    });
                 }
                 let attestation = decode(attestation)?;
                 self.take_proof(head, (signed, &attestation), introduction, &cookie, arrival)
@@ -97,15 +158,31 @@ impl Sessions {
             Handshake::Accept { echo, introduction } => {
                 self.check_freshness(&head.sender, &echo, &introduction, arrival)?;
                 let admission = if self.prove_certificates() {
-                    self.take_accept(head, (signed, &decode(attestation)?), &introduction, arrival)?
+                    self.take_accept(
+                        head,
+                        (signed, &decode(attestation)?),
+                        &introduction,
+                        arrival,
+                    )?
                 } else {
-                    Admission { proven: None, keys: None, is_proof: false }
+                    Admission {
+                        proven: None,
+                        keys: None,
+                        is_proof: false,
+                    }
                 };
                 if introduction.id.name == arrival.own.name {
-                    return Ok(FrameContent::Namesake { id: introduction.id, answer: None });
+                    return Ok(FrameContent::Namesake {
+                        id: introduction.id,
+                        answer: None,
+                    });
                 }
                 let claim = self.admit(head, &introduction.id, admission, arrival)?;
-                Ok(FrameContent::Met { introduction, answer: None, speaks: claim != NameClaim::Taken })
+                Ok(FrameContent::Met {
+                    introduction,
+                    answer: None,
+                    speaks: claim != NameClaim::Taken,
+                })
             }
         }
     }
@@ -123,7 +200,11 @@ impl Sessions {
         if !issued(slot) && !issued(slot.wrapping_sub(1)) {
             return Err(FrameEvent::Replayed);
         }
-        if introduction.id.has_plausible_life() { Ok(()) } else { Err(FrameEvent::Malformed) }
+        if introduction.id.has_plausible_life() {
+            Ok(())
+        } else {
+            Err(FrameEvent::Malformed)
+        }
     }
 
     /// A proof of this node's certificate to a challenger; `None` while the one before may still be answered.
@@ -162,13 +243,19 @@ impl Sessions {
         echo: &Cookie,
         arrival: &Arrival<'_>,
     ) -> Result<FrameContent, FrameEvent> {
-        if self.peers.get(&head.sender).is_some_and(|peer| head.counter <= peer.proof_counter) {
+        if self
+            .peers
+            .get(&head.sender)
+            .is_some_and(|peer| head.counter <= peer.proof_counter)
+        {
             return Err(FrameEvent::Replayed);
         }
         if !self.verifications.allow_host(arrival.from, arrival.now) {
             return Err(FrameEvent::Throttled);
         }
-        let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };
+        let Some(prover) = &mut self.prover else {
+            return Err(FrameEvent::Uncertified);
+        };
         let signed = SignedMessage {
             side: Side::Prover,
             head: head.bytes(self.key.tag()),
@@ -178,28 +265,61 @@ impl Sessions {
         };
         let claimed = (&introduction.id.name, &head.sender, arrival.from);
         let (proven, transcript) = prover.check(&signed, attestation, claimed)?;
-        let Some((private, public)) = prover.draw_ephemeral() else { return Ok(FrameContent::Nothing) };
+        let Some((private, public)) = prover.draw_ephemeral() else {
+            return Ok(FrameContent::Nothing);
+        };
         let is_namesake = introduction.id.name == arrival.own.name;
         // Drawn up before the keys are known: the answer's claim depends on the gossip and the table only.
-        let claim = if is_namesake { NameClaim::Taken } else { self.claim(head, &introduction.id, arrival) };
-        let answer = Introduction { id: arrival.own.clone(), seen_at: arrival.from, claim };
-        let accept = encode(&Handshake::Accept { echo: *echo, introduction: answer });
+        let claim = if is_namesake {
+            NameClaim::Taken
+        } else {
+            self.claim(head, &introduction.id, arrival)
+        };
+        let answer = Introduction {
+            id: arrival.own.clone(),
+            seen_at: arrival.from,
+            claim,
+        };
+        let accept = encode(&Handshake::Accept {
+            echo: *echo,
+            introduction: answer,
+        });
         let own_head = self.head(FrameKind::Handshake);
         let own_head_bytes = own_head.bytes(self.key.tag());
-        let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };
+        let Some(prover) = &mut self.prover else {
+            return Err(FrameEvent::Uncertified);
+        };
         let signed = accepted(own_head_bytes, head.sender, &transcript, &accept);
         let Some((own_attestation, transcript)) = prover.attest(&signed, public) else {
             return Ok(FrameContent::Nothing);
         };
         if is_namesake {
-            let answer = Some(self.write_handshake(&own_head, &head.sender, &accept, &own_attestation));
-            return Ok(FrameContent::Namesake { id: introduction.id, answer });
+            let answer =
+                Some(self.write_handshake(&own_head, &head.sender, &accept, &own_attestation));
+            return Ok(FrameContent::Namesake {
+                id: introduction.id,
+                answer,
+            });
         }
-        let keys = agree(&self.key, (private, &attestation.ephemeral), &transcript, (&self.own, &head.sender), false)?;
-        let admission = Admission { proven: Some(proven), keys: Some(keys), is_proof: true };
+        let keys = agree(
+            &self.key,
+            (private, &attestation.ephemeral),
+            &transcript,
+            (&self.own, &head.sender),
+            false,
+        )?;
+        let admission = Admission {
+            proven: Some(proven),
+            keys: Some(keys),
+            is_proof: true,
+        };
         let claim = self.admit(head, &introduction.id, admission, arrival)?;
         let answer = self.write_handshake(&own_head, &head.sender, &accept, &own_attestation);
-        Ok(FrameContent::Met { introduction, answer: Some(answer), speaks: claim != NameClaim::Taken })
+        Ok(FrameContent::Met {
+            introduction,
+            answer: Some(answer),
+            speaks: claim != NameClaim::Taken,
+        })
     }
 
     /// Verifies the accept of a proof that this node sent.
@@ -213,7 +333,9 @@ impl Sessions {
         if !self.verifications.allow_host(arrival.from, arrival.now) {
             return Err(FrameEvent::Throttled);
         }
-        let Some(prover) = &mut self.prover else { return Err(FrameEvent::Uncertified) };
+        let Some(prover) = &mut self.prover else {
+            return Err(FrameEvent::Uncertified);
+        };
         let name = &introduction.id.name;
         let head_bytes = head.bytes(self.key.tag());
         let mut refusal = FrameEvent::Replayed;
@@ -224,10 +346,22 @@ impl Sessions {
             let signed = accepted(head_bytes, self.own, &proof, message);
             match prover.check(&signed, attestation, (name, &head.sender, arrival.from)) {
                 Ok((proven, transcript)) => {
-                    let Some(private) = prover.take_pending(&pending) else { continue };
+                    let Some(private) = prover.take_pending(&pending) else {
+                        continue;
+                    };
                     let sessions = (&self.own, &head.sender);
-                    let keys = agree(&self.key, (private, &attestation.ephemeral), &transcript, sessions, true)?;
-                    return Ok(Admission { proven: Some(proven), keys: Some(keys), is_proof: false });
+                    let keys = agree(
+                        &self.key,
+                        (private, &attestation.ephemeral),
+                        &transcript,
+                        sessions,
+                        true,
+                    )?;
+                    return Ok(Admission {
+                        proven: Some(proven),
+                        keys: Some(keys),
+                        is_proof: false,
+                    });
                 }
                 Err(reason) => refusal = reason,
             }
@@ -239,22 +373,34 @@ impl Sessions {
     /// the same address must have ended.
     fn claim(&self, head: &FrameHeader, id: &NodeId, arrival: &Arrival<'_>) -> NameClaim {
         let is_speaker = self.peers.speaker_id(&id.name) == Some(head.sender);
-        let is_elsewhere = self.peers.speaker(&id.name).is_none_or(|speaker| speaker.address != arrival.from);
+        let is_elsewhere = self
+            .peers
+            .speaker(&id.name)
+            .is_none_or(|speaker| speaker.address != arrival.from);
         match (arrival.known)(&id.name) {
-            Some(KnownMember { run, life, alive: true })
-                if !is_speaker && (life > id.life || run != id.run && is_elsewhere) =>
-            {
+            Some(KnownMember {
+                run,
+                life,
+                alive: true,
+            }) if !is_speaker && (life > id.life || run != id.run && is_elsewhere) => {
                 NameClaim::Taken
             }
-            Some(KnownMember { life, alive: false, .. }) if life >= id.life => NameClaim::After(life),
+            Some(KnownMember {
+                life, alive: false, ..
+            }) if life >= id.life => NameClaim::After(life),
             _ => NameClaim::Free,
         }
     }
 
     /// True if another session at another address is accepted for a name.
     fn is_heard_elsewhere(&self, head: &FrameHeader, name: &NodeName, from: SocketAddr) -> bool {
-        self.peers.speaker_id(name).is_some_and(|speaker| speaker != head.sender)
-            && self.peers.speaker(name).is_some_and(|speaker| speaker.address != from)
+        self.peers
+            .speaker_id(name)
+            .is_some_and(|speaker| speaker != head.sender)
+            && self
+                .peers
+                .speaker(name)
+                .is_some_and(|speaker| speaker.address != from)
     }
 
     /// Stores a session that has just proven its reachability, and decides whether it is accepted for its name.
@@ -267,7 +413,11 @@ impl Sessions {
     ) -> Result<NameClaim, FrameEvent> {
         let (address, now) = (arrival.from, arrival.now);
         let claim = self.claim(head, id, arrival);
-        let Admission { proven, keys, is_proof } = admission;
+        let Admission {
+            proven,
+            keys,
+            is_proof,
+        } = admission;
         if let Some(peer) = self.peers.get_mut(&head.sender) {
             peer.address = address;
             match keys {
@@ -301,16 +451,25 @@ impl Sessions {
             };
             self.peers.insert(head.sender, peer)?;
         }
-        for throttle in [&mut self.challenges, &mut self.proofs, &mut self.verifications] {
+        for throttle in [
+            &mut self.challenges,
+            &mut self.proofs,
+            &mut self.verifications,
+        ] {
             throttle.know(address, now);
         }
-        self.peers.settle(head.sender, &id.name, claim != NameClaim::Taken, now);
+        self.peers
+            .settle(head.sender, &id.name, claim != NameClaim::Taken, now);
         Ok(claim)
     }
 
     fn handshake(&mut self, to: &SessionId, message: &Handshake) -> Vec<u8> {
         let head = self.head(FrameKind::Handshake);
-        head.write(self.key.tag(), &encode(message), &self.key.seal(&self.own, to))
+        head.write(
+            self.key.tag(),
+            &encode(message),
+            &self.key.seal(&self.own, to),
+        )
     }
 
     fn write_handshake(
@@ -332,7 +491,13 @@ fn accepted<'a>(
     proof: &'a Transcript,
     message: &'a [u8],
 ) -> SignedMessage<'a> {
-    SignedMessage { side: Side::Accepter, head, receiver, context: proof, message }
+    SignedMessage {
+        side: Side::Accepter,
+        head,
+        receiver,
+        context: proof,
+        message,
+    }
 }
 
 /// Time slot of a cookie, which is valid in its slot and the next.

@@ -65,7 +65,11 @@ impl PeerSession {
 
 impl PeerTable {
     pub(super) fn new(max_peers: usize) -> Self {
-        Self { peers: HashMap::new(), session_by_name: HashMap::new(), max_peers }
+        Self {
+            peers: HashMap::new(),
+            session_by_name: HashMap::new(),
+            max_peers,
+        }
     }
 
     pub(super) fn get(&self, session: &SessionId) -> Option<&PeerSession> {
@@ -103,7 +107,9 @@ impl PeerTable {
         from: SocketAddr,
         now: Timestamp,
     ) -> Result<(), FrameEvent> {
-        let Some(peer) = self.peers.get_mut(&head.sender) else { return Ok(()) };
+        let Some(peer) = self.peers.get_mut(&head.sender) else {
+            return Ok(());
+        };
         if peer.address != from && now.since(peer.heard) < HEARD_TIME {
             return Err(FrameEvent::Replayed);
         }
@@ -117,7 +123,11 @@ impl PeerTable {
     }
 
     /// Adds a session, if there is room: the longest idle one gives way when it is idle for long enough.
-    pub(super) fn insert(&mut self, session: SessionId, peer: PeerSession) -> Result<(), FrameEvent> {
+    pub(super) fn insert(
+        &mut self,
+        session: SessionId,
+        peer: PeerSession,
+    ) -> Result<(), FrameEvent> {
         let holder = |peer: &PeerSession| peer.proven.as_ref().map(|proven| proven.holder.clone());
         if let Some(own) = holder(&peer) {
             let is_own = |peer: &PeerSession| holder(peer).as_ref() == Some(&own);
@@ -133,21 +143,36 @@ impl PeerTable {
     }
 
     /// Removes the longest idle of some sessions, when it is idle for long enough.
-    fn make_room(&mut self, now: Timestamp, may_go: impl Fn(&PeerSession) -> bool) -> Result<(), FrameEvent> {
+    fn make_room(
+        &mut self,
+        now: Timestamp,
+        may_go: impl Fn(&PeerSession) -> bool,
+    ) -> Result<(), FrameEvent> {
         let some = self.peers.iter().filter(|(_, peer)| may_go(peer));
         let longest_idle = some.min_by_key(|(_, peer)| peer.heard);
         let idle = longest_idle.filter(|(_, idle)| now.since(idle.heard) >= SESSION_IDLE_TIMEOUT);
-        let session = idle.map(|(session, _)| *session).ok_or(FrameEvent::TooManyPeers)?;
+        let session = idle
+            .map(|(session, _)| *session)
+            .ok_or(FrameEvent::TooManyPeers)?;
         self.remove(&session);
         Ok(())
     }
 
     /// Accepts a session for its name, or notes that another one is.
-    pub(super) fn settle(&mut self, session: SessionId, name: &NodeName, is_accepted: bool, now: Timestamp) {
+    pub(super) fn settle(
+        &mut self,
+        session: SessionId,
+        name: &NodeName,
+        is_accepted: bool,
+        now: Timestamp,
+    ) {
         let former = self.speaker_id(name);
         if is_accepted {
             self.session_by_name.insert(name.clone(), session);
-            if let Some(peer) = former.filter(|former| *former != session).and_then(|former| self.get_mut(&former)) {
+            if let Some(peer) = former
+                .filter(|former| *former != session)
+                .and_then(|former| self.get_mut(&former))
+            {
                 peer.superseded = Some(now);
             }
         }
@@ -155,28 +180,42 @@ impl PeerTable {
             peer.superseded = (!is_accepted).then_some(now);
         }
         let keep = |known: &SessionId| *known == session || Some(*known) == former;
-        self.peers.retain(|known, peer| peer.id.name != *name || keep(known));
+        self.peers
+            .retain(|known, peer| peer.id.name != *name || keep(known));
     }
 
     /// Ends the session of an earlier run of a node; false when there is none.
     pub(super) fn end_earlier_run(&mut self, name: &NodeName, run: u64, now: Timestamp) -> bool {
-        let Some(peer) = self.speaker_mut(name).filter(|peer| peer.id.run != run) else { return false };
+        let Some(peer) = self.speaker_mut(name).filter(|peer| peer.id.run != run) else {
+            return false;
+        };
         peer.superseded = Some(now);
         self.session_by_name.remove(name);
         true
     }
 
     /// Ends sessions; the result are the nodes whose accepted session ended.
-    pub(super) fn expel(&mut self, mut is_expelled: impl FnMut(&PeerSession) -> bool) -> Vec<NodeName> {
-        let expelled = self.peers.iter().filter(|(_, peer)| is_expelled(peer)).map(|(session, _)| *session);
+    pub(super) fn expel(
+        &mut self,
+        mut is_expelled: impl FnMut(&PeerSession) -> bool,
+    ) -> Vec<NodeName> {
+        let expelled = self
+            .peers
+            .iter()
+            .filter(|(_, peer)| is_expelled(peer))
+            .map(|(session, _)| *session);
         let expelled: Vec<_> = expelled.collect();
-        expelled.iter().filter_map(|session| self.remove(session)).collect()
+        expelled
+            .iter()
+            .filter_map(|session| self.remove(session))
+            .collect()
     }
 
     /// Removes a session; its node's name if it was accepted for it.
     fn remove(&mut self, session: &SessionId) -> Option<NodeName> {
         let name = self.peers.remove(session)?.id.name;
-        (self.session_by_name.get(&name) == Some(session)).then(|| self.session_by_name.remove(&name))?;
+        (self.session_by_name.get(&name) == Some(session))
+            .then(|| self.session_by_name.remove(&name))?;
         Some(name)
     }
 

@@ -27,14 +27,38 @@ impl End {
         Self::of_cell(("lot-1", "07"), name, session, identity)
     }
 
-    fn of_cell((cell, key): (&'static str, &str), name: &'static str, session: u8, identity: Option<Identity>) -> Self {
+    fn of_cell(
+        (cell, key): (&'static str, &str),
+        name: &'static str,
+        session: u8,
+        identity: Option<Identity>,
+    ) -> Self {
         let address = SocketAddr::from((Ipv4Addr::new(10, 0, 0, session), 1));
         let name = NodeName::from_static(name);
         let cell = NodeName::from_static(cell);
         let key = (cell.clone(), CellKey::new(&key.repeat(32), &cell));
-        let id = NodeId { name, run: 1, life: 1, role: Role::Auto, gossip: address, broker: None };
-        let sessions = Sessions::new(key, (&id.name, [session; 16], identity), &[session; 32], 4, Arc::default(), NOW);
-        Self { sessions, id, address, known: None }
+        let id = NodeId {
+            name,
+            run: 1,
+            life: 1,
+            role: Role::Auto,
+            gossip: address,
+            broker: None,
+        };
+        let sessions = Sessions::new(
+            key,
+            (&id.name, [session; 16], identity),
+            &[session; 32],
+            4,
+            Arc::default(),
+            NOW,
+        );
+        Self {
+            sessions,
+            id,
+            address,
+            known: None,
+        }
     }
 
     fn hello(&mut self) -> Vec<u8> {
@@ -43,23 +67,54 @@ impl End {
 
     /// A frame with the word for the node of a name.
     fn seal(&mut self, to: &NodeName, word: &[u8]) -> Vec<u8> {
-        self.sessions.seal(to, FrameKind::Payload, word, NOW).unwrap().1
+        self.sessions
+            .seal(to, FrameKind::Payload, word, NOW)
+            .unwrap()
+            .1
     }
 
-    fn open(&mut self, frame: &[u8], from: SocketAddr, now: Timestamp) -> Result<FrameContent, FrameEvent> {
+    fn open(
+        &mut self,
+        frame: &[u8],
+        from: SocketAddr,
+        now: Timestamp,
+    ) -> Result<FrameContent, FrameEvent> {
         let known = self.known;
-        self.sessions.open(frame, &Arrival { from, now, own: &self.id, is_alone: known.is_none(), known: &|_| known })
+        self.sessions.open(
+            frame,
+            &Arrival {
+                from,
+                now,
+                own: &self.id,
+                is_alone: known.is_none(),
+                known: &|_| known,
+            },
+        )
     }
 }
 
 fn payload(from: &End, body: &[u8]) -> FrameContent {
-    let rights = from.sessions.prover.as_ref().map_or(Rights::ALL, |_| Role::Auto.into());
-    FrameContent::Payload { from: from.id.name.clone(), rights, body: body.to_vec() }
+    let rights = from
+        .sessions
+        .prover
+        .as_ref()
+        .map_or(Rights::ALL, |_| Role::Auto.into());
+    FrameContent::Payload {
+        from: from.id.name.clone(),
+        rights,
+        body: body.to_vec(),
+    }
 }
 
 fn answer(opened: Result<FrameContent, FrameEvent>) -> Vec<u8> {
     match opened {
-        Ok(FrameContent::Answer(frame) | FrameContent::Met { answer: Some(frame), .. }) => frame,
+        Ok(
+            FrameContent::Answer(frame)
+            | FrameContent::Met {
+                answer: Some(frame),
+                ..
+            },
+        ) => frame,
         other => panic!("no answer but {other:?}"),
     }
 }
@@ -70,7 +125,14 @@ fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
     let challenge = answer(b.open(&hello, a.address, NOW));
     let proof = answer(a.open(&challenge, b.address, NOW));
     let accept = answer(b.open(&proof, a.address, NOW));
-    assert!(matches!(a.open(&accept, b.address, NOW), Ok(FrameContent::Met { answer: None, speaks: true, .. })));
+    assert!(matches!(
+        a.open(&accept, b.address, NOW),
+        Ok(FrameContent::Met {
+            answer: None,
+            speaks: true,
+            ..
+        })
+    ));
     [hello, challenge, proof, accept]
 }
 
@@ -78,19 +140,38 @@ fn introduce(a: &mut End, b: &mut End) -> [Vec<u8>; 4] {
 fn introduced_nodes_understand_each_other_once() {
     let (mut a, mut b) = (End::new("a", 1), End::new("b", 2));
     introduce(&mut a, &mut b);
-    let (to, frame) = a.sessions.seal(&b.id.name, FrameKind::Payload, b"hi", NOW).unwrap();
+    let (to, frame) = a
+        .sessions
+        .seal(&b.id.name, FrameKind::Payload, b"hi", NOW)
+        .unwrap();
     assert_eq!(to, b.address);
     let heard = payload(&a, b"hi");
     assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::Replayed));
-    assert_eq!(a.open(&frame, b.address, NOW), Err(FrameEvent::Replayed), "sent back");
-    assert_eq!(End::new("c", 3).open(&frame, a.address, NOW), Err(FrameEvent::BadSeal));
-    assert_eq!(End::new("b", 4).open(&frame, a.address, NOW), Err(FrameEvent::BadSeal), "restarted");
+    assert_eq!(
+        a.open(&frame, b.address, NOW),
+        Err(FrameEvent::Replayed),
+        "sent back"
+    );
+    assert_eq!(
+        End::new("c", 3).open(&frame, a.address, NOW),
+        Err(FrameEvent::BadSeal)
+    );
+    assert_eq!(
+        End::new("b", 4).open(&frame, a.address, NOW),
+        Err(FrameEvent::BadSeal),
+        "restarted"
+    );
 }
 
 /// A holder of the cell's key makes a frame in the name of a session that it saw.
 fn forge(key: &CellKey, sender: &SessionId, receiver: &SessionId, counter: u64) -> Vec<u8> {
-    let head = FrameHeader { version: Version::Key, kind: FrameKind::Payload, sender: *sender, counter };
+    let head = FrameHeader {
+        version: Version::Key,
+        kind: FrameKind::Payload,
+        sender: *sender,
+        counter,
+    };
     head.write(key.tag(), b"forged", &key.seal(sender, receiver))
 }
 
@@ -100,7 +181,11 @@ fn a_counter_from_beyond_mutes_nobody() {
     introduce(&mut a, &mut b);
     for counter in [u64::MAX, u64::MAX - 1, 1 << 53, 1 << 22] {
         let frame = forge(&a.sessions.key, &[1; 16], &[2; 16], counter);
-        assert_eq!(b.open(&frame, a.address, NOW), Ok(FrameContent::Stranger), "{counter}");
+        assert_eq!(
+            b.open(&frame, a.address, NOW),
+            Ok(FrameContent::Stranger),
+            "{counter}"
+        );
     }
     assert_eq!(b.sessions.counters.get(FrameEvent::CounterJump), 4);
     let frame = a.seal(&b.id.name, b"hi");
@@ -125,7 +210,10 @@ fn a_session_that_is_heard_is_not_taken_over_from_elsewhere() {
     let (frame, heard) = (a.seal(&b.id.name, b"hi"), payload(&a, b"hi"));
     assert_eq!(b.open(&frame, a.address, NOW), Ok(heard));
     let later = NOW + Duration::from_secs(1);
-    assert!(matches!(take_over(&mut b, later), Ok(FrameContent::Met { .. })), "a node that has moved is met again");
+    assert!(
+        matches!(take_over(&mut b, later), Ok(FrameContent::Met { .. })),
+        "a node that has moved is met again"
+    );
 }
 
 #[test]
@@ -134,7 +222,10 @@ fn a_member_that_floods_is_not_heard_for_long() {
     introduce(&mut a, &mut b);
     let mut taken_in_a_second = |second: u64| {
         let mut is_taken = |n: u64| {
-            let (frame, now) = (a.seal(&b.id.name, b"?"), NOW + Duration::from_micros(1_000_000 * second + 100 * n));
+            let (frame, now) = (
+                a.seal(&b.id.name, b"?"),
+                NOW + Duration::from_micros(1_000_000 * second + 100 * n),
+            );
             b.open(&frame, a.address, now).is_ok()
         };
         (0..10_000).filter(|n| is_taken(*n)).count()
@@ -149,12 +240,24 @@ fn recorded_handshakes_admit_nobody() {
     let [hello, challenge, proof, accept] = introduce(&mut a, &mut b);
     for frame in [&proof, &challenge, &accept] {
         for end in [&mut a, &mut b] {
-            assert!(end.open(frame, SocketAddr::from(([10, 0, 0, 9], 1)), NOW).is_err());
+            assert!(
+                end.open(frame, SocketAddr::from(([10, 0, 0, 9], 1)), NOW)
+                    .is_err()
+            );
         }
     }
     let mut restarted = End::new("b", 3);
-    assert!(matches!(restarted.open(&hello, a.address, NOW), Ok(FrameContent::Answer(_))), "at most a challenge");
-    assert_eq!(restarted.open(&proof, a.address, NOW), Err(FrameEvent::BadSeal));
+    assert!(
+        matches!(
+            restarted.open(&hello, a.address, NOW),
+            Ok(FrameContent::Answer(_))
+        ),
+        "at most a challenge"
+    );
+    assert_eq!(
+        restarted.open(&proof, a.address, NOW),
+        Err(FrameEvent::BadSeal)
+    );
     assert!(restarted.sessions.peers.len() == 0);
 }
 
@@ -166,7 +269,10 @@ fn a_proof_from_elsewhere_or_too_late_is_none() {
     let proof = answer(a.open(&challenge, b.address, NOW));
     let elsewhere = SocketAddr::from(([10, 0, 0, 9], 1));
     assert_eq!(b.open(&proof, elsewhere, NOW), Err(FrameEvent::Replayed));
-    assert_eq!(b.open(&proof, a.address, NOW + Duration::from_secs(5)), Err(FrameEvent::Replayed));
+    assert_eq!(
+        b.open(&proof, a.address, NOW + Duration::from_secs(5)),
+        Err(FrameEvent::Replayed)
+    );
     assert!(b.sessions.peers.len() == 0);
 }
 
@@ -207,8 +313,14 @@ fn junk_is_told_apart() {
     elsewhere[4] ^= 1;
     assert_eq!(a.open(&elsewhere, from, NOW), Err(FrameEvent::WrongCell));
     assert_eq!(a.open(&hello[..40], from, NOW), Err(FrameEvent::Malformed));
-    assert_eq!(a.open(&[hello.clone(), vec![0; 2000]].concat(), from, NOW), Err(FrameEvent::Oversized));
-    assert_eq!(a.open(b"GET / HTTP/1.1", from, NOW), Err(FrameEvent::Malformed));
+    assert_eq!(
+        a.open(&[hello.clone(), vec![0; 2000]].concat(), from, NOW),
+        Err(FrameEvent::Oversized)
+    );
+    assert_eq!(
+        a.open(b"GET / HTTP/1.1", from, NOW),
+        Err(FrameEvent::Malformed)
+    );
 }
 
 proptest! {
@@ -232,20 +344,37 @@ proptest! {
 fn another_key_and_a_misspelt_cell_are_named() {
     let heard = |own: &'static str, other: (&'static str, &str), is_alone: bool| {
         let mut node = End::of_cell((own, "07"), "euclid", 1, None);
-        node.known = (!is_alone).then_some(KnownMember { run: 1, life: 1, alive: true });
+        node.known = (!is_alone).then_some(KnownMember {
+            run: 1,
+            life: 1,
+            alive: true,
+        });
         let mut stranger = End::of_cell(other, "gauss", 7, None);
         let (greeting, from) = (stranger.hello(), stranger.address);
         assert!(node.open(&greeting, from, NOW).is_err());
         let notices = node.sessions.take_notices();
-        notices.into_iter().map(|notice| (notice.kind, notice.cause)).collect::<Vec<_>>()
+        notices
+            .into_iter()
+            .map(|notice| (notice.kind, notice.cause))
+            .collect::<Vec<_>>()
     };
     assert_eq!(
         heard("lot-1", ("lot-1", "08"), false),
-        [(TroubleKind::WrongKey, "heard cell lot-1 with another key, or none, from 10.0.0.7".into())]
+        [(
+            TroubleKind::WrongKey,
+            "heard cell lot-1 with another key, or none, from 10.0.0.7".into()
+        )]
     );
-    let misspelt = [(TroubleKind::OtherCell, "heard cell ux-lott from 10.0.0.7, this is ux-lot".into())];
+    let misspelt = [(
+        TroubleKind::OtherCell,
+        "heard cell ux-lott from 10.0.0.7, this is ux-lot".into(),
+    )];
     assert_eq!(heard("ux-lot", ("ux-lott", "07"), false), misspelt);
     assert_eq!(heard("lot-1", ("lot-2", "07"), false), [], "a neighbour");
-    assert_eq!(heard("lot-1", ("lot-2", "07"), true).len(), 1, "who is alone may have meant the other");
+    assert_eq!(
+        heard("lot-1", ("lot-2", "07"), true).len(),
+        1,
+        "who is alone may have meant the other"
+    );
     assert_eq!(heard("ux-lot", ("crossing", "07"), true), []);
 }

@@ -17,25 +17,45 @@ impl Authority {
     ///
     /// # Errors
     /// [`AuthorityError`] when there is a CA or the directory cannot be written.
-    pub fn init_city(directory: &Path, city: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
+    pub fn init_city(
+        directory: &Path,
+        city: &NodeName,
+        now: Timestamp,
+    ) -> Result<Self, AuthorityError> {
         let parameters = ca_parameters(&format!("ECOD city {city}"), 1, now)?;
-        Self::make(directory, city, true, now, |key| Ok(parameters.self_signed(key)?))
+        Self::make(directory, city, true, now, |key| {
+            Ok(parameters.self_signed(key)?)
+        })
     }
 
     /// Makes a CA for a cell of this city.
     ///
     /// # Errors
     /// [`AuthorityError`] when this is no city, there is a CA or a directory cannot be written.
-    pub fn init_cell(&mut self, directory: &Path, cell: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
+    pub fn init_cell(
+        &mut self,
+        directory: &Path,
+        cell: &NodeName,
+        now: Timestamp,
+    ) -> Result<Self, AuthorityError> {
         self.check_is_city(true)?;
         let mut parameters = ca_parameters(&format!("ECOD cell {cell}"), 0, now)?;
         parameters.use_authority_key_identifier_extension = true;
-        let serial = parameters.serial_number.as_ref().map(|serial| hex::encode(serial.as_ref())).unwrap_or_default();
+        let serial = parameters
+            .serial_number
+            .as_ref()
+            .map(|serial| hex::encode(serial.as_ref()))
+            .unwrap_or_default();
         let issuer = self.issuer()?;
         Self::make(directory, cell, false, now, |key| {
             let expires_at_us = now + days(CA_DAYS);
-            let issued =
-                IssuedCertificate { node: cell.clone(), is_ca: true, serial, expires_at_us, revoked_at_us: None };
+            let issued = IssuedCertificate {
+                node: cell.clone(),
+                is_ca: true,
+                serial,
+                expires_at_us,
+                revoked_at_us: None,
+            };
             self.record(issued, &issuer, now)?;
             Ok(parameters.signed_by(key, &issuer)?)
         })
@@ -45,7 +65,11 @@ impl Authority {
     ///
     /// # Errors
     /// [`AuthorityError`] when there are none or the list cannot be written.
-    pub fn revoke_cell(&mut self, cell: &NodeName, now: Timestamp) -> Result<usize, AuthorityError> {
+    pub fn revoke_cell(
+        &mut self,
+        cell: &NodeName,
+        now: Timestamp,
+    ) -> Result<usize, AuthorityError> {
         match self.revoke_where(|issued| issued.node == *cell && issued.is_ca, now)? {
             0 => Err(AuthorityError::NotIssued(cell.clone())),
             revoked => Ok(revoked),
@@ -58,7 +82,8 @@ impl Authority {
     /// [`AuthorityError`] when its certificate cannot be read.
     pub(crate) fn is_of_city(&self) -> Result<bool, AuthorityError> {
         let unusable = |error: &dyn std::fmt::Display| AuthorityError::Crypto(error.to_string());
-        let own = CertificateDer::from_pem_slice(read(&self.ca())?.as_bytes()).map_err(|error| unusable(&error))?;
+        let own = CertificateDer::from_pem_slice(read(&self.ca())?.as_bytes())
+            .map_err(|error| unusable(&error))?;
         Ok(!is_issued_by(&own, &own))
     }
 
@@ -71,10 +96,20 @@ impl Authority {
             return Ok(());
         }
         let (found, remedy) = if is_city {
-            ("cell", "name the directory that `ecod-node pki city init` made")
+            (
+                "cell",
+                "name the directory that `ecod-node pki city init` made",
+            )
         } else {
-            ("city", "use `ecod-node pki city`, or name the directory of a cell")
+            (
+                "city",
+                "use `ecod-node pki city`, or name the directory of a cell",
+            )
         };
-        Err(AuthorityError::Kind { directory: self.directory.clone(), found, remedy })
+        Err(AuthorityError::Kind {
+            directory: self.directory.clone(),
+            found,
+            remedy,
+        })
     }
 }

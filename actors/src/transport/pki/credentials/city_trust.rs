@@ -34,17 +34,29 @@ pub(super) fn authorities_of(
     city: &CityTlsConfig,
     all: &mut Vec<CertificateRevocationListDer<'static>>,
 ) -> Result<CityAuthorities, CredentialsError> {
-    let own = city.revocation_list.as_deref().map(|path| lists("tls.city.revocation_list", path)).transpose()?;
+    let own = city
+        .revocation_list
+        .as_deref()
+        .map(|path| lists("tls.city.revocation_list", path))
+        .transpose()?;
     let own = own.unwrap_or_default();
     let of_city = authorities("tls.city.ca", &city.ca)?;
     let (mut of_cell, mut revoked) = (Vec::new(), Vec::new());
     for certificate in authorities("tls.ca", cell)? {
-        let Some(signed_by) = of_city.iter().find(|city_ca| is_issued_by(city_ca, &certificate)) else {
+        let Some(signed_by) = of_city
+            .iter()
+            .find(|city_ca| is_issued_by(city_ca, &certificate))
+        else {
             let city_ca = city.ca.display();
-            let reason = format!("{city_ca} has not signed it: make the cell's CA by `ecod-node pki init --city`");
+            let reason = format!(
+                "{city_ca} has not signed it: make the cell's CA by `ecod-node pki init --city`"
+            );
             return Err(file_error("tls.ca", cell, &reason));
         };
-        if own.iter().any(|list| is_list_of(signed_by, list) && lists_serial(list, &certificate)) {
+        if own
+            .iter()
+            .any(|list| is_list_of(signed_by, list) && lists_serial(list, &certificate))
+        {
             tracing::error!(file = %cell.display(), "the city has revoked the cell's CA: none of its certificates counts; \
                 make a new one by `ecod-node pki init --city`");
             revoked.push(certificate);
@@ -53,17 +65,23 @@ pub(super) fn authorities_of(
         }
     }
     all.extend(own);
-    Ok(CityAuthorities { of_cell, revoked, of_city })
+    Ok(CityAuthorities {
+        of_cell,
+        revoked,
+        of_city,
+    })
 }
 
 /// True if a list has the serial number of a certificate.
 fn lists_serial(list: &[u8], certificate: &[u8]) -> bool {
-    let (Ok((_, list)), Ok((_, certificate))) =
-        (CertificateRevocationList::from_der(list), X509Certificate::from_der(certificate))
-    else {
+    let (Ok((_, list)), Ok((_, certificate))) = (
+        CertificateRevocationList::from_der(list),
+        X509Certificate::from_der(certificate),
+    ) else {
         return false;
     };
-    list.iter_revoked_certificates().any(|revoked| revoked.raw_serial() == certificate.raw_serial())
+    list.iter_revoked_certificates()
+        .any(|revoked| revoked.raw_serial() == certificate.raw_serial())
 }
 
 #[cfg(test)]

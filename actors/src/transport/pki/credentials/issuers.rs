@@ -11,7 +11,10 @@ use rustls::crypto::{verify_tls12_signature, verify_tls13_signature};
 use rustls::pki_types::{CertificateDer, CertificateRevocationListDer, ServerName, UnixTime};
 use rustls::server::WebPkiClientVerifier;
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
-use rustls::{CertificateError, DigitallySignedStruct, DistinguishedName, Error, RootCertStore, SignatureScheme};
+use rustls::{
+    CertificateError, DigitallySignedStruct, DistinguishedName, Error, RootCertStore,
+    SignatureScheme,
+};
 
 use super::super::attestation::{is_issued_by, is_list_of};
 use super::{CredentialsError, crypto};
@@ -51,17 +54,29 @@ impl Issuers {
         of_city: Option<Vec<CertificateDer<'static>>>,
         lists: &[CertificateRevocationListDer<'static>],
     ) -> Result<Self, CredentialsError> {
-        let issuers = |cas: Vec<CertificateDer<'static>>| cas.into_iter().map(|ca| Issuer::new(ca, lists)).collect();
+        let issuers = |cas: Vec<CertificateDer<'static>>| {
+            cas.into_iter().map(|ca| Issuer::new(ca, lists)).collect()
+        };
         let of_cell: Vec<Issuer> = issuers(of_cell)?;
         let of_city: Option<Vec<Issuer>> = of_city.map(issuers).transpose()?;
         let all = of_cell.iter().chain(of_city.iter().flatten());
-        let names = all.flat_map(|issuer| issuer.clients.root_hint_subjects().to_vec()).collect();
-        Ok(Self { of_cell, of_city, names })
+        let names = all
+            .flat_map(|issuer| issuer.clients.root_hint_subjects().to_vec())
+            .collect();
+        Ok(Self {
+            of_cell,
+            of_city,
+            names,
+        })
     }
 
     /// True if a certificate may give rights: a city certifies vehicles alone, whatever its certificates say.
     pub(super) fn give_rights(&self, certificate: &[u8]) -> bool {
-        self.of_city.is_none() || self.of_cell.iter().any(|issuer| is_issued_by(&issuer.certificate, certificate))
+        self.of_city.is_none()
+            || self
+                .of_cell
+                .iter()
+                .any(|issuer| is_issued_by(&issuer.certificate, certificate))
     }
 
     fn all(&self) -> impl Iterator<Item = &Issuer> {
@@ -74,22 +89,35 @@ impl Issuer {
         certificate: CertificateDer<'static>,
         lists: &[CertificateRevocationListDer<'static>],
     ) -> Result<Self, CredentialsError> {
-        let unusable = |error: &dyn std::fmt::Display| CredentialsError::Unusable(error.to_string());
+        let unusable =
+            |error: &dyn std::fmt::Display| CredentialsError::Unusable(error.to_string());
         let mut roots = RootCertStore::empty();
-        roots.add(certificate.clone()).map_err(|error| unusable(&error))?;
+        roots
+            .add(certificate.clone())
+            .map_err(|error| unusable(&error))?;
         let roots = Arc::new(roots);
-        let own: Vec<_> = lists.iter().filter(|list| is_list_of(&certificate, list)).cloned().collect();
+        let own: Vec<_> = lists
+            .iter()
+            .filter(|list| is_list_of(&certificate, list))
+            .cloned()
+            .collect();
         // Those of others leave its certificates without a known status.
         let lists = if own.is_empty() { lists.to_vec() } else { own };
         let mut clients = WebPkiClientVerifier::builder_with_provider(Arc::clone(&roots), crypto());
         let mut servers = WebPkiServerVerifier::builder_with_provider(roots, crypto());
         if !lists.is_empty() {
-            clients = clients.with_crls(lists.iter().cloned()).only_check_end_entity_revocation();
+            clients = clients
+                .with_crls(lists.iter().cloned())
+                .only_check_end_entity_revocation();
             servers = servers.with_crls(lists).only_check_end_entity_revocation();
         }
         let clients = clients.build().map_err(|error| unusable(&error))?;
         let servers = servers.build().map_err(|error| unusable(&error))?;
-        Ok(Self { certificate, clients, servers })
+        Ok(Self {
+            certificate,
+            clients,
+            servers,
+        })
     }
 }
 
@@ -102,7 +130,9 @@ fn verify_by<'a, T>(
     for issuer in issuers {
         match verify(issuer) {
             Ok(verified) => return Ok(verified),
-            Err(Error::InvalidCertificate(CertificateError::UnknownIssuer | CertificateError::BadSignature)) => {}
+            Err(Error::InvalidCertificate(
+                CertificateError::UnknownIssuer | CertificateError::BadSignature,
+            )) => {}
             Err(error) => failure = error,
         }
     }
@@ -120,7 +150,9 @@ impl ClientCertVerifier for Issuers {
         _intermediates: &[CertificateDer<'_>],
         now: UnixTime,
     ) -> Result<ClientCertVerified, Error> {
-        verify_by(self.all(), |issuer| issuer.clients.verify_client_cert(end_entity, &[], now))
+        verify_by(self.all(), |issuer| {
+            issuer.clients.verify_client_cert(end_entity, &[], now)
+        })
     }
 
     fn verify_tls12_signature(
@@ -129,7 +161,12 @@ impl ClientCertVerifier for Issuers {
         cert: &CertificateDer<'_>,
         dss: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls12_signature(message, cert, dss, &crypto().signature_verification_algorithms)
+        verify_tls12_signature(
+            message,
+            cert,
+            dss,
+            &crypto().signature_verification_algorithms,
+        )
     }
 
     fn verify_tls13_signature(
@@ -138,23 +175,36 @@ impl ClientCertVerifier for Issuers {
         cert: &CertificateDer<'_>,
         dss: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, Error> {
-        verify_tls13_signature(message, cert, dss, &crypto().signature_verification_algorithms)
+        verify_tls13_signature(
+            message,
+            cert,
+            dss,
+            &crypto().signature_verification_algorithms,
+        )
     }
 
     fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
-        crypto().signature_verification_algorithms.supported_schemes()
+        crypto()
+            .signature_verification_algorithms
+            .supported_schemes()
     }
 }
 
 impl ServingNodes {
     /// Verifier of brokers, which only the cell certifies.
     pub(super) fn brokers(issuers: &Arc<Issuers>) -> Arc<dyn ServerCertVerifier> {
-        Arc::new(Self { issuers: Arc::clone(issuers), with_vehicles: false })
+        Arc::new(Self {
+            issuers: Arc::clone(issuers),
+            with_vehicles: false,
+        })
     }
 
     /// Verifier of doors, which vehicles of the city have, too.
     pub(super) fn doors(issuers: &Arc<Issuers>) -> Arc<dyn ServerCertVerifier> {
-        Arc::new(Self { issuers: Arc::clone(issuers), with_vehicles: true })
+        Arc::new(Self {
+            issuers: Arc::clone(issuers),
+            with_vehicles: true,
+        })
     }
 }
 
@@ -167,9 +217,16 @@ impl ServerCertVerifier for ServingNodes {
         ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
-        let cities = self.issuers.of_city.iter().flatten().filter(|_| self.with_vehicles);
+        let cities = self
+            .issuers
+            .of_city
+            .iter()
+            .flatten()
+            .filter(|_| self.with_vehicles);
         verify_by(self.issuers.of_cell.iter().chain(cities), |issuer| {
-            issuer.servers.verify_server_cert(end_entity, &[], name, ocsp_response, now)
+            issuer
+                .servers
+                .verify_server_cert(end_entity, &[], name, ocsp_response, now)
         })
     }
 

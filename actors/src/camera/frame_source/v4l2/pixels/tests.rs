@@ -3,7 +3,9 @@ use opencv::core::{CV_8UC3, Scalar};
 use super::*;
 
 fn way(fourcc: &[u8; 4]) -> Way {
-    PixelConversion::choose(&[PixelFormat::from_fourcc(*fourcc)]).unwrap().way
+    PixelConversion::choose(&[PixelFormat::from_fourcc(*fourcc)])
+        .unwrap()
+        .way
 }
 
 fn convert(fourcc: &[u8; 4], size: [u32; 2], stride: u32, buffer: &[u8]) -> Result<Mat, String> {
@@ -16,11 +18,25 @@ fn pixel(image: &Mat, row: i32, column: i32) -> [u8; 3] {
 
 #[test]
 fn the_format_that_costs_least_is_chosen() {
-    let formats = |names: &[&[u8; 4]]| names.iter().map(|name| PixelFormat::from_fourcc(**name)).collect::<Vec<_>>();
-    let chosen = |names: &[&[u8; 4]]| PixelConversion::choose(&formats(names)).map(|it| it.format().to_string());
-    assert_eq!(chosen(&[b"MJPG", b"YUYV"]).as_deref(), Some("YUYV"), "as most USB cameras");
+    let formats = |names: &[&[u8; 4]]| {
+        names
+            .iter()
+            .map(|name| PixelFormat::from_fourcc(**name))
+            .collect::<Vec<_>>()
+    };
+    let chosen = |names: &[&[u8; 4]]| {
+        PixelConversion::choose(&formats(names)).map(|it| it.format().to_string())
+    };
+    assert_eq!(
+        chosen(&[b"MJPG", b"YUYV"]).as_deref(),
+        Some("YUYV"),
+        "as most USB cameras"
+    );
     assert_eq!(chosen(&[b"H264", b"MJPG"]).as_deref(), Some("MJPG"));
-    assert_eq!(chosen(&[b"YUYV", b"YU12", b"BGR3"]).as_deref(), Some("BGR3"));
+    assert_eq!(
+        chosen(&[b"YUYV", b"YU12", b"BGR3"]).as_deref(),
+        Some("BGR3")
+    );
     assert_eq!(chosen(&[b"H264", b"pBAA"]), None);
 }
 
@@ -41,12 +57,24 @@ fn packed_and_planar_colors_become_bgr() {
         let image = convert(fourcc, [4, 2], 0, &buffer).unwrap();
         assert_eq!((image.rows(), image.cols(), image.typ()), (2, 4, CV_8UC3));
         let [blue, green, red] = pixel(&image, 1, 3);
-        assert!(blue < 5 && green < 5 && red > 250, "{fourcc:?}: {blue} {green} {red}");
+        assert!(
+            blue < 5 && green < 5 && red > 250,
+            "{fourcc:?}: {blue} {green} {red}"
+        );
     }
     let rgb = [10, 20, 30].repeat(8);
-    assert_eq!(pixel(&convert(b"RGB3", [4, 2], 0, &rgb).unwrap(), 1, 3), [30, 20, 10]);
-    assert_eq!(pixel(&convert(b"BGR3", [4, 2], 0, &rgb).unwrap(), 1, 3), [10, 20, 30]);
-    assert_eq!(pixel(&convert(b"GREY", [4, 2], 0, &[77; 8]).unwrap(), 1, 3), [77; 3]);
+    assert_eq!(
+        pixel(&convert(b"RGB3", [4, 2], 0, &rgb).unwrap(), 1, 3),
+        [30, 20, 10]
+    );
+    assert_eq!(
+        pixel(&convert(b"BGR3", [4, 2], 0, &rgb).unwrap(), 1, 3),
+        [10, 20, 30]
+    );
+    assert_eq!(
+        pixel(&convert(b"GREY", [4, 2], 0, &[77; 8]).unwrap(), 1, 3),
+        [77; 3]
+    );
 }
 
 #[test]
@@ -56,22 +84,42 @@ fn bytes_between_rows_are_no_pixels() {
     let image = convert(b"YUYV", [2, 2], 8, &row.repeat(2)).unwrap();
     assert_eq!((image.rows(), image.cols()), (2, 2));
     let [blue, green, red] = pixel(&image, 1, 1);
-    assert!(blue == green && green == red && blue.abs_diff(128) < 3, "{blue} {green} {red}");
-    assert!(convert(b"BGR3", [2, 2], 7, &[0; 14]).unwrap_err().contains("7 bytes in a row"));
-    assert!(convert(b"YUYV", [4, 2], 4, &[0; 16]).unwrap_err().contains("4x2"));
+    assert!(
+        blue == green && green == red && blue.abs_diff(128) < 3,
+        "{blue} {green} {red}"
+    );
+    assert!(
+        convert(b"BGR3", [2, 2], 7, &[0; 14])
+            .unwrap_err()
+            .contains("7 bytes in a row")
+    );
+    assert!(
+        convert(b"YUYV", [4, 2], 4, &[0; 16])
+            .unwrap_err()
+            .contains("4x2")
+    );
 }
 
 #[test]
 fn a_part_of_a_frame_is_refused() {
-    assert!(convert(b"YUYV", [4, 2], 0, &[0; 15]).unwrap_err().contains("15 of 16 bytes"));
-    assert!(convert(b"MJPG", [4, 2], 0, &[0xff, 0xd8, 0xff]).unwrap_err().contains("not an image"));
+    assert!(
+        convert(b"YUYV", [4, 2], 0, &[0; 15])
+            .unwrap_err()
+            .contains("15 of 16 bytes")
+    );
+    assert!(
+        convert(b"MJPG", [4, 2], 0, &[0xff, 0xd8, 0xff])
+            .unwrap_err()
+            .contains("not an image")
+    );
 }
 
 /// Segments of a JPEG file up to its picture data, and the rest.
 fn without_huffman_tables(jpeg: &[u8]) -> Vec<u8> {
     let (mut bare, mut rest) = (jpeg[..2].to_vec(), &jpeg[2..]);
     while rest[1] != 0xda {
-        let (segment, after) = rest.split_at(2 + usize::from(u16::from_be_bytes([rest[2], rest[3]])));
+        let (segment, after) =
+            rest.split_at(2 + usize::from(u16::from_be_bytes([rest[2], rest[3]])));
         if segment[1] != 0xc4 {
             bare.extend(segment);
         }
@@ -82,14 +130,22 @@ fn without_huffman_tables(jpeg: &[u8]) -> Vec<u8> {
 
 #[test]
 fn motion_jpeg_is_read_also_without_its_tables_and_with_bytes_behind_it() {
-    let image = Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::new(200.0, 100.0, 50.0, 0.0)).unwrap();
+    let image =
+        Mat::new_rows_cols_with_default(48, 64, CV_8UC3, Scalar::new(200.0, 100.0, 50.0, 0.0))
+            .unwrap();
     let jpeg = image_codec::encode_jpeg(&image, 90).unwrap();
     let bare = without_huffman_tables(&jpeg);
-    assert!(bare.len() + 400 < jpeg.len(), "the four tables are left out");
+    assert!(
+        bare.len() + 400 < jpeg.len(),
+        "the four tables are left out"
+    );
     for file in [jpeg.clone(), bare, [jpeg, vec![0; 1000]].concat()] {
         let shown = convert(b"MJPG", [64, 48], 0, &file).unwrap();
         assert_eq!((shown.rows(), shown.cols()), (48, 64));
-        let near = pixel(&shown, 24, 32).iter().zip([200, 100, 50]).all(|(a, b)| a.abs_diff(b) <= 4);
+        let near = pixel(&shown, 24, 32)
+            .iter()
+            .zip([200, 100, 50])
+            .all(|(a, b)| a.abs_diff(b) <= 4);
         assert!(near, "{:?}", pixel(&shown, 24, 32));
     }
 }

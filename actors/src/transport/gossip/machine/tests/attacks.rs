@@ -7,7 +7,11 @@ use super::*;
 fn recorded_frames_change_nothing() {
     let mut cell = Cell::of(4);
     let now = cell.now;
-    cell.nodes.get_mut(&1).unwrap().machine.send(&node_name(2), b"payload", now);
+    cell.nodes
+        .get_mut(&1)
+        .unwrap()
+        .machine
+        .send(&node_name(2), b"payload", now);
     cell.run(100);
     cell.nodes.remove(&4);
     cell.run(2000);
@@ -18,7 +22,8 @@ fn recorded_frames_change_nothing() {
     let recorded = std::mem::take(&mut cell.recorded);
     for (from, _, frame) in &recorded {
         for to in 1..=4 {
-            cell.under_way.push((cell.now, *from, address(to), frame.clone()));
+            cell.under_way
+                .push((cell.now, *from, address(to), frame.clone()));
         }
         if cell.under_way.len() > 40 {
             cell.run(1);
@@ -26,7 +31,15 @@ fn recorded_frames_change_nothing() {
     }
     cell.run(3000);
     cell.assert_complete();
-    assert_eq!(cell.events(), 0, "{:?}", cell.nodes.values().map(|node| &node.events).collect::<Vec<_>>());
+    assert_eq!(
+        cell.events(),
+        0,
+        "{:?}",
+        cell.nodes
+            .values()
+            .map(|node| &node.events)
+            .collect::<Vec<_>>()
+    );
     for node in cell.nodes.values() {
         assert!(node.machine.counters.get(FrameEvent::Replayed) > 0);
         assert!(node.machine.counters.get(FrameEvent::BadSeal) > 0);
@@ -42,7 +55,8 @@ fn recorded_frames_conjure_up_nobody() {
     cell.now = old.now;
     cell.start(1, "node-1");
     for (from, _, frame) in &old.recorded {
-        cell.under_way.push((cell.now, *from, address(1), frame.clone()));
+        cell.under_way
+            .push((cell.now, *from, address(1), frame.clone()));
         if cell.under_way.len() > 20 {
             cell.run(1);
         }
@@ -51,8 +65,16 @@ fn recorded_frames_conjure_up_nobody() {
     assert_eq!(cell.events(), 0);
     let counters = &cell.nodes[&1].machine.counters;
     let answers = old.recorded.len() as u64;
-    assert!(counters.get(FrameEvent::BadSeal) > answers / 2, "{:?}", counters.snapshot());
-    assert!((cell.sent as u64) < 256 + answers / 4, "{} answers", cell.sent);
+    assert!(
+        counters.get(FrameEvent::BadSeal) > answers / 2,
+        "{:?}",
+        counters.snapshot()
+    );
+    assert!(
+        (cell.sent as u64) < 256 + answers / 4,
+        "{} answers",
+        cell.sent
+    );
 }
 
 #[test]
@@ -62,14 +84,25 @@ fn a_flood_of_recorded_greetings_is_answered_at_a_bounded_rate() {
     let mut cell = Cell::seeded(true, 4);
     cell.start(1, "node-1");
     for _ in 0..1000 {
-        (0..20).for_each(|_| cell.under_way.push((cell.now, address(77), address(1), hello.clone())));
+        (0..20).for_each(|_| {
+            cell.under_way
+                .push((cell.now, address(77), address(1), hello.clone()))
+        });
         cell.run(1);
     }
-    assert!(cell.sent < 20 + 10, "{} answers to 20,000 greetings", cell.sent);
+    assert!(
+        cell.sent < 20 + 10,
+        "{} answers to 20,000 greetings",
+        cell.sent
+    );
     assert!(cell.nodes[&1].machine.counters.get(FrameEvent::Throttled) > 10_000);
     cell.start(2, "node-2");
     cell.run(200);
-    assert_eq!(cell.sees(1), ["node-2".to_owned()].into(), "newcomers are met all the same");
+    assert_eq!(
+        cell.sees(1),
+        ["node-2".to_owned()].into(),
+        "newcomers are met all the same"
+    );
 }
 
 proptest! {

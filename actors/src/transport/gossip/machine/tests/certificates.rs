@@ -13,7 +13,10 @@ struct CertifiedCell {
 
 impl CertifiedCell {
     fn new(multicast: bool) -> Self {
-        Self { cell: Cell::new(multicast), authority: TrialAuthority::new() }
+        Self {
+            cell: Cell::new(multicast),
+            authority: TrialAuthority::new(),
+        }
     }
 
     fn of(nodes: usize) -> Self {
@@ -26,7 +29,8 @@ impl CertifiedCell {
     fn start(&mut self, node: usize) {
         let identity = self.authority.identity(&name(node), Role::Auto);
         let run = self.cell.now.micros();
-        self.cell.start_as(node, &name(node), (KEY, Some(identity)), run);
+        self.cell
+            .start_as(node, &name(node), (KEY, Some(identity)), run);
     }
 
     fn machine(&mut self, node: usize) -> &mut GossipMachine {
@@ -64,7 +68,9 @@ fn a_second_node_with_a_certificate_whose_only_seed_is_the_first_gives_up() {
     certified.cell.run(8000);
     let identity = certified.authority.identity(&name(1), Role::Auto);
     let run = certified.cell.now.micros();
-    certified.cell.start_as(9, &name(1), (KEY, Some(identity)), run);
+    certified
+        .cell
+        .start_as(9, &name(1), (KEY, Some(identity)), run);
     certified.machine(9).set_seeds(vec![address(1)]);
     certified.cell.run(8000);
     assert_second_gave_up(&certified.cell);
@@ -99,15 +105,24 @@ fn a_key_without_a_certificate_of_the_cell_admits_nobody() {
     certified.cell.forget_events();
     certified.cell.start(4, "node-4");
     let strange = TrialAuthority::new().identity("node-5", Role::Auto);
-    certified.cell.start_as(5, "node-5", (KEY, Some(strange)), now);
+    certified
+        .cell
+        .start_as(5, "node-5", (KEY, Some(strange)), now);
     certified.cell.run(5000);
     for node in 1..=3 {
         assert_eq!(certified.events(node), [], "{node}");
         let refused = ["node-4", "node-5"].map(|name| (name.to_owned(), TroubleKind::NotAdmitted));
-        assert_eq!(certified.cell.nodes[&node].troubles, refused.into(), "{node}");
+        assert_eq!(
+            certified.cell.nodes[&node].troubles,
+            refused.into(),
+            "{node}"
+        );
         let machine = certified.machine(node);
         assert_eq!(machine.members().len(), 2);
-        assert!(machine.counters.get(FrameEvent::Uncertified) > 0 && machine.counters.get(FrameEvent::Untrusted) > 0);
+        assert!(
+            machine.counters.get(FrameEvent::Uncertified) > 0
+                && machine.counters.get(FrameEvent::Untrusted) > 0
+        );
     }
     assert!(certified.cell.sees(4).is_empty() && certified.cell.sees(5).is_empty());
 }
@@ -120,7 +135,10 @@ fn a_revoked_node_is_down_when_the_list_is_read_and_stays_out_until_it_has_a_new
     for node in 1..=3 {
         let files = certified.authority.files(&node_name(node));
         certified.set_identity(node, TrialAuthority::read(&files, &name(node)));
-        let gone = [MembershipEvent::Expelled { name: node_name(4) }, MembershipEvent::Down { name: node_name(4) }];
+        let gone = [
+            MembershipEvent::Expelled { name: node_name(4) },
+            MembershipEvent::Down { name: node_name(4) },
+        ];
         assert_eq!(certified.events(node), gone, "{node}");
     }
     certified.cell.forget_events();
@@ -150,9 +168,14 @@ fn a_certificate_renewed_while_its_node_runs_is_shown_to_all_without_a_gap() {
 fn a_node_whose_clock_is_wrong_waits_and_is_met_once_it_is_right() {
     let mut certified = CertifiedCell::of(2);
     let right = certified.authority.identity("node-3", Role::Auto);
-    let wrong = Identity { wall: UnixTime::since_unix_epoch(Duration::from_secs(8)), ..right.clone() };
+    let wrong = Identity {
+        wall: UnixTime::since_unix_epoch(Duration::from_secs(8)),
+        ..right.clone()
+    };
     let run = certified.cell.now.micros();
-    certified.cell.start_as(3, "node-3", (KEY, Some(wrong)), run);
+    certified
+        .cell
+        .start_as(3, "node-3", (KEY, Some(wrong)), run);
     certified.cell.run(3000);
     assert!(certified.cell.sees(3).is_empty());
     certified.set_identity(3, right);
@@ -179,7 +202,11 @@ fn nodes_of_which_one_lost_its_sessions_talk_again_within_a_second() {
     certified.cell.run(10);
     for node in [1, 2] {
         let received = |event: &MembershipEvent| matches!(event, MembershipEvent::Received { .. });
-        assert!(certified.events(node).iter().any(received), "{node}: {:?}", certified.events(node));
+        assert!(
+            certified.events(node).iter().any(received),
+            "{node}: {:?}",
+            certified.events(node)
+        );
     }
 }
 
@@ -191,15 +218,30 @@ fn hearsay_about_a_node_does_not_outweigh_its_own_word() {
     let before = certified.machine(1).members();
     for life in [u64::MAX, 1 << 53, certified.cell.now.micros() + 1000] {
         let (gossip, broker) = (address(9), Some(address(9)));
-        let lie = NodeId { name: node_name(3), run: 7, life, role: Role::Edge, gossip, broker };
+        let lie = NodeId {
+            name: node_name(3),
+            run: 7,
+            life,
+            role: Role::Edge,
+            gossip,
+            broker,
+        };
         let now = certified.cell.now;
         certified.machine(2).spread(foca::Member::alive(lie), now);
         certified.cell.run(2000);
     }
     assert_eq!(certified.machine(1).members(), before);
-    let is_news =
-        |event: &MembershipEvent| matches!(event, MembershipEvent::Alive { .. } | MembershipEvent::Down { .. });
-    assert!(!certified.events(1).iter().any(is_news), "{:?}", certified.events(1));
+    let is_news = |event: &MembershipEvent| {
+        matches!(
+            event,
+            MembershipEvent::Alive { .. } | MembershipEvent::Down { .. }
+        )
+    };
+    assert!(
+        !certified.events(1).iter().any(is_news),
+        "{:?}",
+        certified.events(1)
+    );
 }
 
 /// A member says again and again that another is down, which speaks all the while.
@@ -217,8 +259,15 @@ fn a_node_that_is_heard_is_not_down_on_the_word_of_others() {
         certified.cell.run(50);
     }
     let is_down = |event: &MembershipEvent| matches!(event, MembershipEvent::Down { .. });
-    assert!(!certified.events(1).iter().any(is_down), "{:?}", certified.events(1));
+    assert!(
+        !certified.events(1).iter().any(is_down),
+        "{:?}",
+        certified.events(1)
+    );
     certified.cell.nodes.remove(&3);
     certified.cell.run(2000);
-    assert!(!certified.cell.sees(1).contains("node-3"), "one that is silent is");
+    assert!(
+        !certified.cell.sees(1).contains("node-3"),
+        "one that is silent is"
+    );
 }

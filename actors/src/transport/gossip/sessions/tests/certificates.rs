@@ -43,11 +43,18 @@ fn proof(a: &mut End, b: &mut End) -> Vec<u8> {
 }
 
 /// Somebody with the cell's key opens a handshake's frame and seals it again.
-fn reseal(receiver: &SessionId, frame: &[u8], change: impl FnOnce(&mut FrameHeader, &mut Vec<u8>)) -> Vec<u8> {
+fn reseal(
+    receiver: &SessionId,
+    frame: &[u8],
+    change: impl FnOnce(&mut FrameHeader, &mut Vec<u8>),
+) -> Vec<u8> {
     let key = cell_key();
     let mut head = FrameHeader::read(frame, key.tag()).unwrap();
     let (open, sealed) = frame.split_at(HEADER_BYTES);
-    let mut body = key.seal(&head.sender, receiver).open(head.counter, open, sealed).unwrap();
+    let mut body = key
+        .seal(&head.sender, receiver)
+        .open(head.counter, open, sealed)
+        .unwrap();
     change(&mut head, &mut body);
     head.write(key.tag(), &body, &key.seal(&head.sender, receiver))
 }
@@ -68,7 +75,10 @@ fn nodes_with_certificates_understand_each_other_and_know_each_others_rights() {
     let frame = a.seal(&b.id.name, b"once");
     assert!(b.open(&frame, a.address, NOW).is_ok());
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::Replayed));
-    let proven = b.sessions.proven(&a.id.name).map(|(id, proven)| (id, proven.rights));
+    let proven = b
+        .sessions
+        .proven(&a.id.name)
+        .map(|(id, proven)| (id, proven.rights));
     assert_eq!(proven, Some((&a.id, Role::Auto.into())));
 }
 
@@ -78,12 +88,18 @@ fn every_frame_of_the_longest_names_fits_a_datagram() {
     let names: [&'static str; 2] = ["a", "b"].map(|letter| &*letter.repeat(64).leak());
     let [mut a, mut b] = [(names[0], 1), (names[1], 2)].map(|(name, session)| {
         let mut end = node(&mut authority, name, session);
-        let address = "[2001:db8:aaaa:bbbb:cccc:dddd:eeee:ffff]:65535".parse().unwrap();
+        let address = "[2001:db8:aaaa:bbbb:cccc:dddd:eeee:ffff]:65535"
+            .parse()
+            .unwrap();
         (end.id.run, end.id.life) = (u64::MAX, 1 << 54);
         (end.id.gossip, end.id.broker) = (address, Some(address));
         end
     });
-    b.known = Some(KnownMember { run: u64::MAX, life: 1 << 53, alive: false });
+    b.known = Some(KnownMember {
+        run: u64::MAX,
+        life: 1 << 53,
+        alive: false,
+    });
     let sizes = introduce(&mut a, &mut b).map(|frame| frame.len());
     println!("hello, challenge, proof, accept: {sizes:?} bytes");
     assert!(sizes.iter().all(|size| *size <= 1248), "{sizes:?}");
@@ -98,13 +114,21 @@ fn the_cells_key_alone_reads_and_forges_nothing() {
     let frame = a.seal(&b.id.name, b"hi");
     let (open, sealed) = frame.split_at(HEADER_BYTES);
     let head = FrameHeader::read(&frame, key.tag()).unwrap();
-    assert_eq!(key.seal(&own, &other).open(head.counter, open, sealed), None, "read");
+    assert_eq!(
+        key.seal(&own, &other).open(head.counter, open, sealed),
+        None,
+        "read"
+    );
     for counter in [u64::MAX, head.counter + 1] {
         let forged = FrameHeader { counter, ..head };
         let forged = forged.write(key.tag(), b"forged", &key.seal(&own, &other));
         assert_eq!(b.open(&forged, a.address, NOW), Err(FrameEvent::BadSeal));
     }
-    assert_eq!(b.open(&frame, a.address, NOW), Ok(payload(&a, b"hi")), "nobody was muted");
+    assert_eq!(
+        b.open(&frame, a.address, NOW),
+        Ok(payload(&a, b"hi")),
+        "nobody was muted"
+    );
 }
 
 #[test]
@@ -112,9 +136,16 @@ fn a_node_without_certificate_is_not_admitted_and_counted() {
     let (_authority, mut a, _) = two();
     let mut bare = End::new("b", 2);
     let hello = bare.hello();
-    assert_eq!(a.open(&hello, bare.address, NOW), Err(FrameEvent::Uncertified));
+    assert_eq!(
+        a.open(&hello, bare.address, NOW),
+        Err(FrameEvent::Uncertified)
+    );
     let hello = a.hello();
-    assert_eq!(bare.open(&hello, a.address, NOW), Err(FrameEvent::Uncertified), "nor one with, where none are");
+    assert_eq!(
+        bare.open(&hello, a.address, NOW),
+        Err(FrameEvent::Uncertified),
+        "nor one with, where none are"
+    );
     assert_eq!(a.sessions.peers.len() + bare.sessions.peers.len(), 0);
 }
 
@@ -123,14 +154,25 @@ fn a_certificate_of_another_ca_or_name_is_not_admitted() {
     let (mut authority, mut a, mut b) = two();
     let mut strange = node(&mut TrialAuthority::new(), "euclid", 3);
     let forged = proof(&mut strange, &mut b);
-    assert_eq!(b.open(&forged, strange.address, NOW + SLOW), Err(FrameEvent::Untrusted));
+    assert_eq!(
+        b.open(&forged, strange.address, NOW + SLOW),
+        Err(FrameEvent::Untrusted)
+    );
     let mut gauss = node(&mut authority, "gauss", 4);
     gauss.id.name = NodeName::from_static("edge");
     let forged = proof(&mut gauss, &mut b);
-    assert_eq!(b.open(&forged, gauss.address, NOW + SLOW), Err(FrameEvent::Untrusted), "a session of another name");
+    assert_eq!(
+        b.open(&forged, gauss.address, NOW + SLOW),
+        Err(FrameEvent::Untrusted),
+        "a session of another name"
+    );
     let mut posing = End::with("edge", 5, Some(authority.identity("gauss", Role::Auto)));
     let forged = proof(&mut posing, &mut b);
-    assert_eq!(b.open(&forged, posing.address, NOW + SLOW), Err(FrameEvent::Untrusted), "another's name");
+    assert_eq!(
+        b.open(&forged, posing.address, NOW + SLOW),
+        Err(FrameEvent::Untrusted),
+        "another's name"
+    );
     assert_eq!(b.sessions.peers.len(), 0);
     introduce(&mut a, &mut b);
     assert_both_heard(&mut a, &mut b);
@@ -147,7 +189,10 @@ fn a_revoked_certificate_is_not_admitted_and_ends_its_session() {
     let frame = a.seal(&b.id.name, b"hi");
     assert_eq!(b.open(&frame, a.address, NOW), Err(FrameEvent::BadSeal));
     let late = proof(&mut a, &mut b);
-    assert_eq!(b.open(&late, a.address, NOW + SLOW), Err(FrameEvent::Untrusted));
+    assert_eq!(
+        b.open(&late, a.address, NOW + SLOW),
+        Err(FrameEvent::Untrusted)
+    );
     assert_eq!(b.sessions.counters.get(FrameEvent::Expelled), 1);
 }
 
@@ -158,11 +203,16 @@ fn an_expired_certificate_ends_its_session() {
     let mut a = End::with("a", 1, Some(TrialAuthority::read(&files, "a")));
     let mut b = node(&mut authority, "b", 2);
     introduce(&mut a, &mut b);
-    let Some(prover) = &b.sessions.prover else { panic!("no certificates") };
+    let Some(prover) = &b.sessions.prover else {
+        panic!("no certificates")
+    };
     let mut identity = prover.identity().clone();
     assert_eq!(b.sessions.set_identity(identity.clone()).0, []);
     identity.wall = UnixTime::since_unix_epoch(Duration::from_secs(identity.wall.as_secs() + 61));
-    assert_eq!(b.sessions.set_identity(identity).0, std::slice::from_ref(&a.id.name));
+    assert_eq!(
+        b.sessions.set_identity(identity).0,
+        std::slice::from_ref(&a.id.name)
+    );
 }
 
 #[test]
@@ -172,14 +222,26 @@ fn a_repeated_or_altered_proof_disturbs_nothing() {
     assert_both_heard(&mut a, &mut b);
     let (receiver, elsewhere) = (b.sessions.own, SocketAddr::from(([10, 0, 0, 9], 1)));
     assert_eq!(b.open(&first, a.address, NOW), Err(FrameEvent::Replayed));
-    assert_eq!(b.open(&first, elsewhere, NOW), Err(FrameEvent::Replayed), "re-addressed");
+    assert_eq!(
+        b.open(&first, elsewhere, NOW),
+        Err(FrameEvent::Replayed),
+        "re-addressed"
+    );
     let counted_up = reseal(&receiver, &first, |head, _| head.counter += 1000);
-    assert_eq!(b.open(&counted_up, a.address, NOW), Err(FrameEvent::Untrusted), "under a later counter");
+    assert_eq!(
+        b.open(&counted_up, a.address, NOW),
+        Err(FrameEvent::Untrusted),
+        "under a later counter"
+    );
     let swapped = reseal(&receiver, &first, |head, body| {
         head.counter += 1000;
         change_attestation(body, |attestation| attestation.ephemeral = [9; 32]);
     });
-    assert_eq!(b.open(&swapped, a.address, NOW), Err(FrameEvent::Untrusted), "with another ephemeral key");
+    assert_eq!(
+        b.open(&swapped, a.address, NOW),
+        Err(FrameEvent::Untrusted),
+        "with another ephemeral key"
+    );
     assert_both_heard(&mut a, &mut b);
 }
 
@@ -188,28 +250,53 @@ fn a_repeated_or_altered_proof_disturbs_nothing() {
 fn swapped_ephemerals_and_certificates_are_noticed() {
     let (mut authority, mut a, mut b) = two();
     let eve = node(&mut authority, "eve", 6);
-    let Some(prover) = &eve.sessions.prover else { panic!("no certificates") };
+    let Some(prover) = &eve.sessions.prover else {
+        panic!("no certificates")
+    };
     let proof = proof(&mut a, &mut b);
     let accept = answer(b.open(&proof, a.address, NOW + SLOW));
     let to_a = a.sessions.own;
     let swapped = reseal(&to_a, &accept, |_, body| {
-        change_attestation(body, |attestation| attestation.ephemeral = prover.draw_ephemeral().unwrap().1);
+        change_attestation(body, |attestation| {
+            attestation.ephemeral = prover.draw_ephemeral().unwrap().1
+        });
     });
-    assert_eq!(a.open(&swapped, b.address, NOW + SLOW), Err(FrameEvent::Untrusted));
+    assert_eq!(
+        a.open(&swapped, b.address, NOW + SLOW),
+        Err(FrameEvent::Untrusted)
+    );
     // Eve accepts as herself in the session of b, whose words would then be hers.
     let posing = reseal(&to_a, &accept, |head, body| {
         let (message, rest) = decode_first::<Handshake>(body).unwrap();
         let theirs: Attestation = decode(rest).unwrap();
-        let Handshake::Accept { echo, mut introduction } = message else { panic!("no accept") };
+        let Handshake::Accept {
+            echo,
+            mut introduction,
+        } = message
+        else {
+            panic!("no accept")
+        };
         introduction.id.name = NodeName::from_static("eve");
         let message = encode(&Handshake::Accept { echo, introduction });
         let head = head.bytes(cell_key().tag());
-        let signed = SignedMessage { side: Side::Accepter, head, receiver: to_a, context: &[0; 32], message: &message };
+        let signed = SignedMessage {
+            side: Side::Accepter,
+            head,
+            receiver: to_a,
+            context: &[0; 32],
+            message: &message,
+        };
         let (attestation, _) = prover.attest(&signed, theirs.ephemeral).unwrap();
         *body = [message, encode(&attestation)].concat();
     });
     assert!(a.open(&posing, b.address, NOW + SLOW).is_err());
-    assert!(matches!(a.open(&accept, b.address, NOW + SLOW), Ok(FrameContent::Met { .. })), "the honest one counts");
+    assert!(
+        matches!(
+            a.open(&accept, b.address, NOW + SLOW),
+            Ok(FrameContent::Met { .. })
+        ),
+        "the honest one counts"
+    );
     assert_both_heard(&mut a, &mut b);
 }
 
@@ -277,9 +364,20 @@ fn forge_challenges(to: &mut End, in_place_of: SocketAddr) {
             sender: (u128::from(number) << 64).to_be_bytes(),
             counter: number,
         };
-        let challenge = Handshake::Challenge { cookie: Default::default(), name: NodeName::from_static("mallory") };
-        let forged = head.write(key.tag(), &encode(&challenge), &key.seal(&head.sender, &receiver));
-        let from = if number % 2 == 0 { in_place_of } else { SocketAddr::from(([10, 1, (number % 256) as u8, 1], 1)) };
+        let challenge = Handshake::Challenge {
+            cookie: Default::default(),
+            name: NodeName::from_static("mallory"),
+        };
+        let forged = head.write(
+            key.tag(),
+            &encode(&challenge),
+            &key.seal(&head.sender, &receiver),
+        );
+        let from = if number % 2 == 0 {
+            in_place_of
+        } else {
+            SocketAddr::from(([10, 1, (number % 256) as u8, 1], 1))
+        };
         let _ = to.open(&forged, from, NOW + Duration::from_micros(450 * number));
     }
 }
@@ -287,15 +385,21 @@ fn forge_challenges(to: &mut End, in_place_of: SocketAddr) {
 /// True if a node that has restarted is met again.
 fn meets_again(a: &mut End, restarted: &mut End, at: Timestamp) -> bool {
     let challenge = answer(restarted.open(&a.hello(), a.address, at));
-    let Ok(FrameContent::Answer(proof)) = a.open(&challenge, restarted.address, at) else { return false };
+    let Ok(FrameContent::Answer(proof)) = a.open(&challenge, restarted.address, at) else {
+        return false;
+    };
     let accept = answer(restarted.open(&proof, a.address, at));
-    matches!(a.open(&accept, restarted.address, at), Ok(FrameContent::Met { .. }))
+    matches!(
+        a.open(&accept, restarted.address, at),
+        Ok(FrameContent::Met { .. })
+    )
 }
 
 #[test]
 fn forged_challenges_hold_up_no_other_node_and_no_session_that_is_there() {
     let mut authority = TrialAuthority::new();
-    let [mut a, mut b, mut c] = [("a", 1), ("b", 2), ("c", 3)].map(|(name, id)| node(&mut authority, name, id));
+    let [mut a, mut b, mut c] =
+        [("a", 1), ("b", 2), ("c", 3)].map(|(name, id)| node(&mut authority, name, id));
     introduce(&mut a, &mut b);
     introduce(&mut a, &mut c);
     forge_challenges(&mut a, b.address);
@@ -306,8 +410,14 @@ fn forged_challenges_hold_up_no_other_node_and_no_session_that_is_there() {
         end.id.run = 2;
         end
     };
-    assert!(meets_again(&mut a, &mut restarted("c", 3), later), "another node's places are its own");
+    assert!(
+        meets_again(&mut a, &mut restarted("c", 3), later),
+        "another node's places are its own"
+    );
     assert_both_heard(&mut a, &mut b);
     let mut b = restarted("b", 2);
-    assert!(meets_again(&mut a, &mut b, later + Duration::from_secs(1)), "the attack is over");
+    assert!(
+        meets_again(&mut a, &mut b, later + Duration::from_secs(1)),
+        "the attack is over"
+    );
 }
