@@ -215,7 +215,7 @@ fn encoding_of(figures: &mut Figures, name: &str, encoding: Encoding, report: &O
     let limits = Limits::default();
     let bytes = encode(report, encoding);
     let encode_us = median(&times(301, || {
-        drop(std::hint::black_box(encode(report, encoding)))
+        drop(std::hint::black_box(encode(report, encoding)));
     }))
     .as_secs_f64()
         * 1e7;
@@ -224,7 +224,7 @@ fn encoding_of(figures: &mut Figures, name: &str, encoding: Encoding, report: &O
             &bytes,
             &report.node,
             &limits,
-        )))
+        )));
     });
     let decode_us = median(&decodings).as_secs_f64() * 1e7;
     let size = bytes.len() as f64 / 100.0;

@@ -105,7 +105,7 @@ fn ledgers(figures: &mut Figures) {
                 time(|| {
                     evidence
                         .iter()
-                        .for_each(|e| ledger.record(epoch / 10, &aggregator, e))
+                        .for_each(|e| ledger.record(epoch / 10, &aggregator, e));
                 })
             })
             .min()

@@ -162,20 +162,20 @@ async fn the_cell_goes_on_when_any_part_is_killed() {
     let kills: [(&str, &dyn Fn()); 9] = [
         ("election", &|| edge.slots().election.get().unwrap().kill()),
         ("membership", &|| {
-            edge.slots().membership.get().unwrap().kill()
+            edge.slots().membership.get().unwrap().kill();
         }),
         ("recorder", &|| edge.slots().recorder.get().unwrap().kill()),
         ("fuser", &|| edge.slots().fuser.get().unwrap().kill()),
         ("edge-gateway", &|| {
-            edge.slots().gateway.get().unwrap().kill()
+            edge.slots().gateway.get().unwrap().kill();
         }),
         ("edge-follower", &|| {
-            edge.slots().follower.get().unwrap().kill()
+            edge.slots().follower.get().unwrap().kill();
         }),
         ("broker", &|| edge.slots().broker.get().unwrap().kill()),
         ("gateway", &|| euclid.slots().gateway.get().unwrap().kill()),
         ("follower", &|| {
-            euclid.slots().follower.get().unwrap().kill()
+            euclid.slots().follower.get().unwrap().kill();
         }),
     ];
     for (part, kill) in kills {

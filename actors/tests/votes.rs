@@ -297,7 +297,7 @@ async fn killing_the_keeper_or_the_fuser_loses_nothing_that_was_published() {
     let euclid = cav("euclid", &edge).await;
     unmasked(&euclid, &euclid).await;
     let kills: [&dyn Fn(); 2] = [&|| edge.slots().keeper.get().unwrap().kill(), &|| {
-        edge.slots().fuser.get().unwrap().kill()
+        edge.slots().fuser.get().unwrap().kill();
     }];
     for kill in kills {
         let before = reputations(&euclid).unwrap();
@@ -326,7 +326,7 @@ async fn another_candidate_leads_with_the_same_reputations() {
     let edge = edge(|_| ()).await;
     // It never settles a vote itself: what it knows, it was told.
     let standby = member("standby", Role::Auto, &edge, |config| {
-        config.fusion.vote.weighted.freshness_s = 1e9
+        config.fusion.vote.weighted.freshness_s = 1e9;
     })
     .await;
     let euclid = member("euclid", Role::Cav, &edge, |_| ()).await;

@@ -178,7 +178,7 @@ impl Vehicle {
                 );
             }
             Payload::Report(kind, bytes) => {
-                self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?
+                self.fuse(*kind, &Arc::new(decode_report(bytes, from, &limits)?), now)?;
             }
             Payload::Map(bytes) => self.accept(decode(bytes, &limits)?, now),
             Payload::Evidence(bytes) => self.merge(&decode_share(bytes, from, &limits)?, now),

@@ -375,7 +375,7 @@ fn calibration(config: &TrafficConfig) -> [f64; 2] {
             TrackTruth::parse(&serde_json::to_string(&recording.truth).unwrap()).unwrap(),
         );
         fuse(&recording, |_, map| {
-            map.into_iter().for_each(|map| judge.map(map))
+            map.into_iter().for_each(|map| judge.map(map));
         });
         let scores = judge.result();
         let at = &scores.at_default;

@@ -98,7 +98,7 @@ impl Aggregator {
             Command::Adopt { ledger } => self.adopt(ledger),
             Command::AdoptMap { map, received_at } => self.adopt_map(map, *received_at),
             Command::TakeNeighbours { objects, stated_at } => {
-                self.take_neighbours(objects, *stated_at)
+                self.take_neighbours(objects, *stated_at);
             }
             Command::TakeForeign { reputations } => self.take_foreign(reputations),
             Command::Resume { reputations } => self.resume(reputations),

@@ -59,7 +59,7 @@ impl NeighbourView {
             }
         }
         shown.iter_mut().for_each(|stated| {
-            date_objects(std::slice::from_mut(&mut stated.object), cell_offset_us)
+            date_objects(std::slice::from_mut(&mut stated.object), cell_offset_us);
         });
         shown
     }

@@ -307,7 +307,7 @@ impl Election {
         } = message;
         match message.body {
             Body::Status { over, no_login } => {
-                self.take_status(&from, over.as_ref(), no_login, now)
+                self.take_status(&from, over.as_ref(), no_login, now);
             }
             Body::Ask { ask } => self.answer(&from, ask, now),
             Body::LeaderEvidence { ask, age_ms, life } => {

@@ -222,7 +222,7 @@ impl LeadershipNode {
                 self.update_health(now);
             }
             Input::MemberSuspected { name } => {
-                self.feed(ElectionInput::PeerSuspected { peer: name }, now)
+                self.feed(ElectionInput::PeerSuspected { peer: name }, now);
             }
             Input::MemberDown { name } => self.part_with(name, now),
             Input::OwnBroker { address } => self.own_broker = address,

@@ -123,7 +123,7 @@ fn a_ledger_of_a_million_votes_has_few_marks() {
                 correct: 32 * number,
                 incorrect: 0
             }
-        ))
+        ));
     });
     assert!((20..=32).contains(&marks.len()), "{}", marks.len());
 }
@@ -336,7 +336,7 @@ fn own_evidence_soon_outweighs_what_all_others_say() {
             &name(&format!("cell-{cell}")),
             &name("v"),
             counts(0, 100_000),
-        )
+        );
     });
     let votes = foreign.votes(config.initial_votes, |_| 1.0)[&name("v")];
     let needed = (0..500)

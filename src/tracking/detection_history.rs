@@ -87,7 +87,7 @@ impl DetectionHistory {
         for theirs in other.histories {
             match self.slot_of(theirs.sensor) {
                 Some(slot) if self.histories[slot].last_hit < theirs.last_hit => {
-                    self.histories[slot] = theirs
+                    self.histories[slot] = theirs;
                 }
                 None if self.histories.len() < MAX_SLOTS => {
                     self.sensors.push(theirs.sensor);

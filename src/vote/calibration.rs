@@ -247,7 +247,7 @@ mod tests {
     fn learned(votes: impl Iterator<Item = (usize, f64, bool)> + Clone) -> ConfidenceCalibration {
         let mut calibration = ConfidenceCalibration::new(10.0);
         votes.clone().for_each(|(vehicle, confidence, _)| {
-            calibration.record_confidence(vehicle, confidence)
+            calibration.record_confidence(vehicle, confidence);
         });
         for (vehicle, confidence, agreed) in votes {
             calibration.settle(calibration.band(vehicle, confidence), f64::from(agreed));

@@ -31,10 +31,10 @@ pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
     match encoding {
         Encoding::Json => {
-            serde_json::to_writer(&mut bytes, payload).expect("payloads serialise into memory")
+            serde_json::to_writer(&mut bytes, payload).expect("payloads serialise into memory");
         }
         Encoding::Cbor => {
-            ciborium::into_writer(payload, &mut bytes).expect("payloads serialise into memory")
+            ciborium::into_writer(payload, &mut bytes).expect("payloads serialise into memory");
         }
         Encoding::Compact => compact::write(payload, &mut bytes),
     }
@@ -323,7 +323,7 @@ mod tests {
                     r.view = Some(FieldOfView {
                         range_m: -1.0,
                         angle_rad: 1.0,
-                    })
+                    });
                 },
                 RejectReason::OutOfRange,
             ),
@@ -332,7 +332,7 @@ mod tests {
                     r.view = Some(FieldOfView {
                         range_m: 1.0,
                         angle_rad: 1e9,
-                    })
+                    });
                 },
                 RejectReason::OutOfRange,
             ),

@@ -34,9 +34,9 @@ impl Votes {
     fn settle(&mut self, lane: &Epoch, node: NodeName, correct: bool) -> Evidence {
         let add = |counts: &mut Counts| {
             if correct {
-                counts.correct += 1
+                counts.correct += 1;
             } else {
-                counts.incorrect += 1
+                counts.incorrect += 1;
             }
         };
         let course = self

@@ -54,7 +54,7 @@ fn a_cell_left_alone_has_the_best_leader() {
 fn a_killed_leader_is_replaced_in_200_ms() {
     let mut gaps = Vec::new();
     for_seeds(seeds() / 10, |seed| {
-        gaps.extend(failover_gap(seed, true, 1).map(|gap| (gap, seed)))
+        gaps.extend(failover_gap(seed, true, 1).map(|gap| (gap, seed)));
     });
     report("killed", &mut gaps, 200 * MS);
 }
@@ -64,7 +64,7 @@ fn a_killed_leader_is_replaced_in_200_ms() {
 fn a_leader_killed_with_its_standby_is_replaced_in_200_ms() {
     let mut gaps = Vec::new();
     for_seeds(seeds() / 10, |seed| {
-        gaps.extend(failover_gap(seed, true, 2).map(|gap| (gap, seed)))
+        gaps.extend(failover_gap(seed, true, 2).map(|gap| (gap, seed)));
     });
     report("killed with its standby", &mut gaps, 200 * MS);
 }
@@ -74,7 +74,7 @@ fn a_leader_killed_with_its_standby_is_replaced_in_200_ms() {
 fn a_silent_leader_is_replaced_in_400_ms() {
     let mut gaps = Vec::new();
     for_seeds(seeds() / 10, |seed| {
-        gaps.extend(failover_gap(seed, false, 1).map(|gap| (gap, seed)))
+        gaps.extend(failover_gap(seed, false, 1).map(|gap| (gap, seed)));
     });
     report("silent", &mut gaps, 400 * MS);
 }
@@ -85,7 +85,7 @@ fn a_silent_leader_is_replaced_in_400_ms() {
 fn a_side_without_the_leader_has_its_own_in_400_ms() {
     let mut gaps = Vec::new();
     for_seeds(seeds() / 10, |seed| {
-        gaps.extend(split_gap(seed).map(|gap| (gap, seed)))
+        gaps.extend(split_gap(seed).map(|gap| (gap, seed)));
     });
     report("split", &mut gaps, 400 * MS);
 }

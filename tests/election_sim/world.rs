@@ -271,7 +271,7 @@ impl World {
                 self.plan_connect(to, to, 0);
             }
             Arrival::Timer { armed } if armed == self.nodes[to].armed => {
-                self.handle(to, Input::Wake)
+                self.handle(to, Input::Wake);
             }
             Arrival::Timer { .. } => {}
             Arrival::Publish { term } => self.publish(to, term),

@@ -145,13 +145,13 @@ impl Actor for Fuser {
                 state.keeper.send(ReputationKeeperMessage::StepDown);
             }
             FuserMessage::Configure { fusion, landmarks } => {
-                state.command(Command::Configure { fusion, landmarks })
+                state.command(Command::Configure { fusion, landmarks });
             }
             FuserMessage::TakeNeighbours { objects, stated_at } => {
                 state.command(Command::TakeNeighbours { objects, stated_at });
             }
             FuserMessage::TakeForeign { reputations } => {
-                state.command(Command::TakeForeign { reputations })
+                state.command(Command::TakeForeign { reputations });
             }
             FuserMessage::TellUplink => state.present.clear(),
             FuserMessage::Adopt { ledger } => state.command(Command::Adopt { ledger }),

@@ -120,7 +120,7 @@ impl Actor for Gateway {
         match message {
             GatewayMessage::SetBrokers { addresses } => state.set_brokers(addresses, &myself),
             GatewayMessage::SetReportBrokers { addresses } => {
-                state.report_brokers = Some(addresses)
+                state.report_brokers = Some(addresses);
             }
             GatewayMessage::WatchReports { wanted } => state.watch_reports(wanted),
             GatewayMessage::SetSubscriber { subscriber } => inbox.set_subscriber(subscriber),
@@ -130,20 +130,20 @@ impl Actor for Gateway {
                         &kind.topic(report.node.clone()),
                         &*report,
                         Retention::Transient,
-                    )
+                    );
                 });
                 inbox.deliver_local(Incoming::Report { kind, report });
             }
             GatewayMessage::PublishMap { map } => {
                 publishing().in_scope(|| {
-                    state.publish(&Topic::GlobalDetections, &*map, Retention::Transient)
+                    state.publish(&Topic::GlobalDetections, &*map, Retention::Transient);
                 });
                 links_first().await;
                 inbox.deliver_local(Incoming::Map(map));
             }
             GatewayMessage::PublishVerdicts { verdicts } => {
                 publishing().in_scope(|| {
-                    state.publish(&Topic::GlobalVerdicts, &*verdicts, Retention::Transient)
+                    state.publish(&Topic::GlobalVerdicts, &*verdicts, Retention::Transient);
                 });
                 links_first().await;
                 inbox.deliver_local(Incoming::Verdicts(verdicts));

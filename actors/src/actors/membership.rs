@@ -401,7 +401,7 @@ fn draw_secrets() -> Result<(SessionNonce, [u8; 32], u64), ActorProcessingErr> {
 fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: SocketAddr) {
     match (config.has_key(), address.ip().is_loopback()) {
         (true, _) if proves => {
-            tracing::info!(%address, "looking for nodes that have the cell's key and a certificate")
+            tracing::info!(%address, "looking for nodes that have the cell's key and a certificate");
         }
         (true, _) => {
             tracing::info!(%address, "looking for nodes that have the cell's key; certificates are not asked for");
@@ -410,10 +410,10 @@ fn log_who_can_take_part(config: &MembershipConfig, proves: bool, address: Socke
             tracing::warn!(%address, "looking for nodes that have a certificate; no cell key is set");
         }
         (false, true) => {
-            tracing::info!(%address, "looking for nodes on this machine only: no cell key is set")
+            tracing::info!(%address, "looking for nodes on this machine only: no cell key is set");
         }
         (false, false) => {
-            tracing::warn!(%address, "looking for nodes of anyone: no cell key is set")
+            tracing::warn!(%address, "looking for nodes of anyone: no cell key is set");
         }
     }
 }

@@ -165,7 +165,7 @@ impl Actor for ReputationKeeper {
                 state.record(&epoch, round, &evidence, reputations);
             }
             ReputationKeeperMessage::Configure { reputation } => {
-                state.arguments.reputation = reputation
+                state.arguments.reputation = reputation;
             }
             ReputationKeeperMessage::StepDown => state.resync.step_down(),
             ReputationKeeperMessage::Merge { delivery } => state.merge(&delivery),

@@ -149,11 +149,11 @@ impl Actor for Uplink {
             } => state.configure(origin, description, &myself),
             UplinkMessage::Take { delivery } => match delivery.message {
                 FromRegion::Map { topic, map } => {
-                    state.take_map(&topic, *map, delivery.received_at)
+                    state.take_map(&topic, *map, delivery.received_at);
                 }
                 FromRegion::Status(status) => state.hear_status(&status),
                 FromRegion::Reputation(message) => {
-                    state.take_reputation(&message, delivery.received_at, &myself)
+                    state.take_reputation(&message, delivery.received_at, &myself);
                 }
             },
             UplinkMessage::SetPresent { vehicles } => state.set_present(&vehicles),
@@ -216,7 +216,7 @@ impl UplinkState {
         match (self.setup.origin.filter(|_| leads), self.link.take()) {
             (None, Some(link)) => self.leave(link),
             (Some(origin), None) => {
-                self.link = Some(self.connect(Quadkey::of_cell(&origin), myself))
+                self.link = Some(self.connect(Quadkey::of_cell(&origin), myself));
             }
             (Some(_), link) => self.link = link,
             (None, None) => {}

@@ -183,10 +183,10 @@ impl Report {
             SchemaName::Verdicts => self.with(message, |report, it| report.verdicts(at, it)),
             SchemaName::Reputations => self.with(message, |report, it| report.reputations(at, &it)),
             SchemaName::Leadership => self.with(message, |report, it| {
-                report.changes.push(LeadershipChange { at_us: at, ..it })
+                report.changes.push(LeadershipChange { at_us: at, ..it });
             }),
             SchemaName::Counters => self.with(message, |report, it| {
-                report.counters(CounterReading { at_us: at, ..it })
+                report.counters(CounterReading { at_us: at, ..it });
             }),
             SchemaName::NodeStatus => {
                 self.with(message, |report, it| report.timeline.status(it, at))
@@ -196,7 +196,7 @@ impl Report {
                 if *self.camera.get_or_insert_with(|| message.topic.clone()) == message.topic =>
             {
                 self.with(message, |report, it: RecordedPicture| {
-                    report.timeline.picture(it, at)
+                    report.timeline.picture(it, at);
                 })
             }
             _ => true,

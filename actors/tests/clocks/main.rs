@@ -180,7 +180,7 @@ fn run(trial: &Trial) -> Outcome {
             } else {
                 Fake::Off
             },
-        )
+        );
     };
     let nodes = || VEHICLES.into_iter().filter(|name| *name != "feeder");
     for name in nodes().filter(|name| *name != trial.whose) {

@@ -387,10 +387,10 @@ impl Program {
                             topic: String::from_utf8(publish.topic.to_vec()).unwrap(),
                             payload: publish.payload.to_vec(),
                             at: Instant::now(),
-                        })
+                        });
                     }
                     Ok(Event::Incoming(Packet::ConnAck(_) | Packet::SubAck(_))) => {
-                        drop(ready.send(()))
+                        drop(ready.send(()));
                     }
                     Ok(Event::Incoming(Packet::PubAck(answer))) => {
                         let text = answer

@@ -232,7 +232,7 @@ async fn names_without_end_leave_room_for_the_statuses_of_nodes() {
 async fn what_the_cell_would_not_use_is_refused_at_the_door() {
     let mut cell = Cell::new();
     cell.start("edge", Role::Edge, |config| {
-        config.fusion.algorithms = Algorithms::Pace
+        config.fusion.algorithms = Algorithms::Pace;
     })
     .await;
     cell.served_by("edge").await;

@@ -449,7 +449,7 @@ async fn the_door_is_the_same_with_an_external_broker() {
     let mut cell = Cell::new();
     for (name, role) in [("gauss", Role::Auto), ("euclid", Role::Cav)] {
         cell.start(name, role, |config| {
-            config.mqtt.broker = Some(broker.into())
+            config.mqtt.broker = Some(broker.into());
         })
         .await;
     }

@@ -17,7 +17,7 @@ use crate::nodes::{aggregator, start, start_cell, start_with, until};
 async fn full_edge(pki: &mut Pki) -> NodeHandle {
     let tls = pki.issue("edge", Role::Edge, DAY);
     let edge = start_with("edge", Role::Edge, tls, None, |config| {
-        config.broker.max_clients = 1
+        config.broker.max_clients = 1;
     })
     .await;
     until("edge leads alone", || {

@@ -279,7 +279,7 @@ async fn two_hundred_vehicles_lose_nothing() {
     const VEHICLES: usize = 200;
     const REPORTS: usize = 20;
     let mut cell = Cell::start_with(|config| {
-        (config.connect_burst, config.handshake_timeout_ms) = (1000, 10_000)
+        (config.connect_burst, config.handshake_timeout_ms) = (1000, 10_000);
     })
     .await;
     let mut reader = log_in(&mut cell, "gauss", Role::Auto, CLEAN).await;

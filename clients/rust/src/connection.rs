@@ -181,7 +181,7 @@ impl ConnectionState {
             match event {
                 Event::Incoming(Incoming::ConnAck(_)) => state.begin(client),
                 Event::Incoming(Incoming::Publish(message)) => {
-                    self.take(&mut state, &message.topic, &message.payload)
+                    self.take(&mut state, &message.topic, &message.payload);
                 }
                 Event::Incoming(Incoming::SubAck(answer)) => {
                     let refused = answer

@@ -352,7 +352,7 @@ fn a_cell_without_a_usable_description_says_so() {
     let say = |payload| {
         speaker
             .publish(DESCRIPTION, QoS::AtLeastOnce, true, payload)
-            .unwrap()
+            .unwrap();
     };
     for text in [
         "[origin",
@@ -463,7 +463,7 @@ fn only_later_rounds_are_given_and_the_newest_first() {
     let say = |payload: Vec<u8>| {
         speaker
             .publish(MAPS, QoS::AtLeastOnce, false, payload)
-            .unwrap()
+            .unwrap();
     };
     say(map(3, 5));
     assert_eq!(maps.next().unwrap().unwrap().round, 5);

@@ -195,7 +195,7 @@ impl RosCamera {
                 Ok(object) => match object.check_fields() {
                     Ok(_) => placed.push(object),
                     Err((field, flaw)) => {
-                        refused.push(InputRefusal::Report.with(format!("{field}: {flaw}")))
+                        refused.push(InputRefusal::Report.with(format!("{field}: {flaw}")));
                     }
                 },
                 Err(refused_input) => refused.push(refused_input),

@@ -140,7 +140,7 @@ async fn on_a_thread(
     let (done, sent) = oneshot::channel();
     let drive = move || {
         done.send(drive(schedule, load, &target, senders))
-            .unwrap_or_default()
+            .unwrap_or_default();
     };
     thread::Builder::new()
         .name("bench-driver".into())

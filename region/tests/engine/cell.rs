@@ -66,7 +66,7 @@ impl Cell {
                             .extend(answer.return_codes.iter().map(granted));
                     }
                     Ok(Event::Incoming(Packet::Publish(message))) => {
-                        noted.topics.push(message.topic)
+                        noted.topics.push(message.topic);
                     }
                     Err(rumqttc::ConnectionError::ConnectionRefused(_)) => {
                         noted.is_refused = true;

@@ -332,7 +332,7 @@ impl Election {
                 self.lose_leader(now);
             }
             State::Seeking(_) | State::Following(_) | State::Leading(_) => {
-                self.name_successors(now)
+                self.name_successors(now);
             }
         }
     }

@@ -106,7 +106,7 @@ impl Election {
         let least = self.config.beat();
         match &mut self.state {
             State::Following(following) if following.epoch == *epoch => {
-                following.take_round(least, now)
+                following.take_round(least, now);
             }
             State::Leading(leading) => {
                 if let Some(handover) = leading

@@ -376,7 +376,7 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
                     edges(r).foreign = Some(ForeignVotes {
                         correct: -1.0,
                         incorrect: 0.0,
-                    })
+                    });
                 },
                 RejectReason::OutOfRange,
             ),
@@ -385,7 +385,7 @@ fn each_flaw_of_reputations_and_statuses_has_its_reason() {
                     edges(r).foreign = Some(ForeignVotes {
                         correct: 0.0,
                         incorrect: f64::NAN,
-                    })
+                    });
                 },
                 RejectReason::NotFinite,
             ),

@@ -441,10 +441,10 @@ fn log_clock(event: ClockEvent) {
     let seconds = |micros: i64| micros as f64 / 1e6;
     match event {
         ClockEvent::WallStepped(step_us) => {
-            tracing::info!(step_s = seconds(step_us), "this machine's clock was set")
+            tracing::info!(step_s = seconds(step_us), "this machine's clock was set");
         }
         ClockEvent::CellJumped(jump_us) => {
-            tracing::info!(jump_s = seconds(jump_us), "the cell's time jumps")
+            tracing::info!(jump_s = seconds(jump_us), "the cell's time jumps");
         }
     };
 }
@@ -476,10 +476,10 @@ fn log(notice: Notice) {
              or set broker.allow_plaintext, or an external mqtt.broker that is there"
         ),
         Notice::ProcessGone { peer, broker } => {
-            tracing::info!(%peer, %broker, "the process of another node is gone")
+            tracing::info!(%peer, %broker, "the process of another node is gone");
         }
         Notice::LeaderDisconnected { peer } => {
-            tracing::info!(%peer, "the leader's connection to this node broke")
+            tracing::info!(%peer, "the leader's connection to this node broke");
         }
         Notice::Preparing { leader } => tracing::info!(%leader, "preparing to take over"),
         Notice::NotServed { challenger } => {

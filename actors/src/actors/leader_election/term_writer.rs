@@ -120,7 +120,7 @@ async fn write_all(
         let written = written.map_err(std::io::Error::other).flatten();
         match &written {
             Ok(()) if is_failing => {
-                tracing::info!(path = %file.path().display(), "term saved again")
+                tracing::info!(path = %file.path().display(), "term saved again");
             }
             Err(error) if !is_failing => {
                 tracing::warn!(path = %file.path().display(), %error, "term not saved");

@@ -81,7 +81,7 @@ impl V4l2Camera {
         match camera.set_frame_interval(Fract::new(1000, (fps * 1000.0).round().max(1.0) as u32)) {
             Ok(interval) => tracing::debug!(camera = origin, ?layout, %interval, "camera opened"),
             Err(error) => {
-                tracing::debug!(camera = origin, ?layout, fps, %error, "camera rejects the rate")
+                tracing::debug!(camera = origin, ?layout, fps, %error, "camera rejects the rate");
             }
         }
         let stream = camera.into_stream().map_err(refused("it does not start"))?;

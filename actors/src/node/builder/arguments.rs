@@ -296,7 +296,7 @@ impl NodeBuilder {
             credentials: self.security.credentials.clone(),
             // A supervisor that has ended needs no settings.
             apply: Arc::new(move |description| {
-                _ = supervisor.cast(NodeMessage::Describe { description })
+                _ = supervisor.cast(NodeMessage::Describe { description });
             }),
             members: self.members(),
             leadership: self.leadership(),

@@ -46,7 +46,7 @@ impl NodeBuilder {
                     attempts += 1;
                 }
                 Err(BrokerError::Bind { .. }) if attempts > 0 => {
-                    tokio::time::sleep(REBIND_WAIT).await
+                    tokio::time::sleep(REBIND_WAIT).await;
                 }
                 outcome => break outcome.map_err(|error| format!("key `listen`: {error}"))?,
             }
@@ -67,20 +67,20 @@ impl NodeBuilder {
         let credentials = self.security.credentials.clone();
         match (&credentials, listen.ip().is_loopback()) {
             _ if !self.config.serves_nodes() => {
-                tracing::info!(%listen, "broker for programs of this node")
+                tracing::info!(%listen, "broker for programs of this node");
             }
             (None, true) if self.config.data_plane().external.is_some() => tracing::warn!(
                 "mqtt.fallback_to_embedded serves this machine only: without certificates in [tls] or \
                  broker.allow_plaintext other machines are without maps when the external broker is gone"
             ),
             (None, true) => {
-                tracing::info!("broker for this machine only: no certificates are configured")
+                tracing::info!("broker for this machine only: no certificates are configured");
             }
             (None, false) => {
-                tracing::warn!(%listen, "broker for anyone: no certificates are configured")
+                tracing::warn!(%listen, "broker for anyone: no certificates are configured");
             }
             (Some(_), _) => {
-                tracing::info!(%listen, "broker for whoever has a certificate of the cell")
+                tracing::info!(%listen, "broker for whoever has a certificate of the cell");
             }
         }
         let (topics, elected) = (
@@ -117,7 +117,7 @@ impl NodeBuilder {
             {
                 Ok((actor, _)) => break actor,
                 Err(error) if attempts > 0 && error.is::<BindError>() => {
-                    tokio::time::sleep(REBIND_WAIT).await
+                    tokio::time::sleep(REBIND_WAIT).await;
                 }
                 Err(error) => return Err(error),
             }

@@ -98,7 +98,7 @@ async fn serve(
     let router = HttpApi::new(Arc::clone(monitor), config.max_connections).router(access);
     let limit = ConnectionLimit::new(config.max_connections);
     accept(&listener, &limit, &router, || {
-        monitor.sources.counters.count(Event::BrowserRefused)
+        monitor.sources.counters.count(Event::BrowserRefused);
     })
     .await;
 }

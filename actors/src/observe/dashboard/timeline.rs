@@ -345,7 +345,7 @@ mod tests {
         for second in 1..=3600 {
             timeline.frames.push(at(second), || vec![b'x'; 500_000]);
             (0..100).for_each(|n| {
-                timeline.event(EventKind::Trouble, format!("{second} {n}"), at(second))
+                timeline.event(EventKind::Trouble, format!("{second} {n}"), at(second));
             });
             most = most.max(timeline.frames.bytes);
         }

@@ -102,7 +102,7 @@ mod tests {
             match field["type"].as_str() {
                 Some("object") => check(&path, field),
                 Some("array") if field["items"]["type"] == "object" => {
-                    check(&path, &field["items"])
+                    check(&path, &field["items"]);
                 }
                 Some("array") => assert!(is_plain(&field["items"]), "{path}: {field}"),
                 _ => assert!(is_plain(field), "{path}: {field}"),

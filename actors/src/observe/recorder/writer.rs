@@ -187,7 +187,7 @@ impl LogWriter {
                     (FusionConfig::clone(fusion), landmarks.clone());
             }
             LogItem::Journal(JournalEvent::Command(Command::StepDown)) => {
-                aggregator_state.leads = None
+                aggregator_state.leads = None;
             }
             LogItem::Round(round) => aggregator_state.next_round = round.saturating_add(1),
             _ => {}

@@ -224,7 +224,7 @@ impl GossipMachine {
             .or_else(|| self.sessions.heard_at(to, at));
         match address {
             Some(address) if !self.left => {
-                self.send_or_queue(to, address, FrameKind::Payload, payload, at)
+                self.send_or_queue(to, address, FrameKind::Payload, payload, at);
             }
             _ => self.counters.count(FrameEvent::NoSession),
         }
@@ -326,7 +326,7 @@ impl GossipMachine {
         match claim {
             NameClaim::Free => (),
             NameClaim::After(life) if life <= MAX_CLAIMED_LIFE => {
-                self.gossip.start_life_after(life, at)
+                self.gossip.start_life_after(life, at);
             }
             NameClaim::After(_) => (),
             NameClaim::Taken => return self.step_back(from, at),
@@ -421,7 +421,7 @@ impl GossipMachine {
         }
         match self.pending.get_mut(to) {
             Some(pending) if pending.frames.len() < MAX_PENDING_FRAMES => {
-                pending.frames.push((kind, body.to_vec()))
+                pending.frames.push((kind, body.to_vec()));
             }
             _ => self.counters.count(FrameEvent::NoSession),
         }

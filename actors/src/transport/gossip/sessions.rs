@@ -406,7 +406,7 @@ impl Sessions {
             let has = "not admitted: it shows a certificate, and this node has no `[tls]`";
             match &mut self.prover {
                 Some(prover) => {
-                    prover.refuse(&name, from, "it shows no certificate; it has no `[tls]`")
+                    prover.refuse(&name, from, "it shows no certificate; it has no `[tls]`");
                 }
                 None => self.notices.add(&name, TroubleKind::NotAdmitted, has),
             }

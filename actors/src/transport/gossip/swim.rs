@@ -177,7 +177,7 @@ impl Swim {
                 }
                 Some(_) => {}
                 None if update.state() != State::Down => {
-                    self.outputs.push_back(SwimOutput::Unproven(id.clone()))
+                    self.outputs.push_back(SwimOutput::Unproven(id.clone()));
                 }
                 None => {}
             }
@@ -341,9 +341,9 @@ impl Swim {
                     .renewed_at
                     .map_or(now, |renewed_at| renewed_at + MIN_RENEW_INTERVAL);
                 if earliest <= now {
-                    self.renew(now)
+                    self.renew(now);
                 } else {
-                    self.renew_at = Some(earliest)
+                    self.renew_at = Some(earliest);
                 }
             }
             OwnedNotification::Active

@@ -493,7 +493,7 @@ mod tests {
         let held = Arc::new(Mutex::new(Vec::new()));
         let receiver = Arc::clone(&held);
         let inbox = inbox((2, 100), &counters, move |delivery| {
-            receiver.lock().unwrap().push(delivery)
+            receiver.lock().unwrap().push(delivery);
         });
         let payload = |aggregator: &str| {
             let aggregator = NodeName::new(aggregator).ok();

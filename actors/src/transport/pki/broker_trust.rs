@@ -114,7 +114,7 @@ impl BrokerTrust {
         loop {
             match &self.reloaded_from {
                 Some((credentials, known)) => {
-                    drop(timeout(RECHECK_INTERVAL, credentials.changed(known)).await)
+                    drop(timeout(RECHECK_INTERVAL, credentials.changed(known)).await);
                 }
                 None => sleep(RECHECK_INTERVAL).await,
             }

@@ -299,7 +299,7 @@ fn an_object_with_a_coordinate_out_of_range_is_left_out() {
 fn a_confidence_that_is_a_code_is_a_wide_covariance() {
     let variance = |confidence| {
         only(with(|object| {
-            object.position.x_coordinate.confidence.0 = confidence
+            object.position.x_coordinate.confidence.0 = confidence;
         }))
         .covariance_m2
         .unwrap()[0]

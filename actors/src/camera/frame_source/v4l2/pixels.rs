@@ -154,7 +154,7 @@ impl FrameLayout {
         let mut bgr = Mat::default();
         match self.way {
             Way::Packed(_, code) | Way::Planar(code) => {
-                imgproc::cvt_color_def(&pixels, &mut bgr, code)?
+                imgproc::cvt_color_def(&pixels, &mut bgr, code)?;
             }
             Way::Same | Way::Jpeg => pixels.copy_to(&mut bgr)?,
         }

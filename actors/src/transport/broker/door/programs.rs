@@ -465,7 +465,7 @@ impl Handler for DoorHooks {
             }
             Parameter::SessionTerminated(session, _) => {
                 door.change_filters(|filters| {
-                    filters.retain(|(client, _), _| *client != session.id.client_id)
+                    filters.retain(|(client, _), _| *client != session.id.client_id);
                 });
                 (true, before)
             }

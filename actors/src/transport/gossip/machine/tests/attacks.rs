@@ -86,7 +86,7 @@ fn a_flood_of_recorded_greetings_is_answered_at_a_bounded_rate() {
     for _ in 0..1000 {
         (0..20).for_each(|_| {
             cell.under_way
-                .push((cell.now, address(77), address(1), hello.clone()))
+                .push((cell.now, address(77), address(1), hello.clone()));
         });
         cell.run(1);
     }

@@ -258,7 +258,7 @@ fn swapped_ephemerals_and_certificates_are_noticed() {
     let to_a = a.sessions.own;
     let swapped = reseal(&to_a, &accept, |_, body| {
         change_attestation(body, |attestation| {
-            attestation.ephemeral = prover.draw_ephemeral().unwrap().1
+            attestation.ephemeral = prover.draw_ephemeral().unwrap().1;
         });
     });
     assert_eq!(
