@@ -390,7 +390,7 @@ impl Program {
                         });
                     }
                     Ok(Event::Incoming(Packet::ConnAck(_) | Packet::SubAck(_))) => {
-                        drop(ready.send(()));
+                        let _ = ready.send(());
                     }
                     Ok(Event::Incoming(Packet::PubAck(answer))) => {
                         let text = answer
