@@ -32,7 +32,7 @@ check: ## [check] format, clippy and unit tests of the core and of the node with
 	cargo test --locked --quiet -p ecod --lib
 	cargo test --locked --quiet -p ecod-actors --no-default-features --lib --bins
 
-words: ## [check] rates of three habits that make texts hard to read; they may only fall (packaging/check-words --help)
+words: ## [check] three habits that make texts hard to read, per area; the rates may only fall
 	packaging/check-words
 
 # make changelog VERSION=0.2.0 writes the section and removes the fragments.
@@ -47,7 +47,7 @@ setup: ## [start] install the system packages that are missing
 	    DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends $$missing >/dev/null; \
 	fi
 
-demo: setup ## [start] run a whole cell as separate processes on this machine and print what it saw
+demo: setup ## [start] run a whole cell as separate processes on this machine and print its accuracy
 	cargo build --release --locked --bin ecod-node --bin ecod-video --bin ecod-lab
 	$(BUILD)/release/ecod-lab demo --seconds $(SECONDS_PER_SCENE) --out target/demo
 
@@ -71,11 +71,11 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 eval-generated: setup ## VOTE beside the majority on 200 generated label sets
 	cargo test --release --locked -p ecod --test vote_generated -- --include-ignored --nocapture
 
-eval-tracks: setup ## [measure] tracks in generated traffic beside single vehicles and late fusion; table and drawing go into docs/
+eval-tracks: setup ## [measure] tracking in generated traffic beside single vehicles and late fusion; writes table and drawings in docs/
 	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
 	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/evaluation.md --svg docs/tracks.svg --reliability docs/reliability.svg)
 
-# DIR holds copies of the repositories that docs/measurements.md names; all that is missing is told.
+# DIR holds copies of the repositories that docs/measurements.md names; the program names missing ones.
 eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI, WILDTRACK, CF, SP
 	@test -n "$(DIR)" || { echo "make eval-real DIR=... : a directory with the data that docs/measurements.md names"; exit 2; }
 	cargo build --release --locked --bin ecod-node --bin ecod-lab
@@ -108,14 +108,14 @@ test-dashboard: setup monitoring ## the page in a real browser, with pictures in
 monitoring: ## check the rules for Prometheus; takes promtool out of Debian's package if it is not installed
 	packaging/check-monitoring
 
-sim: setup ## [check] simulated cells under faults: SEEDS=10000 of them, or the one of SEED=n
+sim: setup ## [check] simulated cells under faults: SEEDS=10000, or one with SEED=n
 	SEEDS=$${SEEDS:-10000} cargo test --release --locked -p ecod --test election_sim -- --nocapture
 
 sim-check: setup ## bugs put in by hand, each of which the simulated cells must find within SEEDS=1000 seeds
 	packaging/check-sim
 
 trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
-trials: setup ## [measure] real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
+trials: setup ## [measure] gaps of real cells that are killed, stopped and cut off: TRIALS=20 SCENARIOS=a,b NODES=2,5
 	cargo test $(RELEASE) --locked --test trials -- --ignored --exact trials --nocapture
 
 joining: PACKAGES += iproute2 mosquitto-clients
@@ -127,11 +127,11 @@ clocks: setup ## real cells with wrong clocks that step, as vehicle and as leade
 	cargo test --release --locked --test clocks -- --ignored --exact all --nocapture
 
 soak: PACKAGES += iproute2 nftables
-soak: setup ## [measure] a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
+soak: setup ## [measure] a cell of NODES=32 under seeded faults for MINUTES=30, SEED=1
 	cargo test $(RELEASE) --locked --test trials -- --ignored --exact soak::soak --nocapture
 
 attack: PACKAGES += iproute2
-attack: setup ## [measure] attackers of all kinds against real cells, and a table; ROWS=text runs those named so, ATTACK=quick a part
+attack: setup ## [measure] attackers of all kinds against real cells: ROWS=text selects rows, ATTACK=quick a part
 	cargo test $(RELEASE) --locked --test attacks -- --ignored --exact attacks --nocapture
 
 lint: setup ## [check] formatting, clippy and rustdoc with warnings denied
@@ -142,7 +142,7 @@ lint: setup ## [check] formatting, clippy and rustdoc with warnings denied
 doc: setup ## API documentation in target/doc
 	cargo doc --locked --no-deps
 
-audit: ## [check] licences, sources and duplicate policies of all dependencies; known vulnerabilities where the database is reachable
+audit: ## [check] licences, sources, duplicates and known vulnerabilities of all dependencies
 	packaging/audit
 
 core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
@@ -179,7 +179,7 @@ foxglove-check: setup ## a camera's log against Foxglove's published schemas, an
 tracing-check: setup ## follow a detection through two nodes, with the feature otel
 	cargo test --locked -p ecod-actors --features otel --test tracing
 
-fuzz: setup ## [check] decoders, evidence and the fuser against hostile input, SECONDS=60 each or RUNS=n executions each; TARGETS=payload,... runs those only
+fuzz: setup ## [check] hostile input for decoders, evidence and fuser: SECONDS=60 or RUNS=n per target, TARGETS=payload,...
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
 
 verify-handshake: ## the membership's handshake against an attacker that has the network, the cell's key and a certificate; needs Verifpal
@@ -223,11 +223,11 @@ dds-check: PACKAGES := build-essential ca-certificates iproute2 python3-venv
 dds-check: setup ## live topics of ROS 2 and a detector's, in a network of their own, against Cyclone DDS for Python; needs root
 	packaging/check-dds
 
-deb: setup ## [release] Debian packages of a node, with camera and without, and of the COCO weights, in target/debian
+deb: setup ## [release] Debian packages with camera, without camera, and of the COCO weights, in target/debian
 	packaging/deb
 
 deb-arm64: PACKAGES += debootstrap systemd-container
-deb-arm64: setup ## [release] the same packages for arm64, built in a Debian of its own in target/arm64-root; needs root
+deb-arm64: setup ## [release] these packages for arm64, built in a Debian in target/arm64-root; needs root
 	packaging/arm64 packaging/deb
 
 package-check-arm64: PACKAGES += mosquitto-clients python3 qrencode
@@ -240,7 +240,7 @@ package-check: setup ## build the package without camera, and install, run, upgr
 	packaging/check-package
 
 footprint: PACKAGES += python3
-footprint: deb ## [measure] hold size, memory and start of the packages' node against bars: with camera and COCO, and without
+footprint: deb ## [measure] size, memory and start time of the packaged node against bars
 	packaging/check-footprint
 
 release: PACKAGES += apt-utils debootstrap gnupg systemd-container
@@ -262,7 +262,7 @@ city: setup ## a region of three servers with 2000 simulated cells and 20 real o
 	REGION_PROGRAM=$(PROGRAMS)/ecod-region $(PROGRAMS)/examples/city --node $(PROGRAMS)/ecod-node \
 	    $(if $(filter quick,$(CITY)),--quick --cells 200 --real 2 --seconds 6,--real 20 $(CITY))
 
-bench: setup ## [measure] speed of the core, the detectors and the path through the broker, in target/bench.json
+bench: setup ## [measure] speed of core, detectors and broker path, in target/bench.json
 	packaging/bench
 
 instructions: PACKAGES := build-essential ca-certificates valgrind
