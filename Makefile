@@ -14,12 +14,32 @@ PASSES ?= 50
 
 comma := ,
 
-.PHONY: help setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
+.PHONY: help help-all check words changelog setup demo demo-picture testbed eval-labels eval-generated eval-tracks eval-city eval-tracks-check eval-real liars test test-dashboard monitoring sim sim-check trials joining clocks soak attack lint doc audit bench core-only fuzz instructions rooms code-lines replay-check replay-check-arm64 edge-only recording-check models-check live-check foxglove-check tracing-check verify-handshake asyncapi-check python-client-check cpm-check ros2-check dds-check deb deb-arm64 package-check package-check-arm64 footprint release release-check instructions-arm64 city clean
 
-help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+# A target that `make help` lists has its group in square brackets.
+help:
+	@awk -F ':.*## ' 'BEGIN { n = split("start check measure release", groups, " ") } \
+	    match($$2, /^\[[a-z]+\] /) { group = substr($$2, 2, RLENGTH - 3); text[group] = text[group] sprintf("  %-12s %s\n", $$1, substr($$2, RLENGTH + 1)) } \
+	    END { for (i = 1; i <= n; i++) printf "%s\n%s", groups[i], text[groups[i]] }' $(MAKEFILE_LIST)
 
-setup: ## install the system packages that are missing
+help-all: ## [start] list all targets
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { sub(/^\[[a-z]+\] /, "", $$2); printf "%-24s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+check: ## [check] format, clippy and unit tests of the core and of the node without OpenCV, as on each push
+	cargo fmt --all --check
+	cargo clippy --locked -p ecod --lib --tests -- -D warnings
+	cargo clippy --locked -p ecod-actors --no-default-features --lib --bins -- -D warnings
+	cargo test --locked --quiet -p ecod --lib
+	cargo test --locked --quiet -p ecod-actors --no-default-features --lib --bins
+
+words: ## [check] three habits that make texts hard to read, per area; the rates may only fall
+	packaging/check-words
+
+# make changelog VERSION=0.2.0 writes the section and removes the fragments.
+changelog: ## [release] join the fragments of changes/ into a section of CHANGELOG.md
+	packaging/join-changes $(VERSION)
+
+setup: ## [start] install the system packages that are missing
 	@missing=$$(for p in $(PACKAGES); do dpkg-query -W -f='$${Status}' $$p 2>/dev/null | grep -q 'ok installed' || echo $$p; done); \
 	if [ -n "$$missing" ]; then \
 	    echo "installing" $$missing; \
@@ -27,7 +47,7 @@ setup: ## install the system packages that are missing
 	    DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends $$missing >/dev/null; \
 	fi
 
-demo: setup ## run a whole cell as separate processes on this machine and print what it saw
+demo: setup ## [start] run a whole cell as separate processes on this machine and print its accuracy
 	cargo build --release --locked --bin ecod-node --bin ecod-video --bin ecod-lab
 	$(BUILD)/release/ecod-lab demo --seconds $(SECONDS_PER_SCENE) --out target/demo
 
@@ -51,11 +71,11 @@ eval-labels: setup ## accuracy of VOTE on label sets; the table goes into docs/a
 eval-generated: setup ## VOTE beside the majority on 200 generated label sets
 	cargo test --release --locked -p ecod --test vote_generated -- --include-ignored --nocapture
 
-eval-tracks: setup ## tracks in generated traffic beside single vehicles and late fusion; table and drawing go into docs/
+eval-tracks: setup ## [measure] tracking in generated traffic beside single vehicles and late fusion; writes table and drawings in docs/
 	cargo run --release --quiet --locked --example eval_tracks -- --seeds $(or $(TRAFFIC),report) \
 	    $(if $(filter tuning,$(TRAFFIC)),,--write-table docs/evaluation.md --svg docs/tracks.svg --reliability docs/reliability.svg)
 
-# DIR holds copies of the repositories that docs/measurements.md names; all that is missing is told.
+# DIR holds copies of the repositories that docs/measurements.md names; the program names missing ones.
 eval-real: setup ## accuracy on real recordings and label sets in DIR=...: KITTI, WILDTRACK, CF, SP
 	@test -n "$(DIR)" || { echo "make eval-real DIR=... : a directory with the data that docs/measurements.md names"; exit 2; }
 	cargo build --release --locked --bin ecod-node --bin ecod-lab
@@ -78,7 +98,7 @@ eval-tracks-check: setup ## figures of tracks against TrackEval and motmetrics f
 # Most tests wait most of their time. TEST_FLAGS=--no-run only builds them.
 test: export RUST_TEST_THREADS ?= $(shell expr 2 '*' $$(nproc))
 test: PACKAGES += libfaketime mosquitto mosquitto-clients nats-server
-test: setup ## all tests
+test: setup ## [check] all tests
 	cargo test --locked $(TEST_FLAGS)
 
 test-dashboard: PACKAGES += chromium chromium-driver
@@ -88,14 +108,14 @@ test-dashboard: setup monitoring ## the page in a real browser, with pictures in
 monitoring: ## check the rules for Prometheus; takes promtool out of Debian's package if it is not installed
 	packaging/check-monitoring
 
-sim: setup ## simulated cells under faults: SEEDS=10000 of them, or the one of SEED=n
+sim: setup ## [check] simulated cells under faults: SEEDS=10000, or one with SEED=n
 	SEEDS=$${SEEDS:-10000} cargo test --release --locked -p ecod --test election_sim -- --nocapture
 
 sim-check: setup ## bugs put in by hand, each of which the simulated cells must find within SEEDS=1000 seeds
 	packaging/check-sim
 
 trials: PACKAGES += iproute2 mosquitto mosquitto-clients nftables
-trials: setup ## real cells, killed, stopped and cut off: TRIALS=20 each; SCENARIOS=a,b and NODES=2,5 run those only
+trials: setup ## [measure] gaps of real cells that are killed, stopped and cut off: TRIALS=20 SCENARIOS=a,b NODES=2,5
 	cargo test $(RELEASE) --locked --test trials -- --ignored --exact trials --nocapture
 
 joining: PACKAGES += iproute2 mosquitto-clients
@@ -107,14 +127,14 @@ clocks: setup ## real cells with wrong clocks that step, as vehicle and as leade
 	cargo test --release --locked --test clocks -- --ignored --exact all --nocapture
 
 soak: PACKAGES += iproute2 nftables
-soak: setup ## a cell of NODES=32 under seeded faults for MINUTES=30; SEED=1
+soak: setup ## [measure] a cell of NODES=32 under seeded faults for MINUTES=30, SEED=1
 	cargo test $(RELEASE) --locked --test trials -- --ignored --exact soak::soak --nocapture
 
 attack: PACKAGES += iproute2
-attack: setup ## attackers of all kinds against real cells, and a table; ROWS=text runs those named so, ATTACK=quick a part
+attack: setup ## [measure] attackers of all kinds against real cells: ROWS=text selects rows, ATTACK=quick a part
 	cargo test $(RELEASE) --locked --test attacks -- --ignored --exact attacks --nocapture
 
-lint: setup ## formatting, clippy and rustdoc with warnings denied
+lint: setup ## [check] formatting, clippy and rustdoc with warnings denied
 	cargo fmt --all --check
 	cargo clippy --locked --workspace --exclude ecod-fuzz --all-targets --features ecod-instructions/detectors -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --locked --no-deps --document-private-items
@@ -122,7 +142,7 @@ lint: setup ## formatting, clippy and rustdoc with warnings denied
 doc: setup ## API documentation in target/doc
 	cargo doc --locked --no-deps
 
-audit: ## licences, sources and duplicate policies of all dependencies; known vulnerabilities where the database is reachable
+audit: ## [check] licences, sources, duplicates and known vulnerabilities of all dependencies
 	packaging/audit
 
 core-only: ## prove that the core needs no runtime: it depends on a list of crates, none of them tokio, sockets or OpenCV
@@ -159,7 +179,7 @@ foxglove-check: setup ## a camera's log against Foxglove's published schemas, an
 tracing-check: setup ## follow a detection through two nodes, with the feature otel
 	cargo test --locked -p ecod-actors --features otel --test tracing
 
-fuzz: setup ## decoders, evidence and the fuser against hostile input, SECONDS=60 each or RUNS=n executions each; TARGETS=payload,... runs those only
+fuzz: setup ## [check] hostile input for decoders, evidence and fuser: SECONDS=60 or RUNS=n per target, TARGETS=payload,...
 	packaging/fuzz $(or $(SECONDS),60) $(subst $(comma), ,$(TARGETS))
 
 verify-handshake: ## the membership's handshake against an attacker that has the network, the cell's key and a certificate; needs Verifpal
@@ -203,11 +223,11 @@ dds-check: PACKAGES := build-essential ca-certificates iproute2 python3-venv
 dds-check: setup ## live topics of ROS 2 and a detector's, in a network of their own, against Cyclone DDS for Python; needs root
 	packaging/check-dds
 
-deb: setup ## Debian packages of a node, with camera and without, and of the COCO weights, in target/debian
+deb: setup ## [release] Debian packages with camera, without camera, and of the COCO weights, in target/debian
 	packaging/deb
 
 deb-arm64: PACKAGES += debootstrap systemd-container
-deb-arm64: setup ## the same packages for arm64, built in a Debian of its own in target/arm64-root; needs root
+deb-arm64: setup ## [release] these packages for arm64, built in a Debian in target/arm64-root; needs root
 	packaging/arm64 packaging/deb
 
 package-check-arm64: PACKAGES += mosquitto-clients python3 qrencode
@@ -220,11 +240,11 @@ package-check: setup ## build the package without camera, and install, run, upgr
 	packaging/check-package
 
 footprint: PACKAGES += python3
-footprint: deb ## hold size, memory and start of the packages' node against bars: with camera and COCO, and without
+footprint: deb ## [measure] size, memory and start time of the packaged node against bars
 	packaging/check-footprint
 
 release: PACKAGES += apt-utils debootstrap gnupg systemd-container
-release: setup ## packages for amd64 and arm64, SBOM, checksums and an apt repository of the commit, in target/dist; KEY=... signs it
+release: setup ## [release] packages for amd64 and arm64, SBOM, checksums and an apt repository of the commit, in target/dist; KEY=... signs it
 	packaging/release
 
 release-check: PACKAGES += debootstrap gnupg
@@ -242,7 +262,7 @@ city: setup ## a region of three servers with 2000 simulated cells and 20 real o
 	REGION_PROGRAM=$(PROGRAMS)/ecod-region $(PROGRAMS)/examples/city --node $(PROGRAMS)/ecod-node \
 	    $(if $(filter quick,$(CITY)),--quick --cells 200 --real 2 --seconds 6,--real 20 $(CITY))
 
-bench: setup ## speed of the core, the detectors and the path through the broker, in target/bench.json
+bench: setup ## [measure] speed of core, detectors and broker path, in target/bench.json
 	packaging/bench
 
 instructions: PACKAGES := build-essential ca-certificates valgrind
