@@ -26,8 +26,8 @@ pub enum TracksMode {
 pub struct TracksConfig {
     /// When objects are tracked: `auto`, the default, in a cell without known locations; `on`; `off`.
     pub mode: TracksMode,
-    /// Standard deviation in metres, in each direction, of positions reported without covariance, until it is learnt.
-    /// Default 0.3.
+    /// Standard deviation in metres, in each direction, of near positions without covariance, until it
+    /// is estimated; 0.012 m more for each metre of distance. Default 0.15.
     pub noise_m: f64,
     /// Minimum standard deviation in metres of any reported position. Default 0.1.
     pub noise_floor_m: f64,
