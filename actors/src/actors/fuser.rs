@@ -504,12 +504,22 @@ impl FuserState {
         } in left_out
         {
             self.counters.count(Event::EntryLeftOut);
+            let kind = if *reason == RejectReason::TooManyObjects {
+                TroubleKind::Overload
+            } else {
+                TroubleKind::Misplaced
+            };
             for vehicle in contributors {
-                self.counters.troubles().note_about_with(vehicle.as_str(), TroubleKind::Misplaced, || {
-                    format!(
+                let troubles = self.counters.troubles();
+                troubles.note_about_with(vehicle.as_str(), kind, || match kind {
+                    TroubleKind::Overload => {
+                        "the map leaves out objects that only it reports: it has more than its share"
+                            .to_owned()
+                    }
+                    _ => format!(
                         "the map leaves out an object of its reports, which would be out of bounds: {}",
                         reason.in_words()
-                    )
+                    ),
                 });
             }
         }
