@@ -1,4 +1,5 @@
 mod beside;
+mod crowd;
 mod fast;
 mod fixed;
 mod foreign;
