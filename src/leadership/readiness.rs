@@ -61,8 +61,9 @@ impl Readiness {
         }
     }
 
-    /// Judges from the leadership, the epoch and arrival of the last accepted round, and whether a broker carries what
-    /// the node publishes. Without a `timeout` rounds are not waited for.
+    /// Determines readiness from the leadership, the epoch and arrival time of the last accepted
+    /// round, and whether a broker carries the node's messages. Without a `timeout`, rounds are not
+    /// required.
     pub fn judge(
         leadership: &Leadership,
         last_round: Option<&(Epoch, Timestamp)>,
@@ -78,7 +79,7 @@ impl Readiness {
             return not("leading without a working broker".into());
         }
         if leadership.is_leading() && leadership.is_deserted {
-            // By the word of others: it must not restart this node.
+            // This depends on other nodes' reports, so it must not restart this node.
             let reason = "leading, but no follower can log in at this node's broker".into();
             return Self {
                 ready: false,

@@ -28,14 +28,14 @@ impl From<Role> for Rights {
 }
 
 impl Rights {
-    /// The rights of all nodes in a cell without certificates: a node is what it declares.
+    /// The rights of all nodes in a cell without certificates: every declaration is accepted.
     pub const ALL: Self = Self {
         role: Role::Edge,
         priority: u8::MAX,
         may_describe: true,
     };
 
-    /// The rights of a node that never leads.
+    /// The rights of a node that may not lead.
     pub const NONE: Self = Self {
         role: Role::Cav,
         priority: 0,
@@ -56,7 +56,8 @@ impl Rights {
         }
     }
 
-    /// True if a node may declare this role and priority. A priority says nothing about a node that never leads.
+    /// True if a node may declare this role and priority. The priority of a node that may not lead
+    /// is ignored.
     pub fn allow(self, role: Role, priority: u8) -> bool {
         role == Role::Cav || rank(role) <= rank(self.role) && priority <= self.priority
     }

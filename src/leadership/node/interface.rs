@@ -76,7 +76,7 @@ pub enum Input {
         /// The node.
         name: NodeName,
     },
-    /// The node's own broker listens, or no longer does.
+    /// The node's own broker started or stopped listening.
     OwnBroker {
         /// Its address.
         address: Option<SocketAddr>,
@@ -88,14 +88,14 @@ pub enum Input {
         /// The node.
         node: NodeName,
     },
-    /// One of the gateway's links changed.
+    /// The state of one of the gateway's links changed.
     LinkChanged {
         /// The broker at its other end.
         broker: BrokerAddress,
         /// Its state now.
         state: LinkState,
     },
-    /// A broker passed on what a node says about itself, or its last will.
+    /// A broker forwarded a node's status or its last will.
     StatusHeard {
         /// The status.
         status: NodeStatus,
@@ -118,7 +118,7 @@ pub enum Input {
         rounds_due: u64,
         /// Processor load of the machine, 0 to 100 %.
         load_percent: u8,
-        /// All nodes that the membership knows.
+        /// All nodes that the membership has discovered.
         members: Vec<SeenMember>,
     },
     /// The answer to [`Effect::AskParts`], later.
@@ -126,7 +126,7 @@ pub enum Input {
         /// The answer.
         sample: HealthSample,
     },
-    /// The fuser was started anew and has forgotten that it leads.
+    /// The fuser was restarted and has lost the state of leading.
     FuserRestarted,
     /// The gateway was started anew and has no links.
     GatewayRestarted,
@@ -139,9 +139,9 @@ pub enum Input {
         /// True if the node keeps reputations.
         keeps_reputations: bool,
     },
-    /// Parts of the node's status that it tells to all. It may come with every look.
+    /// Parts of the node's published status. This input may come with every check.
     Telling {
-        /// All present troubles that the node knows of.
+        /// All current troubles of the node.
         troubles: Vec<Trouble>,
         /// Address and port of its page.
         page: Option<String>,
@@ -165,8 +165,9 @@ pub enum Effect {
         /// The message.
         message: ElectionMessage,
     },
-    /// Show the leadership to all other parts. It comes before the [`Effect::Lead`] that it announces: the node's broker
-    /// admits the first round only if it knows the leader.
+    /// Publish the leadership to all other parts. It precedes the [`Effect::Lead`] that it
+    /// announces, because the node's broker admits the first round only after it has received the
+    /// new leader.
     TellLeadership {
         /// The leadership.
         leadership: Leadership,
@@ -186,7 +187,7 @@ pub enum Effect {
     },
     /// Let the present round last its whole length: another node is about to lead from the next one on.
     HoldRound,
-    /// Publish nothing more in this epoch.
+    /// Stop publishing in this epoch.
     StopPublishing {
         /// The leadership that ended.
         epoch: Epoch,
@@ -196,7 +197,7 @@ pub enum Effect {
         /// The brokers.
         links: WantedLinks,
     },
-    /// Tell all nodes this about the node.
+    /// Publish this status of the node.
     PublishStatus {
         /// The status.
         status: NodeStatus,
@@ -206,9 +207,9 @@ pub enum Effect {
         /// The node.
         to: NodeName,
     },
-    /// Look at the own parts and hand in [`Input::Looked`] at once.
+    /// Check the node's own parts and pass [`Input::Looked`] at once.
     Look,
-    /// Ask broker, gateway and fuser, and hand in [`Input::PartsAnswered`] when they have answered.
+    /// Query broker, gateway and fuser, and pass [`Input::PartsAnswered`] when they have answered.
     AskParts,
     /// Count a message of this node that states a term or round beyond what a cell can have reached.
     CountImplausible {
@@ -222,7 +223,7 @@ pub enum Effect {
     },
 }
 
-/// Something worth a line in the log that no other effect tells.
+/// An event for the log that is not visible in any other effect.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Notice {
     /// All parts work again.
@@ -292,7 +293,7 @@ pub enum Notice {
 }
 
 impl NodeSettings {
-    /// True if the node never leads.
+    /// True if the node cannot become leader.
     pub(super) fn is_vehicle_only(&self) -> bool {
         self.election.role == Role::Cav
     }
