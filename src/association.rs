@@ -32,10 +32,11 @@ pub struct ClusterSize {
     pub columns: usize,
 }
 
-/// The best assignments, at most one for each row and each column, cluster by cluster. A row without a column costs
-/// nothing.
+/// The best assignments, at most one for each row and each column, cluster by cluster. A row may
+/// remain without a column at no cost.
 ///
-/// `limit` may assign a cluster in its own way: the time to solve one grows with the cube of its size.
+/// `limit` may assign a large cluster by other means, because the time to solve a cluster grows
+/// with the cube of its size.
 pub fn assign<C: Candidate>(
     candidates: Vec<C>,
     limit: impl Fn(ClusterSize, &[C]) -> Option<Vec<C>>,

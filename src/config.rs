@@ -24,7 +24,8 @@ impl ConfigError {
         }
     }
 
-    /// The same error with the key below `section`; an error without a key gets that of the section.
+    /// The same error with the key prefixed by `section`; an error without a key gets the section
+    /// as its key.
     #[must_use]
     pub fn within(mut self, section: &str) -> Self {
         self.key = if self.key.is_empty() {

@@ -1,12 +1,13 @@
-//! Cells that a vehicle drives through: in which of them it takes part, by its position.
+//! Roaming: selects the cell in which a vehicle is a member, by its position.
 //!
 //! ```text
 //! position ── observe ──> CellChoice ──> CellMove::Join    get ready in the next cell, and go on in the present one
 //!       the next follows ── enter ──┘└─> CellMove::GiveUp  stay in the present one
 //! ```
 //!
-//! A cell is a circle around its origin. A vehicle changes to a cell that it is in, and that is nearer than the present one by
-//! [`MARGIN_M`]. Distances are to the circles' edges, negative inside. Where circles overlap, the border is in the middle.
+//! A cell is a circle around its origin. A vehicle changes to a cell if it is inside that cell, and
+//! that cell is nearer than the current one by [`MARGIN_M`]. Distances are to the circles' edges,
+//! negative inside. Where circles overlap, the border is in the middle.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -27,7 +28,7 @@ pub const RETRY_AFTER: Duration = Duration::from_secs(30);
 /// Time for which a cell is not tried again from which the vehicle has turned away.
 pub const TURN_PAUSE: Duration = Duration::from_secs(5);
 
-/// A cell as a vehicle knows it.
+/// A cell in a vehicle's list.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KnownCell {
     /// Its name.
@@ -45,7 +46,7 @@ impl KnownCell {
     }
 }
 
-/// What a vehicle is to do.
+/// The next step of the vehicle.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CellMove {
     /// Get ready in this cell, and go on in the present one until then.
@@ -76,12 +77,13 @@ impl CellChoice {
         }
     }
 
-    /// The cell in which the vehicle takes part.
+    /// The cell in which the vehicle is a member.
     pub fn present(&self) -> &NodeName {
         &self.present
     }
 
-    /// Takes the vehicle's position at `now`, none if it is not known. The same again lets time pass.
+    /// Processes the vehicle's position at `now`, or `None` if it is unavailable. Repeated calls
+    /// with the same position let time pass.
     pub fn observe(
         &mut self,
         place: Option<&GeographicPosition>,

@@ -48,7 +48,7 @@ pub struct FusionConfig {
     pub round: RoundConfig,
     /// Parameters of PACE.
     pub pace: PaceConfig,
-    /// Parameters of tracking: the objects in maps that are at no known location.
+    /// Parameters of tracking, which produces the objects in maps that are not at a landmark.
     pub tracks: TracksConfig,
     /// Parameters of VOTE.
     pub vote: VoteConfig,
@@ -57,7 +57,7 @@ pub struct FusionConfig {
 }
 
 impl FusionConfig {
-    /// True if objects are tracked in a cell with or without known locations.
+    /// True if objects are tracked in a cell with or without landmarks.
     pub fn tracks_objects(&self, has_landmarks: bool) -> bool {
         let is_wanted = match self.tracks.mode {
             TracksMode::Auto => !has_landmarks,
@@ -67,7 +67,7 @@ impl FusionConfig {
         self.algorithms.pace() && is_wanted
     }
 
-    /// True if rounds yield evidence about vehicles in a cell with or without known locations.
+    /// True if rounds yield evidence about vehicles in a cell with or without landmarks.
     pub fn rates_vehicles(&self, has_landmarks: bool) -> bool {
         self.algorithms.vote() || self.tracks_objects(has_landmarks)
     }

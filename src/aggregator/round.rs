@@ -37,7 +37,7 @@ config_section! {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum RoundClose {
-    /// Nothing but time, as in the paper. Adds up to a period of latency.
+    /// Only the time, as in the paper. Adds up to a period of latency.
     Periodic,
     /// Every live vehicle has reported since the last round, at the latest the period, or a tenth more while reports
     /// come in. The default.
@@ -129,21 +129,22 @@ pub enum FirstRound {
 /// Time for a vehicle to connect to a new broker, with a margin. The vehicle misses maps that are sent earlier.
 pub const CONNECT_TIME: Duration = Duration::from_millis(25);
 
-/// Lengths of the rounds after the first of an unplanned leadership: a vehicle that connects late waits for one of these,
-/// not for a whole period.
+/// Lengths of the rounds after the first round of an unplanned leadership: a vehicle that connects
+/// late waits for one of these rounds, not for a whole period.
 const EARLY: [Duration; 2] = [CONNECT_TIME, Duration::from_millis(50)];
 
 /// Number of shortened rounds after the first of an unplanned leadership.
 pub const EARLY_ROUNDS: usize = EARLY.len();
 
-/// Number of its intervals after which a silent vehicle is no longer live.
+/// Number of report intervals after which a silent vehicle stops counting as live.
 const LIVE_INTERVALS: u32 = 3;
 
 /// Time for which a silent vehicle is remembered. Reports that come less often do not hold up rounds.
 const REMEMBERED: Duration = Duration::from_secs(3);
 
-/// Maximum number of rounds in a period. Excepted are the first rounds of a leadership and those that follow at once with
-/// the reports of vehicles that were due; they are few, as a vehicle is not due again for half a period.
+/// Maximum number of rounds in a period. The first rounds of a leadership are exempt, and so are
+/// the rounds that immediately follow with the reports of vehicles that were due. They are few,
+/// because a vehicle is not due again for half a period.
 const MAX_RATE: u32 = 5;
 
 /// Inverse share of a period by which the end of a round is delayed after its first report.
@@ -168,7 +169,8 @@ impl RoundTrigger {
         }
     }
 
-    /// Goes on with another interval; the present round lasts no longer than either.
+    /// Applies another interval; the current round lasts no longer than the old and the new
+    /// interval.
     pub(super) fn configure(&mut self, config: RoundConfig) {
         self.length = self.length.min(config.period());
         self.config = config;

@@ -55,8 +55,8 @@ pub struct GeographicPose {
     pub latitude_deg: f64,
     /// Longitude in degrees, east positive.
     pub longitude_deg: f64,
-    /// Height above the ellipsoid in metres; without one, that of the cell's origin. At 5 km from the origin, an error of
-    /// 10 m moves the vehicle by 8 mm.
+    /// Height above the ellipsoid in metres; if absent, the height of the cell's origin. At 5 km
+    /// from the origin, an error of 10 m moves the vehicle by 8 mm.
     pub height_m: Option<f64>,
     /// Heading in degrees, clockwise from true north.
     pub azimuth_deg: f64,

@@ -12,7 +12,7 @@ use crate::model::origin::{GeographicOrigin, GeographicPosition};
 /// Digits of the tile of a cell. Its side is 1.22 km at the equator, and 0.61 km at 60° of latitude.
 pub const CELL_TILE_DIGITS: u8 = 15;
 
-/// Largest latitude in degrees of the projection; tiles of places beyond it are those at it.
+/// Maximum latitude of the projection in degrees; places beyond it get the tile at this latitude.
 const MAX_LATITUDE_DEG: f64 = 85.051_128_78;
 
 /// Maximum digits of a tile.
@@ -70,7 +70,8 @@ impl Quadkey {
         )
     }
 
-    /// This tile and those that touch it: nine, or fewer at the ends of the map in the north and south.
+    /// This tile and the adjacent tiles: nine, or fewer at the northern and southern ends of the
+    /// map.
     pub fn with_neighbours(self) -> Vec<Self> {
         let tiles = 1_i64 << self.digits;
         let at = |dx: i64, dy: i64| {

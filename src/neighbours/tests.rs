@@ -395,7 +395,8 @@ fn a_cell_beyond_the_bound_is_refused_until_another_is_silent() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 200, ..ProptestConfig::default() })]
 
-    /// Whatever is delayed, doubled and overtaken: nothing old is taken, nothing twice, and no object is there twice.
+    /// With any delays, duplicates and reordering, each map is used at most once and while it is
+    /// recent, and each object appears once.
     #[test]
     fn no_order_of_messages_makes_a_map_old_or_an_object_double(
         delays in vec((0_u64..10, 0_u64..10_000, any::<bool>()), 200),
@@ -405,7 +406,7 @@ proptest! {
         let mut messages = Vec::new();
         for (number, (kind, late_ms, is_double)) in delays.into_iter().enumerate() {
             let sent = 100 * number as u64;
-            // Most take what they take at least and some jitter, and so do the first.
+            // Most messages have the least delay plus some jitter, including the first ones.
             let late_ms = if kind < 7 || sent < 1500 { late_ms % 40 } else { late_ms };
             messages.push((sent + 50 + late_ms, number, sent));
             if is_double {

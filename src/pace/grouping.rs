@@ -28,7 +28,8 @@ pub(super) fn places_after(
     }
 }
 
-/// The items of one vehicle and the place of each. Places are apart from items, so that regrouping reads nothing else.
+/// The items of one vehicle and the place of each. Places are stored separately from items, so that
+/// regrouping reads only the places.
 #[derive(Debug, Clone)]
 pub(super) struct VehicleItems<'a, T> {
     pub(super) node: NodeName,

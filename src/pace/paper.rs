@@ -28,7 +28,7 @@ pub struct PaperPace {
     grouping: Grouping,
 }
 
-/// A vehicle's latest report: its objects near known locations, once for each location.
+/// A vehicle's latest report: its objects near landmarks, once for each landmark.
 #[derive(Debug, Clone, Default)]
 struct LatestDetections {
     captured_at: Timestamp,
@@ -77,7 +77,7 @@ impl PaperPace {
         self.landmarks = Arc::new(self.landmarks.extended(added, self.gate_m));
     }
 
-    /// The known locations and the gate in metres.
+    /// The landmarks and the gate in metres.
     pub(super) fn places(&self) -> (&LandmarkIndex, f64) {
         (&self.landmarks, self.gate_m)
     }

@@ -101,7 +101,7 @@ pub struct Mount {
     pub left_m: f64,
     /// Angle of the axis from the vehicle's heading in radians, counter-clockwise.
     pub pan_rad: f64,
-    /// Height above the ground in metres, if it is known.
+    /// Height above the ground in metres, if available.
     pub height_m: Option<f64>,
     /// Angle of the axis below the horizon in radians.
     pub pitch_rad: f64,
@@ -118,8 +118,8 @@ impl Mount {
         }
     }
 
-    /// The pose of the camera as reports state it, with what is known of its height and tilt. Without a height, an axis
-    /// that is level in the configuration says nothing.
+    /// The pose of the camera as reports state it, including its height and tilt if configured. A
+    /// level axis without a configured height is the default and is not stated.
     pub fn stated_pose(&self, camera: &Pose) -> WirePose {
         let known = |angle_rad| (self.height_m.is_some() || self.is_tilted()).then_some(angle_rad);
         let (pitch_rad, roll_rad) = (known(self.pitch_rad), known(self.roll_rad));

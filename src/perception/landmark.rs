@@ -1,4 +1,4 @@
-//! Known locations: the set R of the paper.
+//! Landmarks: the set R of the paper.
 
 mod config;
 mod grid;
@@ -12,7 +12,7 @@ pub use index::{LandmarkCandidate, LandmarkGate, LandmarkIndex};
 
 use crate::model::names::{Label, LandmarkId};
 
-/// A known location at which an object may stand.
+/// A location, given in the configuration, at which an object may stand.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Landmark {
     /// The location's name.

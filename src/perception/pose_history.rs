@@ -36,7 +36,7 @@ impl PoseHistory {
         is_later
     }
 
-    /// The pose at a time; `None` if no pose is known near it.
+    /// The pose at a time; `None` if there is no pose near that time.
     pub fn at(&self, time: Timestamp) -> Option<Pose> {
         let after = self.poses.partition_point(|(at, _)| *at < time);
         let Some((next_at, next)) = self.poses.get(after) else {

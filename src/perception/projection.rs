@@ -37,7 +37,7 @@ use crate::wire::PerceivedObject;
 /// The reason why a detection has no position.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ProjectionError {
-    /// Neither a size for the label nor a default size is configured.
+    /// The configuration has no size for the label and no default size.
     #[error(
         "no known size for label {0:?} and no default size: set camera.projection.sizes, or camera.mount.height_m to \
          range it by the ground"
@@ -282,7 +282,7 @@ struct LineOfSight {
     distance_m: f64,
     /// Standard deviation of the distance.
     along_m: f64,
-    /// Standard deviation of the bearing, without that of the heading.
+    /// Standard deviation of the bearing, excluding the error of the heading.
     turn_rad: f64,
 }
 

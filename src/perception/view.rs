@@ -1,8 +1,10 @@
-//! The known locations in view of a camera: near enough to be read, inside the image, not turned away, not hidden. A
-//! camera whose height is known has the rows of the image judged by the ground, others by the columns alone.
+//! The landmarks in view of a camera: near enough to be read, inside the image, not turned away,
+//! not hidden. If the camera's height is configured, image rows are checked by the ground;
+//! otherwise only columns are checked.
 //!
-//! A report lists them as `seen`, so that a location in view without a detection is known to be empty. A false claim does
-//! more harm than a missing one: a location must meet every condition.
+//! A report lists these landmarks as `seen`, so that a landmark in view without a detection counts
+//! as empty. A false claim does more harm than a missing one, so a landmark must meet every
+//! condition.
 
 use nalgebra::{Matrix3, Point2, Point3, Vector2};
 
@@ -17,8 +19,8 @@ use crate::wire::PerceivedObject;
 config_section! {
     /// Conditions for a location to be in view.
     pub struct ViewConfig {
-        /// Width of the target or object to be recognised at a location, in metres; default that of the smallest listed
-        /// size or, without any, 0.05.
+        /// Width of the target or object to be recognised at a location, in metres; by default the
+        /// smallest configured size or, without any, 0.05.
         pub target_width_m: Option<f64> = None, checked by check_optional(1e-4, 1e3);
         /// Minimum width in pixels of the target as it is turned; default 36: a placard code of 21 modules at 1.7 pixels
         /// each. Less claims more locations, some of which the detector cannot read.
@@ -38,7 +40,7 @@ config_section! {
     }
 }
 
-/// Widths of target and occluder of placards, where nothing is known.
+/// Widths of target and occluder of placards, used without configured sizes.
 const PLACARD_TARGET_M: f64 = 0.05;
 const PLACARD_OCCLUDER_M: f64 = 0.07;
 
@@ -93,7 +95,8 @@ impl PosedCamera {
         }
     }
 
-    /// The pixel of a point on the ground, or as high as the camera if its height is not known; `None` behind the camera.
+    /// The pixel of a point on the ground or, if the camera's height is not configured, at the
+    /// camera's height; `None` behind the camera.
     pub fn pixel(&self, point: &Point2<f64>) -> Option<Point2<f64>> {
         let level = self
             .pose
@@ -219,7 +222,7 @@ impl Occluder {
     }
 }
 
-/// The visible share of a flat target's width, 0 to 1; 1 if its facing is not known.
+/// The visible share of a flat target's width, 0 to 1; 1 if it has no facing.
 fn visible_width_share(facing_rad: Option<f64>, camera: &Pose, position: &Point2<f64>) -> f64 {
     let to_camera = camera.position - position;
     facing_rad.map_or(1.0, |facing_rad| {

@@ -1,4 +1,4 @@
-//! The fields of a recorded line beside its report.
+//! The fields of a recorded line that are not part of its report.
 
 use serde::Deserialize;
 

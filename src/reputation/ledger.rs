@@ -25,7 +25,7 @@ pub struct ReputationLedger {
     pub(super) statements: BTreeMap<Epoch, Statements>,
     /// Signed shares on trial, by lane, and when the trial ends.
     pub(super) on_trial: BTreeMap<Epoch, (Statements, Timestamp)>,
-    /// Time of the last reset, in cells without certificates; 0 if there was none.
+    /// Time of the last reset, in cells without certificates; 0 without a reset.
     pub(super) reset_at: Timestamp,
 }
 
@@ -97,13 +97,14 @@ impl ReputationLedger {
         }
     }
 
-    /// Time of the last reset; 0 if there was none.
+    /// Time of the last reset; 0 without a reset.
     pub fn reset_at(&self) -> Timestamp {
         self.reset_at
     }
 
-    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write there. Other lanes give
-    /// way to it, see [`Self::merge_entries`]. The vote is not counted where its lane alone takes all the room.
+    /// Counts one vote in the lane of `epoch` and `aggregator`; only that aggregator may write this
+    /// lane. Other lanes are removed to make room, see [`Self::merge_entries`]. The vote is not
+    /// counted if its lane alone takes all the room.
     pub fn record(&mut self, epoch: u64, aggregator: &NodeName, evidence: &Evidence) {
         let lane = Epoch::new(epoch, aggregator.clone());
         let Some(record) =
@@ -167,7 +168,7 @@ impl ReputationLedger {
         self.reputations_beside(config, &BTreeMap::new())
     }
 
-    /// The same, beside votes of other cells, by [`ReputationConfig::mean_with`].
+    /// The same reputations, including votes of other cells, by [`ReputationConfig::mean_with`].
     pub fn reputations_beside(
         &self,
         config: &ReputationConfig,
@@ -207,7 +208,8 @@ impl ReputationLedger {
         latest
     }
 
-    /// What other cells are told of each vehicle; of its votes the `memory_votes` latest are remembered.
+    /// The counts of each vehicle to send to other cells; the `memory_votes` latest votes count as
+    /// kept.
     pub fn cell_counts(&self, memory_votes: f64) -> BTreeMap<NodeName, CellCounts> {
         let latest = self.latest(memory_votes);
         let counts = |(node, (correct, incorrect)): (NodeName, (u64, u64))| {

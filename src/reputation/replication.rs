@@ -13,9 +13,10 @@ use crate::wire::{LedgerEntry, LedgerMark};
 /// Maximum number of lanes: the latest are kept. One aggregator has at most half of them.
 pub const MAX_LANES: usize = 128;
 
-/// Maximum number of counts and marks, of which one aggregator has at most half. For a new one the oldest lanes are
-/// dropped: those of its own aggregator if that one has its half. It is not taken where only its own and later lanes are
-/// left, except in the present leader's lane, to which later lanes give way too.
+/// Maximum number of counts and marks, of which one aggregator has at most half. For a new entry
+/// the oldest lanes are dropped: lanes of its own aggregator if that aggregator has its half. The
+/// entry is refused if only its own and later lanes remain, except in the current leader's lane,
+/// for which later lanes are dropped too.
 pub const MAX_ENTRIES: usize = 131_072;
 
 /// The key of a count: an entry without its numbers.
@@ -82,7 +83,7 @@ impl ReputationLedger {
         })
     }
 
-    /// Number of votes that are known of a mark's vehicle in its lane.
+    /// Number of votes in the ledger of a mark's vehicle in its lane.
     pub fn votes_of(&self, mark: &LedgerMark) -> u64 {
         self.record_of(mark.epoch, &mark.aggregator, &mark.node)
             .map_or(0, |record| record.sum.total())
@@ -106,10 +107,11 @@ impl ReputationLedger {
         self.lanes.contains_key(lane)
     }
 
-    /// Takes the larger of every count; true when that changed anything.
+    /// Takes the larger of every count; returns true if that changed any.
     ///
-    /// Beyond [`MAX_LANES`] and [`MAX_ENTRIES`] the oldest lanes are forgotten, so that all who merge the same entries
-    /// forget the same lanes. The lane of the `present` leader always has room and is never forgotten.
+    /// Beyond [`MAX_LANES`] and [`MAX_ENTRIES`] the oldest lanes are dropped, so that all nodes
+    /// that merge the same entries drop the same lanes. The lane of the `present` leader always has
+    /// room and is not dropped.
     pub fn merge_entries(
         &mut self,
         entries: impl IntoIterator<Item = LedgerEntry>,
@@ -159,7 +161,8 @@ impl ReputationLedger {
         }
     }
 
-    /// The marks that `evidence` reached in a lane; it must be what was recorded there last.
+    /// The marks that `evidence` reached in a lane; it must be the evidence that was recorded there
+    /// last.
     pub fn marks_reached(
         &self,
         epoch: u64,
@@ -249,8 +252,8 @@ impl ReputationLedger {
         )
     }
 
-    /// Forgets the oldest lanes until there is room for one more count or mark in `lane`; false if the lanes that are
-    /// left do not give way to it.
+    /// Drops the oldest lanes until there is room for one more count or mark in `lane`; returns
+    /// false if the remaining lanes must be kept.
     fn make_room(&mut self, lane: &Epoch, present: Option<&Epoch>) -> bool {
         loop {
             let is_new = !self.lanes.contains_key(lane);
@@ -275,8 +278,8 @@ impl ReputationLedger {
         }
     }
 
-    /// Forgets the oldest lane except the present one, of the same aggregator or of all, if it is older than `lane` or
-    /// `lane` is the present one.
+    /// Drops the oldest lane except the current one, of the same aggregator or of all, if it is
+    /// older than `lane` or `lane` is the current one.
     fn forget_oldest(
         &mut self,
         lane: &Epoch,
@@ -296,7 +299,7 @@ impl ReputationLedger {
         true
     }
 
-    /// Forgets a lane.
+    /// Drops a lane.
     pub(super) fn forget(&mut self, lane: &Epoch) {
         self.resize(&lane.leader, self.size_of(lane), 0);
         self.lanes.remove(lane);

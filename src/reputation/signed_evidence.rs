@@ -1,7 +1,8 @@
 //! Signed evidence: counts that come from the signed shares of their aggregators.
 //!
-//! A node that passes a lane on sends the signed shares of its aggregator. When the certificate of an aggregator is
-//! revoked, its statements go, and the counts with them. Statements on trial count, and are neither passed on nor saved.
+//! A node that passes a lane on sends the signed shares of the lane's aggregator. When the
+//! certificate of an aggregator is revoked, its statements are dropped together with their counts.
+//! Statements on probation count, but are not passed on or saved.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -48,8 +49,9 @@ impl ReputationLedger {
         changed
     }
 
-    /// Ends trials: those that `has_failed` names, whose shares and counts are dropped, and those whose time is over. The
-    /// result is their lanes, and whether each is evidence now.
+    /// Ends probations: of the lanes that `has_failed` selects, whose shares and counts are
+    /// dropped, and of those whose time is over. Returns these lanes, and whether each is evidence
+    /// now.
     pub fn end_trials(
         &mut self,
         now: Timestamp,
@@ -85,7 +87,7 @@ impl ReputationLedger {
         self.statements.values().flat_map(|lane| &lane.signed)
     }
 
-    /// True if the counts of a lane come from signed shares. Those that this node counted itself do not.
+    /// True if the counts of a lane come from signed shares. This node's own counts do not.
     pub fn is_stated(&self, lane: &Epoch) -> bool {
         self.statements.contains_key(lane) || self.on_trial.contains_key(lane)
     }

@@ -1,10 +1,12 @@
-//! Statements: the signed shares of one lane. Those to which later ones leave nothing to add are dropped from time to time.
+//! Statements: the signed shares of one lane. Statements that are fully covered by later ones are
+//! dropped from time to time.
 
 use std::sync::Arc;
 
 use crate::wire::{LedgerShare, MAX_SHARE_ENTRIES};
 
-/// Number of statements of a lane beyond those of the last clearing at which it is cleared again.
+/// Number of statements of a lane, in addition to those left by the last clearing, at which it is
+/// cleared again.
 const MAX_NEW: usize = 16;
 
 /// Maximum size of a lane's statements, in multiples of the lane's own. An aggregator that signs each vehicle's counts
@@ -16,7 +18,7 @@ const MAX_COPIES: usize = 4;
 pub(super) struct Statements {
     /// The latest last.
     pub(super) signed: Vec<Arc<LedgerShare>>,
-    /// Number of statements at which those that add nothing are dropped.
+    /// Number of statements at which redundant statements are dropped.
     clear_at: usize,
 }
 
@@ -35,7 +37,7 @@ impl Statements {
         }
     }
 
-    /// Drops the statements to which later ones leave nothing to add.
+    /// Drops the statements that are fully covered by later ones.
     fn clear(&mut self, lane_size: usize, mut adds: impl FnMut(&LedgerShare) -> bool) {
         let mut room = MAX_COPIES * (lane_size + MAX_SHARE_ENTRIES);
         let is_needed = |share: &Arc<LedgerShare>| {

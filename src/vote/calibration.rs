@@ -1,4 +1,5 @@
-//! Calibration: the weight of a stated confidence, learned from agreement with the other vehicles.
+//! Calibration: the weight of a stated confidence, estimated from agreement with the other
+//! vehicles.
 
 use std::collections::BTreeSet;
 
@@ -18,7 +19,7 @@ const MEMORY_VOTES: f64 = 20_000.0;
 /// Least and greatest weight of a vote for its confidence.
 const WEIGHT_RANGE: (f64, f64) = (0.1, 3.0);
 
-/// Agreement of votes with those of the other vehicles, by band.
+/// Agreement of votes with the other vehicles' votes, by band.
 #[derive(Debug, Clone, Default, PartialEq)]
 struct BandCounts {
     agreed: [f64; BANDS],
@@ -48,15 +49,17 @@ struct ConfidenceHistogram {
 
 /// Weights of confidences.
 ///
-/// A detector's confidence orders its detections but is no probability: one vehicle's 0.6 may be another's 0.9. A
-/// vehicle's overall quality is its reputation; its confidence tells which of its votes are better than others.
+/// A detector's confidence orders its detections but is no probability: one vehicle's 0.6 may be
+/// another's 0.9. A vehicle's overall quality is its reputation; its confidence ranks its votes by
+/// quality.
 ///
 /// - A vote's band is the rank of its confidence among all of the vehicle's.
-/// - Its weight is the log-odds of being right in that band, divided by the log-odds over all bands.
-/// - The weights are made non-decreasing by pooling adjacent violators (Barlow et al. 1972; Zadrozny & Elkan 2002):
-///   confidence that misleads has no effect.
-/// - Of the differences between bands only the part beyond chance is kept (James & Stein 1961): confidence that is
-///   uninformative has no effect.
+/// - Its weight is the log-odds of being right in that band, divided by the log-odds over all
+///   bands.
+/// - The weights are made non-decreasing by pooling adjacent violators (Barlow et al. 1972;
+///   Zadrozny & Elkan 2002): confidence that misleads has no effect.
+/// - Of the differences between bands only the part beyond chance is kept (James & Stein 1961):
+///   confidence that is uninformative has no effect.
 /// - Until there is evidence, the weight is the stated confidence divided by the mean of all.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ConfidenceCalibration {
@@ -94,7 +97,7 @@ impl ConfidenceCalibration {
         histogram.total += 1.0;
     }
 
-    /// Forgets the confidences of vehicles, whose indices may be reused.
+    /// Removes the confidences of vehicles, whose indices may be reused.
     pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
         for &vehicle in vehicles {
             if let Some(histogram) = self.histograms.get_mut(vehicle) {
@@ -127,12 +130,12 @@ impl ConfidenceCalibration {
         self.settled.add(band, agreement, 1.0);
     }
 
-    /// Replaces the live evidence by that of `other`.
+    /// Replaces the live evidence by the live evidence of `other`.
     pub(super) fn take_live(&mut self, other: Self) {
         self.live = other.live;
     }
 
-    /// Forgets the live evidence.
+    /// Clears the live evidence.
     pub(super) fn clear_live(&mut self) {
         self.live = BandCounts::default();
     }

@@ -15,7 +15,7 @@ pub const MAX_LABELS: usize = 65_535;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VoteMode {
-    /// Learned reputation × calibrated confidence × visibility; the default.
+    /// Estimated reputation × calibrated confidence × visibility; the default.
     #[default]
     Weighted,
     /// The paper's formulas to the letter.
@@ -32,17 +32,19 @@ pub struct VoteConfig {
     pub paper: PaperConfig,
     /// Settings of `weighted` mode.
     pub weighted: WeightedConfig,
-    /// Maximum number of landmarks; beyond it an open cell forgets the oldest. Default 1024. Bounds memory.
+    /// Maximum number of landmarks; beyond it an open cell drops the oldest landmark. Default 1024.
+    /// Bounds memory.
     pub max_landmarks: usize,
-    /// Maximum number of vehicles. Beyond it long silent ones are forgotten; without any, reports of new vehicles are
-    /// rejected. Default 256. Bounds memory.
+    /// Maximum number of vehicles. Beyond it vehicles that have been silent for long are dropped;
+    /// if there are none, reports of new vehicles are rejected. Default 256. Bounds memory.
     pub max_vehicles: usize,
-    /// Maximum number of distinct labels of the cell, in `paper` mode of a landmark. Default 256. Bounds memory. Beyond
-    /// it the least useful labels are forgotten, first those of the vehicle that introduced most. In `paper` mode, whose
-    /// sums never end, votes for new labels are ignored.
+    /// Maximum number of distinct labels in the cell or, in `paper` mode, of a landmark. Default
+    /// 256. Bounds memory. Beyond it the least useful labels are dropped, beginning with labels of
+    /// the vehicle that introduced most. In `paper` mode, whose sums are permanent, votes for new
+    /// labels are ignored.
     pub max_labels: usize,
-    /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's own synonyms go first.
-    /// Default: none.
+    /// Labels that count as another one everywhere, such as `vase = "sports ball"`; a landmark's
+    /// own synonyms have precedence. Default: no synonyms.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub synonyms: BTreeMap<Label, Label>,
 }
@@ -102,8 +104,9 @@ config_section! {
         /// More suppresses more single frames with a wrong label, but notices a new object later. 0 takes the last statement
         /// alone, for inputs in which a new statement corrects the earlier one.
         pub smoothing_share: f64 = 0.5, in 0.0 to 10.0;
-        /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion against its own record of one
-        /// class; default 5. Less learns classes faster from noise.
+        /// Weight, in votes, of a vehicle's overall reliability and of the fleet's confusion
+        /// against the vehicle's own record of one class; default 5. A lower value adapts to
+        /// classes faster, but also to noise.
         pub class_prior_votes: f64 = 5.0, in 1e-3 to 1e6;
         /// Weight, in votes, of the fleet's reliability against the vehicle's own; default 8.
         pub vehicle_prior_votes: f64 = 8.0, in 1e-3 to 1e6;
@@ -135,8 +138,8 @@ config_section! {
         pub visibility_at_max_range: f64 = 0.3, in 1e-3 to 1.0;
         /// Votes on older landmarks that are judged again per fresh vote; default 8. More settles sooner, costs more.
         pub revisit_votes: f64 = 8.0, in 0.0 to 1e6;
-        /// Weight, in votes, of stated confidences against calibrated ones; default 10. More trusts stated confidences for
-        /// longer.
+        /// Weight, in votes, of stated confidences against calibrated ones; default 10. A higher
+        /// value uses stated confidences for longer.
         pub calibration_votes: f64 = 10.0, in 1e-3 to 1e9;
     }
 }

@@ -8,8 +8,8 @@ pub(super) type LabelIndex = u16;
 /// Scale below which counts are written anew.
 const MIN_SCALE: f64 = 1e-60;
 
-/// Sparse expected counts of (true label, stated label): pairs that never occurred take no memory. All counts share one
-/// scale, so that the cost of fading does not depend on their number.
+/// Sparse expected counts of (true label, stated label): pairs that did not occur take no memory.
+/// All counts share one scale, so that the cost of fading does not depend on their number.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Confusion {
     cells: BTreeMap<(LabelIndex, LabelIndex), f64>,
@@ -46,7 +46,7 @@ impl Confusion {
         }
     }
 
-    /// Forgets all evidence about any of `labels`.
+    /// Removes all evidence about any of `labels`.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         let is_about = |&(truth, stated): &(LabelIndex, LabelIndex)| {
             labels.contains(&truth) || labels.contains(&stated)

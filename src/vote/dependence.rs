@@ -1,13 +1,16 @@
 //! Dependence between vehicles: pairs that agree more often than their reliability explains.
 //!
-//! Honest vehicles agree because they see the same truth. If their votes depend on each other through the truth alone,
-//! the chance-corrected agreement κ of two vehicles is the product r_i · r_j of what each shares with the truth. This is
-//! the one-factor model of Spearman (1904), which needs no truth; κ is Cohen's (1960), with the cell's shares of labels
-//! as chance. More agreement means that one copies the other or that both err for the same reason (Dong, Berti-Équille
-//! & Srivastava 2009). ρ = (κ − r_i r_j) / (1 − r_i r_j) is the part of a vote that is not its own.
+//! Honest vehicles agree because they see the same truth. If their votes depend on each other
+//! through the truth alone, the chance-corrected agreement κ of two vehicles is the product r_i ·
+//! r_j of their agreements with the truth. This is the one-factor model of Spearman (1904), which
+//! needs no truth; κ is Cohen's (1960), with the cell's shares of labels as chance. More agreement
+//! means that one vehicle copies the other or that both err for the same reason (Dong,
+//! Berti-Équille & Srivastava 2009). ρ = (κ − r_i r_j) / (1 − r_i r_j) is the part of a vote that
+//! is not its own.
 //!
-//! Of two groups that contradict each other, either could be the honest one. The group of more *vehicles* is taken for
-//! it, however closely the others agree. That bounds the number of liars that are withstood at fewer than half.
+//! Of two groups that contradict each other, either could be the honest one. The group of more
+//! *vehicles* is assumed to be honest, however closely the others agree. The method therefore
+//! withstands malicious vehicles only if they are fewer than half.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -19,7 +22,8 @@ const MAX_COMPARED: usize = 8;
 const MAX_COMPARED_STORED: usize = 32;
 /// Standard deviations by which agreement must exceed the expected agreement.
 const SIGNIFICANCE: f64 = 4.0;
-/// The same over stored votes, where many pairs are tested at once: one in 3 million exceeds it by chance.
+/// The same threshold for stored votes, where many pairs are tested at once: one in 3 million
+/// exceeds it by chance.
 const SIGNIFICANCE_STORED: f64 = 5.0;
 /// Agreement κ of two vehicles that surely belong to one group; closer agreement earns no more influence.
 const SAME_GROUP: f64 = 0.3;
@@ -106,7 +110,7 @@ impl Dependence {
         self.memory = memory;
     }
 
-    /// As [`Self::new`], for all stored votes together: nothing fades.
+    /// As [`Self::new`], for all stored votes together, without fading.
     pub(super) fn of_stored() -> Self {
         let (max_compared, significance) = (MAX_COMPARED_STORED, SIGNIFICANCE_STORED);
         Self {
@@ -117,7 +121,7 @@ impl Dependence {
         }
     }
 
-    /// Forgets vehicles, whose indices may be reused.
+    /// Removes vehicles, whose indices may be reused.
     pub(super) fn forget(&mut self, vehicles: &BTreeSet<usize>) {
         self.pairs
             .retain(|(one, other), _| !vehicles.contains(one) && !vehicles.contains(other));
@@ -136,7 +140,7 @@ impl Dependence {
         }
     }
 
-    /// Forgets how often labels were stated; their indices may be reused.
+    /// Clears how often labels were stated; their indices may be reused.
     pub(super) fn forget_labels(&mut self, labels: &BTreeSet<LabelIndex>) {
         for &label in labels {
             let Some(stated) = self.stated.get_mut(usize::from(label)).map(std::mem::take) else {

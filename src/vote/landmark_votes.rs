@@ -69,7 +69,7 @@ impl RecentStatements {
         more.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(stated).0
     }
 
-    /// Forgets statements of labels whose indices may be reused.
+    /// Removes statements of labels whose indices may be reused.
     pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) {
         self.labels
             .iter_mut()
@@ -103,7 +103,7 @@ impl StoredVote {
     }
 }
 
-/// The votes on one landmark, at most one of each vehicle, in order of vehicle.
+/// The votes on one landmark, at most one per vehicle, in order of vehicle.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LandmarkVotes {
     pub(super) votes: Vec<StoredVote>,
@@ -235,7 +235,8 @@ impl LandmarkVotes {
             .collect()
     }
 
-    /// Forgets labels with the votes for them; returns the number of votes. Not allowed while it is counted.
+    /// Removes labels with the votes for them; returns the number of votes. Not allowed while they
+    /// are counted.
     pub(super) fn forget_labels(&mut self, is_gone: impl Fn(LabelIndex) -> bool) -> usize {
         let votes = self.votes.len();
         self.votes.retain(|vote| !is_gone(vote.label));

@@ -1,4 +1,4 @@
-//! The default voting: learned reputation × calibrated confidence × visibility.
+//! The default voting: estimated reputation × calibrated confidence × visibility.
 
 mod batch;
 mod eviction;
@@ -44,7 +44,7 @@ pub(super) struct WeightedVoting {
     vehicles: BTreeMap<NodeName, usize>,
     /// By index of the vehicle.
     names: Vec<NodeName>,
-    /// Indices of forgotten vehicles.
+    /// Indices of removed vehicles.
     free: Vec<usize>,
     /// Settled votes, by index of the vehicle.
     counts: Vec<Counts>,
@@ -82,7 +82,7 @@ impl WeightedVoting {
         Duration::from_secs_f64(self.config.freshness_s)
     }
 
-    /// The index of a vehicle, a new or free one if it has none.
+    /// The index of a vehicle; a new or reused index if the vehicle has none.
     fn vehicle(&mut self, node: &NodeName) -> usize {
         if let Some(&vehicle) = self.vehicles.get(node) {
             return vehicle;
@@ -214,7 +214,7 @@ impl VotingMethod for WeightedVoting {
         self.landmarks.entry(landmark).or_default();
     }
 
-    /// Keeps what its votes taught.
+    /// The results of the landmark's votes are kept.
     fn remove_landmark(&mut self, landmark: &LandmarkId) {
         self.remove_votes(landmark, |_| true);
         if let Some(due) = self
@@ -227,7 +227,7 @@ impl VotingMethod for WeightedVoting {
         self.changed.remove(landmark);
     }
 
-    /// Forgets their votes and all evidence about them; other vehicles take their indices.
+    /// Removes the vehicles' votes and all evidence about them; other vehicles reuse their indices.
     fn remove_vehicles(&mut self, nodes: &BTreeSet<NodeName>) {
         self.evict_vehicles(nodes);
     }
@@ -334,7 +334,7 @@ impl VotingMethod for WeightedVoting {
         self.fresh_votes += 1;
     }
 
-    /// Judges the landmarks that changed, then some older ones in turn.
+    /// Evaluates the landmarks that changed, then some older landmarks in turn.
     fn close(&mut self, now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>) {
         self.expire(now);
         if self.dependence.is_due() {

@@ -36,7 +36,7 @@ pub struct NeighbourObject {
     /// The cell whose map has it.
     #[n(0)]
     pub cell: NodeName,
-    /// Time in seconds since the neighbour's map was fused, as far as it is known.
+    /// Estimated time in seconds since the neighbour's map was fused.
     #[cbor(n(1), with = "Half")]
     pub age_s: f64,
     /// The object as that map has it, in this cell's frame.

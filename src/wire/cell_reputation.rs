@@ -26,13 +26,14 @@ pub struct CellReputation {
     /// Number of votes that did not.
     #[n(4)]
     pub incorrect: u64,
-    /// Number of the votes that agreed and are older than those that the cell remembers.
+    /// Number of the votes that agreed and that the cell has already dropped.
     #[n(5)]
     pub old_correct: u64,
     /// Number of such votes that did not agree.
     #[n(6)]
     pub old_incorrect: u64,
-    /// Time of the last reset of the cell's evidence; absent if there was none. Counts from before do not count.
+    /// Time of the last reset of the cell's evidence; absent without a reset. Earlier counts are
+    /// invalid.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(7)]
     pub reset_at_us: Option<Timestamp>,

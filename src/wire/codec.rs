@@ -1,4 +1,4 @@
-//! JSON, CBOR and compact CBOR; the first byte tells them apart.
+//! JSON, CBOR and compact CBOR, which are distinguished by the first byte.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -22,10 +22,10 @@ pub enum Encoding {
     Compact,
 }
 
-/// Writes a payload.
+/// Encodes a payload.
 ///
 /// # Panics
-/// Never for the payloads of this crate: they serialise into memory.
+/// Does not panic for the payloads of this crate: they serialise into memory.
 #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
@@ -41,11 +41,11 @@ pub fn encode<T: Payload>(payload: &T, encoding: Encoding) -> Vec<u8> {
     bytes
 }
 
-/// Reads any payload whose `schema` is known and checks every value in it. Entries that are not valid are left out;
-/// [`decode_entries`] returns them.
+/// Decodes any payload of a supported `schema` and checks every value in it. Invalid entries are
+/// left out; [`decode_entries`] returns them.
 ///
 /// # Errors
-/// The first reason found; see [`RejectReason`].
+/// Returns the first reason found; see [`RejectReason`].
 pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReason> {
     decode_entries(bytes, limits).map(|(payload, _)| payload)
 }
@@ -198,7 +198,7 @@ mod tests {
         }
     }
 
-    /// The reason for which a report is rejected, the same in all encodings.
+    /// The reason for which a report is rejected; it is equal in all encodings.
     fn reason(report: &ObjectReport) -> Option<RejectReason> {
         let cbor =
             decode_report(&encode(report, Encoding::Cbor), &node(), &Limits::default()).err();
@@ -213,7 +213,7 @@ mod tests {
             .objects
             .iter()
             .all(|o| o.x_m.is_finite() && o.confidence.is_finite());
-        // JSON has no word for a number that is none.
+        // JSON cannot represent NaN and infinities.
         if finite
             && report.pose.is_none_or(|pose| {
                 pose.heading_rad.is_finite() && pose.pitch_rad.is_none_or(f64::is_finite)

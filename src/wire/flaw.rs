@@ -1,6 +1,6 @@
-//! Faults of a rejected payload, in words: the field and its fault.
+//! Faults of a rejected payload as text: the field and its fault.
 //!
-//! A payload that can be used is never looked at here.
+//! Usable payloads are not examined here.
 
 use std::fmt;
 
@@ -23,7 +23,7 @@ pub struct Flaw {
 }
 
 impl Flaw {
-    /// A flaw of a field; without fault where there is none to tell.
+    /// A flaw of a field; `fault` is empty if there is no further information.
     pub fn new(reason: RejectReason, field: impl Into<String>, fault: impl Into<String>) -> Self {
         Self {
             reason,
@@ -62,7 +62,7 @@ impl Flaw {
         }
     }
 
-    /// The flaw of a report in JSON; `None` if it has none.
+    /// The flaw of a report in JSON; `None` if the report is valid.
     pub(crate) fn of_json(text: &[u8], reason: RejectReason, limits: &Limits) -> Option<Self> {
         let line = || serde_json::from_slice(text).unwrap_or_default();
         let report: ObjectReport = match read_json(text) {

@@ -34,26 +34,28 @@ pub struct LedgerShare {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(5)]
     pub signed: Option<LedgerSignature>,
-    /// Time of the last reset of the cell's evidence, in cells without certificates; absent if there was none. Evidence
-    /// from before does not count.
+    /// Time of the last reset of the cell's evidence, in cells without certificates; absent without
+    /// a reset. Earlier evidence is invalid.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(6)]
     pub reset_at_us: Option<Timestamp>,
 }
 
 impl LedgerShare {
-    /// The bytes that an aggregator signs: the compact encoding of `["ecod ledger 1", cell, entries, marks]`. Sender and
-    /// term are not among them, so that others can pass the counts on.
+    /// The bytes that an aggregator signs: the compact encoding of
+    /// `["ecod ledger 1", cell, entries, marks]`. Sender and term are not included, so that other
+    /// nodes can pass the counts on.
     ///
     /// # Panics
-    /// Never: it writes into memory.
+    /// Does not panic: it writes into memory.
     #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
     pub fn signed_bytes(&self, cell: &NodeName) -> Vec<u8> {
         let content = ("ecod ledger 1", cell, &self.entries, &self.marks);
         minicbor::to_vec(content).expect("shares are written into memory")
     }
 
-    /// The leadership whose counts these are. `None` without counts and marks, and for those of several leaderships.
+    /// The leadership to which these counts belong. `None` without counts and marks, and for counts
+    /// of several leaderships.
     pub fn lane(&self) -> Option<Epoch> {
         let entries = self
             .entries
@@ -66,7 +68,7 @@ impl LedgerShare {
             .then(|| Epoch::new(term, aggregator.clone()))
     }
 
-    /// True if it has neither counts nor marks.
+    /// True if there are no counts and no marks.
     pub fn is_empty(&self) -> bool {
         self.entries.is_empty() && self.marks.is_empty()
     }
@@ -121,10 +123,10 @@ pub struct LedgerMark {
     /// Its number of votes then, divided by 32.
     #[n(3)]
     pub number: u64,
-    /// Number of those that agreed with the verdict.
+    /// Number of votes that agreed with the verdict.
     #[n(4)]
     pub correct: u64,
-    /// Number of those that did not.
+    /// Number of votes that did not agree with the verdict.
     #[n(5)]
     pub incorrect: u64,
 }

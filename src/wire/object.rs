@@ -31,7 +31,7 @@ pub struct PerceivedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(4), with = "CovarianceForm", has_nil)]
     pub covariance_m2: Option<[f64; 3]>,
-    /// The known location to which the node assigns this object; required in VOTE.
+    /// The landmark to which the node assigns this object; required in VOTE.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(5), with = "Text", has_nil)]
     pub landmark: Option<LandmarkId>,
@@ -82,7 +82,7 @@ pub struct FieldOfView {
     pub angle_rad: f64,
 }
 
-/// An object at no known location, at the time of fusion.
+/// An object that is not at a landmark, at the time of fusion.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FusedObject {
     /// Stable identity of the object.

@@ -1,4 +1,4 @@
-//! The topics of a region, on which cells tell of themselves by their place on Earth.
+//! The topics of a region, on which cells publish by their place on Earth.
 
 use crate::model::names::NodeName;
 use crate::model::quadkey::{CELL_TILE_DIGITS, Quadkey};

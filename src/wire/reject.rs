@@ -5,7 +5,7 @@ use std::fmt;
 /// Defines the reasons together with their names in counters.
 macro_rules! reject_reasons {
     ($($(#[$doc:meta])* $reason:ident = $name:literal,)*) => {
-        /// The reason why a payload was not used; nothing has changed then.
+        /// The reason why a payload was not used. The state is unchanged in this case.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
         pub enum RejectReason {
             $($(#[$doc])* $reason,)*
@@ -28,7 +28,7 @@ macro_rules! reject_reasons {
 reject_reasons! {
     /// More bytes than [`Limits`](super::Limits) allow.
     TooLarge = "too_large",
-    /// Neither JSON nor CBOR, truncated, not UTF-8, or without a required field.
+    /// Not valid JSON or CBOR, truncated, not UTF-8, or without a required field.
     Malformed = "malformed",
     /// A `schema` other than [`SCHEMA_VERSION`](super::SCHEMA_VERSION).
     UnknownSchema = "unknown_schema",
@@ -64,9 +64,9 @@ reject_reasons! {
     NotFused = "not_fused",
     /// A payload without a signature of the cell, or evidence or a round without its aggregator's, where there must be one.
     BadSignature = "bad_signature",
-    /// Evidence of a node that is not known as a candidate.
+    /// Evidence of a node that is not a registered candidate.
     NotCandidate = "not_candidate",
-    /// Evidence of a term that the election does not know yet.
+    /// Evidence of a term that the election has not seen yet.
     UnknownTerm = "unknown_term",
     /// Evidence of a leadership that its sender cannot vouch for.
     Unattested = "unattested",

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 /// A present trouble, with cause and remedy in words for people.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct Trouble {
-    /// Stable name of its kind, such as `clock_off`. Later versions may know further kinds.
+    /// Stable name of its kind, such as `clock_off`. Later versions may have further kinds.
     #[n(0)]
     pub kind: String,
     /// The vehicle, address or host that it is about; absent if it is about the node itself.

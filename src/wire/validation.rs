@@ -75,7 +75,7 @@ const COUNT_BOUND: f64 = (1u64 << 52) as f64;
 /// Largest angle in radians: headings may count full turns.
 const ANGLE_BOUND_RAD: f64 = 1e6;
 
-/// Largest yaw rate of a frame: far more than that of any vehicle.
+/// Maximum yaw rate of a frame, far above any vehicle's yaw rate.
 const YAW_RATE_BOUND_RADPS: f64 = 100.0;
 
 /// Maximum number of classes with scores of one object.
@@ -94,8 +94,8 @@ pub trait Payload: Serialize + DeserializeOwned + Encode<()> + for<'b> Decode<'b
         limits.payload_bytes
     }
 
-    /// Removes the entries whose values are not valid, and returns what was removed. One bad entry of a map, of verdicts or
-    /// of reputations costs the others nothing.
+    /// Removes the entries with invalid values, and returns the removed entries. One bad entry of a
+    /// map, of verdicts or of reputations does not affect the other entries.
     fn remove_invalid(&mut self) -> Vec<InvalidEntry> {
         Vec::new()
     }

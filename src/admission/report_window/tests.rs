@@ -387,7 +387,7 @@ fn vehicles_that_are_rejected_for_their_time_on_and_on_are_untimely() {
     let mut last = Timeliness::default();
     for n in 0..100 {
         heard(n, "good", 0);
-        // A clock that nobody can follow.
+        // A clock that jumps too much to be estimated.
         heard(n, "bad", n * 10_000_000);
         last = heard(n, "worse", n * 20_000_000);
     }

@@ -1,4 +1,4 @@
-//! Known locations in a configuration file.
+//! Landmarks in a configuration file.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,7 +9,7 @@ use super::{Landmark, Synonym, VacancySign};
 use crate::config::{ConfigError, check_range};
 use crate::model::names::{Label, LandmarkId, MAX_NAME_BYTES, is_label};
 
-/// One known location.
+/// One landmark.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LandmarkConfig {
@@ -23,10 +23,10 @@ pub struct LandmarkConfig {
     /// around.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub facing_deg: Option<f64>,
-    /// A fixed sign that is in view while the location is empty. Default: none.
+    /// A fixed sign that is in view while the location is empty. Default: no sign.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub vacancy: Option<VacancyConfig>,
-    /// Labels that count as another one here, such as `vase = "sports ball"`. Default: none.
+    /// Labels that count as another one here, such as `vase = "sports ball"`. Default: no synonyms.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub synonyms: BTreeMap<Label, Label>,
 }

@@ -76,7 +76,8 @@ impl Grid {
         .filter(move |(_, offset)| offset.norm_squared() <= radius_m * radius_m)
     }
 
-    /// The points in the buckets of a cell and of the `more` next ones of its row, with all others in these buckets.
+    /// The points in the buckets of a cell and of the `more` next cells of its row, including all
+    /// other points in these buckets.
     fn row_cells(
         &self,
         first: i32,

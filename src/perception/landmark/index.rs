@@ -41,8 +41,8 @@ pub struct LandmarkGate {
     pub radius_m: f64,
     /// Largest distance in standard deviations.
     pub sigmas: f64,
-    /// Standard deviation in metres that is added to every reported one. It covers errors that the vehicle cannot report:
-    /// those of the map and of its own pose.
+    /// Standard deviation in metres that is added to every reported one. It covers errors that the
+    /// vehicle cannot report: errors of the map and of the vehicle's own pose.
     pub floor_m: f64,
 }
 
@@ -95,7 +95,8 @@ impl LandmarkIndex {
         self.by_id.get(id).copied()
     }
 
-    /// The same for ids that mostly come in configuration order: `expected` is tried first.
+    /// As `position_of`, for ids that mostly arrive in configuration order: `expected` is tried
+    /// first.
     pub fn position_near(&self, id: &LandmarkId, expected: usize) -> Option<usize> {
         if self.ids.get(expected) == Some(id) {
             Some(expected)

@@ -21,10 +21,11 @@ pub enum Ranging {
     Corners,
     /// z = f_y · height / box height: exact for an upright object at any yaw.
     BoxHeight,
-    /// d = s / (2 tan(α/2)) with α the angle between the bearings of the two edges: exact for a width perpendicular to
-    /// the line of sight, too far for one that is turned away.
+    /// d = s / (2 tan(α/2)) with α the angle between the bearings of the two edges: exact for a
+    /// width perpendicular to the line of sight, too far for an object that is turned away.
     BoxWidth,
-    /// Where the foot of the box meets the ground: for objects that stand on level ground, with the camera's height known.
+    /// From the intersection of the foot of the box with the ground: for objects on level ground
+    /// and a camera of configured height.
     Ground,
     /// The paper's formulas (PACE client, Algorithm 1) to the letter, with their errors: d = s / tan α with α spread
     /// evenly over the columns, and bearings from the left edge of the image. `projection/paper.rs` explains them.
@@ -77,14 +78,14 @@ impl ObjectSize {
     }
 }
 
-/// Known sizes by label.
+/// Object sizes by label.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObjectSizes {
-    /// Size of labels that are not listed, such as decoded texts. Default none: labels of COCO have their usual sizes, and
-    /// others no position, unless the ground gives one.
+    /// Size of labels that are not listed, such as decoded texts. Default: no size. Labels of COCO
+    /// then have their usual sizes, and other labels have no position, unless the ground gives one.
     pub default: Option<ObjectSize>,
-    /// Sizes of listed labels; default none.
+    /// Sizes of listed labels; default empty.
     pub labels: BTreeMap<Label, ObjectSize>,
 }
 
@@ -115,11 +116,12 @@ impl ObjectSizes {
 config_section! {
     /// Settings of projection.
     pub struct ProjectionConfig {
-        /// The way of ranging; default `auto`: from corners, otherwise from the box's height and, if the camera's height
-        /// is known, the ground. `box_height` needs upright objects, `box_width` objects that face the camera, `ground`
-        /// objects on level ground; `paper` has the published formulas with their errors.
+        /// The method of ranging; default `auto`: from corners, otherwise from the box's height
+        /// and, if the camera's height is configured, the ground. `box_height` needs upright
+        /// objects, `box_width` objects that face the camera, `ground` objects on level ground;
+        /// `paper` has the published formulas with their errors.
         pub ranging: Ranging = Ranging::default();
-        /// True sizes of objects; default none but the usual ones of COCO's labels.
+        /// True sizes of objects; by default only the usual sizes of COCO's labels.
         pub sizes: ObjectSizes = ObjectSizes::default(), checked by ObjectSizes::validate;
         /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach 0.5, neural
         /// detectors 3 and more.

@@ -12,11 +12,12 @@ pub(super) struct Estimate {
     pub(super) errors: Errors,
 }
 
-/// Difference of two estimates in standard deviations above which one of them rests on a false assumption.
+/// Difference of two estimates in standard deviations above which one of the estimates must be
+/// based on a false assumption.
 pub(super) const CONFLICT_SIGMAS: f64 = 3.0;
 
 impl Estimate {
-    /// The estimate as far as it lies before the camera.
+    /// The estimate, if it lies in front of the camera.
     pub(super) fn in_front(self) -> Option<Self> {
         (self.distance_m > 0.0 && self.distance_m.is_finite()).then_some(self)
     }

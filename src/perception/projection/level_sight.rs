@@ -10,7 +10,7 @@ use super::error_sources::{Errors, Source};
 pub(super) struct LevelSight {
     /// Off the heading of the axis in radians, counter-clockwise positive.
     pub(super) bearing_rad: f64,
-    /// Standard deviation of the bearing in radians, without that of the heading.
+    /// Standard deviation of the bearing in radians, excluding the error of the heading.
     pub(super) turn_rad: f64,
     /// Tangent of the angle below the horizon.
     pub(super) slope: f64,

@@ -108,7 +108,8 @@ impl WeightedVoting {
         }
     }
 
-    /// Forgets all live evidence and every verdict, and judges all landmarks in turn, `sweeps` times.
+    /// Clears all live evidence and every verdict, and evaluates all landmarks in turn, `sweeps`
+    /// times.
     pub(super) fn start_again(&mut self, sweeps: u32) {
         self.model.clear_live();
         self.model.clear_coupling();
@@ -128,7 +129,7 @@ impl WeightedVoting {
         }
     }
 
-    /// Replaces all live evidence by that of the weighted majorities.
+    /// Replaces all live evidence by the evidence from the weighted majorities.
     pub(super) fn start_from_majorities(&mut self) {
         let weights = self.calibration.weights();
         self.model.clear_live();

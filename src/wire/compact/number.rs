@@ -28,7 +28,7 @@ const HALF: std::ops::RangeInclusive<f64> = 6.103_515_625e-5..=65_504.0;
 /// Magnitudes of normal single-precision numbers.
 const SINGLE: std::ops::RangeInclusive<f64> = f32::MIN_POSITIVE as f64..=f32::MAX as f64;
 
-/// Bits of a double's fraction beyond those of a half and of a single.
+/// Bits of a double's fraction in excess of the bits of a half and of a single.
 const BEYOND_HALF: u64 = (1 << 42) - 1;
 const BEYOND_SINGLE: u64 = (1 << 29) - 1;
 

@@ -570,7 +570,7 @@ fn a_map_for_others_is_taken_with_a_place_on_earth_alone() {
     assert_eq!(message.map, cell_map().map);
 }
 
-/// The compact encoding rounds numbers: none that is valid becomes one that is not.
+/// The compact encoding rounds numbers: a valid number must not become invalid.
 #[test]
 fn the_largest_valid_numbers_are_valid_after_the_rounding_of_every_encoding() {
     let object = FusedObject {
