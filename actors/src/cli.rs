@@ -1,4 +1,4 @@
-//! Command line of `ecod-node`, with the parts that `ecod-lab` shares.
+//! Command line of `ecod-node`, including the parts that `ecod-lab` shares.
 
 #[cfg(feature = "camera")]
 mod calibrate;
@@ -83,7 +83,8 @@ enum Command {
     /// The settings that all nodes of a cell share: set, show, compare
     #[command(subcommand)]
     Cell(cell::CellCommand),
-    /// Forget the evidence behind the reputations, the highest term, or the cell's description, of a node that is stopped
+    /// Drop the evidence behind the reputations, the highest term, or the cell's description, of a
+    /// node that is stopped
     Reset(reset::ResetArguments),
     /// Print the JSON Schemas of every message
     Schema,
@@ -112,10 +113,10 @@ pub struct Failure {
 /// Exit code for an unusable configuration or argument.
 const USAGE: u8 = 2;
 
-/// Exit code of a node whose name is another's.
+/// Exit code of a node whose name is already in use.
 const NAME_TAKEN: u8 = 4;
 
-/// Exit code for input of which nothing, or too little, could be used.
+/// Exit code for input that is unusable or almost unusable.
 const REJECTED: u8 = 3;
 
 /// Runs the program with the process's arguments.
@@ -123,7 +124,7 @@ pub fn main() -> ExitCode {
     exit("ecod-node", parse().and_then(run_command))
 }
 
-/// The exit code of `program`; a failure is told of on standard error.
+/// The exit code of `program`; a failure is printed on standard error.
 pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -134,7 +135,7 @@ pub fn exit(program: &str, outcome: Result<(), Failure>) -> ExitCode {
     }
 }
 
-/// The process's arguments; ends the process on those that no program of the project has.
+/// The process's arguments; ends the process if they are invalid for every program of the project.
 fn parse() -> Result<Cli, Failure> {
     Cli::try_parse().map_err(|error| {
         let command = match error.get(ContextKind::InvalidSubcommand) {
@@ -146,7 +147,7 @@ fn parse() -> Result<Cli, Failure> {
     })
 }
 
-/// Names the command of another program, and how to get that.
+/// Names the command of another program, and how to install that program.
 fn elsewhere(instead: &str) -> Failure {
     let program = instead.split(' ').next().unwrap_or_default();
     let build =
@@ -164,10 +165,10 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     let level = match &cli.command {
         _ if is_service => "info,rmqtt=warn,rmqtt_net=warn",
         Some(Command::Top(_)) => "off",
-        // Nothing of a trial is to outlive it.
+        // A trial keeps no state.
         #[cfg(feature = "camera")]
         Some(Command::Try(_)) => "warn,ecod_actors::actors::reputation_keeper=error",
-        // The command tells of refusals itself.
+        // The command reports refusals itself.
         Some(Command::Cell(_)) => "warn,rumqttc=off",
         _ => "warn",
     };
@@ -195,10 +196,10 @@ fn run_command(cli: Cli) -> Result<(), Failure> {
     }
 }
 
-/// Writes to standard output. A reader that closes it early, such as `head`, is no failure.
+/// Writes to standard output. A reader that closes it early, such as `head`, is not a failure.
 ///
 /// # Errors
-/// When it cannot be written.
+/// Returns an error if standard output cannot be written.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut output = std::io::stdout().lock();
     match output
@@ -217,7 +218,7 @@ impl From<anyhow::Error> for Failure {
 }
 
 impl Failure {
-    /// A node whose name is another's.
+    /// A node whose name is already in use.
     fn name_taken(error: anyhow::Error) -> Self {
         Self {
             error,
@@ -233,7 +234,7 @@ impl Failure {
         }
     }
 
-    /// Input of which nothing, or too little, could be used.
+    /// Input that is unusable or almost unusable.
     fn rejected(error: anyhow::Error) -> Self {
         Self {
             error,

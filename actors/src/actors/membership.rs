@@ -46,7 +46,8 @@ pub struct MembershipArguments {
     pub run: u64,
     /// The role it was started with.
     pub role: Role,
-    /// Address of the node's broker, if it has one. Others replace 0.0.0.0 by the address at which they see the node.
+    /// Address of the node's broker, if it has one. Other nodes replace 0.0.0.0 by the address from
+    /// which the node's packets arrive.
     pub broker: Option<SocketAddr>,
     /// The node's certificates. With them, all nodes of the cell prove theirs.
     pub credentials: Option<Arc<Credentials>>,
@@ -54,7 +55,7 @@ pub struct MembershipArguments {
     pub config: MembershipConfig,
     /// Callback for every event.
     pub events: EventSink,
-    /// All living nodes but this one, by name.
+    /// All living nodes except this one, by name.
     pub members: watch::Sender<Vec<Member>>,
     /// The counters of the gossip socket.
     pub counters: Arc<FrameCounters>,
@@ -69,7 +70,7 @@ pub struct MembershipState {
     machine: GossipMachine,
     socket: Arc<GossipSocket>,
     deadline: watch::Sender<Option<Timestamp>>,
-    /// Tells the socket's task that a [`MembershipMessage::Wake`] was handled.
+    /// Notifies the socket's task that a [`MembershipMessage::Wake`] was handled.
     handled: Arc<Notify>,
     events: EventSink,
     members: watch::Sender<Vec<Member>>,
@@ -205,7 +206,7 @@ impl Actor for Membership {
                 if let Some(identity) = state.certificates.as_mut().map(CertificateWatch::identity)
                 {
                     state.machine.set_identity(identity, now);
-                    // Nodes may have shown renewed certificates, which is no event.
+                    // Nodes may have shown renewed certificates, for which there is no event.
                     state.tell_members();
                 }
             }
@@ -272,7 +273,7 @@ impl MembershipState {
     }
 }
 
-/// The node's certificates, and whether its own was valid when last looked at.
+/// The node's certificates, and whether its own certificate was valid at the last check.
 struct CertificateWatch {
     credentials: Arc<Credentials>,
     own: Option<Distrust>,
@@ -286,8 +287,8 @@ impl CertificateWatch {
         }
     }
 
-    /// The present certificates and time. Logs when the own certificate begins or ceases to be valid, such as when the
-    /// clock is set.
+    /// The current certificates and time. Logs when the node's own certificate becomes valid or
+    /// invalid, for example after a change of the clock.
     fn identity(&mut self) -> Identity {
         let (credentials, wall) = (self.credentials.current(), UnixTime::now());
         let own = credentials
@@ -359,7 +360,7 @@ async fn watch_socket(
 /// Time between two attempts to join the multicast group.
 const REJOIN_PERIOD: Duration = Duration::from_secs(5);
 
-/// Joins the multicast group, if enabled; false when that does not work, or not yet.
+/// Joins the multicast group, if enabled; returns false if that fails.
 fn join_group(socket: &GossipSocket, config: &MulticastConfig) -> bool {
     if config.enabled && socket.address().is_ipv6() {
         tracing::warn!(

@@ -109,10 +109,10 @@ pub enum CalibrationError {
     Malformed(PathBuf, String),
 }
 
-/// Photographs among files and directories; those of a directory in the order of their names.
+/// Photographs among files and directories; the files of a directory are sorted by name.
 ///
 /// # Errors
-/// [`CalibrationError::Directory`] when one cannot be listed.
+/// Returns [`CalibrationError::Directory`] if a directory cannot be listed.
 pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> {
     let mut photographs = Vec::new();
     for path in paths {

@@ -82,7 +82,8 @@ pub enum SourceConfig {
         #[serde(default)]
         fps: Option<f64>,
     },
-    /// A GStreamer pipeline that ends in `appsink`, such as one from `libcamerasrc` on a Raspberry Pi.
+    /// A GStreamer pipeline that ends in `appsink`, for example with `libcamerasrc` on a Raspberry
+    /// Pi.
     Gstreamer {
         /// The pipeline as for `gst-launch-1.0`; BGR, with `appsink drop=true max-buffers=1`.
         pipeline: String,
@@ -96,7 +97,7 @@ pub enum SourceConfig {
     Video {
         /// The file.
         path: PathBuf,
-        /// True if to restart at the end. Default false.
+        /// Whether to restart at the end. Default false.
         #[serde(default)]
         looping: bool,
     },
@@ -107,17 +108,18 @@ pub enum SourceConfig {
         /// Frames per second. Default 10.
         #[serde(default = "default_fps")]
         fps: f64,
-        /// True if to restart at the end. Default false.
+        /// Whether to restart at the end. Default false.
         #[serde(default)]
         looping: bool,
     },
 }
 
 impl SourceConfig {
-    /// Opens the source; may block as long as the camera does. `timeout` applies to all but files.
+    /// Opens the source; may block as long as the camera does. `timeout` applies to all sources
+    /// except files.
     ///
     /// # Errors
-    /// [`FrameError::Open`] naming the source and what is wrong.
+    /// Returns [`FrameError::Open`] with the source and the cause.
     pub fn open(&self, timeout: Duration) -> Result<Box<dyn FrameSource>, FrameError> {
         match self {
             Self::V4l2 {
@@ -140,14 +142,15 @@ impl SourceConfig {
         }
     }
 
-    /// Device, pipeline, address or path, as it may be shown: without user and password.
+    /// Device, pipeline, address or path in a form that may be shown: without user and password.
     fn origin(&self) -> String {
         match self {
             Self::V4l2 { device: path, .. }
             | Self::Video { path, .. }
             | Self::Images { path, .. } => path.display().to_string(),
             Self::Gstreamer { pipeline } => video::without_credentials(pipeline),
-            // Without a scheme it is refused, but its secret must not be shown with the error.
+            // Without a scheme the address is refused, but its secret must not be shown with the
+            // error.
             Self::Url { url } if !url.contains("://") => {
                 url.rsplit('@').next().unwrap_or_default().to_owned()
             }

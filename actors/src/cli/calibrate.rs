@@ -28,7 +28,8 @@ pub(super) struct CalibrateArguments {
 
 #[derive(Debug, Subcommand)]
 enum CalibrateCommand {
-    /// Find height and tilt of a camera: from points on the ground, a board that lies there, or people who walk
+    /// Find height and tilt of a camera: from points on the ground, a board that lies there, or
+    /// people who walk
     #[command(subcommand)]
     Mount(mount::MountCommand),
 }

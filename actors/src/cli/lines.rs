@@ -60,7 +60,7 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     if kind.is_dir() {
         bail!("cannot read {}: it is a directory", path.display());
     }
-    // A pipe ends with its writer; a device may never end.
+    // A pipe ends with its writer; a device may not end.
     if kind.is_block_device() || kind.is_char_device() && !file.is_terminal() {
         bail!("cannot read {}: it is a device, not a file", path.display());
     }
@@ -74,10 +74,10 @@ pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     Ok(Box::new(source))
 }
 
-/// Checks that an output file is none of `inputs`.
+/// Checks that an output file differs from all `inputs`.
 ///
 /// # Errors
-/// Naming the file.
+/// Returns an error that names the file.
 pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<()> {
     // A file may have several names.
     let file = |path: &Path| {
@@ -92,10 +92,10 @@ pub fn check_apart<P: AsRef<Path>>(path: &Path, inputs: &[P]) -> anyhow::Result<
     Ok(())
 }
 
-/// Creates or truncates a file that is none of `inputs`.
+/// Creates or truncates a file that differs from all `inputs`.
 ///
 /// # Errors
-/// Naming the file.
+/// Returns an error that names the file.
 pub fn create(path: &Path, inputs: &[PathBuf]) -> anyhow::Result<Box<dyn Write>> {
     if path == Path::new("-") {
         return Ok(Box::new(BufWriter::new(io::stdout().lock())));

@@ -55,7 +55,8 @@ pub enum LogFormat {
     Journal,
 }
 
-/// Standard variable with the collector of spans; without it nothing is exported.
+/// Standard variable with the address of the collector of spans; spans are exported only if it is
+/// set.
 const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
 
 /// Prefix of event fields in the journal, followed by `_`.
@@ -122,7 +123,7 @@ fn stderr_is_journal() -> bool {
         .is_ok_and(|file| stream == format!("{}:{}", file.dev(), file.ino()))
 }
 
-/// An export that this program was built without.
+/// An export in a program that was built without it.
 #[cfg(not(feature = "otel"))]
 pub enum Export {}
 

@@ -21,7 +21,7 @@ pub(super) struct LogsNodeArguments {
 /// Files of one node's log, in order.
 pub(super) struct Logs {
     pub(super) files: Vec<PathBuf>,
-    /// Error of the first file whose configuration is unknown.
+    /// Error of the first file without a configuration.
     pub(super) unusable: Option<LogError>,
 }
 

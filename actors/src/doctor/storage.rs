@@ -113,7 +113,8 @@ pub(super) fn directories(config: &NodeConfig) -> Vec<Finding> {
     findings
 }
 
-/// Checks that the packaged service writes only what its unit allows. The user who runs this check may have more rights.
+/// Checks that the packaged service writes only to paths that its unit allows. The user who runs
+/// this check may have more rights.
 pub(super) fn service(config: &NodeConfig, file: &Path) -> Vec<Finding> {
     if !absolute(file).starts_with(SERVICE_CONFIGURATION) {
         return Vec::new();

@@ -10,7 +10,7 @@ use crate::transport::mqtt::Delivery;
 /// Requests to the keeper of the cell's description.
 #[derive(Debug)]
 pub enum DescriptionKeeperMessage {
-    /// Take the authenticated word of a node about its description.
+    /// Process a node's authenticated statement about its description.
     Hear {
         /// The node.
         from: NodeName,
@@ -23,7 +23,7 @@ pub enum DescriptionKeeperMessage {
     },
     /// Take a description from a broker.
     Take {
-        /// The description and the way that it came.
+        /// The description and its path of delivery.
         delivery: Delivery<Arc<CellDescription>>,
     },
     /// Set the cell's description, which was checked.
@@ -33,6 +33,6 @@ pub enum DescriptionKeeperMessage {
     },
     /// Publish to a broker that has just accepted a link.
     Connected,
-    /// Repeat what others lack, and try the disk again.
+    /// Repeat messages that other nodes still lack, and try the disk again.
     Tick,
 }

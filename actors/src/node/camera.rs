@@ -15,10 +15,10 @@ use crate::camera::perception::{Perception, VehicleCamera};
 use crate::node::config::NodeConfig;
 use crate::observe::dashboard::{CameraSetup, ShownCamera};
 
-/// The pose of a vehicle that stands still; none where poses are received.
+/// The pose of a vehicle that stands still; `None` if poses are received.
 ///
 /// # Errors
-/// When it is on Earth, and has no place in the cell's frame.
+/// Returns an error if the pose is on Earth and has no place in the cell's frame.
 pub fn standing_pose(config: &NodeConfig) -> anyhow::Result<Option<Pose>> {
     let is_used = config.has_camera() && config.pose.listen.is_none();
     let pose = is_used
@@ -64,7 +64,8 @@ pub fn lens(camera: &CameraConfig) -> anyhow::Result<Lens> {
         .context("key `camera.optics.calibration`")
 }
 
-/// The algorithms that a camera's reports are for. Without known locations there is nothing to vote on.
+/// The algorithms that a camera's reports are for. Without landmarks there is no location to vote
+/// on.
 pub fn algorithms(config: &NodeConfig, camera: &CameraConfig) -> Algorithms {
     match config.fusion.algorithms {
         Algorithms::Both if !camera.votes || config.landmarks.is_empty() => Algorithms::Pace,

@@ -26,11 +26,12 @@ use crate::platform::installed;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CocoConfig {
-    /// ONNX file with the inputs and outputs of the built-in model. Default none: the built-in model.
+    /// ONNX file with the inputs and outputs of the built-in model. Default: not set, the built-in
+    /// model.
     pub model: Option<PathBuf>,
     /// Minimum confidence of a detection. Default 0.4. Trade-off: lower values find more objects and more false ones.
     pub threshold: f64,
-    /// Intersection over union above which two boxes of one class count as the same object. Default 0.5.
+    /// Intersection over union above which two boxes of one class are merged. Default 0.5.
     pub max_overlap: f64,
     /// True if to also search four overlapping quarters of the image. Default false. Finds objects of
     /// half the size and takes five times as long.
@@ -125,7 +126,7 @@ impl CocoDetector {
         let name = file
             .as_ref()
             .map_or_else(|| "built-in".into(), |path| format!("{path:?}"));
-        // OpenCV tells more in further lines.
+        // OpenCV gives more details in further lines.
         let first_line = |reason: String| reason.lines().next().unwrap_or_default().to_owned();
         let unusable = |reason: String| ModelError::Unusable {
             path: name.clone(),

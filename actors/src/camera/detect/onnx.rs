@@ -1,7 +1,7 @@
 //! Detector that runs an exported model: YOLO, SSD and DETR families, in ONNX.
 //!
-//! The file says the input's size and often the labels. One run on a plain image shows the shapes of the outputs, which
-//! tell the family.
+//! The file contains the input's size and often the labels. One run on a plain image shows the
+//! shapes of the outputs, which identify the family.
 
 mod decode;
 mod family;
@@ -34,16 +34,17 @@ use crate::platform::bounded_file;
 pub struct OnnxConfig {
     /// The model's ONNX file.
     pub model: PathBuf,
-    /// File with the label of each class on a line. Default none: labels of the model's metadata, or COCO's.
+    /// File with the label of each class on its own line. Default: not set; the labels are taken
+    /// from the model's metadata, or are COCO's.
     #[serde(default)]
     pub labels: Option<PathBuf>,
-    /// Family of the model. Default none: found by its outputs.
+    /// Family of the model. Default: not set; detected from its outputs.
     #[serde(default)]
     pub family: Option<Family>,
-    /// Width and height of the network's input in pixels. Default none: those of the model.
+    /// Width and height of the network's input in pixels. Default: not set; taken from the model.
     #[serde(default)]
     pub input_px: Option<[u16; 2]>,
-    /// Values of pixels. Default none: those of the family.
+    /// Range of pixel values. Default: not set; the family's values.
     #[serde(default)]
     pub normalization: Option<Normalization>,
     /// Minimum confidence of a detection. Default 0.4.
@@ -52,8 +53,8 @@ pub struct OnnxConfig {
     /// Minimum confidence by label, in place of `threshold`.
     #[serde(default)]
     pub thresholds: BTreeMap<String, f64>,
-    /// Intersection over union above which two boxes of one class count as the same object. Default 0.5. Not for models
-    /// that suppress such boxes themselves.
+    /// Intersection over union above which two boxes of one class are merged. Default 0.5. Not for
+    /// models that suppress such boxes themselves.
     #[serde(default = "default_max_overlap")]
     pub max_overlap: f64,
 }
@@ -129,7 +130,7 @@ pub enum OnnxError {
         /// Names, types and shapes.
         inputs: String,
     },
-    /// The file says no size of the image.
+    /// The file does not contain the size of the image.
     #[error(
         "model {path:?} takes images of any size: set `input_px` to the size of its training, such as [640, 640]"
     )]
@@ -184,7 +185,7 @@ pub enum OnnxError {
         /// The model.
         path: PathBuf,
     },
-    /// The count of labels is not that of the classes.
+    /// The number of labels differs from the number of classes.
     #[error(
         "{labels} labels in {path:?}, but the model has {classes} classes: list one on each line, in its order"
     )]
@@ -204,7 +205,7 @@ pub enum OnnxError {
         /// The name.
         label: String,
     },
-    /// No labels are known.
+    /// No labels are available.
     #[error(
         "model {path:?} has {classes} classes without names: set `labels` to a file with one on each line"
     )]
@@ -238,7 +239,7 @@ pub struct OnnxDetector {
     config: OnnxConfig,
     network: Network,
     head: Head,
-    /// By the network's numbers; none for numbers that are no class.
+    /// By the network's numbers; `None` for numbers without a class.
     classes: Vec<Option<Class>>,
 }
 
@@ -376,7 +377,7 @@ impl Detect for OnnxDetector {
     }
 }
 
-/// Names of the classes in their order, if they are known, and their file.
+/// Names of the classes in their order, if available, and their file.
 fn names(
     config: &OnnxConfig,
     network: &Network,

@@ -1,7 +1,8 @@
-//! Detections from a file, in place of a detector: for recordings and for nodes without a usable model.
+//! Detections from a file instead of a detector: for recordings and for nodes without a usable
+//! model.
 //!
-//! The file is JSON Lines: line n holds what was detected in frame n, as an array of
-//! [`ecod::model::detection::Detection`]s, empty when nothing was:
+//! The file is JSON Lines: line n holds the detections of frame n as an array of
+//! [`ecod::model::detection::Detection`]s, which may be empty:
 //!
 //! ```text
 //! [{"label":"cup","confidence":0.93,"bounding_box":{"x_min":12.5,"y_min":80,"x_max":96,"y_max":171}}]
@@ -17,13 +18,13 @@ use super::{Detect, DetectError};
 use crate::camera::frame::CameraFrame;
 use crate::platform::bounded_file;
 
-/// Where recorded detections come from.
+/// Source of recorded detections.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RecordedConfig {
     /// The JSON Lines file.
     pub path: PathBuf,
-    /// True if to start again after the last line; default false: nothing is detected from then on.
+    /// Whether to start again after the last line; default false: later frames have no detections.
     #[serde(default)]
     pub looping: bool,
 }

@@ -177,13 +177,13 @@ impl Drop for Capture {
 pub struct Readers(Arc<AtomicUsize>);
 
 impl Readers {
-    /// Those of all captures in this process.
+    /// The readers of all captures in this process.
     pub fn of_process() -> &'static Self {
         static ALL: LazyLock<Readers> = LazyLock::new(Readers::default);
         &ALL
     }
 
-    /// Waits at most `timeout` until none runs.
+    /// Waits at most `timeout` until all readers have ended.
     pub fn wait_for_end(&self, timeout: Duration) {
         let until = Instant::now() + timeout;
         while self.0.load(Ordering::SeqCst) > 0 && Instant::now() < until {
@@ -234,7 +234,7 @@ struct CaptureLoop {
     status: watch::Sender<CaptureStatus>,
     events: SyncSender<CaptureEvent>,
     inbox: Receiver<CaptureEvent>,
-    /// Number of the present opening and its reader.
+    /// Number of the current opening and its reader.
     opening: Arc<AtomicU64>,
     abandoned: Vec<JoinHandle<()>>,
     captured: u64,

@@ -31,7 +31,8 @@ pub(super) struct V4l2Camera {
 }
 
 impl V4l2Camera {
-    /// Opens a device in the first pixel format of [`pixels`] that it has. It takes the nearest size and rate that it has.
+    /// Opens a device in the first pixel format of [`pixels`] that it supports. The device uses the
+    /// nearest size and rate that it supports.
     pub(super) fn open(
         device: &Path,
         size: [Option<u32>; 2],

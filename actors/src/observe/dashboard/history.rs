@@ -13,7 +13,7 @@ use serde::Serialize;
 use super::snapshot::json;
 use super::timeline::Timeline;
 
-/// One leader's time in the lead, as this node saw it.
+/// One leader's time in the lead, as observed by this node.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct LeaderTerm {
     /// The leader.
@@ -24,7 +24,8 @@ pub(crate) struct LeaderTerm {
     pub from_us: Timestamp,
     /// Time at which this node stopped; absent while it follows.
     pub until_us: Option<Timestamp>,
-    /// Milliseconds between the last round accepted before and this leader's first; absent until both are known.
+    /// Milliseconds between the last accepted round before this term and this leader's first round;
+    /// absent until both have arrived.
     pub gap_ms: Option<u64>,
 }
 

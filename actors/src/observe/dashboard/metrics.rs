@@ -32,7 +32,7 @@ type FloatGauge = Gauge<f64, AtomicU64>;
 /// All metrics as text.
 ///
 /// # Errors
-/// Never for text; the encoder's writer may fail.
+/// Does not fail for text; the encoder's writer may fail.
 pub(crate) fn metrics(monitor: &NodeMonitor) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("ecod");
     node(&mut registry, monitor);
@@ -109,7 +109,7 @@ fn node(registry: &mut Registry, monitor: &NodeMonitor) {
 
 fn troubles(registry: &mut Registry, monitor: &NodeMonitor) {
     let present = monitor.sources.counters.troubles().present().into_iter();
-    // Not by name: names come from outside, and there is no end of them.
+    // Not by name: names come from outside and are unbounded in number.
     let mut by_kind: BTreeMap<(String, &str), i64> = BTreeMap::new();
     for Trouble { kind, about, .. } in present {
         *by_kind

@@ -17,11 +17,11 @@ pub struct CameraSetup {
     pub optics: OpticsConfig,
     /// Configured mount, with which the camera's pose is reported.
     pub mount: MountConfig,
-    /// True if the camera is one of `[[cameras]]`.
+    /// True if the camera is an entry of `[[cameras]]`.
     pub is_one_of_several: bool,
 }
 
-/// Points of the ground that were clicked in a picture of the camera and on the map.
+/// Points on the ground that were clicked in a picture of the camera and on the map.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct MountQuestion {

@@ -19,7 +19,8 @@ pub struct PageAccess {
 
 #[derive(Debug)]
 struct PageToken {
-    /// Signatures are compared in constant time, so that timing reveals neither the token nor its length.
+    /// Signatures are compared in constant time, so that timing does not reveal the token or its
+    /// length.
     key: hmac::Key,
     cookie_name: String,
 }

@@ -100,12 +100,13 @@ pub(super) struct Clues<'a> {
     /// The exporter's name of the model.
     pub(super) description: &'a str,
     pub(super) input: ImageSize,
-    /// True if the network is told the size that it scales boxes to.
+    /// True if the network has an input for the size to which it scales boxes.
     pub(super) scales_boxes: bool,
 }
 
 impl Head {
-    /// The family and layout that the outputs fit; none if they fit none, or another than the configured family.
+    /// The family and layout that the outputs fit; `None` if they fit no family, or another than
+    /// the configured one.
     pub(super) fn find(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<Self> {
         let (family, layout) = by_names(clues, outputs).or_else(|| by_shape(clues, outputs))?;
         let is_tensorflow = outputs

@@ -22,10 +22,11 @@ impl Classes {
             .checked_sub(self.first + usize::from(self.has_none_last))
     }
 
-    /// The label of each number. `names` are the classes in order; without them, the classes must be COCO's.
+    /// The label of each number. `names` are the classes in order; without them, the classes must
+    /// be COCO's.
     ///
     /// # Errors
-    /// The count of classes when it differs from that of the names, or when it is not COCO's.
+    /// Returns the number of classes if it differs from the number of names, or is not COCO's.
     pub(super) fn labels(
         &self,
         names: Option<&[String]>,

@@ -88,8 +88,9 @@ impl Letterbox {
         }
     }
 
-    /// The input's numbers for an image of 8-bit blue, green and red. `convert` gives those of a pixel in the order of the
-    /// network's channels, which are planes or, with `channels_last`, beside each other.
+    /// The input's numbers for an image of 8-bit blue, green and red. `convert` returns the numbers
+    /// of a pixel in the order of the network's channels, which are planes or, with
+    /// `channels_last`, adjacent.
     pub(super) fn fill(
         self,
         image: &Mat,
