@@ -1,4 +1,4 @@
-//! The page about a log, with sections on how right maps and verdicts were, by the truth that is given.
+//! The page about a log, with sections on the accuracy of maps and verdicts, by the given truth.
 
 pub(crate) mod tracks;
 
@@ -17,12 +17,12 @@ pub fn judged_by(truth: Truth) -> Report {
     Report::with_section(Locations(Evaluation::new(truth)))
 }
 
-/// A report that judges the objects of maps by where they really were.
+/// A report that evaluates the objects of maps by their true positions.
 pub fn judged_by_tracks(truth: TrackTruth) -> Report {
     Report::with_section(Objects(TrackEvaluation::new(truth)))
 }
 
-/// Accuracy at known locations.
+/// Accuracy at landmarks.
 #[derive(Debug)]
 struct Locations(Evaluation);
 

@@ -45,7 +45,8 @@ impl Testbed {
     /// Reads a scene file.
     ///
     /// # Errors
-    /// [`TestbedError`] when the text is not JSON, or names the scene, the key and what is wrong with its value.
+    /// Returns a [`TestbedError`] if the text is not JSON; otherwise it names the scene, the key
+    /// and the fault of its value.
     pub fn from_json(text: &str) -> Result<Self, TestbedError> {
         file::read(text)
     }
@@ -123,7 +124,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// The spots as the known locations of PACE.
+    /// The spots as landmarks of PACE.
     pub fn landmarks(&self, placard: &Placard) -> Vec<Landmark> {
         self.spots
             .iter()
@@ -148,7 +149,7 @@ pub struct Spot {
 }
 
 impl Spot {
-    /// The spot as a known location, with its `EMPTY` placard as the sign of vacancy.
+    /// The spot as a landmark, with its `EMPTY` placard as the vacancy sign.
     pub fn landmark(&self, placard: &Placard) -> Landmark {
         Landmark {
             id: self.id.clone(),

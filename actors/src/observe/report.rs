@@ -112,10 +112,10 @@ impl Report {
         }
     }
 
-    /// Takes a file. The page lists what is unusable.
+    /// Reads a file. The page lists its unusable parts.
     ///
     /// # Errors
-    /// [`LogError::Unreadable`].
+    /// Returns [`LogError::Unreadable`] if the file cannot be read.
     pub fn file(&mut self, path: &Path) -> Result<(), LogError> {
         self.offset_us = cell_offset_us(path)?;
         let mut log = LogReader::open(path)?;

@@ -43,11 +43,13 @@ pub enum Event {
     BrokerRefused,
     /// A map newer than all before was accepted.
     MapAccepted,
-    /// A map, verdicts or reputations came again, as each does that arrives over two links.
+    /// A map, verdicts or reputations arrived again, as every message that arrives over two links
+    /// does.
     Repeated,
     /// An object of a report had no effect on any vote, such as at an unknown landmark.
     VoteIgnored,
-    /// A report was used for tracking only, as a later one of its vehicle had come before it.
+    /// A report was used for tracking only, because a later report of its vehicle had arrived
+    /// first.
     ReportOvertaken,
     /// A report came too late for tracking.
     ReportLate,
@@ -93,7 +95,7 @@ pub enum Event {
     DetectionUnplaced,
     /// A pose for a moving vehicle was malformed, or not later than the one before.
     PoseRejected,
-    /// A frame of a moving vehicle was not reported: no pose is known near its time.
+    /// A frame of a moving vehicle was not reported: there is no pose near its time.
     FrameWithoutPose,
     /// The embedded broker refused a client: its address connects too often, or too many connections wait.
     ClientThrottled,
@@ -115,19 +117,22 @@ pub enum Event {
     ClientExpelled,
     /// A map of the cell was handed to the connection to the region's broker.
     RegionPublished,
-    /// A map of the cell was not sent to the region: its broker is not connected or passes nothing on.
+    /// A map of the cell was not sent to the region: its broker is not connected or does not
+    /// forward messages.
     RegionWithheld,
     /// A packet came in from the region's broker.
     RegionReceived,
     /// A map of a neighbouring cell, newer than all of that cell before, was accepted.
     CellMapAccepted,
-    /// An object of a neighbouring cell was not used: outside of what that cell may tell of, or beyond the maximum number.
+    /// An object of a neighbouring cell was not used: outside of the area that its cell may report,
+    /// or beyond the maximum number.
     NeighbourRefused,
     /// The cell's counts about a vehicle were handed to the connection to the region's broker.
     CellReputationPublished,
-    /// Counts of another cell about a vehicle that is present were taken and held something new.
+    /// Counts of another cell about a present vehicle were accepted and contained news.
     CellReputationAccepted,
-    /// The region is not told of a vehicle that has left: too many wait for its broker.
+    /// Counts about a vehicle that has left were not sent to the region: too many are waiting for
+    /// its broker.
     CellReputationDropped,
 }
 
@@ -174,15 +179,15 @@ impl Counters {
         self.events[event as usize].fetch_add(times, Ordering::Relaxed);
     }
 
-    /// Counts a rejected payload, other than a report, of a node, or of a broker where the sender is not known. It is a
-    /// trouble, unless elections and re-ordering explain it.
+    /// Counts a rejected payload other than a report, by its node, or by the broker if the sender
+    /// is unavailable. It is a trouble, unless elections or re-ordering explain it.
     pub fn reject(&self, reason: RejectReason, source: &str) {
         self.reject_message(reason, source, || {
             format!("message rejected: {}", reason.in_words())
         });
     }
 
-    /// Counts a rejected payload as [`Self::reject`] does, with the cause in words.
+    /// Counts a rejected payload as [`Self::reject`] does, with the cause as text.
     pub fn reject_message(
         &self,
         reason: RejectReason,
@@ -196,7 +201,7 @@ impl Counters {
         }
     }
 
-    /// Counts a rejected report, with the cause in words.
+    /// Counts a rejected report, with the cause as text.
     pub fn reject_report(
         &self,
         reason: RejectReason,
@@ -230,7 +235,7 @@ impl Counters {
         self.shed.count(reason, source);
         let cause = match reason {
             ShedReason::ReaderSlow => "reads too slowly and misses the oldest messages",
-            // A busy fuser takes the later report: the vehicle need not know.
+            // A busy fuser uses the later report: the vehicle need not be informed.
             ShedReason::ReportReplaced => return,
             _ => "sends more than is taken, the rest is not used",
         };
@@ -278,8 +283,8 @@ impl Counters {
     }
 }
 
-/// The trouble that a reason is a sign of where a report is rejected. Some occur without anybody's fault: around a change of leader, or on a network
-/// that re-orders.
+/// The trouble indicated by a reason for which a report is rejected. Some reasons also occur
+/// without a fault: around a change of leader, or on a network that re-orders.
 fn trouble_of(reason: RejectReason) -> Option<TroubleKind> {
     use RejectReason as Reason;
     match reason {

@@ -39,6 +39,7 @@ pub enum BrokerHealth {
     Stopped,
     /// Serves clients at this address.
     Serving(SocketAddr),
-    /// Has ended by itself or hangs. The actor ends with this answer, and the node must not lead meanwhile.
+    /// The broker has ended by itself or hangs. The actor ends with this answer, and the node must
+    /// not lead in the meantime.
     Dead,
 }

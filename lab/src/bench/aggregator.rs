@@ -1,4 +1,4 @@
-//! An aggregator of the benchmark's own: a node in a process of its own, with its broker, on loopback.
+//! An aggregator started by the benchmark: a node in its own process, with its broker, on loopback.
 
 use std::fs;
 use std::net::SocketAddr;

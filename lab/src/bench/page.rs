@@ -23,10 +23,10 @@ const EVENT_END: &[u8] = b"\n\n";
 /// Time that any part may take.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Asks for all that a browser asks for until it has something to draw.
+/// Requests all files that a browser requests until it can draw a picture.
 ///
 /// # Errors
-/// When the page is not there or sends no picture.
+/// Returns an error if the page is unreachable or sends no picture.
 pub async fn fetch(page: SocketAddr) -> anyhow::Result<PageFigures> {
     let begun = Instant::now();
     let mut bytes = 0;

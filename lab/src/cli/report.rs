@@ -1,4 +1,4 @@
-//! `ecod-lab report`: a log as one page, judged by what is true.
+//! `ecod-lab report`: a log as one page, evaluated against the truth.
 
 use std::path::{Path, PathBuf};
 
@@ -30,7 +30,7 @@ pub(super) fn run(arguments: &LogReportArguments) -> Result<(), Failure> {
     page(&arguments.page, report, truth, "ecod-lab")
 }
 
-/// A report that judges by the truth in this file.
+/// A report that is evaluated against the truth in this file.
 fn judged(path: &Path) -> anyhow::Result<Report> {
     let text =
         bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;

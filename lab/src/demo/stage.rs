@@ -49,7 +49,7 @@ pub(super) struct Played {
     pub(super) restarted_at: Option<Timestamp>,
 }
 
-/// Time for all nodes to start and see.
+/// Time for all nodes to start and detect objects.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// Time for which the edge is gone.
@@ -58,7 +58,7 @@ const EDGE_GONE: Duration = Duration::from_secs(1);
 /// Time from the first reports of all vehicles to the first map that is judged: the memory of PACE.
 const SETTLING: Duration = Duration::from_secs(1);
 
-/// Where a node listens: its broker, for other nodes, and for poses.
+/// Addresses of a node: of its broker, for other nodes, and for poses.
 #[derive(Debug, Clone, Copy)]
 struct NodeAddresses {
     broker: SocketAddr,
@@ -74,7 +74,7 @@ pub(super) struct Stage<'a> {
 }
 
 impl<'a> Stage<'a> {
-    /// A stage for so many nodes; nothing of an earlier cell stays in the directory.
+    /// A stage for a number of nodes; files of an earlier cell are removed from the directory.
     pub(super) fn new(
         program: &'a Path,
         directory: &'a Path,
@@ -156,7 +156,7 @@ impl<'a> Stage<'a> {
         })
     }
 
-    /// The maps that a vehicle got, in order.
+    /// The maps that a vehicle received, in order.
     pub(super) fn map_log(&self, vehicle: &NodeName) -> anyhow::Result<Vec<ReceivedMap>> {
         let path = self.map_log_file(vehicle);
         let text =
@@ -203,8 +203,8 @@ impl<'a> Stage<'a> {
     }
 }
 
-/// Waits for reports of all vehicles and maps of the edge, then for the time to be judged, in which the edge is killed and
-/// started again, and says when that was.
+/// Waits for reports of all vehicles and maps of the edge, then for the evaluated time, during
+/// which the edge is killed and restarted. Returns the times of these events.
 async fn watch(
     nodes: &mut [NodeProcess],
     collector: &ReportCollector,

@@ -130,7 +130,7 @@ fn at(name: &str, best_f1_pct: Option<f64>, scores: &ThresholdScores) -> Vec<Str
         .collect()
 }
 
-/// A share in percent; a dash where there is none.
+/// A share in percent; a dash without a value.
 pub(crate) fn percent(share: Option<f64>) -> String {
     share.map_or_else(|| "-".into(), |share| format!("{share:.2}"))
 }

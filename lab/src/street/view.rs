@@ -1,4 +1,5 @@
-//! Pictures of the street: everything is projected by the pinhole camera and painted from far to near.
+//! Pictures of the street: all bodies are projected by the pinhole camera and painted from far to
+//! near.
 
 use std::collections::BTreeMap;
 

@@ -32,7 +32,8 @@ pub enum TestbedError {
     /// A value is missing, of the wrong kind or out of range.
     #[error("{place}: `{key}` {reason}")]
     Value {
-        /// `scene file`, `recording`, or `scene` and its name or, if it has none, its number counted from 0.
+        /// `scene file`, `recording`, or `scene` and its name or, if it has no name, its number
+        /// counted from 0.
         place: String,
         /// Path of the key, such as `spots[2].truth`.
         key: String,

@@ -1,8 +1,10 @@
-//! The paper's VOTE testbed: recorded detector output through the projector, the naming of locations and VOTE.
+//! The paper's VOTE testbed: recorded detector output processed by the projector, the naming of
+//! locations and VOTE.
 //!
-//! Sizes were not recorded. Those of the objects on the table follow from the boxes that read them right; people and
-//! furniture have their natural size, which puts what is seen of them behind the table where it belongs; of anything
-//! else only the bearing is trusted. Poses are taken to be as exact as the recorded bearings turn out.
+//! Sizes were not recorded. Sizes of the objects on the table follow from the boxes with their
+//! right label. People and furniture have their natural size, which places visible parts of them
+//! correctly behind the table. For all other labels only the bearing is used. The accuracy of poses
+//! is derived from the scatter of the recorded bearings.
 
 pub mod generate;
 
@@ -55,15 +57,16 @@ const SIZES: [(&str, f64, f64); 16] = [
     ("truck", 3.0, 0.3),
     ("tv", 0.5, 0.3),
 ];
-/// Height in metres of what has any other label, to find its bearing with.
+/// Height in metres of objects with any other label, for computing their bearing.
 const ANY_HEIGHT_M: f64 = 0.11;
-/// Which location an object of known size is taken for.
+/// Gate for assigning an object of listed size to a location.
 const GATE: LandmarkGate = LandmarkGate {
     radius_m: 0.5,
     sigmas: 3.0,
     floor_m: 0.02,
 };
-/// Greatest angle in radians between an object of unknown size and the location that it is taken for.
+/// Maximum angle in radians between an object of unknown size and the location to which it is
+/// assigned.
 const MAX_BESIDE_RAD: f64 = 0.15;
 /// By what factor such an object may be higher or lower than [`ANY_HEIGHT_M`] if it stands at the location.
 const MAX_HEIGHT_FACTOR: f64 = 5.0;
@@ -101,7 +104,7 @@ pub struct FrameLabel {
     pub frame: u64,
     /// The location.
     pub landmark: LandmarkId,
-    /// The verdict; null for none.
+    /// The verdict; null without a verdict.
     pub label: Option<Label>,
     /// True if it is among the accepted labels.
     pub right: bool,
@@ -142,7 +145,7 @@ pub fn run(name: &str, recording: &IntersectionRecording) -> anyhow::Result<Inte
 }
 
 impl IntersectionResult {
-    /// The mean of scenes with equally many verdicts; `None` of none.
+    /// The mean of scenes with equally many verdicts; `None` without scenes.
     pub fn mean(name: &str, scenes: &[Self]) -> Option<Self> {
         let first = scenes.first()?;
         let mean = |figure: &dyn Fn(&Self) -> f64| {
@@ -197,7 +200,7 @@ pub fn reports(recording: &IntersectionRecording) -> Vec<ObjectReport> {
     reports
 }
 
-/// Takes every object of unknown size for the location that is least beside it.
+/// Assigns every object of unknown size to the location with the smallest angle to it.
 fn name_by_bearing(report: &mut ObjectReport, landmarks: &[Landmark]) {
     let Some(camera) = report.pose.map(Pose::from) else {
         return;
@@ -279,7 +282,7 @@ fn fuse(
     Ok((fused, scores))
 }
 
-/// Every frame counts by itself.
+/// Every frame counts separately.
 fn truth(recording: &IntersectionRecording) -> anyhow::Result<Truth> {
     let spans = |accepted: &[Label]| -> Vec<_> {
         (0..recording.frame_count())

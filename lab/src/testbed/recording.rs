@@ -1,5 +1,5 @@
-//! The intersection of the paper's VOTE testbed: what the vehicles' detectors said, frame by frame, and what stood
-//! there.
+//! The intersection of the paper's VOTE testbed: the detections of the vehicles, frame by frame,
+//! and the true objects.
 //!
 //! Files are in inches, degrees and shares of the image, and converted while being read.
 
@@ -21,7 +21,7 @@ const BOX_ORDER: &str = "y_min, x_min, y_max, x_max";
 /// Frames and boxes that a file may have, to bound memory.
 const MAX_BOXES: usize = 1_000_000;
 
-/// Known objects and the detections of the vehicles that watch them.
+/// The true objects, and the detections of the vehicles that watch them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IntersectionRecording {
     /// The camera of every vehicle.

@@ -31,7 +31,8 @@ pub struct ImageRecorder {
 }
 
 impl ImageRecorder {
-    /// As configured, for a camera of a vehicle; `None` without a log, or without images in it.
+    /// A recorder as configured, for a camera of a vehicle; `None` without a log, or without images
+    /// in it.
     pub fn new(
         config: Option<&RecordConfig>,
         vehicle: &NodeName,
@@ -132,7 +133,8 @@ mod tests {
         );
     }
 
-    /// A Pi without a clock of its own starts years ago: viewers look for the vehicle's pose at the picture's time.
+    /// A Pi without a real-time clock starts with a time years ago: viewers look for the vehicle's
+    /// pose at the picture's time.
     #[test]
     fn a_picture_is_dated_as_reports_are() {
         let clock = CellClock::default();

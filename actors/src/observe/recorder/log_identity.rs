@@ -22,7 +22,7 @@ pub struct LogIdentity {
     pub version: String,
     /// Configuration of the fusion.
     pub fusion: FusionConfig,
-    /// Known locations of the cell.
+    /// Landmarks of the cell.
     pub landmarks: Vec<LandmarkConfig>,
 }
 

@@ -1,4 +1,4 @@
-//! Queue from the parts of a node to the recorder. Sending never waits.
+//! Queue from the parts of a node to the recorder. Sending does not block.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{SyncSender, TrySendError};
@@ -55,7 +55,7 @@ pub enum LogItem {
     Picture(Box<CapturedPicture>),
 }
 
-/// A camera's picture, with what was detected in it.
+/// A camera's picture with its detections.
 #[derive(Debug, Clone)]
 pub struct CapturedPicture {
     /// Name of the camera, if it has one.
@@ -75,7 +75,7 @@ pub struct CapturedPicture {
 }
 
 impl LogItem {
-    /// True if the log holds anything of it.
+    /// True if the log contains any part of the item.
     pub(crate) fn is_written(&self) -> bool {
         !matches!(self, Self::Round(_))
     }
@@ -88,7 +88,7 @@ impl LogItem {
         )
     }
 
-    /// True if an exact rerun of the aggregator needs it.
+    /// True if an exact replay of the aggregator needs it.
     pub(crate) fn is_of_journal(&self) -> bool {
         matches!(self, Self::Report(..) | Self::Journal(_))
     }
@@ -154,7 +154,7 @@ impl LogSender {
         self.0.change.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Counts lost entries, and those of the journal that the log must note.
+    /// Counts lost entries, and the lost journal entries that the log must record.
     pub(crate) fn count_lost(&self, entries: u64, of_journal: u64) {
         self.0.counters.add(Event::RecordDropped, entries);
         self.0.missing.fetch_add(of_journal, Ordering::Relaxed);
@@ -176,7 +176,8 @@ impl LogSender {
         &self.0.counters
     }
 
-    /// Replaces the queue; `None` disconnects the recorder. One that begins has the present settings.
+    /// Replaces the queue; `None` disconnects the recorder. A recorder that starts gets the current
+    /// settings.
     pub(crate) fn connect(&self, queue: Option<SyncSender<LogEntry>>) {
         if queue.is_some() {
             self.change().take();

@@ -1,4 +1,5 @@
-//! Timeline of a log: what the dashboard's page shows of a live cell, in the cell's time.
+//! Timeline of a log: the same view that the dashboard's page has of a live cell, in the cell's
+//! time.
 
 use std::collections::BTreeMap;
 use std::path::Path;

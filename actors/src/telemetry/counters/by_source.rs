@@ -22,7 +22,7 @@ pub enum ShedReason {
     StatusThrottled,
     /// A vehicle and its parts reported more than 15,000 objects a second; the report was not fused.
     ObjectsThrottled,
-    /// A newer report of the same vehicle came before the fuser read this one.
+    /// A newer report of the same vehicle arrived before the fuser read this one.
     ReportReplaced,
     /// A neighbouring cell sent maps more often than 20 times a second; the map was not decoded.
     CellThrottled,

@@ -1,6 +1,7 @@
 //! Bytes that the broker holds for its clients, bounded for each principal and in total.
 //!
-//! Two kinds of bytes are held for a client: those that it does not read, and packets that it has begun and not ended.
+//! Two kinds of bytes are held for a client: bytes that it has not read, and incomplete packets
+//! that it has sent.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -8,7 +9,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use ecod::model::time::Timestamp;
 use tokio::sync::oneshot;
 
-/// Bytes held by connection. Beyond a bound, the connection that has held some for the longest time gives way: it is cut.
+/// Held bytes by connection. If a bound is exceeded, the connection that has held bytes for the
+/// longest time is cut.
 #[derive(Debug, Clone)]
 pub(super) struct Backlog {
     table: Arc<Mutex<BacklogTable>>,
@@ -62,7 +64,7 @@ impl Backlog {
         }
     }
 
-    /// A part for one more connection, and a receiver that ends when the connection has to.
+    /// An entry for one more connection, and a receiver that ends when the connection must be cut.
     pub(super) fn open(&self, principal: Option<Arc<str>>) -> (BacklogSlot, oneshot::Receiver<()>) {
         let mut table = self.table();
         let number = table.next_number;
@@ -96,7 +98,7 @@ impl BacklogSlot {
         self.set(|holding| holding.unread = bytes, now);
     }
 
-    /// Records the bytes of a packet that the client has not ended.
+    /// Records the bytes of an incomplete packet of the client.
     pub(super) fn set_unfinished(&self, bytes: usize, now: Timestamp) {
         self.set(|holding| holding.unfinished = bytes, now);
     }
@@ -173,7 +175,7 @@ impl BacklogTable {
 }
 
 impl Holding {
-    /// Held bytes; those of a connection that is being cut do not count.
+    /// Held bytes; connections that are being cut don't count.
     fn bytes(&self) -> usize {
         if self.cut.is_some() {
             self.unread + self.unfinished

@@ -64,10 +64,10 @@ pub fn check_key(config: &MembershipConfig, cell: &NodeName) -> Result<(), KeyEr
     CellKey::load(config, cell).map(drop)
 }
 
-/// The key that signs payloads, derived from the cell's.
+/// The key that signs payloads, derived from the cell's key.
 ///
 /// # Errors
-/// [`KeyError`] when the key file cannot be used.
+/// Returns a [`KeyError`] if the key file cannot be used.
 pub(crate) fn payload_key(
     config: &MembershipConfig,
     cell: &NodeName,
@@ -132,12 +132,13 @@ impl CellKey {
         key.expect("HKDF gives as much as a hash's length")
     }
 
-    /// Public tag in every frame that tells cells apart.
+    /// Public tag in every frame, which distinguishes cells.
     pub(crate) fn tag(&self) -> [u8; 4] {
         self.tag
     }
 
-    /// The key of one session with certificates, of the secret that both sides agreed on and of their transcript.
+    /// The key of one session with certificates, derived from the shared secret of both sides and
+    /// their transcript.
     #[expect(
         clippy::expect_used,
         reason = "the length asked for is fixed and allowed"
@@ -156,8 +157,8 @@ impl CellKey {
         }
     }
 
-    /// The cipher of frames from one session to another. The sender's frame counter is the nonce, so that no two frames
-    /// share key and nonce.
+    /// The cipher of frames from one session to another. The sender's frame counter is the nonce,
+    /// so that every frame has a different pair of key and nonce.
     #[expect(
         clippy::expect_used,
         reason = "the length asked for is fixed and allowed"
@@ -178,7 +179,8 @@ impl CellKey {
 pub(crate) struct FrameCipher(aead::LessSafeKey);
 
 impl FrameCipher {
-    /// Encrypts what follows the first `head` bytes of the frame, and authenticates all of it.
+    /// Encrypts the bytes after the first `head` bytes of the frame, and authenticates the whole
+    /// frame.
     #[expect(
         clippy::expect_used,
         reason = "the cipher seals 256 GiB, a datagram has 64 KiB"

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::Member;
 use super::socket::is_of_this_machine;
 
-/// Identity of a node. Of two with one name, the one with the greater `life` is accepted.
+/// Identity of a node. If two nodes have one name, the node with the greater `life` is accepted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct NodeId {
     pub(crate) name: NodeName,
@@ -18,7 +18,7 @@ pub(crate) struct NodeId {
     /// Counts up from when the membership started, whenever the node returns from the dead or its addresses change.
     pub(crate) life: u64,
     pub(crate) role: Role,
-    /// Address of its gossip socket; unspecified while the node does not know it.
+    /// Address of its gossip socket; unspecified until the node has discovered it.
     pub(crate) gossip: SocketAddr,
     pub(crate) broker: Option<SocketAddr>,
 }
@@ -83,7 +83,7 @@ mod tests {
             gossip: gossip.parse().unwrap(),
             broker: Some("127.0.0.1:1883".parse().unwrap()),
         };
-        // An address of nobody: reserved for documentation.
+        // An address reserved for documentation.
         assert_eq!(id("192.0.2.7:17884").member(None).broker, None);
         assert_eq!(
             id("127.0.0.1:17884").member(None).broker,

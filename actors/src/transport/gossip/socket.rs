@@ -160,7 +160,7 @@ mod tests {
             ..MembershipConfig::default()
         })
         .unwrap();
-        // An interface of nobody: reserved for documentation.
+        // An interface address reserved for documentation.
         let absent = MulticastConfig {
             interface: Some(Ipv4Addr::new(192, 0, 2, 7)),
             ..MulticastConfig::default()

@@ -22,7 +22,7 @@ pub struct Token {
     pub(super) secret: [u8; 16],
 }
 
-/// A text that is no token, or not a whole one.
+/// A text that is not a token, or not a whole one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
     "this is no token, or not the whole of it; `ecod-node invite NAME` prints one, which begins with `{PREFIX}`"

@@ -23,7 +23,7 @@ use super::{BROKER_NAME, DOOR_NAME, OBSERVER_MARK};
 use crate::platform::bounded_file;
 use crate::platform::state_file::{content, replace_file, with_checksum};
 
-/// Days for which a node's certificate is valid unless told otherwise.
+/// Default validity of a node's certificate in days.
 pub const DEFAULT_DAYS: u32 = 365;
 
 /// Days for which a CA is valid.
@@ -62,7 +62,7 @@ struct IssuedCertificate {
     revoked_at_us: Option<Timestamp>,
 }
 
-/// An error of the authority; the files before it are still there.
+/// An error of the authority; the previous files remain.
 #[derive(Debug, thiserror::Error)]
 pub enum AuthorityError {
     /// A file could not be read or written.
@@ -79,7 +79,7 @@ pub enum AuthorityError {
     /// The directory has a CA already, whose certificates would become invalid.
     #[error("{0} has a CA already; a new one needs an empty directory")]
     Exists(PathBuf),
-    /// The CA of a cell where that of a city is needed, or the other way round.
+    /// The CA of a cell where a city's CA is needed, or the reverse.
     #[error("{directory} has the CA of a {found}: {remedy}")]
     Kind {
         /// The directory.
@@ -165,7 +165,7 @@ impl Authority {
     /// Opens the CA of a directory.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there is none.
+    /// Returns an [`AuthorityError`] if there is no CA.
     pub fn open(directory: &Path) -> Result<Self, AuthorityError> {
         Ok(Self {
             directory: directory.into(),
@@ -182,12 +182,13 @@ impl Authority {
         Ok(lock)
     }
 
-    /// Makes a key and a certificate for a node: `nodes/<node>.key` and `nodes/<node>.pem`. Earlier ones are
-    /// overwritten, and stay valid until they expire or are revoked. In the election the node can declare no more than
-    /// `rights`.
+    /// Creates a key and a certificate for a node: `nodes/<node>.key` and `nodes/<node>.pem`.
+    /// Earlier ones are overwritten, and stay valid until they expire or are revoked. In the
+    /// election the node cannot declare more than `rights`.
     ///
     /// # Errors
-    /// [`AuthorityError`] when the name cannot have one or a file cannot be written.
+    /// Returns an [`AuthorityError`] if the name cannot have a certificate or a file cannot be
+    /// written.
     pub fn issue(
         &mut self,
         node: &NodeName,
@@ -273,7 +274,7 @@ impl Authority {
         &self.register.cell
     }
 
-    /// True if a node has a certificate that is neither revoked nor expired.
+    /// True if a node has a certificate that is valid: not revoked and not expired.
     pub(crate) fn has_certificate(&self, node: &NodeName, now: Timestamp) -> bool {
         let is_valid = |issued: &IssuedCertificate| {
             issued.revoked_at_us.is_none() && issued.expires_at_us > now
@@ -284,11 +285,12 @@ impl Authority {
             .any(|issued| issued.node == *node && is_valid(issued))
     }
 
-    /// Revokes all certificates of a node, also those that have expired, and rewrites the revocation list; returns their
-    /// number. Evidence that was signed in a certificate's time counts after it, until it is revoked.
+    /// Revokes all certificates of a node, including expired ones, and rewrites the revocation
+    /// list; returns their number. Evidence that was signed while a certificate was valid counts
+    /// after its expiry, until it is revoked.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there are none or the list cannot be written.
+    /// Returns an [`AuthorityError`] if there are no certificates or the list cannot be written.
     pub fn revoke(&mut self, node: &NodeName, now: Timestamp) -> Result<usize, AuthorityError> {
         match self.revoke_where(|issued| issued.node == *node && !issued.is_ca, now)? {
             0 => Err(AuthorityError::NotIssued(node.clone())),
@@ -392,7 +394,7 @@ impl Authority {
 /// Checks that a node may have a certificate under the name.
 ///
 /// # Errors
-/// [`AuthorityError::Name`] when it is one of an observer.
+/// Returns [`AuthorityError::Name`] if the name belongs to an observer.
 pub(crate) fn check_name(node: &NodeName) -> Result<(), AuthorityError> {
     if node.as_str().contains(OBSERVER_MARK) {
         Err(AuthorityError::Name(node.clone()))
@@ -420,7 +422,7 @@ fn read_register(directory: &Path) -> Result<IssuedCertificates, AuthorityError>
     register.map_err(|reason| AuthorityError::Register { path, reason })
 }
 
-/// Parameters of a CA's certificate with so many CAs below it in a row.
+/// Parameters of a CA's certificate with a maximum number of CAs below it in a chain.
 fn ca_parameters(
     name: &str,
     below: u8,

@@ -127,7 +127,7 @@ pub(super) fn frames(text: &str, has_camera: bool) -> anyhow::Result<ParsedFrame
     Ok(frames)
 }
 
-/// Names the path of what cannot be read.
+/// Names the path of the unreadable part.
 fn parsed<T: DeserializeOwned>(text: &str) -> anyhow::Result<T> {
     Ok(serde_path_to_error::deserialize(
         &mut serde_json::Deserializer::from_str(text),

@@ -129,7 +129,8 @@ impl AtThreshold {
             .iter()
             .map(|(ids, count)| count * lives.jaccard(*ids, *count))
             .collect();
-        // Equal sums for equal input: the order of a hash table is not that of the input.
+        // Sorted, because the order of a hash table would make equal inputs give slightly different
+        // sums.
         weighted.sort_unstable_by(f64::total_cmp);
         let assa = weighted.iter().sum::<f64>() / matches.max(1.0);
         let loca = if matches > 0.0 {

@@ -11,14 +11,14 @@ use super::{MATCH_DISTANCE_M, ScoredFrame};
 /// Counts of a whole sequence.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct IdentityScore {
-    /// Objects said that bear the identity matched to the true one.
+    /// Reported objects with the identity matched to the true one.
     true_positives: u64,
-    /// True objects and objects said, together.
+    /// Number of true and reported objects together.
     all: u64,
 }
 
 impl IdentityScore {
-    /// Twice the right ones by all; zero if there is nothing.
+    /// Twice the true positives divided by all objects; zero without objects.
     pub(super) fn f1(&self) -> f64 {
         2.0 * self.true_positives as f64 / self.all.max(1) as f64
     }

@@ -10,7 +10,7 @@ use crate::testbed::Scene;
 /// Scene files and axes are in inches.
 pub(super) const METRES_PER_INCH: f64 = 0.0254;
 
-/// Where the world lies on the picture: east to the right, north up.
+/// The mapping of the world to the picture: east to the right, north up.
 #[derive(Debug)]
 pub(super) struct Sheet {
     /// South-western corner in metres.
@@ -29,7 +29,7 @@ impl Sheet {
     const BOTTOM_PX: f64 = 52.0;
     /// Length of the frame's longer side.
     const FRAME_PX: f64 = 600.0;
-    /// Room around what the scene holds: for placards and names.
+    /// Padding around the scene, for placards and names.
     const PADDING_M: f64 = 3.0 * METRES_PER_INCH;
     /// Least side of the frame.
     const MIN_M: f64 = 24.0 * METRES_PER_INCH;

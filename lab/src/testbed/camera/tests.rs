@@ -108,7 +108,7 @@ fn a_nearer_placard_hides_a_farther_one() {
         .is_some()
     );
     let (first, second) = (still(&two), still(&lot(16.0, 210.0, alone)));
-    // The nearer card covers both what is behind it and how that is turned.
+    // The nearer card covers the card behind it and that card's rotation.
     let near = &two.cards(scene)[2];
     let seen = Sighting::of(near, &[], &scene.cavs[0].pose, &two).unwrap();
     assert_eq!(seen.shown, 1.0);

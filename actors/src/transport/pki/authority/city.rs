@@ -1,4 +1,4 @@
-//! The CA of a city, above those of its cells.
+//! The CA of a city, above the CAs of its cells.
 
 use std::path::Path;
 
@@ -12,11 +12,11 @@ use super::super::attestation::is_issued_by;
 use super::{Authority, AuthorityError, CA_DAYS, IssuedCertificate, ca_parameters, days, read};
 
 impl Authority {
-    /// Makes a CA for a city, as [`Authority::init`] makes one for a cell. It certifies vehicles, which hold in all cells of
-    /// the city and lead in none, and the CAs of cells.
+    /// Creates a CA for a city, as [`Authority::init`] does for a cell. It certifies vehicles,
+    /// which are valid in all cells of the city and cannot lead there, and the CAs of cells.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there is a CA or the directory cannot be written.
+    /// Returns an [`AuthorityError`] if there is a CA already or the directory cannot be written.
     pub fn init_city(
         directory: &Path,
         city: &NodeName,
@@ -61,10 +61,10 @@ impl Authority {
         })
     }
 
-    /// Revokes the CAs of a cell, such as one whose key was stolen; returns their number.
+    /// Revokes the CAs of a cell, for example if its key was stolen; returns their number.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there are none or the list cannot be written.
+    /// Returns an [`AuthorityError`] if there are no such CAs or the list cannot be written.
     pub fn revoke_cell(
         &mut self,
         cell: &NodeName,
@@ -87,10 +87,10 @@ impl Authority {
         Ok(!is_issued_by(&own, &own))
     }
 
-    /// Checks that this is the CA of a city, or else that of a cell.
+    /// Checks that this is the CA of a city, or otherwise of a cell.
     ///
     /// # Errors
-    /// [`AuthorityError::Kind`].
+    /// Returns [`AuthorityError::Kind`].
     pub fn check_is_city(&self, is_city: bool) -> Result<(), AuthorityError> {
         if self.register.is_city == is_city {
             return Ok(());
