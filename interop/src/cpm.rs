@@ -1,7 +1,8 @@
 //! Collective perception messages of ETSI TS 103 324 V2.1.1, in UPER.
 //!
-//! Positions in a message are metres east and north of its reference position, which is on Earth (WGS 84). So a cell needs an
-//! origin on Earth. Confidences of positions are half widths at a level of 95 %: 1.96 standard deviations.
+//! Positions in a message are metres east and north of its reference position, which is on Earth
+//! (WGS 84). A cell therefore needs an origin on Earth. Confidences of positions are half widths at
+//! a level of 95 %: 1.96 standard deviations.
 
 mod classes;
 mod decoding;
@@ -22,13 +23,14 @@ pub use encoding::{encode_map, encode_report};
 pub use identifiers::{ObjectIds, RECEIVED_PART, StationIds, is_received};
 pub use segments::Segments;
 
-/// Maximum size of a message in bytes: 255 objects with all that a message may say of each need less than half of it.
+/// Maximum size of a message in bytes: 255 objects with all optional fields need less than half of
+/// it.
 pub const MAX_BYTES: usize = 64 * 1024;
 
 /// Standard deviations in the half width of an interval of 95 %.
 const SIGMAS: f64 = 1.96;
 
-/// Coordinates in centimetres that are no codes of those out of range.
+/// Coordinates in centimetres, excluding the codes for values out of range.
 const COORDINATES_CM: std::ops::RangeInclusive<i32> = -131_071..=131_070;
 
 /// Code of a coordinate's confidence: the half width is more than 40.94 m.
@@ -46,12 +48,12 @@ const MESSAGE_ID: u8 = 14;
 /// Milliseconds from the Unix epoch to 2004-01-01, less the five leap seconds since then, which `TimestampIts` counts.
 const ITS_EPOCH_MS: u64 = 1_072_915_200_000 - 5_000;
 
-/// A cell as its messages need it.
+/// The properties of a cell that its messages need.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CpmCell {
     /// Place of the cell's frame on Earth.
     pub origin: GeographicOrigin,
-    /// Labels of vacancy signs, which are no objects.
+    /// Labels of vacancy signs, which are not objects.
     pub vacancy_signs: BTreeSet<Label>,
 }
 

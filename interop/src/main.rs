@@ -1,4 +1,4 @@
-//! Program `ecod-interop`: bridges between a cell and the languages of others.
+//! Program `ecod-interop`: bridges between a cell and other systems' message formats.
 
 #[cfg(feature = "ros2")]
 use std::fmt::Display;
@@ -17,7 +17,8 @@ use {
     ecod_interop::dds::{DetectorTopics, RosBridge, RosCamera, RosSettings},
 };
 
-/// Bridges between a cell and the messages of other stations. Runs beside a node, as any program does.
+/// Bridges between a cell and the messages of other stations. Runs in addition to a node, like any
+/// local program.
 #[derive(Parser)]
 #[command(name = "ecod-interop", version)]
 struct Cli {
@@ -54,7 +55,8 @@ struct RosOptions {
     /// Address of this machine in a network in which to announce itself; may be given several times. Default: in all.
     #[arg(long, value_name = "ADDRESS")]
     network: Vec<std::net::IpAddr>,
-    /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in that of a camera with a --pose or --pose-topic.
+    /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in the frame of a camera with a
+    /// --pose or --pose-topic.
     #[arg(long, value_name = "TOPIC", group = "detections")]
     detections_3d: Option<String>,
     /// Topic of vision_msgs/Detection2DArray: boxes in pictures without distortion.
@@ -177,16 +179,16 @@ fn class_label(text: &str) -> Result<(String, String), String> {
     Ok((class.to_owned(), label.to_owned()))
 }
 
-/// Where the node is, and its name. All can be set by the environment, as for nodes.
+/// Address of the node, and its name. All options can be set by the environment, as for nodes.
 #[derive(Args)]
 struct Connection {
-    /// HOST:PORT of the node's door.
+    /// HOST:PORT of the node's local broker.
     #[arg(long, env = "ECOD_BROKER")]
     broker: Option<String>,
     /// Name of the cell.
     #[arg(long, env = "ECOD_CELL")]
     cell: Option<String>,
-    /// Name of the node beside which the program runs. Default: the machine's host name.
+    /// Name of the program's node. Default: the machine's host name.
     #[arg(long, env = "ECOD_NAME")]
     node: Option<String>,
     /// Certificate of the cell's authority (PEM).
@@ -283,7 +285,7 @@ fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String
     Ok(())
 }
 
-/// A log, or those of a directory in the order of their names.
+/// A log, or the logs of a directory sorted by name.
 #[cfg(feature = "ros2")]
 fn logs(path: &std::path::Path) -> Result<Vec<PathBuf>, String> {
     if !path.is_dir() {

@@ -25,7 +25,7 @@ impl CellAccount {
         }
     }
 
-    /// MQTT filters of what the cell may publish.
+    /// MQTT filters of the topics that the cell may publish.
     pub fn writes(&self) -> Vec<String> {
         let Self { cell, tile } = self;
         let (tile, cell) = (*tile, cell.clone());
@@ -42,9 +42,11 @@ impl CellAccount {
             .collect()
     }
 
-    /// MQTT filters of what the cell may read: its own, maps and descriptions of the tiles around, and reputations.
+    /// MQTT filters of the topics that the cell may read: its own topics, maps and descriptions of
+    /// the tiles around, and reputations.
     ///
-    /// Statuses of others are not among them: they name the runs of nodes, and so what their connections may be called.
+    /// Statuses of other cells are excluded: they contain the runs of nodes, from which the ids of
+    /// their connections could be derived.
     pub fn reads(&self) -> Vec<String> {
         let Self { cell, tile } = self;
         let kinds = [RegionTopicKind::Map, RegionTopicKind::Cell];
@@ -59,7 +61,7 @@ impl CellAccount {
 
     /// The user as an element of `users` in NATS's configuration.
     ///
-    /// The password stands there as it is; docs/city.md says why.
+    /// The password is stored there in plain text; docs/city.md explains why.
     pub fn nats(&self, password: &str) -> String {
         let list = |filters: Vec<String>| {
             let subjects: Vec<_> = filters

@@ -1,4 +1,4 @@
-//! A program's part in cells of real nodes, and at a real broker that says anything.
+//! A program in cells of real nodes, and at a real broker that sends arbitrary messages.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on says where")]
 
@@ -23,7 +23,7 @@ use ecod_client::{
 use rumqttc::{Client, MqttOptions, QoS};
 use tokio::runtime::Runtime;
 
-/// Maximum time for anything on a machine that does much else.
+/// Maximum time for any step on a busy machine.
 const SOON: Duration = Duration::from_secs(30);
 
 fn loopback() -> SocketAddr {
@@ -53,7 +53,7 @@ fn config(name: &'static str, role: Role) -> NodeConfig {
     config
 }
 
-/// A running node and its door.
+/// A running node and its local broker.
 struct Node {
     runtime: Runtime,
     handle: Option<NodeHandle>,
@@ -405,7 +405,7 @@ fn what_the_door_refuses_the_program_learns() {
     assert!(cell.report(frame()).is_ok(), "each refusal is told once");
 }
 
-/// A broker that takes anything, and a client that says anything.
+/// A broker that accepts any message, and a client that sends arbitrary messages.
 fn broker() -> (EmbeddedBroker, SocketAddr) {
     let mut broker = EmbeddedBroker::new(BrokerConfig::default());
     let address = broker.start(loopback()).unwrap();

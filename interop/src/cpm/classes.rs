@@ -6,7 +6,7 @@ use c_its_parser::standards::cdd_2_2_1::etsi_its_cdd::{
     VruSubProfilePedestrian,
 };
 
-/// Vehicles by `TrafficParticipantType`; the first label of a type is the one that a received message gets.
+/// Vehicles by `TrafficParticipantType`; the first label of a type is used for received messages.
 const VEHICLES: [(&str, u8); 12] = [
     ("vehicle", 0),
     ("car", 5),

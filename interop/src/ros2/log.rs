@@ -26,7 +26,7 @@ pub enum ConversionError {
     /// It has no MCAP's first bytes.
     #[error("is no MCAP, as logs of nodes are")]
     NoLog,
-    /// Nothing was written.
+    /// The output would be empty.
     #[error("no map, report or picture of a node is there, {0} messages of other kinds")]
     Empty(u64),
     /// It cannot be read.
@@ -45,11 +45,11 @@ pub enum ConversionError {
 pub struct Conversion {
     /// Messages written.
     pub written: u64,
-    /// Messages of other channels, which have no form in ROS.
+    /// Messages of other channels, which have no equivalent in ROS.
     pub passed_over: u64,
-    /// Messages that are not as a node writes them.
+    /// Messages that differ from the form in which a node writes them.
     pub unusable: u64,
-    /// Logs that end before their last messages, as that of a killed node does, or are damaged.
+    /// Number of logs that end early, like the log of a killed node, or are damaged.
     pub cut: u64,
 }
 
@@ -294,7 +294,7 @@ impl<W: Write + Seek> TimedOutput<'_, W> {
     }
 }
 
-/// The topic of the only camera, or of one with a name.
+/// The topic of the only camera, or of a named camera.
 fn camera_topic(camera: &str, kind: &str) -> String {
     match NodeName::new(camera) {
         Ok(name) => format!("/ecod/camera/{}/{kind}", ros_name(&name)),

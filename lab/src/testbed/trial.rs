@@ -38,10 +38,10 @@ pub struct Trial<'a> {
 const START: Timestamp = Timestamp(1_700_000_000_000_000);
 
 impl Trial<'_> {
-    /// Runs the scene on all cores; `progress` is told of every frame seen.
+    /// Runs the scene on all cores; `progress` is called for every processed frame.
     ///
     /// # Errors
-    /// When a part of the pipeline cannot be built or a frame cannot be rendered.
+    /// Returns an error if a part of the pipeline cannot be built or a frame cannot be rendered.
     pub fn run(&self, progress: impl Fn() + Sync) -> anyhow::Result<SceneResult> {
         let reports = self.reports(&progress)?;
         let mut fused = self.aggregator(Algorithms::Pace);
@@ -90,7 +90,7 @@ impl Trial<'_> {
         })
     }
 
-    /// Fuses one verdict's reports and judges what comes of them.
+    /// Fuses one verdict's reports and evaluates the result.
     fn judge(
         &self,
         aggregator: &mut Aggregator,

@@ -9,13 +9,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrafficConfig {
-    /// Vehicles that report, of those that move. Default 8.
+    /// Number of reporting vehicles among the moving ones. Default 8.
     pub observers: usize,
     /// Vehicles that move, observers among them. Default 60.
     pub vehicles: usize,
     /// Vehicles that are parked. Default 40.
     pub parked: usize,
-    /// Parked vehicles that report, too, beside the `observers`. Default 0.
+    /// Number of parked vehicles that also report, in addition to the `observers`. Default 0.
     pub standing: usize,
     /// People on the pavements. Default 30; with 0 and no bicycles there is one class only.
     pub people: usize,
@@ -36,11 +36,12 @@ pub struct TrafficConfig {
     /// All observers capture at the same moments and reports arrive at once. Default false: each has a phase of its
     /// own, and reports take their time.
     pub synchronous: bool,
-    /// Seconds for which an object that nobody can see any more still belongs to the truth. Default 1.
+    /// Seconds for which an object that observers have lost from view still belongs to the truth.
+    /// Default 1.
     pub memory_s: f64,
     /// Sensors of the observers.
     pub sensor: SensorConfig,
-    /// Optional parts of reports, beside labels, confidences and positions.
+    /// Optional parts of reports, in addition to labels, confidences and positions.
     pub said: SaidConfig,
 }
 
@@ -58,13 +59,14 @@ pub struct SensorConfig {
     pub noise_m: f64,
     /// Addition to it for every metre of range. Default 0.005.
     pub noise_per_m: f64,
-    /// Standard deviation in metres of what an observer is wrong about one object for about a second. Default 0.15.
+    /// Standard deviation in metres of an observer's error about one object, which lasts for about
+    /// a second. Default 0.15.
     pub bias_m: f64,
     /// False alarms of one frame, on average per report. Default 0.8.
     pub clutter: f64,
-    /// False alarms that last, on average begun a second by each observer. Default 0.25.
+    /// Lasting false alarms, on average begun per second by each observer. Default 0.25.
     pub ghosts_per_s: f64,
-    /// Places a block that look like an object to all who pass. Default 0.7.
+    /// Places per block that look like an object to all passing vehicles. Default 0.7.
     pub lures: f64,
     /// Standard deviation of an observer's own position in metres; changes within half a minute. Default 0.35.
     pub pose_m: f64,
@@ -72,13 +74,13 @@ pub struct SensorConfig {
     pub pose_rad: f64,
     /// Time in seconds by which every second observer stamps its captures late. Default 0.
     pub stamped_late_s: f64,
-    /// Mean time in seconds that a report takes beyond 30 ms. Default 0.025.
+    /// Mean delay of a report in seconds beyond 30 ms. Default 0.025.
     pub latency_s: f64,
     /// Share of reports that are lost; as many come 0.2 to 0.5 s late. Default 0.01.
     pub lost: f64,
 }
 
-/// Optional parts of reports, beside labels, confidences and positions.
+/// Optional parts of reports, in addition to labels, confidences and positions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SaidConfig {
@@ -181,7 +183,8 @@ impl TrafficConfig {
         }
     }
 
-    /// Long roads about one block: observers pass others that are parked, one after the other, and go on reporting.
+    /// Long roads around one block: observers pass parked observers, one after the other, and
+    /// continue to report.
     pub fn much_passed() -> Self {
         Self {
             observers: 24,

@@ -2,9 +2,9 @@
 
 use nalgebra::{Point2, Vector2};
 
-/// From the middle of a road to that of a lane, in metres.
+/// Distance from the middle of a road to the middle of a lane, in metres.
 const LANE_M: f64 = 1.75;
-/// From the middle of a road to that of a parked vehicle.
+/// Distance from the middle of a road to a parked vehicle.
 const PARKED_M: f64 = 5.2;
 /// From the middles of both roads to a post.
 const POST_M: f64 = 9.0;
@@ -143,7 +143,8 @@ impl Roads {
         ]
     }
 
-    /// Position and heading in radians of a camera on a post: four look at each crossing, the middle one first.
+    /// Position and heading in radians of a camera on a post: four face each crossing, the middle
+    /// crossing first.
     pub(super) fn post(&self, number: usize) -> (Point2<f64>, f64) {
         let crossings = self.count * self.count;
         let crossing = (number / 4 + crossings / 2 + self.count / 2) % crossings;
