@@ -90,7 +90,7 @@ pub struct Placements {
 pub struct Aggregator {
     leads: Option<Epoch>,
     next_round: u64,
-    /// The cell's time less the time of the caller in microseconds.
+    /// The cell's time minus the time of the caller in microseconds.
     cell_offset_us: i64,
     windows: [ReportWindow; ReportKind::COUNT],
     rounds: RoundTrigger,
@@ -370,16 +370,16 @@ impl Aggregator {
         }
     }
 
-    /// Judges VOTE's stored votes `passes` times and returns the verdicts as a round of their own; see [`Vote::refine`].
-    /// `None` without VOTE or leadership.
+    /// Re-evaluates VOTE's stored votes `passes` times and returns the verdicts as a separate
+    /// round; see [`Vote::refine`]. `None` without VOTE or leadership.
     pub fn refine(&mut self, passes: u32, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let verdicts = self.vote.as_mut()?.refine(passes);
         Some(self.number_verdicts(&epoch, verdicts, now))
     }
 
-    /// Judges the incomplete packet of VOTE's `paper` mode in a round of its own, at the end of a recording. `None` if no
-    /// packet was begun, or without leadership.
+    /// Evaluates the incomplete packet of VOTE's `paper` mode in a separate round, at the end of a
+    /// recording. `None` if no packet was begun, or without leadership.
     pub fn end_packet(&mut self, now: Timestamp) -> Option<Verdicts> {
         let epoch = self.leads.clone()?;
         let by_packets = self.by_packets;

@@ -37,8 +37,8 @@ impl ConfigError {
     }
 }
 
-/// Defines a section of the configuration: the default of each field and its check, if any, stand beside its
-/// documentation. A check is a range, which may name other fields, or a function.
+/// Defines a section of the configuration: the default of each field and its check, if any, stand
+/// next to its documentation. A check is a range, which may name other fields, or a function.
 ///
 /// Generates the struct, its `Default` and `validate`.
 macro_rules! config_section {
@@ -63,7 +63,8 @@ macro_rules! config_section {
             /// Checks all values.
             ///
             /// # Errors
-            /// [`ConfigError`](crate::config::ConfigError) that names the first key out of range.
+            /// Returns a [`ConfigError`](crate::config::ConfigError) that names the first key out
+            /// of range.
             pub fn validate(&self) -> Result<(), crate::config::ConfigError> {
                 #[allow(unused_variables)]
                 let Self { $($field,)* } = self;
@@ -79,7 +80,7 @@ pub(crate) use config_section;
 /// Checks that `value` is a number from `low` to `high`.
 ///
 /// # Errors
-/// [`ConfigError`] otherwise, also for NaN.
+/// Returns a [`ConfigError`] otherwise, also for NaN.
 pub fn check_range(key: &str, value: f64, low: f64, high: f64) -> Result<(), ConfigError> {
     if (low..=high).contains(&value) {
         Ok(())

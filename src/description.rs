@@ -325,7 +325,7 @@ impl DescriptionExchange {
         self.finish(now)
     }
 
-    /// Notes a new connection to a broker, which may not have the description.
+    /// Records a new connection to a broker, which may lack the description.
     pub fn connect(&mut self, now: Timestamp) -> Vec<DescriptionEffect> {
         self.is_due = true;
         self.finish(now)
@@ -355,7 +355,8 @@ impl DescriptionExchange {
         highest.min(MAX_INTEGER)
     }
 
-    /// Adopts the greatest body that enough candidates state, unless too many were adopted lately.
+    /// Adopts the greatest body that enough candidates state, unless too many were adopted
+    /// recently.
     fn adopt_proven(&mut self, now: Timestamp) {
         let authors = |stamp: DescriptionStamp| {
             self.statements

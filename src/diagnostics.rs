@@ -64,7 +64,7 @@ trouble_kinds! {
     Untimely = "untimely", SHORT, "run a time service where its reports are made, such as chrony";
     /// A clock differs from the cell's time by seconds.
     ClockOff = "clock_off", SHORT, "run a time service on it, such as chrony";
-    /// The camera gives no frames.
+    /// The camera delivers no frames.
     Camera = "camera", UNTIL_SETTLED, "`ecod-node doctor` tries the camera and names what is missing";
     /// The pose of the camera is unavailable, so the detections in its frames cannot be placed.
     NoPose = "no_pose", SHORT, "send poses to `pose.listen`, or set `pose`; `origin` if they are on Earth";
@@ -152,7 +152,7 @@ impl TroubleKind {
         matches!(self, Self::Untimely | Self::Malformed | Self::NotPermitted)
     }
 
-    /// True if a node with this trouble of its own does not do its work.
+    /// True if a node with this trouble cannot do its work.
     pub fn is_disabling(self) -> bool {
         matches!(self, Self::ReportsRefused | Self::Camera | Self::NoPose)
     }
@@ -220,7 +220,8 @@ impl KnownTrouble {
 }
 
 impl TroubleRegister {
-    /// Notes a trouble of the node itself, or about another; returns it if it is news for the log.
+    /// Records a trouble of the node itself, or about another; returns it if it is news for the
+    /// log.
     pub fn note(
         &mut self,
         kind: TroubleKind,
@@ -303,14 +304,14 @@ impl TroubleRegister {
         Some(news)
     }
 
-    /// Notes that a trouble is over.
+    /// Records that a trouble is over.
     pub fn settle(&mut self, kind: TroubleKind, about: Option<&str>) {
         if let Some(entry) = self.entries.get_mut(&key(kind, about)) {
             entry.is_settled = true;
         }
     }
 
-    /// Notes that all troubles of a kind are over, whomever they are about.
+    /// Records that all troubles of a kind are over, for all subjects.
     pub fn settle_all(&mut self, kind: TroubleKind) {
         let of_kind = self
             .entries
@@ -366,7 +367,7 @@ fn key(kind: TroubleKind, about: Option<&str>) -> Key {
     (about.map(name), kind)
 }
 
-/// A text of at most so many bytes, with an ellipsis after the last whole word if it is longer.
+/// A text of at most `max_bytes` bytes, with an ellipsis after the last whole word if it is longer.
 fn shortened(text: &str, max_bytes: usize) -> String {
     const ELLIPSIS: &str = " …";
     if text.len() <= max_bytes {

@@ -1,4 +1,4 @@
-//! Leadership: who leads the cell, and whose rounds a node accepts.
+//! Leadership: the election of the cell's leader, and the acceptance of its rounds.
 //!
 //! | step | machine |
 //! |---|---|

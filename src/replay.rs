@@ -461,7 +461,7 @@ impl Replay {
 /// The report of a line and its kind, for programs that read a recording without replaying it.
 ///
 /// # Errors
-/// The flaw for which a replay would reject the line.
+/// Returns the flaw for which a replay would reject the line.
 pub fn read_report(text: &[u8], limits: &Limits) -> Result<(ReportKind, ObjectReport), Flaw> {
     RecordedReport::read(text, limits).map(|line| (line.kind, line.report))
 }

@@ -49,7 +49,7 @@ impl KnownCell {
 /// The next step of the vehicle.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CellMove {
-    /// Get ready in this cell, and go on in the present one until then.
+    /// Prepare in this cell, and stay in the present one until then.
     Join(NodeName),
     /// Leave this cell again, and stay in the present one.
     GiveUp(NodeName),
@@ -125,7 +125,8 @@ impl CellChoice {
         Some(CellMove::Join(name))
     }
 
-    /// Notes that the vehicle follows in the next cell; true if that is its cell from now on.
+    /// Records that the vehicle follows a leader in the next cell; returns true if this becomes its
+    /// cell.
     pub fn enter(&mut self, cell: &NodeName) -> bool {
         let Some((next, _)) = self.next.take_if(|(next, _)| next == cell) else {
             return false;
@@ -134,7 +135,7 @@ impl CellChoice {
         true
     }
 
-    /// Notes that a cell could not be joined: it is left alone for [`RETRY_AFTER`].
+    /// Records that a cell could not be joined: it is not tried again for [`RETRY_AFTER`].
     pub fn fail(&mut self, cell: &NodeName, now: Timestamp) {
         self.next.take_if(|(next, _)| next == cell);
         self.failed.insert(cell.clone(), now + RETRY_AFTER);

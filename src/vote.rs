@@ -108,7 +108,7 @@ pub struct Vote {
     arrivals: VecDeque<LandmarkId>,
     last_reports: BTreeMap<NodeName, LastReport>,
     method: ConfiguredMethod,
-    /// Vacancy signs that were read lately, and when, by vehicle.
+    /// Vacancy signs that were recently read, with the time, by vehicle.
     signs: BTreeMap<LandmarkId, BTreeMap<NodeName, Timestamp>>,
     ignored: u64,
 }
@@ -370,8 +370,9 @@ impl Vote {
         sign.is_some_and(|sign| self.voted_label(landmark, &sign.label) == voted)
     }
 
-    /// Notes that a vehicle read a landmark's vacancy sign. True if it is behind an object, and no vote against that: at
-    /// least as many other vehicles read an object there as read the sign. Those do not count that were mostly wrong.
+    /// Records that a vehicle read a landmark's vacancy sign. Returns true if the sign is behind an
+    /// object, so that reading it is not a vote against the object: at least as many other vehicles
+    /// read an object there as read the sign. Vehicles that were mostly wrong are not counted.
     fn is_behind_object(
         &mut self,
         landmark: &LandmarkId,
@@ -463,8 +464,8 @@ impl Vote {
         VoteRound { verdicts, evidence }
     }
 
-    /// Begins a leadership: earlier votes go on deciding verdicts but yield no evidence, because the previous leader
-    /// settles them.
+    /// Begins a leadership: earlier votes still contribute to verdicts but yield no evidence,
+    /// because the previous leader settles them.
     pub(crate) fn begin_record(&mut self, now: Timestamp) {
         self.method.get_mut().begin_record(now);
     }
@@ -497,7 +498,7 @@ impl Vote {
         self.method.get_mut().adopt(ledger, &self.config);
     }
 
-    /// Takes the votes of other cells, by the weight in votes of the prior beside which they count; without effect in
+    /// Sets the votes of other cells, given the weight of the prior in votes; has no effect in
     /// `paper` mode.
     pub fn set_foreign(&mut self, votes_beside: impl Fn(f64) -> BTreeMap<NodeName, ForeignVotes>) {
         self.method.get_mut().set_foreign(&votes_beside);

@@ -273,7 +273,7 @@ pub struct LandmarkState {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(6), with = "skip_empty", has_nil)]
     pub observers: Vec<NodeName>,
-    /// Labels that nodes read at the location lately, and which nodes; in a cell that votes, too.
+    /// Labels that nodes recently read at the location, with the nodes; also in a cell that votes.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(7), with = "skip_empty", has_nil)]
     pub readings: Vec<LabelReading>,
@@ -427,12 +427,12 @@ pub struct NodeStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(9)]
     pub description: Option<DescriptionStatus>,
-    /// Present troubles of the node, and of vehicles as the node sees them.
+    /// Current troubles of the node, and of vehicles as observed by the node.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(10), with = "skip_empty", has_nil)]
     pub troubles: Vec<Trouble>,
-    /// Address and port at which the node serves its page; absent without one. An unspecified address stands for all of
-    /// the node's own.
+    /// Address and port at which the node serves its page; absent without one. An unspecified
+    /// address represents all of the node's own addresses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(11)]
     pub page: Option<String>,

@@ -64,7 +64,7 @@ enum Command {
     Top(top::TopArguments),
     /// Join a cell as an observer and record all its messages (MCAP)
     Record(record::RecordArguments),
-    /// Make maps and verdicts of a recording again; equal input gives equal output
+    /// Recompute maps and verdicts of a recording; equal input gives equal output
     Replay(replay::ReplayArguments),
     /// Write an HTML report about a log: leadership, latency, gaps, reputations, coverage, losses
     Report(report::ReportArguments),

@@ -155,7 +155,7 @@ pub type Starting = Pin<Box<dyn Future<Output = Result<NodeHandle, NodeError>> +
 /// Starts a node; `config` is taken as valid.
 ///
 /// # Errors
-/// [`NodeError`] when a part cannot start, such as when the broker's port is busy.
+/// Returns a [`NodeError`] if a part cannot start, such as when the broker's port is busy.
 pub fn start(config: NodeConfig) -> Starting {
     Box::pin(async move {
         let vehicle = VehicleParts::new(&config);

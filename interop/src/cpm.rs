@@ -45,7 +45,8 @@ const PROTOCOL_VERSION: u8 = 2;
 /// Kind of message in the header: CPM.
 const MESSAGE_ID: u8 = 14;
 
-/// Milliseconds from the Unix epoch to 2004-01-01, less the five leap seconds since then, which `TimestampIts` counts.
+/// Milliseconds from the Unix epoch to 2004-01-01, minus the five leap seconds since then, which
+/// `TimestampIts` counts.
 const ITS_EPOCH_MS: u64 = 1_072_915_200_000 - 5_000;
 
 /// The properties of a cell that its messages need.

@@ -262,7 +262,7 @@ fn convert(log: &std::path::Path, output: &std::path::Path) -> Result<(), String
             .map_err(|error| format!("{}: {error}", log.display()))
     };
     let done = write().map_err(|error| {
-        // A part of a file, and in the way of the next try.
+        // An incomplete file, which would block the next attempt.
         let removed = std::fs::remove_file(output).err();
         let left = removed
             .map(|error| format!("; {} is left there: {error}", output.display()))

@@ -38,7 +38,8 @@ enum Command {
     Street(street::StreetArguments),
     /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
     Testbed(testbed::TestbedArguments),
-    /// Measure a live cell under simulated vehicles: latency beside the bare broker, capacity, costs
+    /// Measure a live cell under simulated vehicles: latency compared to the bare broker, capacity,
+    /// costs
     Bench(bench::BenchArguments),
     /// Write one page about a log, as `ecod-node report`, evaluated against the truth
     Report(report::LogReportArguments),

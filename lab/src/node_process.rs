@@ -32,7 +32,7 @@ impl NodeProcess {
     /// Writes the node's configuration to the directory and starts it; its log goes there too.
     ///
     /// # Errors
-    /// When a file cannot be written or the program cannot be run.
+    /// Returns an error if a file cannot be written or the program cannot be run.
     pub fn start(program: &Path, config: &NodeConfig, directory: &Path) -> anyhow::Result<Self> {
         let name = config
             .name
@@ -61,7 +61,7 @@ impl NodeProcess {
     /// Starts the node again, with its configuration; the log goes on.
     ///
     /// # Errors
-    /// When the program cannot be run.
+    /// Returns an error if the program cannot be run.
     pub fn restart(&mut self) -> anyhow::Result<()> {
         self.child = spawn(&self.program, &self.file, &self.log)?;
         self.starts += 1;
@@ -72,7 +72,7 @@ impl NodeProcess {
     /// SIGKILL: the node has no time for farewells.
     ///
     /// # Errors
-    /// When the operating system refuses.
+    /// Returns an error if the operating system refuses.
     pub async fn kill(&mut self) -> anyhow::Result<()> {
         self.killed = true;
         self.child
@@ -94,7 +94,7 @@ impl NodeProcess {
     /// Looks whether it still runs.
     ///
     /// # Errors
-    /// When the process has ended by itself, with the last line of its log.
+    /// Returns an error if the process has ended by itself, with the last line of its log.
     pub fn check(&mut self) -> anyhow::Result<()> {
         if !self.killed
             && let Some(status) = self.child.try_wait()?
@@ -109,7 +109,7 @@ impl NodeProcess {
     /// The address that the node names in its log by this message, as soon as it does.
     ///
     /// # Errors
-    /// When the process has ended by itself.
+    /// Returns an error if the process has ended by itself.
     pub async fn address(&mut self, message: &str) -> anyhow::Result<SocketAddr> {
         loop {
             let log = fs::read_to_string(&self.log).unwrap_or_default();

@@ -12,7 +12,7 @@ use crate::eval::tracks::{TrackEvaluation, TrackTruth};
 use crate::eval::{Evaluation, Scores, Truth};
 use tracks::{tables, without_map};
 
-/// A report that judges maps and verdicts by what stands at each location.
+/// A report that evaluates maps and verdicts by the true object at each location.
 pub fn judged_by(truth: Truth) -> Report {
     Report::with_section(Locations(Evaluation::new(truth)))
 }

@@ -130,7 +130,7 @@ pub fn generate(config: &TrafficConfig, uniform: &mut dyn FnMut() -> f64) -> Tra
     watch.finish()
 }
 
-/// All that is there.
+/// The state of the town.
 struct Town {
     roads: Roads,
     buildings: Vec<Building>,

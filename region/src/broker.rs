@@ -115,7 +115,7 @@ impl BrokerLogin {
 /// The first line of a file.
 ///
 /// # Errors
-/// When it cannot be read or is empty.
+/// Returns an error if it cannot be read or is empty.
 pub fn read_secret(path: &Path) -> anyhow::Result<Secret> {
     let text =
         bounded_file::read_text(path).with_context(|| format!("cannot read {}", path.display()))?;

@@ -115,8 +115,9 @@ impl ReportWindow {
     /// Admits a report and returns its capture time on the aggregator's clock.
     ///
     /// # Errors
-    /// [`RejectReason::FromTheFuture`] (also for a timestamp that no other report agrees with), [`RejectReason::Stale`],
-    /// [`RejectReason::OutOfOrder`] for certain and possible duplicates, or [`RejectReason::TooManyVehicles`].
+    /// Returns [`RejectReason::FromTheFuture`] (also for a timestamp that no other report agrees
+    /// with), [`RejectReason::Stale`], [`RejectReason::OutOfOrder`] for certain and possible
+    /// duplicates, or [`RejectReason::TooManyVehicles`].
     pub fn admit(
         &mut self,
         report: &ObjectReport,

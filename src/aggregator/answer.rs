@@ -8,8 +8,8 @@
 use crate::model::names::Label;
 use crate::wire::{LabelReading, LandmarkState, Verdict};
 
-/// Combines the state of a place by PACE with its verdict and with what each vehicle read there. `sign` is the label of
-/// the place's vacancy sign.
+/// Combines the state of a place by PACE with its verdict and with each vehicle's reading there.
+/// `sign` is the label of the place's vacancy sign.
 pub(super) fn agree(
     mut state: LandmarkState,
     verdict: Option<&Verdict>,

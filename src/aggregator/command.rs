@@ -78,7 +78,7 @@ pub enum Command {
     },
     /// [`Aggregator::set_cell_offset`].
     SetCellOffset {
-        /// The cell's time less the aggregator's clock in microseconds.
+        /// The cell's time minus the aggregator's clock in microseconds.
         offset_us: i64,
     },
 }

@@ -75,7 +75,7 @@ impl FusionConfig {
     /// Checks all values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.window
             .validate()

@@ -28,7 +28,7 @@ impl ForeignView {
         (self.reputations, self.trust) = (Arc::clone(reputations), None);
     }
 
-    /// Makes the next call of `weigh` update votes and tracks, because they may have started anew.
+    /// Makes the next call of `weigh` update votes and tracks, because they may have restarted.
     pub(super) fn repeat(&mut self) {
         self.trust = None;
     }
@@ -59,7 +59,8 @@ impl ForeignView {
         }
     }
 
-    /// The votes beside the prior of published reputations, if they have changed since the last call.
+    /// The votes of other cells for published reputations, if they have changed since the last
+    /// call.
     pub(super) fn take_news(
         &mut self,
         prior_votes: f64,
@@ -85,7 +86,8 @@ impl Aggregator {
         self.foreign.set(reputations);
     }
 
-    /// The votes of other cells beside the prior of published reputations, if they have changed since the last call.
+    /// The votes of other cells for published reputations, if they have changed since the last
+    /// call.
     pub fn take_foreign_news(&mut self) -> Option<BTreeMap<NodeName, ForeignVotes>> {
         self.foreign.take_news(self.initial_votes)
     }

@@ -1,4 +1,5 @@
-//! The descriptions that a node had, and who stated them: the way back when a certificate is revoked.
+//! The descriptions that a node had, and the nodes that stated them, for going back when a
+//! certificate is revoked.
 
 use std::sync::Arc;
 

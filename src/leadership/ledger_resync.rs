@@ -93,7 +93,7 @@ struct Followed {
 /// Outcome of a share that was merged, or of a period that passed.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Merged {
-    /// True if the ledger changed, or what of it is to be saved.
+    /// True if the ledger, or its part to be saved, has changed.
     pub is_news: bool,
     /// Reasons why entries were left out.
     pub refused: Vec<RejectReason>,
@@ -262,7 +262,7 @@ impl LedgerResync {
         } else {
             self.judge(share, ledger, leadership, now)
         };
-        // A signed share is taken whole or not at all: it is passed on as it is.
+        // A signed share is accepted as a whole or not at all, because it is passed on unchanged.
         let is_whole =
             taken.entries.len() == share.entries.len() && taken.marks.len() == share.marks.len();
         if is_over || (self.is_signed && !is_whole) {
@@ -509,7 +509,7 @@ impl LedgerResync {
         period + period.div_ceil(2) + u32::try_from(earlier).unwrap_or(u32::MAX) % period.max(1)
     }
 
-    /// Everything, if the leader is to have it and did not get it a moment ago.
+    /// All evidence, if the leader should have it and has not received it recently.
     fn take_everything(&mut self, ledger: &ReputationLedger, now: Timestamp) -> Vec<LedgerShare> {
         let is_due = self
             .everything_sent_at

@@ -27,7 +27,7 @@ pub enum LinkState {
     Up,
     /// Connected, but messages are not echoed: the broker hangs, or its answers are lost.
     Stalled,
-    /// Not connected; attempts go on.
+    /// Not connected; attempts continue.
     Down,
     /// Not connected because the port is closed: the broker's process has ended. Attempts continue.
     Refused,

@@ -185,7 +185,7 @@ impl LeadershipNode {
         std::mem::take(&mut self.effects)
     }
 
-    /// Time at which to hand in [`Input::Wake`].
+    /// Time at which to pass [`Input::Wake`].
     pub fn next_deadline(&self) -> Timestamp {
         self.deadline
     }
@@ -445,8 +445,8 @@ impl LeadershipNode {
         self.accepted = Some(epoch);
     }
 
-    /// Notes a look. The list of members makes up for events from before the start, and for members that a restarted
-    /// membership lost without a word.
+    /// Processes a check. The list of members compensates for events before the start, and for
+    /// members that a restarted membership lost without an event.
     fn take_look(
         &mut self,
         rounds_due: u64,
@@ -469,7 +469,8 @@ impl LeadershipNode {
         self.check_logins(now);
     }
 
-    /// Notes whether this node is logged in at the brokers of leader and standby. Beside an external broker it need not be.
+    /// Checks whether this node is logged in at the brokers of leader and standby. With an external
+    /// broker this is not required.
     fn check_logins(&mut self, now: Timestamp) {
         let plane = self.links.plane();
         let needs_none = !plane.embedded

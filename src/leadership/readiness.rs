@@ -14,9 +14,9 @@ use crate::model::time::Timestamp;
 pub struct Readiness {
     /// True if the node is ready.
     pub ready: bool,
-    /// The reason in words.
+    /// The reason as text.
     pub reason: String,
-    /// True if a start anew may help.
+    /// True if a restart may help.
     #[serde(skip)]
     pub needs_restart: bool,
 }
@@ -36,7 +36,7 @@ impl Readiness {
         }
     }
 
-    /// The readiness of the same node with what may be the cause, if it is not ready.
+    /// The readiness of the same node with a possible cause, if it is not ready.
     #[must_use]
     pub fn because(self, cause: Option<&str>) -> Self {
         match cause {
@@ -48,7 +48,8 @@ impl Readiness {
         }
     }
 
-    /// The readiness of the same node with a problem of its settings, if there is one, which no start anew mends.
+    /// The readiness of the same node with a problem of its settings, if there is one, which a
+    /// restart does not fix.
     #[must_use]
     pub fn unless(self, problem: Option<String>) -> Self {
         match problem {

@@ -12,15 +12,15 @@
 //! | `ask_period` | one of these, 200 ms | not above an answer's wait | lost questions are repeated in time |
 //! | `answer_time` | `claim_step * 2`, 120 ms | below `ask_period` | the answer arrives before the next question |
 //! | `near_beat` | `beat * 8`, 400 ms | below `response_timeout` | a second successor receives the new standby in time |
-//! | `contact_timeout` | `idle_beat * 5/2`, 6.25 s | above two idle beats | one lost beat is no lost contact |
-//! | `overdue`, `missing` | 3/2 and 5/2 of a round interval | in this order | doubt comes before loss |
+//! | `contact_timeout` | `idle_beat * 5/2`, 6.25 s | above two idle beats | one lost beat does not end the contact |
+//! | `overdue`, `missing` | 3/2 and 5/2 of a round interval | in this order | suspicion comes before loss |
 //! | [`ELECTED_SILENCE`] | 250 ms | above two rounds | one late round is tolerated |
 //! | [`SUCCESSOR_CREDIT`] | 500 ms | twice [`ELECTED_SILENCE`] | election messages arrive within it |
 //! | [`EPOCH_MEMORY`] | 3 s | above [`MAX_ROUND_AGE`] and [`SUCCESSOR_CREDIT`] | a forged epoch ends, a queued round does not return |
 //! | [`LEADER_DELAY_MEMORY`] | 10 s | above [`EPOCH_MEMORY`] | alternating leaders don't make an old round look fresh |
-//! | [`MAX_ROUND_AGE`] | 1 s | above [`MAX_ROUND_WAIT`] | the rest is the way itself |
+//! | [`MAX_ROUND_AGE`] | 1 s | above [`MAX_ROUND_WAIT`] | the rest is the transit time |
 //! | [`MAX_ROUND_WAIT`] | 900 ms | above [`SUCCESSOR_CREDIT`] | a failover alone does not make rounds stale |
-//! | [`MAX_ADOPTED_MAP_AGE`] | 1 s | [`MAX_ROUND_AGE`] | a new leader goes on from maps that others may still accept |
+//! | [`MAX_ADOPTED_MAP_AGE`] | 1 s | [`MAX_ROUND_AGE`] | a new leader continues from maps that other nodes may still accept |
 //! | [`LIVE_STREAM_TIME`] | 150 ms | above a round | at least two rounds prove a live stream |
 //! | [`FAREWELL_TIME`] | 1 s | not below [`MAX_ROUND_AGE`] | a broker forwards every round that receivers may accept |
 //! | [`LINK_LINGER`] | 2 s | above [`FAREWELL_TIME`] | the last round finds a link |
@@ -35,15 +35,15 @@
 //! | [`LEDGER_TIMEOUT`] | 1 s | above [`VEHICLE_CONNECT_TIME`], below `handover` | a lost ledger delays a handover and does not end it |
 //! | [`PREPARATION_STEP`] | 50 ms | below [`VEHICLE_CONNECT_TIME`] | it delays a handover by little |
 //! | [`LATE_WAKE`] | 20 ms | below `stall_ms` | messages are read before lateness stops the clock |
-//! | [`DRAIN_TIME`] | 10 ms | below [`LATE_WAKE`] | the delay itself is no late timer |
-//! | [`DEPARTED_TIME`] | 5 s | above [`REDISCOVERY_TIME`] | the end of a broker is understood after its node was given up |
-//! | [`REDISCOVERY_TIME`] | 2 s | above `response_timeout` | a membership that restarts costs no leader |
+//! | [`DRAIN_TIME`] | 10 ms | below [`LATE_WAKE`] | the delay itself does not make a timer late |
+//! | [`DEPARTED_TIME`] | 5 s | above [`REDISCOVERY_TIME`] | the end of a broker is attributed to its node after the node was given up |
+//! | [`REDISCOVERY_TIME`] | 2 s | above `response_timeout` | a restart of the membership does not end a leadership |
 //! | [`DISK_TIMEOUT`] | 1 s | below `handover` | a hung disk delays a handover and does not end it |
 //! | [`RENEWAL_PAUSE`] | 10 s | above `response_timeout` | a follower that refuses each epoch does not wear out terms |
-//! | [`TERM_WINDOW`] | 1 h | | terms rise by a bounded step in it, whoever states them |
+//! | [`TERM_WINDOW`] | 1 h | | terms rise by a bounded step in it, from any source |
 //! | [`FULL_RESYNC_PAUSE`] | 5 s | below a snapshot period, 10 s | a new leader gets all evidence before its own next snapshot |
 //! | [`LAST_WORD_TIME`] | 5 s | above `handover` | the last evidence of a leader counts after a handover |
-//! | [`EVIDENCE_TRIAL`] | 20 s | above [`RENEWAL_PAUSE`] and two idle beats | a node follows a false claimant for less |
+//! | [`EVIDENCE_TRIAL`] | 20 s | above [`RENEWAL_PAUSE`] and two idle beats | a false claimant is followed for a shorter time |
 //! | [`MAX_RESET_AHEAD`] | 24 h | | a reset from the far future would block all later resets |
 //! | `LIFE_SIGN_STEP_MS` | 10 ms | below a beat | signs of life are dated closely, and signed rarely |
 //! | [`CLOCK_MEMORY`] | 15 s | above two of `contact_timeout` | the stamps of idle beats and their answers are still compared |
@@ -61,7 +61,7 @@ pub const MAX_ROUND_AGE: Duration = Duration::from_secs(1);
 /// shortest path.
 pub const MAX_ROUND_WAIT: Duration = Duration::from_millis(900);
 
-/// Maximum age of the map whose objects a new leader goes on with.
+/// Maximum age of the map from whose objects a new leader continues.
 pub const MAX_ADOPTED_MAP_AGE: Duration = Duration::from_secs(1);
 
 /// Time for which rounds must arrive no faster than they were made before their delay counts as the

@@ -6,7 +6,7 @@ use crate::leadership::election::Election;
 use crate::model::epoch::Epoch;
 use crate::model::names::NodeName;
 
-/// The leader and its standby, as one node sees them.
+/// The leader and its standby, as seen by one node.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash)]
 pub struct Leadership {
     /// The node's own place in its cell.

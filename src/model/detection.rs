@@ -90,7 +90,7 @@ pub struct Detection {
 /// Reads the detections of one frame from a line of a recording, a JSON array.
 ///
 /// # Errors
-/// A description of the first flaw.
+/// Returns a description of the first flaw.
 pub fn parse_detections(line: &str) -> Result<Vec<Detection>, String> {
     let detections: Vec<Detection> =
         serde_json::from_str(line).map_err(|error| error.to_string())?;

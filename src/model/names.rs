@@ -28,7 +28,7 @@ impl NodeName {
     /// Checks and takes a name.
     ///
     /// # Errors
-    /// [`InvalidName`] when a character or the length is not allowed.
+    /// Returns an [`InvalidName`] if a character or the length is not allowed.
     pub fn new(name: impl AsRef<str>) -> Result<Self, InvalidName> {
         Self::try_from(SmolStr::new(name))
     }

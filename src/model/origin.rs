@@ -66,7 +66,7 @@ impl GeographicPose {
     /// Checks all values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("latitude_deg", self.latitude_deg, -90.0, 90.0)?;
         check_range("longitude_deg", self.longitude_deg, -180.0, 180.0)?;
@@ -110,7 +110,7 @@ impl StatedPose {
     /// The pose in a frame with this origin.
     ///
     /// # Errors
-    /// [`PoseError`] for a pose on Earth without an origin, or far from it.
+    /// Returns a [`PoseError`] for a pose on Earth without an origin, or far from it.
     pub fn in_map(&self, origin: Option<&GeographicOrigin>) -> Result<Pose, PoseError> {
         match self {
             Self::InMap(pose) => Ok(*pose),
@@ -123,7 +123,7 @@ impl GeographicOrigin {
     /// Checks all values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("latitude_deg", self.latitude_deg, -90.0, 90.0)?;
         check_range("longitude_deg", self.longitude_deg, -180.0, 180.0)?;
@@ -168,11 +168,11 @@ impl GeographicOrigin {
         Point3::new(east * cos + north * sin, north * cos - east * sin, up)
     }
 
-    /// The pose in the frame of a pose on Earth. North there and north at the origin are different directions, except on
-    /// one meridian.
+    /// The pose in the frame of a pose on Earth. North there and north at the origin are different
+    /// directions, except on one meridian.
     ///
     /// # Errors
-    /// [`PoseError::TooFar`] at more than 100 km from the origin.
+    /// Returns [`PoseError::TooFar`] at more than 100 km from the origin.
     pub fn pose_to_map(&self, pose: &GeographicPose) -> Result<Pose, PoseError> {
         let GeographicPose {
             latitude_deg,

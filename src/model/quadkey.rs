@@ -97,7 +97,7 @@ impl Quadkey {
         self.digits
     }
 
-    /// The tile of so many digits, at most its own, that this one is in.
+    /// The enclosing tile with this number of digits, at most this tile's own.
     #[must_use]
     pub fn outer(self, digits: u8) -> Self {
         let fewer = self.digits.saturating_sub(digits);

@@ -82,7 +82,7 @@ struct DelayEstimate {
 }
 
 impl CellMapFilter {
-    /// A filter for so many cells at most.
+    /// Creates a filter for at most `max_cells` cells.
     pub fn new(max_cells: usize) -> Self {
         Self {
             max_cells,

@@ -221,7 +221,7 @@ fn maps_count_in_the_order_of_epoch_and_round() {
         neighbours.accept(&east(), message, ms(at + 50))
     };
     assert_eq!(taken(1, "a", 20, 2000), Err(RejectReason::OutOfOrder));
-    // A new leader's clock is unknown, and the cell's time goes on.
+    // A new leader's clock is unknown, and the cell's time continues.
     assert_eq!(taken(2, "b", 1, 2100), Ok(()));
     assert_eq!(taken(1, "a", 99, 2200), Err(RejectReason::Superseded));
     assert_eq!(taken(2, "b", 2, 2300), Ok(()));
@@ -308,7 +308,7 @@ fn late_for_long(cells: u64, late_ms: impl Fn(u64) -> u64) -> [Vec<usize>; 2] {
         |(sent, cell): (u64, u64)| sent + 20 + if sent < 40_000 { 0 } else { late_ms(cell) };
     messages.sort_by_key(|message| received(*message));
     for (sent, cell) in messages {
-        // Each clock is off by seconds of its own.
+        // Each clock has its own error of some seconds.
         let message = map(
             1,
             "a",

@@ -131,13 +131,14 @@ impl Projection {
         }
     }
 
-    /// Places a detection from `camera` whose distortion has been removed; for `cut` see [`Self::cut`].
+    /// Places a detection from `camera` whose distortion has been removed; for `cut` see
+    /// [`Self::cut`].
     ///
-    /// `target` is the middle of the detection's solved corners in the camera frame, in metres; only [`Ranging::Auto`] and
-    /// [`Ranging::Corners`] use it.
+    /// `target` is the middle of the detection's solved corners in the camera frame, in metres;
+    /// only [`Ranging::Auto`] and [`Ranging::Corners`] use it.
     ///
     /// # Errors
-    /// [`ProjectionError`] if the detection gives no position.
+    /// Returns a [`ProjectionError`] if the detection gives no position.
     pub fn place(
         &self,
         detection: &Detection,

@@ -22,8 +22,9 @@ config_section! {
         /// Width of the target or object to be recognised at a location, in metres; by default the
         /// smallest configured size or, without any, 0.05.
         pub target_width_m: Option<f64> = None, checked by check_optional(1e-4, 1e3);
-        /// Minimum width in pixels of the target as it is turned; default 36: a placard code of 21 modules at 1.7 pixels
-        /// each. Less claims more locations, some of which the detector cannot read.
+        /// Minimum width in pixels of the target at its actual angle; default 36: a placard code of
+        /// 21 modules at 1.7 pixels each. A lower value claims more locations, some of which the
+        /// detector cannot read.
         pub min_target_px: f64 = 36.0, in 0.0 to 1e5;
         /// Minimum distance in pixels of the target from the left and right edges of the image; default 8.
         pub margin_px: f64 = 8.0, in 0.0 to 1e5;

@@ -4,7 +4,7 @@ use serde::Deserialize;
 
 use crate::model::time::Timestamp;
 
-/// The optional fields of a line beside its report.
+/// The optional fields of a line that are not part of its report.
 #[derive(Debug, Deserialize)]
 pub(super) struct Envelope {
     #[serde(default)]

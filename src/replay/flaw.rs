@@ -1,4 +1,4 @@
-//! Faults of a line of a recording, in words.
+//! Faults of a line of a recording, as text.
 
 use super::envelope::Envelope;
 use crate::wire::flaw::read_json;

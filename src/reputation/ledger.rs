@@ -122,7 +122,7 @@ impl ReputationLedger {
         self.reach_mark(&lane, &evidence.node, sum);
     }
 
-    /// Takes in all evidence of `other`, within the same bounds.
+    /// Merges all evidence of `other`, within the same bounds.
     pub fn merge(&mut self, other: &Self) {
         self.merge_entries(other.entries(), None);
         self.merge_marks(other.marks(), None);
@@ -197,7 +197,7 @@ impl ReputationLedger {
         totals.into_iter().map(reputation).collect()
     }
 
-    /// (correct, incorrect) among each vehicle's so many latest votes.
+    /// (correct, incorrect) among each vehicle's `memory_votes` latest votes.
     fn latest(&self, memory_votes: f64) -> BTreeMap<&NodeName, (f64, f64)> {
         let mut latest: BTreeMap<&NodeName, (f64, f64)> = BTreeMap::new();
         for (node, record) in self.latest_first() {
@@ -231,8 +231,9 @@ impl ReputationLedger {
         self.totals().into_iter().map(counts).collect()
     }
 
-    /// The (correct, incorrect) votes of every vehicle by stated label: the `memory_votes` latest, without the very
-    /// latest ones, of which `own` gives the number. Each lane's votes are divided among labels as in the whole lane.
+    /// The (correct, incorrect) votes of every vehicle by stated label: the `memory_votes` latest,
+    /// without the very latest ones, whose number `own` returns. Each lane's votes are divided
+    /// among labels as in the whole lane.
     pub fn remembered(
         &self,
         memory_votes: f64,

@@ -27,7 +27,7 @@ impl Marks {
         self.0.iter().map(|(number, counts)| (*number, *counts))
     }
 
-    /// Merges a mark, taking the larger counts; true when that changed anything.
+    /// Merges a mark, taking the larger counts; true if that changed anything.
     pub(super) fn insert(&mut self, number: u64, counts: Counts) -> bool {
         if !self.would_keep(number) {
             return false;

@@ -41,7 +41,7 @@ impl ReputationLedger {
         })
     }
 
-    /// The counts that `keys` name, as they are now.
+    /// The current counts of `keys`.
     pub fn entries_of(&self, keys: &BTreeSet<EntryKey>) -> Vec<LedgerEntry> {
         let find = |EntryKey { lane, node, label }: &EntryKey| {
             Some(entry(
@@ -183,7 +183,8 @@ impl ReputationLedger {
         votes.into_iter().filter_map(reached).collect()
     }
 
-    /// Takes in marks, within the bounds of [`Self::merge_entries`]; true when that changed anything.
+    /// Merges marks, within the bounds of [`Self::merge_entries`]; returns true if that changed
+    /// any.
     pub fn merge_marks(
         &mut self,
         marks: impl IntoIterator<Item = LedgerMark>,
@@ -307,7 +308,8 @@ impl ReputationLedger {
         self.on_trial.remove(lane);
     }
 
-    /// Notes that so many counts and marks of an aggregator became so many.
+    /// Records that the number of counts and marks of an aggregator changed from `before` to
+    /// `after`.
     pub(super) fn resize(&mut self, aggregator: &NodeName, before: usize, after: usize) {
         let size =
             (self.sizes.remove(aggregator).unwrap_or_default() + after).saturating_sub(before);

@@ -15,14 +15,14 @@ use crate::model::time::Timestamp;
 use crate::wire::LedgerShare;
 
 impl ReputationLedger {
-    /// Takes in the counts and marks of a share; true when that changed anything.
+    /// Merges the counts and marks of a share; returns true if that changed any.
     pub fn merge_share(&mut self, share: &LedgerShare, present: Option<&Epoch>) -> bool {
         self.merge_entries(share.entries.iter().cloned(), present)
             | self.merge_marks(share.marks.iter().cloned(), present)
     }
 
-    /// Takes in a share that its aggregator signed, and keeps it. The signature is verified before; the share is of one
-    /// lane. True when that changed any count or mark.
+    /// Merges and stores a share signed by its aggregator. The caller has verified the signature;
+    /// the share contains one lane. Returns true if that changed any count or mark.
     pub fn merge_statement(&mut self, share: &Arc<LedgerShare>, present: Option<&Epoch>) -> bool {
         let changed = self.merge_share(share, present);
         if let Some(lane) = share.lane().filter(|lane| self.lanes.contains_key(lane)) {
@@ -92,7 +92,7 @@ impl ReputationLedger {
         self.statements.contains_key(lane) || self.on_trial.contains_key(lane)
     }
 
-    /// Drops what this node counted itself, under the name `aggregator`; true if there was any.
+    /// Drops this node's own counts, under the name `aggregator`; returns true if there were any.
     pub fn forget_own(&mut self, aggregator: &NodeName) -> bool {
         let is_own = |lane: &&Epoch| lane.leader == *aggregator && !self.is_stated(lane);
         let own: Vec<_> = self.lanes.keys().filter(is_own).cloned().collect();
@@ -100,7 +100,8 @@ impl ReputationLedger {
         !own.is_empty()
     }
 
-    /// Drops the signed shares that are not valid, and the counts that came by them alone; true if there were any.
+    /// Drops the signed shares that are invalid, and counts that come only from them; returns true
+    /// if there were any.
     pub fn retain_statements(&mut self, mut is_valid: impl FnMut(&LedgerShare) -> bool) -> bool {
         let mut has_dropped = false;
         let lanes: BTreeSet<_> = self

@@ -80,7 +80,7 @@ impl ConfidenceCalibration {
         }
     }
 
-    /// Goes on with another weight of stated confidences.
+    /// Applies another weight of stated confidences.
     pub(super) fn configure(&mut self, prior_votes: f64) {
         self.prior_votes = prior_votes;
     }

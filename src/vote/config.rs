@@ -67,7 +67,7 @@ impl VoteConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the first value out of range.
+    /// Returns a [`ConfigError`] that names the first value out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("max_landmarks", self.max_landmarks as f64, 1.0, 1e6)?;
         check_range("max_vehicles", self.max_vehicles as f64, 1.0, 1e5)?;
@@ -124,8 +124,9 @@ config_section! {
         pub pair_memory_votes: f64 = 100.0, in 2.0 to 1e9;
         /// Votes until a vehicle counts as proven; default 10.
         pub probation_votes: f64 = 10.0, in 0.0 to 1e6;
-        /// Maximum weight of all newcomers at a landmark, as a multiple of the proven vehicles'; default 0.5. Bounds the gain
-        /// of an attacker who rejoins under new names; larger lets newcomers in sooner.
+        /// Maximum weight of all newcomers at a landmark, as a multiple of the proven vehicles';
+        /// default 0.5. Bounds the gain of an attacker who rejoins under new names; a higher value
+        /// lets newcomers have influence sooner.
         pub newcomer_share: f64 = 0.5, in 0.0 to 1e9;
         /// Probability by which a label must lead the one published to replace it; default 0.1. More flickers less, reacts
         /// later.

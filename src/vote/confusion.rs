@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Index of a label in the cell's [`LabelTable`](super::label_table::LabelTable).
 pub(super) type LabelIndex = u16;
 
-/// Scale below which counts are written anew.
+/// Scale below which all counts are rescaled.
 const MIN_SCALE: f64 = 1e-60;
 
 /// Sparse expected counts of (true label, stated label): pairs that did not occur take no memory.

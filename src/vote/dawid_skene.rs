@@ -126,7 +126,7 @@ impl DawidSkene {
         }
     }
 
-    /// Goes on under other settings.
+    /// Applies other settings.
     pub(super) fn configure(&mut self, config: WeightedConfig) {
         self.config = config;
     }

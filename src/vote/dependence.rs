@@ -74,7 +74,7 @@ pub(super) struct AgreementGroups {
     pub(super) dependent: usize,
 }
 
-/// Pairwise agreement of vehicles and what follows from it.
+/// Pairwise agreement of vehicles, and the resulting weights.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Dependence {
     /// Comparisons over which a pair's counts fade to 1/e.
@@ -105,7 +105,7 @@ impl Dependence {
         }
     }
 
-    /// Goes on with another memory.
+    /// Applies another memory.
     pub(super) fn configure(&mut self, memory: f64) {
         self.memory = memory;
     }
@@ -213,7 +213,7 @@ impl Dependence {
         1.0 / (1.0 + shared)
     }
 
-    /// Whether a fit is due: it then costs no more than the comparisons since the last one.
+    /// Whether a fit is due: it then costs at most as much as the comparisons since the last one.
     pub(super) fn is_due(&self) -> bool {
         self.compared >= self.pairs.len().max(64)
     }

@@ -13,7 +13,7 @@ const INDEPENDENT_FRAMES: f64 = 1.0 / 3.0;
 /// tanh(0.8 z) is the two-sided normal probability of z, within 0.02.
 const NORMAL_TO_LOGISTIC: f64 = 0.8;
 
-/// A vote that counts at present.
+/// A vote that currently counts.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct StoredVote {
     pub(super) vehicle: usize,
@@ -109,7 +109,7 @@ pub(super) struct LandmarkVotes {
     pub(super) votes: Vec<StoredVote>,
     /// Probability of each label as of the last judgement.
     pub(super) posterior: Posterior,
-    /// Whether the live evidence contains votes and posterior at present.
+    /// Whether the live evidence currently contains votes and posterior.
     pub(super) counted: bool,
     /// The label of the verdict.
     pub(super) published: Option<LabelIndex>,

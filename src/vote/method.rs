@@ -1,4 +1,4 @@
-//! A method that turns votes into verdicts, and what all methods share.
+//! The interface of voting methods, which turn votes into verdicts, and their common types.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -23,7 +23,7 @@ pub(super) struct NewVote<'a> {
 
 /// A voting method. The default methods do nothing, for steps that a method does not need.
 pub(super) trait VotingMethod {
-    /// Goes on under other settings of the same mode.
+    /// Applies other settings of the same mode.
     fn configure(&mut self, config: &VoteConfig);
 
     /// Adds a landmark, so that it has a verdict even without votes.

@@ -33,13 +33,13 @@ pub struct CellMap {
 /// An object of a neighbouring cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct NeighbourObject {
-    /// The cell whose map has it.
+    /// The cell whose map contains the object.
     #[n(0)]
     pub cell: NodeName,
     /// Estimated time in seconds since the neighbour's map was fused.
     #[cbor(n(1), with = "Half")]
     pub age_s: f64,
-    /// The object as that map has it, in this cell's frame.
+    /// The object in that map, converted to this cell's frame.
     #[n(2)]
     pub object: FusedObject,
 }

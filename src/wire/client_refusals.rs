@@ -1,4 +1,4 @@
-//! Refusals that a node's broker shows to the programs beside it.
+//! Refusals that a node's broker shows to its local programs.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

@@ -28,7 +28,6 @@ pub(super) fn is_compact(first: u8) -> bool {
     first >> 5 == ARRAY
 }
 
-/// Writes a payload.
 #[expect(clippy::expect_used, reason = "writing to memory does not fail")]
 pub(super) fn write<T: Encode<()>>(payload: &T, bytes: &mut Vec<u8>) {
     minicbor::encode(payload, bytes).expect("payloads are written into memory");

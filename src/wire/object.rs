@@ -47,7 +47,7 @@ pub struct PerceivedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(8), with = "Half", has_nil)]
     pub size_m: Option<[f64; 2]>,
-    /// The detector's confidence in each class, 0 to 1, if it gives more than the best one.
+    /// The detector's confidence in each class, 0 to 1, if it provides more than the best one.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[cbor(n(9), with = "Half", has_nil)]
     pub scores: BTreeMap<Label, f64>,

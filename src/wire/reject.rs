@@ -77,7 +77,7 @@ reject_reasons! {
 }
 
 impl RejectReason {
-    /// The name in words.
+    /// The name as text.
     pub fn in_words(self) -> String {
         self.as_str().replace('_', " ")
     }

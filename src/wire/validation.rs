@@ -258,7 +258,7 @@ impl PerceivedObject {
 /// Checks that a time of fusion is less than [`MAX_FUSED_AHEAD_S`] ahead.
 ///
 /// # Errors
-/// [`RejectReason::FromTheFuture`].
+/// Returns [`RejectReason::FromTheFuture`].
 pub fn check_fused_at(fused_at: Timestamp, received_at: Timestamp) -> Result<(), RejectReason> {
     let ahead = fused_at.since(received_at);
     if ahead.as_secs() < MAX_FUSED_AHEAD_S {

@@ -130,7 +130,7 @@ pub fn photographs(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CalibrationError> 
 /// A photograph as 8-bit gray.
 ///
 /// # Errors
-/// [`CalibrationError::UnreadableImage`].
+/// Returns [`CalibrationError::UnreadableImage`].
 pub fn read_gray(path: &Path) -> Result<Mat, CalibrationError> {
     let unreadable = |_| CalibrationError::UnreadableImage(path.to_owned());
     let mut gray = Mat::default();
@@ -143,10 +143,11 @@ pub fn read_gray(path: &Path) -> Result<Mat, CalibrationError> {
     Ok(gray)
 }
 
-/// Calibrates a camera (Zhang 2000). The photographs should show the board at different angles and all over the image.
+/// Calibrates a camera (Zhang 2000). The photographs should show the board at different angles and
+/// all over the image.
 ///
 /// # Errors
-/// [`CalibrationError`], naming the image it is about.
+/// Returns a [`CalibrationError`], that names the image it is about.
 pub fn calibrate(
     images: &[PathBuf],
     board: &Chessboard,
@@ -227,7 +228,7 @@ impl Calibration {
     /// Reads a calibration file.
     ///
     /// # Errors
-    /// [`CalibrationError::File`] or [`CalibrationError::Malformed`].
+    /// Returns [`CalibrationError::File`] or [`CalibrationError::Malformed`].
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
         let text = bounded_file::read_text(path)
             .map_err(|error| CalibrationError::File(path.to_owned(), error))?;
@@ -249,7 +250,7 @@ impl Calibration {
     /// Writes a calibration file.
     ///
     /// # Errors
-    /// [`CalibrationError::File`] when it cannot be written.
+    /// Returns [`CalibrationError::File`] if it cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), CalibrationError> {
         let text = toml::to_string(self)
             .map_err(|error| CalibrationError::Malformed(path.to_owned(), error.to_string()))?;

@@ -25,7 +25,8 @@ pub trait Detect: Send {
     /// Objects in the frame in any order, in pixels of `frame.image`.
     ///
     /// # Errors
-    /// [`DetectError`] when the image is unusable or a library fails; the next frame may succeed.
+    /// Returns a [`DetectError`] if the image is unusable or a library fails; the next frame may
+    /// succeed.
     fn detect(&mut self, frame: &CameraFrame) -> Result<Vec<Detection>, DetectError>;
 }
 

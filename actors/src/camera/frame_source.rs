@@ -21,7 +21,8 @@ pub trait FrameSource: Send {
     /// Waits for the next frame; may block as long as the camera does.
     ///
     /// # Errors
-    /// [`FrameError`]. After [`FrameError::Unusable`] the source continues; after other errors it must be reopened.
+    /// Returns a [`FrameError`]. After [`FrameError::Unusable`] the source continues; after other
+    /// errors it must be reopened.
     fn next_frame(&mut self) -> Result<CameraFrame, FrameError>;
 }
 
@@ -33,7 +34,7 @@ pub enum FrameError {
     Open {
         /// Device, pipeline, address or path.
         origin: String,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
     /// One frame is not an image; the source continues.
@@ -41,7 +42,7 @@ pub enum FrameError {
     Unusable {
         /// Path of the frame, or the device.
         origin: String,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
     /// A live source delivers no more frames.
@@ -49,7 +50,7 @@ pub enum FrameError {
     Lost {
         /// Device, pipeline, address or path.
         origin: String,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
     /// A live source delivered no frame within the timeout.
@@ -95,7 +96,7 @@ pub enum SourceConfig {
     },
     /// A video file, played at its own rate.
     Video {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Whether to restart at the end. Default false.
         #[serde(default)]
@@ -172,7 +173,7 @@ impl SourceConfig {
     /// Checks every value, but not whether the source exists.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         match self {
             Self::V4l2 {

@@ -74,10 +74,12 @@ pub fn decode(bytes: &[u8]) -> Result<Mat, ImageError> {
     Ok(bgr)
 }
 
-/// JPEG of an 8-bit image, BGR or gray. `quality` is 1 to 100. Colours have half the resolution, as in OpenCV's files.
+/// JPEG of an 8-bit image, BGR or gray. `quality` is 1 to 100. Colours have half the resolution, as
+/// in OpenCV's files.
 ///
 /// # Errors
-/// [`ImageError::TooLarge`], [`ImageError::Encoding`], or [`ImageError::OpenCv`] for an image of another type.
+/// Returns [`ImageError::TooLarge`], [`ImageError::Encoding`], or [`ImageError::OpenCv`] for an
+/// image of another type.
 pub fn encode_jpeg(image: &Mat, quality: u8) -> Result<Vec<u8>, ImageError> {
     let size = ImageSize::of(image);
     let side = |pixels| u16::try_from(pixels).map_err(|_| ImageError::TooLarge(size));

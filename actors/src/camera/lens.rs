@@ -32,7 +32,7 @@ impl Lens {
     /// The lens for frames of this size: this one if they have its shape.
     ///
     /// # Errors
-    /// [`SizeMismatch`] for frames of another shape, unless the lens takes any.
+    /// Returns a [`SizeMismatch`] for frames of another shape, unless the lens takes any.
     pub fn of_frames(&self, frame: ImageSize) -> Result<Self, SizeMismatch> {
         let size = ImageSize::from(&self.intrinsics);
         match size.check_shape(frame) {
@@ -57,7 +57,7 @@ impl Lens {
     /// The lens of frames of this size, with their detections scaled to its image size.
     ///
     /// # Errors
-    /// [`SizeMismatch`] for frames of another shape, unless the lens takes any.
+    /// Returns a [`SizeMismatch`] for frames of another shape, unless the lens takes any.
     pub fn fitted(
         &self,
         frame: ImageSize,

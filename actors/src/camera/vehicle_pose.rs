@@ -145,7 +145,7 @@ const WORLD_M: f64 = 1e8;
 /// ```
 ///
 /// # Errors
-/// The problem as text.
+/// Returns the problem as text.
 pub fn read_pose(
     datagram: &[u8],
     now: Timestamp,

@@ -162,7 +162,7 @@ fn read(file: &Path) -> Result<String, Failure> {
     Ok(text)
 }
 
-/// The text of a file that is small enough for a description; no more of a larger one is read.
+/// The text of a file that is small enough for a description; larger files are not read further.
 fn read_bounded(file: &Path) -> anyhow::Result<String> {
     let text = bounded_file::read_text(file)?;
     ensure!(

@@ -21,7 +21,7 @@ pub enum LineRead {
 /// Reads the next line into `line`, of at most `limit` bytes.
 ///
 /// # Errors
-/// When the source cannot be read.
+/// Returns an error if the source cannot be read.
 pub fn read_line(
     source: &mut impl BufRead,
     limit: usize,
@@ -47,7 +47,7 @@ const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
 /// Opens a file to read, after a byte order mark.
 ///
 /// # Errors
-/// Naming the file.
+/// Returns an error that names the file.
 pub fn open(path: &Path) -> anyhow::Result<Box<dyn BufRead>> {
     if path == Path::new("-") {
         return Ok(Box::new(io::stdin().lock()));

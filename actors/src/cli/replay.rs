@@ -227,7 +227,7 @@ impl Usable {
 /// The cell that a configuration file describes; without a file, an open one.
 ///
 /// # Errors
-/// When the file cannot be used.
+/// Returns an error if the file cannot be used.
 pub fn cell(path: Option<&Path>) -> Result<ReplayConfig, Failure> {
     let Some(path) = path else {
         return Ok(ReplayConfig::default());

@@ -76,7 +76,7 @@ async fn terminal_gone([hangup, terminate]: [std::io::Result<Signal>; 2]) -> std
     discard_output()
 }
 
-/// Takes the terminal over, and gives it back if it is still there.
+/// Takes over the terminal, and restores it if it still exists.
 fn draw_until_quit(node: &Mutex<Option<NodeHandle>>, config: &NodeConfig) -> std::io::Result<()> {
     let is_gone = || !std::io::stdout().is_terminal();
     let shown = ratatui::try_init().and_then(|mut terminal| {

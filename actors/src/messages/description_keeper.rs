@@ -12,7 +12,7 @@ use crate::transport::mqtt::Delivery;
 pub enum DescriptionKeeperMessage {
     /// Process a node's authenticated statement about its description.
     Hear {
-        /// The node.
+        /// Name of the node.
         from: NodeName,
         /// True if it may lead.
         may_lead: bool,

@@ -25,7 +25,7 @@ pub enum FuserMessage {
     TakeMap {
         /// The map.
         map: Arc<GlobalMap>,
-        /// When it came.
+        /// Time of receipt.
         received_at: Timestamp,
     },
     /// Do not continue from a map of this aggregator, because it is not trusted any more.
@@ -70,7 +70,7 @@ pub enum FuserMessage {
         /// The cell's landmarks.
         landmarks: Vec<LandmarkConfig>,
     },
-    /// Start from evidence that came from elsewhere.
+    /// Start from evidence of another source.
     Adopt {
         /// All available evidence.
         ledger: Arc<ReputationLedger>,

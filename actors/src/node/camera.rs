@@ -27,10 +27,11 @@ pub fn standing_pose(config: &NodeConfig) -> anyhow::Result<Option<Pose>> {
     pose.context("key `pose.latitude_deg`")
 }
 
-/// The way from a camera's detections to reports, as configured. Each frame has its own pose.
+/// The processing from a camera's detections to reports, as configured. Each frame has its own
+/// pose.
 ///
 /// # Errors
-/// When its calibration file cannot be used.
+/// Returns an error if the camera's calibration file cannot be used.
 pub fn perception(config: &NodeConfig, camera: &CameraConfig) -> anyhow::Result<Perception> {
     let gate = config.fusion.pace.gate();
     let vehicle_camera = VehicleCamera {
@@ -56,7 +57,7 @@ pub fn perception(config: &NodeConfig, camera: &CameraConfig) -> anyhow::Result<
 /// A camera's lens.
 ///
 /// # Errors
-/// When its calibration file cannot be used.
+/// Returns an error if its calibration file cannot be used.
 pub fn lens(camera: &CameraConfig) -> anyhow::Result<Lens> {
     camera
         .optics

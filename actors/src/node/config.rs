@@ -151,7 +151,7 @@ pub enum LoadError {
     /// The file does not exist or cannot be read.
     #[error("cannot read configuration {path}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The operating system's error.
         source: std::io::Error,
@@ -389,7 +389,7 @@ impl NodeConfig {
     /// The protection of links and payloads; the files that the configuration names are read.
     ///
     /// # Errors
-    /// [`SecurityError`] naming the file.
+    /// Returns a [`SecurityError`] that names the file.
     pub fn security(&self) -> Result<Security, SecurityError> {
         Security::load(
             self.tls.as_ref().zip(self.name.as_ref()),

@@ -52,10 +52,11 @@ pub struct Roamer {
 }
 
 impl Roamer {
-    /// Starts the vehicle in its own cell; `config` is taken as valid. Without `cells` it stays there.
+    /// Starts the vehicle in its own cell; `config` is taken as valid. Without `cells` it stays
+    /// there.
     ///
     /// # Errors
-    /// [`NodeError`] when a part cannot start, or the file of cells cannot be used.
+    /// Returns a [`NodeError`] if a part cannot start, or the file of cells cannot be used.
     pub async fn start(config: NodeConfig) -> Result<Self, NodeError> {
         let mut cells = config
             .load_cells()

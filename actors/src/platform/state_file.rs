@@ -45,7 +45,7 @@ impl StateFile {
     /// Lock on the state of a node, which its process holds as long as it runs.
     ///
     /// # Errors
-    /// When another process holds it, or the directory cannot be written.
+    /// Returns an error if another process holds it, or the directory cannot be written.
     pub fn lock(directory: &Path, cell: &NodeName, node: &NodeName) -> io::Result<File> {
         fs::create_dir_all(directory)?;
         let file = OpenOptions::new()
@@ -57,7 +57,7 @@ impl StateFile {
         Ok(file)
     }
 
-    /// The file.
+    /// Path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -104,7 +104,7 @@ impl StateFile {
     /// Deletes the file; true if there was one.
     ///
     /// # Errors
-    /// When the directory refuses it.
+    /// Returns an error if the directory refuses it.
     pub fn delete(&self) -> io::Result<bool> {
         match fs::remove_file(&self.path) {
             Ok(()) => Ok(true),
@@ -116,7 +116,7 @@ impl StateFile {
     /// Replaces the state. After `Ok` it survives a loss of power.
     ///
     /// # Errors
-    /// When the directory or disk refuses it; the state before is then still there.
+    /// Returns an error if the directory or disk refuses it; the state before is then still there.
     pub fn save<T: Serialize>(&self, state: &T) -> io::Result<()> {
         fs::create_dir_all(self.path.parent().unwrap_or(Path::new(".")))?;
         replace_file(
@@ -160,7 +160,7 @@ fn checksum(state: &[u8]) -> String {
 /// survives a loss of power.
 ///
 /// # Errors
-/// When the directory or disk refuses it; the file before is then still there.
+/// Returns an error if the directory or disk refuses it; the file before is then still there.
 pub(crate) fn replace_file(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     let temporary = path.with_extension("tmp");
     // A temporary file that was left over would keep its own permissions.

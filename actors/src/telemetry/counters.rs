@@ -25,7 +25,7 @@ pub enum Event {
     PublishRefused,
     /// A payload was not sent because it is larger than receivers accept.
     PublishTooLarge,
-    /// A packet came in from a broker.
+    /// A packet arrived from a broker.
     Received,
     /// The broker sent back what this node had published; it was delivered in-process already.
     Echo,
@@ -51,7 +51,7 @@ pub enum Event {
     /// A report was used for tracking only, because a later report of its vehicle had arrived
     /// first.
     ReportOvertaken,
-    /// A report came too late for tracking.
+    /// A report arrived too late for tracking.
     ReportLate,
     /// A new object was not tracked: there are too many tracks, or too many near it.
     ObjectRefused,
@@ -87,7 +87,7 @@ pub enum Event {
     SourceFailed,
     /// A browser's request was refused for its token, its host name, or lack of room.
     BrowserRefused,
-    /// A browser's request was refused because too many were made lately.
+    /// A browser's request was refused because there were too many recently.
     BrowserThrottled,
     /// The dashboard's address could not be listened on.
     DashboardNotBound,
@@ -120,7 +120,7 @@ pub enum Event {
     /// A map of the cell was not sent to the region: its broker is not connected or does not
     /// forward messages.
     RegionWithheld,
-    /// A packet came in from the region's broker.
+    /// A packet arrived from the region's broker.
     RegionReceived,
     /// A map of a neighbouring cell, newer than all of that cell before, was accepted.
     CellMapAccepted,

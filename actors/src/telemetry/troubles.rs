@@ -13,13 +13,13 @@ use crate::platform::clock;
 pub struct Troubles(Mutex<TroubleRegister>);
 
 impl Troubles {
-    /// Notes a trouble of this node itself.
+    /// Records a trouble of this node itself.
     pub fn note(&self, kind: TroubleKind, cause: &str) {
         let news = self.register().note(kind, None, cause, clock::now());
         log(news);
     }
 
-    /// Notes a trouble of a vehicle, address or host.
+    /// Records a trouble of a vehicle, address or host.
     pub fn note_about(&self, about: &str, kind: TroubleKind, cause: &str) {
         let news = self.register().note(kind, Some(about), cause, clock::now());
         log(news);
@@ -33,7 +33,7 @@ impl Troubles {
         log(news);
     }
 
-    /// Notes a trouble of this node itself, or about another, with a remedy of its own.
+    /// Records a trouble of this node itself, or about another, with a remedy of its own.
     pub fn note_with_remedy(
         &self,
         about: Option<&str>,
@@ -47,7 +47,7 @@ impl Troubles {
         log(news);
     }
 
-    /// Notes that a trouble of this node itself, or about another, is over.
+    /// Records that a trouble of this node itself, or about another, is over.
     pub fn settle(&self, kind: TroubleKind, about: Option<&str>) {
         self.register().settle(kind, about);
     }

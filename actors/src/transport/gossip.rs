@@ -71,18 +71,18 @@ pub enum MembershipEvent {
     },
     /// A node does not answer. It is declared down unless it answers soon.
     Suspected {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
     /// A node is down.
     Down {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
     /// The certificate of a node was revoked or has expired. An event that the node is down
     /// follows.
     Expelled {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
     /// A living node's addresses changed.

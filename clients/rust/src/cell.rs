@@ -237,10 +237,11 @@ impl Cell {
         self.read(&format!("{RECEIVED}/+"), |streams| &streams.foreign, false)
     }
 
-    /// Publishes a collective perception message (CPM) on `cpm/<level>`, as [`Cell::report`] does a report.
+    /// Publishes a collective perception message (CPM) on `cpm/<level>`, as [`Cell::report`] does a
+    /// report.
     ///
     /// # Errors
-    /// [`Error::Refused`] when the broker refused the login or an earlier message there.
+    /// Returns [`Error::Refused`] if the broker refused the login or an earlier message there.
     pub fn publish_cpm(&self, level: &str, payload: Vec<u8>) -> Result<bool, Error> {
         self.publish(&self.topics.cpm(level), payload)
     }

@@ -59,7 +59,7 @@ pub(crate) const RECEIVED: &str = "cpm/received";
 const RETRY_MIN: Duration = Duration::from_millis(100);
 const RETRY_MAX: Duration = Duration::from_secs(5);
 
-/// Time to send what waits when the connection is closed.
+/// Time for sending queued messages when the connection is closed.
 const FLUSH_TIMEOUT: Duration = Duration::from_secs(1);
 
 impl ConnectionState {
@@ -116,7 +116,7 @@ impl ConnectionState {
             .0
     }
 
-    /// Sends what waits, and ends the connection and all loops over messages.
+    /// Sends queued messages, and ends the connection and all iterators over messages.
     pub(crate) fn close(&self) {
         let mut state = self.state();
         state.is_closing = true;
@@ -136,7 +136,8 @@ impl ConnectionState {
     fn run(&self, options: &MqttOptions) {
         let mut wait = RETRY_MIN;
         loop {
-            // A client of its own for each connection: what waited in the last one is too old.
+            // Each connection has a new client, because messages queued in the last one are too
+            // old.
             let (client, mut connection) = Client::new(options.clone(), MAX_WAITING);
             let began = Instant::now();
             let lost = self.carry(&client, &mut connection);

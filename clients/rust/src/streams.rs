@@ -147,7 +147,7 @@ impl<M> MessageStream<M> {
             .admitted_at
             .is_some_and(|at| now.duration_since(at) >= EPOCH_MEMORY)
         {
-            // The cell may have started anew.
+            // The cell may have restarted.
             self.gate = EpochGate::default();
         }
         self.gate.admit(
@@ -177,7 +177,7 @@ impl<M> MessageStream<M> {
         self.number
     }
 
-    /// The earliest of the newest payloads that came after the numbered one.
+    /// The earliest of the newest payloads that arrived after the numbered one.
     pub(crate) fn after(&self, number: u64) -> Option<(u64, Arc<M>)> {
         self.newest
             .values()

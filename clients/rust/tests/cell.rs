@@ -313,7 +313,7 @@ fn a_position_of_a_map_is_one_on_earth_by_the_origin_of_the_cell() {
         std::thread::sleep(Duration::from_millis(20));
     };
     assert_eq!(cell.description().unwrap().set_by.as_str(), "edge");
-    // As PROJ has it, for 12.4 m east and 3.1 m south.
+    // By PROJ, for 12.4 m east and 3.1 m south.
     let (latitude_deg, longitude_deg) = (52.22964774062, 21.01241017960);
     let pose = GeographicPose {
         latitude_deg,
@@ -428,7 +428,7 @@ fn map(epoch: u64, round: u64) -> Vec<u8> {
     encode(&map, Encoding::Json)
 }
 
-/// A request to a node, which numbers it, or what another broker retains.
+/// A request to a node, which numbers it, or the message that another broker retains.
 fn description(text: &str) -> Vec<u8> {
     let set_by = NodeName::from_static("edge");
     let hash = ContentHash::default();

@@ -80,7 +80,7 @@ impl MessageFrame {
     /// Covariance of a received reference position in the cell's frame.
     ///
     /// # Errors
-    /// [`CpmError::NoPosition`] for an error out of range.
+    /// Returns [`CpmError::NoPosition`] for an error out of range.
     pub(super) fn position_error(
         &self,
         ellipse: &cdd::PosConfidenceEllipse,

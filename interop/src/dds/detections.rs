@@ -382,7 +382,7 @@ impl CameraInfo {
     }
 }
 
-/// The way from a message's frame to the cell's.
+/// The conversion from a message's frame to the cell's.
 struct ToMap {
     origin: Pose,
     turn: Matrix3<f64>,

@@ -89,7 +89,7 @@ impl<W: Write + Seek> RosLog<W> {
     /// Begins an MCAP.
     ///
     /// # Errors
-    /// [`ConversionError`] if the output cannot be written.
+    /// Returns a [`ConversionError`] if the output cannot be written.
     pub fn new(output: W) -> Result<Self, ConversionError> {
         let options = WriteOptions::new()
             .profile("ros2")
@@ -107,7 +107,7 @@ impl<W: Write + Seek> RosLog<W> {
     /// Writes the messages of a log.
     ///
     /// # Errors
-    /// [`ConversionError`] if this is no log, or the output cannot be written.
+    /// Returns a [`ConversionError`] if this is no log, or the output cannot be written.
     pub fn add(&mut self, mut log: impl Read) -> Result<(), ConversionError> {
         let options = LinearReaderOptions::default()
             .with_skip_end_magic(true)
@@ -183,7 +183,8 @@ impl<W: Write + Seek> RosLog<W> {
     /// Ends the MCAP.
     ///
     /// # Errors
-    /// [`ConversionError`] if it cannot be written, or no message of a node's log was found.
+    /// Returns a [`ConversionError`] if it cannot be written, or no message of a node's log was
+    /// found.
     pub fn finish(mut self) -> Result<Conversion, ConversionError> {
         self.output.writer.finish()?;
         if self.done.written == 0 {

@@ -30,10 +30,11 @@ pub struct OwnAggregator {
 }
 
 impl OwnAggregator {
-    /// Starts `program` as an edge with a dashboard, recording if `records`, and waits until its broker serves.
+    /// Starts `program` as an edge with a dashboard, recording if `records`, and waits until its
+    /// broker serves.
     ///
     /// # Errors
-    /// When it cannot be started or ends.
+    /// Returns an error if it cannot be started or ends.
     pub async fn start(program: &Path, records: bool) -> anyhow::Result<Self> {
         let directory = std::env::temp_dir().join(format!("ecod-bench-{}", std::process::id()));
         fs::create_dir_all(&directory)
@@ -76,7 +77,7 @@ impl OwnAggregator {
     /// Target of the measurement.
     ///
     /// # Errors
-    /// When the process has ended.
+    /// Returns an error if the process has ended.
     pub fn target(&mut self) -> anyhow::Result<&Target> {
         self.process.check()?;
         Ok(&self.target)

@@ -101,7 +101,7 @@ const LAST_MAP: Duration = Duration::from_secs(1);
 /// Starts an edge and a vehicle, and measures each way for so long.
 ///
 /// # Errors
-/// When a node cannot be started or ends, or no map comes.
+/// Returns an error if a node cannot be started or ends, or no map comes.
 pub async fn measure(program: &Path, duration: Duration) -> anyhow::Result<DoorFigures> {
     let directory = std::env::temp_dir().join(format!("ecod-doors-{}", std::process::id()));
     fs::create_dir_all(&directory)

@@ -31,8 +31,8 @@ impl AnswerBytes {
     }
 }
 
-/// Answers once all vehicles have sent, with a map's and a verdict's bytes; has a thread of its own, as the aggregator
-/// has, and ends when dropped.
+/// Answers once all vehicles have sent, with a map's and a verdict's bytes; runs on its own thread,
+/// like the aggregator, and ends when dropped.
 #[derive(Debug)]
 pub(super) struct Echo {
     _stop: oneshot::Sender<()>,

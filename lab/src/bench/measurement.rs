@@ -51,7 +51,7 @@ const LEAD_IN: Duration = Duration::from_millis(300);
 /// Connects the vehicles, sends the load and gathers the answers.
 ///
 /// # Errors
-/// When the broker cannot be reached or no map comes.
+/// Returns an error if the broker cannot be reached or no map comes.
 pub async fn measure(target: &Target, load: Load) -> anyhow::Result<BenchFigure> {
     let load = Load {
         votes: load.votes && target.votes,

@@ -61,11 +61,11 @@ const OUT: &str = "ecod/bench/out";
 const BACK: &str = "ecod/bench/back";
 const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Measures with two bare MQTT 3.1.1 clients, in nanoseconds from when a message was handed to its client to when it
-/// was back.
+/// Measures with two bare MQTT 3.1.1 clients, in nanoseconds from when a message was handed to its
+/// client to when it was back.
 ///
 /// # Errors
-/// [`TwoHopError`] when the broker cannot be reached or loses messages.
+/// Returns a [`TwoHopError`] if the broker cannot be reached or loses messages.
 pub async fn raw(broker: &BrokerAddress, load: TwoHopLoad) -> Result<Histogram<u64>, TwoHopError> {
     let error = |source| TwoHopError::Connection {
         broker: broker.clone(),

@@ -41,7 +41,8 @@ pub(super) struct BenchArguments {
     /// once
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..50))]
     spread_ms: u64,
-    /// Broker of a running cell to be measured; without it the program starts an aggregator of its own on loopback
+    /// Broker of a running cell to be measured; without it the program starts its own aggregator on
+    /// loopback
     #[arg(long, value_name = "HOST:PORT")]
     connect: Option<BrokerAddress>,
     /// Configuration of a node of the running cell: its broker, its name, its locations

@@ -82,7 +82,7 @@ impl ReportCollector {
             .len()
     }
 
-    /// Whose map came last.
+    /// The node whose map arrived last.
     pub(super) fn leader(&self) -> Option<NodeName> {
         lock(&self.seen).leader.clone()
     }

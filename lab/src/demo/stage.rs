@@ -30,7 +30,7 @@ pub struct Progress {
 /// Event of a running demo.
 #[derive(Debug, Clone, Copy)]
 pub enum News {
-    /// So many reports were seen so far.
+    /// Number of reports received so far.
     Reports(usize),
     /// The edge's process was killed.
     EdgeKilled,

@@ -55,7 +55,7 @@ pub fn found(report: &ObjectReport) -> Vec<FoundObject> {
 pub struct LatestReports(BTreeMap<NodeName, (Timestamp, Vec<FoundObject>)>);
 
 impl LatestReports {
-    /// Takes a report, unless a later one is there already.
+    /// Stores a report, unless a later one is already stored.
     pub fn report(&mut self, report: &ObjectReport) {
         let last = self.0.entry(report.node.clone()).or_default();
         if report.captured_at_us > last.0 {

@@ -66,7 +66,6 @@ struct ParsedObject {
 enum FilePlace {
     /// On the ground, in metres.
     Ground(Point2<f64>),
-    /// In the image.
     Image(BoundingBox),
 }
 
@@ -284,7 +283,7 @@ pub fn sequence_at(time: Timestamp) -> usize {
 /// Checks that no sequence, of several, lasts into the next one.
 ///
 /// # Errors
-/// Naming the sequence.
+/// Returns an error that names the sequence.
 pub fn check_lengths<'a>(
     sequences: impl IntoIterator<Item = &'a Sequence>,
     frame_rate_hz: f64,

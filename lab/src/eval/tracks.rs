@@ -64,7 +64,7 @@ pub struct ScoredFrame {
     pub said: Vec<SaidObject>,
 }
 
-/// An object that was there.
+/// A true object.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrueObject {
     /// Its identity; small numbers, they count places in tables.
@@ -82,7 +82,7 @@ pub struct SaidObject {
     pub id: u32,
     /// The class it was given.
     pub label: Label,
-    /// Confidence that it is there; only the order matters to average precision.
+    /// Confidence that the object exists; for average precision only the order matters.
     pub score: f64,
     /// Probability that it exists, wherever exactly, if it is stated apart.
     pub existence: Option<f64>,

@@ -27,7 +27,7 @@ use crate::testbed::birdseye::VEHICLE_COLORS;
 /// A map and the time at which a vehicle had it.
 #[derive(Debug, Clone, Copy)]
 pub struct KnownMap<'a> {
-    /// When it came.
+    /// Time of receipt.
     pub known_at: Timestamp,
     /// The map.
     pub map: &'a GlobalMap,
@@ -43,7 +43,7 @@ pub struct Film<'a> {
     pub edge: NodeName,
     /// The maps that the first camera's node got, in order.
     pub maps: Vec<KnownMap<'a>>,
-    /// The maps that it would have made of its own reports, in order.
+    /// The maps that the node would have made from its own reports, in order.
     pub alone: Vec<KnownMap<'a>>,
     /// All reports.
     pub reports: Vec<&'a ObjectReport>,
@@ -581,7 +581,7 @@ impl FilmScene<'_> {
 }
 
 impl Street {
-    /// The placards of what stands nearest to a place.
+    /// The placards of the body nearest to a place.
     fn placard_near(&self, place: &Point2<f64>, at_s: f64) -> Option<&Solid> {
         let worn = self
             .bodies

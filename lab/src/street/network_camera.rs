@@ -70,11 +70,11 @@ impl Drop for EndOnDrop {
 }
 
 impl NetworkCamera {
-    /// Starts the camera; second zero of the street is `start`. Each camera takes its pictures at a phase of its own, a share of the
-    /// time between two.
+    /// Starts the camera; second zero of the street is `start`. Each camera takes its pictures at
+    /// its own phase, a share of the time between two pictures.
     ///
     /// # Errors
-    /// When no port is free, or a placard cannot be drawn.
+    /// Returns an error if no port is free, or a placard cannot be drawn.
     pub async fn start(
         street: &Arc<Street>,
         number: usize,

@@ -13,7 +13,7 @@ pub(super) enum Route {
     Stands(Pose),
     /// Around a closed way at a constant speed.
     Loop {
-        /// The way's corners; the last is followed by the first.
+        /// The corners of the route; the first follows the last.
         corners: Vec<Point2<f64>>,
         /// Metres per second.
         speed_mps: f64,
@@ -70,7 +70,7 @@ impl Route {
     }
 }
 
-/// The point of a closed way so many metres from its first corner.
+/// The point of a closed route at a distance in metres from its first corner.
 fn point(corners: &[Point2<f64>], along_m: f64) -> Point2<f64> {
     let sides = || corners.iter().zip(corners.iter().cycle().skip(1));
     let length_m: f64 = sides().map(|(from, to)| nalgebra::distance(from, to)).sum();

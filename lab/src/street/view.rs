@@ -48,7 +48,7 @@ impl StreetView {
     /// A view with all placards of the street.
     ///
     /// # Errors
-    /// When a label does not fit into a code, or OpenCV fails.
+    /// Returns an error if a label does not fit into a code, or OpenCV fails.
     pub(crate) fn new(street: &Street) -> anyhow::Result<Self> {
         let mut placards = BTreeMap::new();
         for label in street.bodies.iter().filter_map(|body| body.label.clone()) {
@@ -78,7 +78,7 @@ impl StreetView {
     /// The picture of a camera at a time in seconds, without noise: 8-bit BGR.
     ///
     /// # Errors
-    /// When OpenCV fails.
+    /// Returns an error if OpenCV fails.
     pub(crate) fn render(
         &self,
         street: &Street,

@@ -378,7 +378,8 @@ impl BirdseyePicture<'_> {
         group
     }
 
-    /// Truth and agreed label of every spot, in rows beside the lot, each led to its spot by a line.
+    /// Truth and agreed label of every spot, in rows next to the lot, each connected to its spot by
+    /// a line.
     fn table(&self) -> Group {
         let frame_left = self.sheet.left();
         let columns = [-268.0, -196.0, -100.0].map(|offset| frame_left + offset);

@@ -66,7 +66,7 @@ impl TestbedCamera {
     /// Frame number `index`, with vibration, blur, uneven light and noise: 8-bit BGR.
     ///
     /// # Errors
-    /// [`RenderError`] when OpenCV fails.
+    /// Returns a [`RenderError`] if OpenCV fails.
     pub fn frame(&self, index: u64) -> Result<Mat, RenderError> {
         self.sensor.expose(&self.still, index)
     }

@@ -344,7 +344,7 @@ fn check_spots(fields: Vec<SpotFields>, place: &KeyPath) -> Result<Vec<Spot>, Te
             truth,
         });
     }
-    // Spots without a direction of their own face as the others do on average, or +x.
+    // Spots without their own direction face in the others' average direction, or +x.
     let facing_rad = mean
         .try_normalize(1e-9)
         .map_or(0.0, |mean| mean.y.atan2(mean.x));

@@ -68,7 +68,8 @@ const GATE: LandmarkGate = LandmarkGate {
 /// Maximum angle in radians between an object of unknown size and the location to which it is
 /// assigned.
 const MAX_BESIDE_RAD: f64 = 0.15;
-/// By what factor such an object may be higher or lower than [`ANY_HEIGHT_M`] if it stands at the location.
+/// Factor by which the height of such an object may differ from [`ANY_HEIGHT_M`] if it stands at
+/// the location.
 const MAX_HEIGHT_FACTOR: f64 = 5.0;
 
 /// Result of a recording.
@@ -113,7 +114,7 @@ pub struct FrameLabel {
 /// Runs a recording.
 ///
 /// # Errors
-/// When a report cannot be written or read back.
+/// Returns an error if a report cannot be written or read back.
 pub fn run(name: &str, recording: &IntersectionRecording) -> anyhow::Result<IntersectionResult> {
     let reports = reports(recording);
     let (fused, scores) = fuse(recording, &reports, Algorithms::Vote, VoteMode::Weighted)?;
@@ -231,7 +232,7 @@ fn name_by_bearing(report: &mut ObjectReport, landmarks: &[Landmark]) {
 /// A report as a line of a recording that `replay` reads.
 ///
 /// # Errors
-/// When it cannot be written as JSON.
+/// Returns an error if it cannot be written as JSON.
 pub fn line(report: &ObjectReport, kind: ReportKind) -> serde_json::Result<String> {
     let mut line = serde_json::to_value(report)?;
     line["topic"] = json!(match kind {

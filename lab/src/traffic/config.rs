@@ -33,8 +33,8 @@ pub struct TrafficConfig {
     pub convoy: bool,
     /// The observers are cameras on posts, four about a crossing, whose pose errors stay. Default false.
     pub fixed: bool,
-    /// All observers capture at the same moments and reports arrive at once. Default false: each has a phase of its
-    /// own, and reports take their time.
+    /// All observers capture at the same moments and reports arrive at once. Default false: each
+    /// observer has its own phase, and reports are delayed.
     pub synchronous: bool,
     /// Seconds for which an object that observers have lost from view still belongs to the truth.
     /// Default 1.
@@ -203,7 +203,7 @@ impl TrafficConfig {
     /// Checks all values.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("roads", self.roads as f64, 2.0, 32.0)?;
         check_range("block_m", self.block_m, 50.0, 1000.0)?;

@@ -74,7 +74,6 @@ impl Roads {
         }
     }
 
-    /// All lanes.
     pub(super) fn lanes(&self) -> Vec<Path> {
         let crossings =
             (0..self.count).flat_map(|column| (0..self.count).map(move |row| (column, row)));
@@ -119,7 +118,7 @@ impl Roads {
         }
     }
 
-    /// Where a vehicle parks beside a lane.
+    /// Position and heading of a vehicle parked next to a lane.
     pub(super) fn parking(&self, path: Path, along_m: f64) -> (Point2<f64>, f64) {
         let (at, heading_rad) = self.place(path, along_m);
         let right = Vector2::new(heading_rad.sin(), -heading_rad.cos());

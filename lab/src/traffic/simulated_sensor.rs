@@ -226,7 +226,7 @@ impl SimulatedSensor {
         }
     }
 
-    /// Detection of a body that is there.
+    /// Detection of an existing body.
     fn glance(
         &mut self,
         config: &TrafficConfig,

@@ -24,7 +24,7 @@ impl CellMapLog {
     /// An empty log.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if it cannot be written.
     pub fn create(path: &Path) -> anyhow::Result<Self> {
         let file =
             File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
@@ -76,7 +76,7 @@ impl CellMapLog {
     /// Ends the file; returns the number of cells and of maps in it.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if it cannot be written.
     pub fn finish(mut self) -> anyhow::Result<(usize, u64)> {
         self.writer.finish()?;
         Ok((

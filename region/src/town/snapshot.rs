@@ -109,11 +109,11 @@ pub struct TownCellView {
 pub struct ObjectView {
     /// Its identity.
     pub id: Uuid,
-    /// The cell whose map has it.
+    /// The cell whose map contains the object.
     pub cell: NodeName,
     /// Its label.
     pub label: Label,
-    /// The probability that it is there.
+    /// The probability that the object exists.
     pub confidence: f64,
     /// Latitude in degrees.
     pub latitude_deg: f64,

@@ -28,7 +28,8 @@ fn tile() -> Quadkey {
     Quadkey::of_cell(&PLACE)
 }
 
-/// A map of this round, sent at once, with an object so many metres to the east of the origin for each of these.
+/// A map of this round, sent at once, with objects at these distances in metres to the east of the
+/// origin.
 fn map(
     town: &mut RegionTown,
     cell: &'static str,

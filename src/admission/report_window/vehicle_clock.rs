@@ -262,7 +262,7 @@ impl VehicleClock {
         (report.captured_at_us, Some(report.seq)) <= (self.last_captured, self.last_seq)
     }
 
-    /// Notes the vehicle's latest report.
+    /// Records the vehicle's latest report.
     fn advance(
         &mut self,
         report: &ObjectReport,

@@ -15,24 +15,24 @@ pub enum ElectionInput {
     },
     /// The membership found a node. Messages can be sent to it from now on.
     PeerAlive {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
     },
     /// The membership suspects a node. If that node is the leader, the election checks it at once.
     PeerSuspected {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
     },
     /// The membership gave up a node. The leader's own beats have precedence, see
     /// [`crate::leadership::election`].
     PeerDown {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
     },
     /// A node's process has certainly ended: its connection broke, and its broker's port refuses
     /// new connections.
     PeerGone {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
     },
     /// The state of the node's own parts or its load changed. Until the first such input the node

@@ -78,7 +78,7 @@ impl GrowthLimit {
             && self.admits_votes(&key_of_mark(mark), votes, now)
     }
 
-    /// Notes the counts of a share that the ledger has now.
+    /// Records the counts of a share that the ledger has now.
     pub(super) fn note(&mut self, share: &LedgerShare, ledger: &ReputationLedger, now: Timestamp) {
         for entry in share
             .entries

@@ -68,12 +68,12 @@ pub enum Input {
     },
     /// The membership doubts a node.
     MemberSuspected {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
     /// The membership gave a node up.
     MemberDown {
-        /// The node.
+        /// Name of the node.
         name: NodeName,
     },
     /// The node's own broker started or stopped listening.
@@ -85,7 +85,7 @@ pub enum Input {
     BrokerProven {
         /// The broker.
         broker: BrokerAddress,
-        /// The node.
+        /// Name of the node.
         node: NodeName,
     },
     /// The state of one of the gateway's links changed.
@@ -128,7 +128,7 @@ pub enum Input {
     },
     /// The fuser was restarted and has lost the state of leading.
     FuserRestarted,
-    /// The gateway was started anew and has no links.
+    /// The gateway was restarted and has no links.
     GatewayRestarted,
     /// The settings that all nodes of the cell share have changed.
     Described {
@@ -204,14 +204,14 @@ pub enum Effect {
     },
     /// Share all evidence about vehicles: a node needs it to lead, or to remain the leader.
     SendSnapshot {
-        /// The node.
+        /// Name of the node.
         to: NodeName,
     },
     /// Check the node's own parts and pass [`Input::Looked`] at once.
     Look,
     /// Query broker, gateway and fuser, and pass [`Input::PartsAnswered`] when they have answered.
     AskParts,
-    /// Count a message of this node that states a term or round beyond what a cell can have reached.
+    /// Count a message of this node that states an implausibly high term or round.
     CountImplausible {
         /// The sender.
         from: NodeName,
@@ -240,7 +240,7 @@ pub enum Notice {
     },
     /// A node's process is gone: its broker ended.
     ProcessGone {
-        /// The node.
+        /// Name of the node.
         peer: NodeName,
         /// Its broker.
         broker: BrokerAddress,
@@ -255,9 +255,10 @@ pub enum Notice {
         /// The leader that hands over.
         leader: NodeName,
     },
-    /// A node is ready to be handed the lead, and this node is not logged in at its broker, or another node's is there.
+    /// A node is ready to take over leadership, but this node is not logged in at its broker, or
+    /// another node's broker answers at its address.
     NotServed {
-        /// The node.
+        /// Name of the node.
         challenger: NodeName,
     },
     /// This node cannot log in at brokers that it should use, or it can again.
@@ -274,7 +275,7 @@ pub enum Notice {
     },
     /// A node declared more than its certificate allows, or claimed a lead that it may not have.
     Overreached {
-        /// The node.
+        /// Name of the node.
         from: NodeName,
         /// The role that it declared.
         role: Role,

@@ -19,7 +19,7 @@ pub(super) struct Members {
 }
 
 impl Members {
-    /// Notes a living member.
+    /// Records a living member.
     pub(super) fn place(&mut self, member: SeenMember) {
         self.living.insert(member.name.clone(), member);
     }
@@ -72,7 +72,7 @@ impl Members {
         self.living.get(name)?.broker.clone()
     }
 
-    /// Nodes whose broker is, or was a moment ago, at this address.
+    /// Nodes whose broker is or recently was at this address.
     pub(super) fn at(&self, broker: &BrokerAddress, now: Timestamp) -> Vec<NodeName> {
         let living = self
             .living

@@ -5,7 +5,7 @@ use crate::model::names::NodeName;
 /// Proof of a round's aggregator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Origin {
-    /// It came over the aggregator's own broker, has its signature, or is the node's own.
+    /// It arrived over the aggregator's own broker, has its signature, or is the node's own.
     Proven,
     /// Only claimed in the message itself: in a cell without certificates, or over another node's
     /// broker.

@@ -43,7 +43,8 @@ pub struct SuccessionFilter {
     /// Start of the current period in which messages of other nodes are admitted, or in which the
     /// elected leader's messages are not.
     others_since: Option<Timestamp>,
-    /// The elected leader beside which others have used up their credit, also in terms that it renews.
+    /// The elected leader during whose leadership other nodes have used up their credit, including
+    /// terms that it renews.
     overruled: Option<NodeName>,
     /// The publisher of a term that the election has not seen, while there is no leader.
     stranger: Option<Stranger>,

@@ -219,7 +219,8 @@ fn a_heading_is_clockwise_from_the_north_of_where_the_vehicle_is() {
             "{turned:?}"
         );
     }
-    // 68 km to the east, north is 0.8° off; who drives there by the compass drives so in the map.
+    // 68 km to the east, north is 0.8° off; a compass course there corresponds to this heading in
+    // the map.
     let there = origin.pose_to_map(&pose(52.2, 22.0, 0.0)).unwrap();
     let ahead = origin.pose_to_map(&pose(52.2001, 22.0, 0.0)).unwrap();
     let driven = ahead.position - there.position;

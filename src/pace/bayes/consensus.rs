@@ -15,7 +15,6 @@ pub(super) struct LabelScores<'a> {
     labels: SmallVec<[(&'a Label, f64); 4]>,
 }
 
-/// The agreed label.
 pub(super) struct AgreedLabel<'a> {
     pub(super) label: &'a Label,
     pub(super) posterior: f64,

@@ -76,7 +76,7 @@ impl LandmarkConfig {
     /// Checks one location.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_label("id", &self.id)?;
         check_synonyms(&self.synonyms)?;
@@ -94,7 +94,7 @@ impl LandmarkConfig {
     /// Checks all locations of a cell and that their names differ.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the location by its position in the list.
+    /// Returns a [`ConfigError`] that names the location by its position in the list.
     pub fn validate_all(locations: &[Self]) -> Result<(), ConfigError> {
         let mut ids = BTreeSet::new();
         for (index, location) in locations.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Settings of projection: the way of ranging, object sizes and uncertainties.
+//! Settings of projection: the method of ranging, object sizes and uncertainties.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use super::coco_sizes;
 use crate::config::{ConfigError, check_range, config_section};
 use crate::model::names::Label;
 
-/// The way to find the distance of a detection.
+/// The method of finding the distance of a detection.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Ranging {
@@ -47,8 +47,8 @@ pub struct ObjectSize {
     pub width_m: f64,
     /// Height in metres; the side of a square target.
     pub height_m: f64,
-    /// Length in metres, the horizontal extent across the width; default the width. It matters where the ground gives the
-    /// distance.
+    /// Length in metres, the horizontal extent across the width; default the width. It matters if
+    /// the ground gives the distance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub length_m: Option<f64>,
     /// Relative standard deviation of sizes of this kind and of the focal length together; default 0.02. Too small
@@ -101,7 +101,7 @@ impl ObjectSizes {
     /// Checks every size.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if let Some(size) = &self.default {
             size.validate().map_err(|e| e.within("default"))?;

@@ -123,7 +123,7 @@ pub fn fit_mount(
     let (start, grown, _) = fit.improved((fit.start(), vec![1.0; fit.people]), |off| {
         (FREEDOM + 1.0) / (FREEDOM + off * off)
     });
-    // Errors beyond a few medians count no more.
+    // Errors beyond a few medians are not counted.
     let mut off: Vec<f64> = fit
         .errors(&start, &grown)
         .iter()

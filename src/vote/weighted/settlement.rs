@@ -75,10 +75,11 @@ impl WeightedVoting {
         }
     }
 
-    /// Turns the judged votes on a landmark into settled evidence; they begin to count anew.
+    /// Turns the evaluated votes on a landmark into settled evidence; new votes are counted from
+    /// then on.
     ///
-    /// All are settled at once. If they were settled in turn, the first would be judged by evidence that the others
-    /// still lack.
+    /// All are settled at once. If they were settled in turn, the first would be evaluated by
+    /// evidence that the others still lack.
     pub(super) fn settle_votes(&mut self, landmark: &LandmarkId) {
         self.remove_live(landmark);
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {

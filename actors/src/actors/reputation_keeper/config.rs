@@ -30,7 +30,7 @@ impl ReputationKeeperConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the key, the value and the allowed range.
+    /// Returns a [`ConfigError`] that names the key, the value and the allowed range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("publish_period_s", self.publish_period_s, 0.05, 3600.0)?;
         check_range(

@@ -81,12 +81,12 @@ const RANSAC_CONFIDENCE: f64 = 0.999;
 /// Maximum standard deviation in degrees of a pitch that is worth reporting.
 const MAX_PITCH_SIGMA_DEG: f64 = 5.0;
 
-/// Fits a camera to points: P3P within RANSAC (Fischler, Bolles 1981), then the pose of a plane (Collins, Bartoli 2014)
-/// from the inliers, refined by Levenberg and Marquardt. Places are in any frame on the ground, x to y counter-clockwise
-/// from above.
+/// Fits a camera to points: P3P within RANSAC (Fischler, Bolles 1981), then the pose of a plane
+/// (Collins, Bartoli 2014) from the inliers, refined by Levenberg and Marquardt. Places are in any
+/// frame on the ground, x to y counter-clockwise from above.
 ///
 /// # Errors
-/// [`GroundFitError`] when no camera fits, or several do.
+/// Returns a [`GroundFitError`] if no camera fits, or several do.
 pub fn fit_ground_points(
     points: &[GroundPoint],
     intrinsics: &Intrinsics,

@@ -33,8 +33,8 @@ pub struct CocoConfig {
     pub threshold: f64,
     /// Intersection over union above which two boxes of one class are merged. Default 0.5.
     pub max_overlap: f64,
-    /// True if to also search four overlapping quarters of the image. Default false. Finds objects of
-    /// half the size and takes five times as long.
+    /// Whether to also search four overlapping quarters of the image. Default false. Finds objects
+    /// of half the size and takes five times as long.
     pub tiling: bool,
 }
 
@@ -53,7 +53,7 @@ impl CocoConfig {
     /// Checks every value; the model is checked when it is loaded.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("threshold", self.threshold, 0.01, 1.0)?;
         check_range("max_overlap", self.max_overlap, 0.0, 1.0)
@@ -66,13 +66,13 @@ pub enum ModelError {
     /// The file cannot be read.
     #[error("cannot read model {path:?}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The operating system's error.
         #[source]
         source: std::io::Error,
     },
-    /// The program has no weights inside or beside it, and no file is configured.
+    /// The program has no built-in or installed weights, and no file is configured.
     #[error(
         "there are no weights for coco: install the package ecod-node-coco, or set `model` to a file, such as \
          models/ssdlite_mobilenet_v2_coco.onnx"
@@ -85,7 +85,7 @@ pub enum ModelError {
     Unusable {
         /// The file, or `built-in`.
         path: String,
-        /// The problem.
+        /// Description of the problem.
         reason: String,
     },
 }
@@ -119,7 +119,7 @@ impl CocoDetector {
     /// Loads the model and runs it once to check it.
     ///
     /// # Errors
-    /// [`ModelError`] naming the file.
+    /// Returns a [`ModelError`] that names the file.
     pub fn new(config: CocoConfig) -> Result<Self, ModelError> {
         let packaged = || installed::path(PACKAGED).filter(|_| BUILT_IN.is_none());
         let file = config.model.clone().or_else(packaged);

@@ -85,7 +85,7 @@ impl OnnxConfig {
     /// Checks every value; files are checked when they are loaded.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         for side in self.input_px.into_iter().flatten() {
             check_range("input_px", f64::from(side), 32.0, 4096.0)?;
@@ -115,9 +115,9 @@ pub enum OnnxError {
         "model {path:?} cannot be run: {reason}; export it to onnx with 32-bit weights and standard operators"
     )]
     NotRunnable {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
-        /// The runtime's words.
+        /// Error message of the runtime.
         reason: String,
     },
     /// The network does not take one image.
@@ -125,7 +125,7 @@ pub enum OnnxError {
         "model {path:?} takes {inputs}; export it for one image, such as images tensor(f32) [1, 3, 640, 640]"
     )]
     UnknownInputs {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Names, types and shapes.
         inputs: String,
@@ -135,7 +135,7 @@ pub enum OnnxError {
         "model {path:?} takes images of any size: set `input_px` to the size of its training, such as [640, 640]"
     )]
     AnySize {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
     },
     /// The network takes another size than the configured one.
@@ -143,7 +143,7 @@ pub enum OnnxError {
         "model {path:?} takes images of {taken}, not {told}: remove `input_px` or export it for that size"
     )]
     OtherSize {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Size of the network.
         taken: ImageSize,
@@ -155,11 +155,11 @@ pub enum OnnxError {
         "model {path:?} fails with an image of {size}: {reason}; try sides that are multiples of 32 in `input_px`"
     )]
     RefusedSize {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Size of the image.
         size: ImageSize,
-        /// The runtime's words.
+        /// Error message of the runtime.
         reason: String,
     },
     /// The outputs fit no family, or not the configured one.
@@ -168,7 +168,7 @@ pub enum OnnxError {
          docs/cameras.md lists the shapes"
     )]
     UnknownOutputs {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Names and shapes.
         outputs: String,
@@ -182,7 +182,7 @@ pub enum OnnxError {
         "model {path:?} gives boxes of yolox in pixels: export it without `--decode_in_inference`"
     )]
     InPixels {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
     },
     /// The number of labels differs from the number of classes.
@@ -210,7 +210,7 @@ pub enum OnnxError {
         "model {path:?} has {classes} classes without names: set `labels` to a file with one on each line"
     )]
     NoLabels {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// Count of classes.
         classes: usize,
@@ -218,7 +218,7 @@ pub enum OnnxError {
     /// A threshold is for a label that the model does not have.
     #[error("`thresholds` names {label:?}, but the labels of model {path:?} are {labels}")]
     UnknownLabel {
-        /// The model.
+        /// Path of the model file.
         path: PathBuf,
         /// The label.
         label: String,
@@ -247,7 +247,7 @@ impl OnnxDetector {
     /// Loads the model and runs it once to see its outputs.
     ///
     /// # Errors
-    /// [`OnnxError`] with the file and the remedy.
+    /// Returns an [`OnnxError`] with the file and the remedy.
     pub fn new(config: OnnxConfig) -> Result<Self, OnnxError> {
         let path = &config.model;
         let told = config.input_px.map(|[width, height]| ImageSize {

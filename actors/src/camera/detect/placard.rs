@@ -54,7 +54,7 @@ impl PlacardConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if !(1..=MAX_PASSES).contains(&self.passes.len()) {
             return Err(ConfigError::new(

@@ -35,7 +35,7 @@ pub enum RecordingError {
     /// The file cannot be read.
     #[error("cannot read recorded detections {path:?}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The system's error.
         #[source]
@@ -44,7 +44,7 @@ pub enum RecordingError {
     /// A line is not an array of detections.
     #[error("recorded detections {path:?}, line {line}: {reason}")]
     Malformed {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// Line number, from 1.
         line: usize,
@@ -65,7 +65,7 @@ impl RecordedDetector {
     /// Reads the whole recording.
     ///
     /// # Errors
-    /// [`RecordingError`] naming the file and the first bad line.
+    /// Returns a [`RecordingError`] that names the file and the first bad line.
     pub fn open(config: &RecordedConfig) -> Result<Self, RecordingError> {
         let path = &config.path;
         let text = bounded_file::read_text(path).map_err(|source| RecordingError::Unreadable {

@@ -47,7 +47,7 @@ impl CaptureConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] with the first key out of range.
+    /// Returns a [`ConfigError`] with the first key out of range.
     pub fn validate(&self) -> Result<(), ConfigError> {
         check_range("stall_timeout_s", self.stall_timeout_s, 0.01, 3600.0)?;
         check_range("retry_min_s", self.retry_min_s, 0.001, 3600.0)?;
@@ -100,7 +100,7 @@ impl Capture {
     /// Starts to capture. `open` is called on threads of the capture.
     ///
     /// # Errors
-    /// When the operating system gives no thread.
+    /// Returns an error if the operating system gives no thread.
     pub fn start(open: Opener, config: CaptureConfig) -> std::io::Result<Self> {
         let slot = Arc::new(LatestSlot::default());
         let (status_sender, status) = watch::channel(CaptureStatus::default());

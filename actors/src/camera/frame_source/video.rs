@@ -244,7 +244,7 @@ impl LastWords {
         Ok(Self { line, ended })
     }
 
-    /// The last line, once there is no more or time is up.
+    /// The last line, after the end of the output or the timeout.
     fn wait(&self) -> String {
         // Returns when the reader ends, because no message is sent.
         let _ = self.ended.recv_timeout(LAST_WORDS_TIME);

@@ -37,7 +37,7 @@ pub(super) enum MountCommand {
     Points(PointsArguments),
     /// From a photograph of a QR code or chessboard on the ground
     Board(GroundBoardArguments),
-    /// From people who walk before the camera, by the node's own source and detector
+    /// From people who walk in front of the camera, with the node's own source and detector
     People(PeopleArguments),
 }
 

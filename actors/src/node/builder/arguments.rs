@@ -106,7 +106,7 @@ impl NodeBuilder {
         }
     }
 
-    /// The identity of the node's log; `record.name` stands for the node's name where it is set.
+    /// The identity of the node's log; `record.name` replaces the node's name if it is set.
     fn log_identity(&self) -> LogIdentity {
         let NodeConfig {
             cell,

@@ -83,7 +83,7 @@ pub enum DescriptionError {
          {described}; remove the key from the node's configuration, or change the description by `ecod-node cell set`"
     )]
     Contradicts {
-        /// The key.
+        /// Configuration key.
         key: String,
         /// The node's own value.
         own: String,

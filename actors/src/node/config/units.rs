@@ -55,7 +55,7 @@ impl NodeConfig {
     }
 }
 
-/// Adds the paths of doubtful numbers, each with its value and unit in words.
+/// Adds the paths of doubtful numbers, each with its value and unit as text.
 fn collect(value: &Value, path: &str, found: &mut Vec<(String, String)>) {
     let number = match value {
         Value::Table(table) => {

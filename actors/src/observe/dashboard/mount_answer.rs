@@ -10,7 +10,7 @@ use crate::camera::mount_calibration::{
     MeasuredPoint, fit_mount_to_points, mount_table, vehicle_of,
 };
 
-/// Settings of a camera that fitting its mount needs, beside points.
+/// Settings of a camera that fitting its mount needs, in addition to points.
 #[derive(Debug, Clone)]
 pub struct CameraSetup {
     /// Configured optics.
@@ -45,7 +45,7 @@ impl MountQuestion {
     /// The mount of a camera that reports this pose.
     ///
     /// # Errors
-    /// The reason in a sentence, with the remedy.
+    /// Returns the reason in a sentence, with the remedy.
     pub(crate) fn answer(&self, setup: &CameraSetup, camera: &Pose) -> Result<MountAnswer, String> {
         let lens = setup
             .optics

@@ -79,7 +79,7 @@ pub struct NodeFacts {
 }
 
 impl NodeSources {
-    /// The node as it is now.
+    /// The current facts about the node.
     pub(crate) fn node_facts(&self) -> NodeFacts {
         NodeFacts {
             round_period_s: self.vitals.shared.borrow().round_period_s,

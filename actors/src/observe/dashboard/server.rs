@@ -30,7 +30,7 @@ impl Server {
     /// Starts the thread; `bound` receives the address once the server listens.
     ///
     /// # Errors
-    /// When the operating system gives no thread.
+    /// Returns an error if the operating system gives no thread.
     pub(crate) fn start(
         config: DashboardConfig,
         monitor: Arc<NodeMonitor>,

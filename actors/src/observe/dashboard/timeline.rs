@@ -31,7 +31,7 @@ pub(crate) struct TimelineEvent {
     pub at_us: Timestamp,
     /// Its kind.
     pub kind: EventKind,
-    /// The event in words.
+    /// The event as text.
     pub text: String,
 }
 
@@ -39,7 +39,7 @@ pub(crate) struct TimelineEvent {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum EventKind {
-    /// A node came.
+    /// A node joined.
     Joined,
     /// A node left, or does not answer.
     Lost,

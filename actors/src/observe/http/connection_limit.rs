@@ -39,7 +39,6 @@ pub(crate) struct ConnectionSlot {
     number: u64,
 }
 
-/// An admitted connection.
 #[derive(Debug)]
 pub(crate) struct AdmittedConnection {
     pub(crate) slot: ConnectionSlot,

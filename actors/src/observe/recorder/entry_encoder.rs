@@ -37,7 +37,7 @@ pub(crate) trait MessageSink {
     /// Takes a message.
     ///
     /// # Errors
-    /// When it cannot be kept; the remaining messages of its entry are then skipped.
+    /// Returns an error if it cannot be kept; the remaining messages of its entry are then skipped.
     fn put(&mut self, message: EncodedMessage<'_>) -> McapResult<()>;
 }
 

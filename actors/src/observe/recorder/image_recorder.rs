@@ -59,7 +59,8 @@ impl ImageRecorder {
         if frame.captured_at < self.due {
             return;
         }
-        // By whole periods, so that frames that come unevenly are not lost; anew after a pause.
+        // In whole periods, so that frames that arrive unevenly are not lost; restarted after a
+        // pause.
         let next = self.due + self.period;
         self.due = if next + self.period <= frame.captured_at {
             frame.captured_at + self.period

@@ -126,7 +126,8 @@ impl LogSender {
         }))
     }
 
-    /// Queues an item. A full queue drops and counts it, but for the latest change of settings, which waits beside the queue.
+    /// Queues an item. A full queue drops and counts it, except for the latest change of settings,
+    /// which is kept separately.
     pub fn send(&self, at: Timestamp, item: LogItem) {
         let queue = self.0.queue.read().unwrap_or_else(PoisonError::into_inner);
         let Some(queue) = &*queue else { return };
@@ -145,7 +146,7 @@ impl LogSender {
         }
     }
 
-    /// Takes the change of settings that waits beside the queue, if its time has come.
+    /// Takes the change of settings that is kept outside the queue, if its time has come.
     pub(crate) fn take_change(&self, now: Timestamp) -> Option<LogEntry> {
         self.change().take_if(|change| change.at <= now)
     }

@@ -82,7 +82,7 @@ impl Default for LogTimeline {
 /// Microseconds from the recording node's clock to the cell's time, by the first round in a file.
 ///
 /// # Errors
-/// [`LogError::Unreadable`].
+/// Returns [`LogError::Unreadable`].
 pub(super) fn cell_offset_us(path: &Path) -> Result<i64, LogError> {
     let mut offsets = LogReader::open(path)?.filter_map(|event| match event {
         Ok(LogEvent::Message(it))

@@ -41,7 +41,7 @@ impl ShedReason {
 /// Messages of one source that were not used for one reason.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SourceCount<R> {
-    /// Why.
+    /// Reason.
     pub reason: R,
     /// Name of the node, or address or id of the broker's client.
     pub source: String,

@@ -43,7 +43,8 @@ struct Holding {
 const MAX_BYTES_EACH: usize = 10 * 1024 * 1024;
 const MAX_BYTES: usize = 32 * 1024 * 1024;
 
-/// Room beside the largest packet of a principal, and largest packets in total, where they are larger.
+/// Room in addition to the largest packet of a principal, and number of largest packets in total,
+/// if packets are larger.
 const SPARE_BYTES: usize = 2 * 1024 * 1024;
 const MAX_PACKETS: usize = 4;
 
@@ -144,7 +145,8 @@ impl Drop for BacklogSlot {
 }
 
 impl BacklogTable {
-    /// Cuts connections, the oldest holding first, until the rest of a group hold no more than a bound.
+    /// Cuts connections, the oldest holding first, until the rest of a group holds at most the
+    /// bound.
     fn cut_oldest(&mut self, is_member: impl Fn(&Holding) -> bool, bound: usize) {
         loop {
             let members = || {

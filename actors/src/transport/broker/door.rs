@@ -43,7 +43,7 @@ pub(super) use self::refusals::DoorRefusal;
 
 /// The node of a local broker, and its connections to the cell.
 pub struct DoorSetup {
-    /// The node.
+    /// Name of the node.
     pub node: NodeName,
     /// Client id of the node's own gateway.
     pub gateway_id: String,

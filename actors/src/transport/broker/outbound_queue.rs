@@ -42,7 +42,7 @@ const RETAIN: u8 = 0x01;
 pub(super) struct QueueFull;
 
 impl OutboundQueue {
-    /// An empty queue of at most so many messages.
+    /// An empty queue for at most `max_packets` messages.
     pub(super) fn new(max_packets: usize) -> Self {
         Self {
             bytes: VecDeque::new(),

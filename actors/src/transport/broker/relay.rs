@@ -21,7 +21,7 @@ use super::subscriptions::MAX_SUBSCRIPTIONS;
 use crate::platform::clock;
 use crate::telemetry::counters::{Counters, ShedReason};
 
-/// Limits of what passes between clients and rmqtt.
+/// Limits of the traffic between clients and rmqtt.
 pub(super) struct RelayLimits {
     pub(super) backlog: Backlog,
     pub(super) throttle: ByteThrottle,

@@ -109,7 +109,7 @@ impl MembershipConfig {
     /// Checks every value.
     ///
     /// # Errors
-    /// [`ConfigError`] naming the first key that cannot be used.
+    /// Returns a [`ConfigError`] that names the first key that cannot be used.
     pub fn validate(&self) -> Result<(), ConfigError> {
         if self.key.is_some() && self.key_file.is_some() {
             return Err(ConfigError::new(

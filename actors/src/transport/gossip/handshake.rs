@@ -161,7 +161,7 @@ impl Prover {
         None
     }
 
-    /// A key pair for one handshake; `None` when the system gives no random numbers.
+    /// A key pair for one handshake; `None` if the system provides no random numbers.
     pub(crate) fn draw_ephemeral(&self) -> Option<(EphemeralPrivateKey, [u8; 32])> {
         let private = EphemeralPrivateKey::generate(&X25519, &self.random).ok()?;
         let public = private.compute_public_key().ok()?;

@@ -12,7 +12,7 @@ use super::config::MembershipConfig;
 /// One run of a node's membership, drawn at random.
 pub(crate) type SessionId = [u8; 16];
 
-/// Random number that makes a session of its own for each run, in a cell with certificates.
+/// Random number that makes the session unique for each run, in a cell with certificates.
 pub(crate) type SessionNonce = [u8; 16];
 
 /// The session of a node in a cell with certificates. Only a node of this name can show the nonce of it.
@@ -43,7 +43,7 @@ pub enum KeyError {
     /// The key file is not there or cannot be read.
     #[error("cannot read cell key {path}: {source}")]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: std::path::PathBuf,
         /// The operating system's error.
         source: std::io::Error,
@@ -51,7 +51,7 @@ pub enum KeyError {
     /// The key file holds less than a key.
     #[error("cell key in {path} must have at least 12 characters")]
     TooShort {
-        /// The file.
+        /// Path of the file.
         path: std::path::PathBuf,
     },
 }
@@ -59,7 +59,7 @@ pub enum KeyError {
 /// Checks that the configured key can be used.
 ///
 /// # Errors
-/// [`KeyError`] when the key file cannot be used.
+/// Returns a [`KeyError`] if the key file cannot be used.
 pub fn check_key(config: &MembershipConfig, cell: &NodeName) -> Result<(), KeyError> {
     CellKey::load(config, cell).map(drop)
 }
@@ -76,11 +76,11 @@ pub(crate) fn payload_key(
 }
 
 impl CellKey {
-    /// Reads the configured key. Without one the key is derived from the cell's name, which separates cells and gives
-    /// no protection.
+    /// Reads the configured key. Without one the key is derived from the cell's name, which
+    /// separates cells and gives no protection.
     ///
     /// # Errors
-    /// [`KeyError`] when the key file cannot be used.
+    /// Returns a [`KeyError`] if the key file cannot be used.
     pub(crate) fn load(config: &MembershipConfig, cell: &NodeName) -> Result<Self, KeyError> {
         let Some(path) = &config.key_file else {
             return Ok(Self::new(

@@ -28,8 +28,8 @@ impl ReplayWindow {
     /// Accepts a counter.
     ///
     /// # Errors
-    /// [`FrameEvent::Replayed`] when it was accepted before or is too old, [`FrameEvent::CounterJump`] when it is too far
-    /// ahead. The window is then as before.
+    /// Returns [`FrameEvent::Replayed`] if it was accepted before or is too old,
+    /// [`FrameEvent::CounterJump`] when it is too far ahead. The window is then as before.
     pub(crate) fn take(&mut self, counter: u64) -> Result<(), FrameEvent> {
         if let Some(ahead) = counter.checked_sub(self.highest).filter(|ahead| *ahead > 0) {
             if ahead > MAX_JUMP {

@@ -45,7 +45,7 @@ pub enum Incoming {
     },
     /// A node has stopped, or has stopped using this broker, and withdrew its status.
     StatusWithdrawn {
-        /// The node.
+        /// Name of the node.
         node: NodeName,
         /// The broker that forwarded it.
         via: BrokerAddress,

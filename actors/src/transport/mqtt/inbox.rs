@@ -426,7 +426,7 @@ mod tests {
     use super::*;
     use crate::telemetry::counters::Shed;
 
-    /// The inbox of the edge, for so many undelivered messages and reports per second.
+    /// The inbox of the edge, with limits for undelivered messages and for reports per second.
     fn inbox(
         (capacity, max_report_hz): (usize, u32),
         counters: &Arc<Counters>,

@@ -51,7 +51,7 @@ pub(crate) enum LinkChange {
     Namesake(Uuid),
     /// A stalled broker has sent a packet.
     Answered,
-    /// Not connected; attempts go on.
+    /// Not connected; attempts continue.
     Lost(LinkState),
 }
 
@@ -367,7 +367,7 @@ impl LinkTask {
         }
     }
 
-    /// Notes a refusal of the broker.
+    /// Records a refusal of the broker.
     fn report_refusal(&mut self, refusal: String) {
         let broker = self.broker.to_string();
         let cause = format!("broker refuses this node: {refusal}");

@@ -53,7 +53,7 @@ impl Security {
     /// Reads the certificates of the node that `tls` names, and the key of the cell.
     ///
     /// # Errors
-    /// [`SecurityError`] naming the file.
+    /// Returns a [`SecurityError`] that names the file.
     pub fn load(
         tls: Option<(&TlsConfig, &NodeName)>,
         mqtt: &MqttConfig,
@@ -86,7 +86,7 @@ impl Security {
     /// The protection of the connection to the region's broker, with the node's own certificate.
     ///
     /// # Errors
-    /// When the file of the CA cannot be used.
+    /// Returns an error if the file of the CA cannot be used.
     pub fn of_uplink(
         &self,
         broker: BrokerAddress,

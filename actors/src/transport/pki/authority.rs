@@ -68,7 +68,7 @@ pub enum AuthorityError {
     /// A file could not be read or written.
     #[error("cannot use {path}")]
     File {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The operating system's error.
         source: io::Error,
@@ -92,7 +92,7 @@ pub enum AuthorityError {
     /// The register cannot be read.
     #[error("{path} cannot be used: {reason}; put a copy of it back")]
     Register {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The error.
         reason: String,
@@ -118,7 +118,7 @@ impl Authority {
     /// Makes a CA for a cell in a directory, which is made too, with an empty revocation list.
     ///
     /// # Errors
-    /// [`AuthorityError`] when there is a CA or the directory cannot be written.
+    /// Returns an [`AuthorityError`] if there is a CA or the directory cannot be written.
     pub fn init(directory: &Path, cell: &NodeName, now: Timestamp) -> Result<Self, AuthorityError> {
         let parameters = ca_parameters(&format!("ECOD cell {cell}"), 0, now)?;
         Self::make(directory, cell, false, now, |key| {
@@ -203,11 +203,11 @@ impl Authority {
         write(&nodes.join(format!("{node}.pem")), &certificate)
     }
 
-    /// Certificate in PEM for a key that stays with the node, with the same rights as [`Authority::issue`], and its serial
-    /// number in hexadecimal digits.
+    /// Certificate in PEM for a key that stays with the node, with the same rights as
+    /// [`Authority::issue`], and its serial number in hexadecimal digits.
     ///
     /// # Errors
-    /// [`AuthorityError`] when the name cannot have one or a file cannot be written.
+    /// Returns an [`AuthorityError`] if the name cannot have one or a file cannot be written.
     pub(crate) fn certify(
         &mut self,
         node: &NodeName,

@@ -85,7 +85,7 @@ pub enum CredentialsError {
     File {
         /// The configuration key that names the file.
         key: &'static str,
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The error.
         reason: String,
@@ -93,7 +93,7 @@ pub enum CredentialsError {
     /// The certificate names another node.
     #[error("key `tls.certificate`: {path} is for {found}, this node is {node}")]
     WrongName {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// The node that it names.
         found: NodeName,
@@ -106,7 +106,7 @@ pub enum CredentialsError {
          {path} allows at most {allowed}; issue one by `ecod-node pki issue {node} --role {role} --priority {priority}`"
     )]
     Overreached {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// This node.
         node: NodeName,
@@ -129,10 +129,11 @@ const RELOAD_INTERVAL: Duration = Duration::from_millis(500);
 const MAX_PEM_BYTES: u64 = 16 * 1024 * 1024;
 
 impl LoadedCredentials {
-    /// The node that a certificate names, and its rights if the cell has issued it. Its validity is verified elsewhere.
+    /// The node that a certificate names, and its rights if the cell has issued it. Its validity is
+    /// verified elsewhere.
     ///
     /// # Errors
-    /// [`InvalidCertificate`] when it names no node.
+    /// Returns an [`InvalidCertificate`] if it names no node.
     pub(crate) fn subject_of(
         &self,
         certificate: &[u8],
@@ -145,7 +146,7 @@ impl Credentials {
     /// Reads a node's files.
     ///
     /// # Errors
-    /// [`CredentialsError`] naming the file.
+    /// Returns a [`CredentialsError`] that names the file.
     pub fn load(files: &TlsConfig, node: &NodeName) -> Result<Self, CredentialsError> {
         let (fingerprints, current) = (fingerprints(files), Arc::new(read(files, node)?));
         let cache = Mutex::new(CachedCredentials {

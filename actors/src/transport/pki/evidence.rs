@@ -65,7 +65,7 @@ impl EvidenceSigner {
         }
     }
 
-    /// Signs a share of the node's own counts. `None` if the system gives no random numbers.
+    /// Signs a share of the node's own counts. `None` if the system provides no random numbers.
     pub fn sign(&self, share: LedgerShare) -> Option<LedgerShare> {
         let loaded = self.credentials.current();
         let signature = BASE64.encode(loaded.sign(&share.signed_bytes(&self.cell)).ok()?);
@@ -100,7 +100,8 @@ impl EvidenceSigner {
     /// Verifies a share that was received.
     ///
     /// # Errors
-    /// [`EvidenceError`] unless the share's aggregator signed it, with a valid certificate of a node that may lead.
+    /// Returns an [`EvidenceError`] unless the share's aggregator signed it, with a valid
+    /// certificate of a node that may lead.
     pub fn verify(&mut self, share: &LedgerShare) -> Result<(), EvidenceError> {
         let signatory = self.signatory(share)?;
         // Before the certificate begins, this machine's clock is wrong.

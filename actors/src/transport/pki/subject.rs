@@ -40,7 +40,7 @@ impl CertificateSubject {
     /// Reads a certificate in DER.
     ///
     /// # Errors
-    /// [`InvalidCertificate`] when it names no node.
+    /// Returns an [`InvalidCertificate`] if it names no node.
     pub fn of(certificate: &[u8]) -> Result<Self, InvalidCertificate> {
         let (_, parsed) =
             X509Certificate::from_der(certificate).map_err(|_| InvalidCertificate::Malformed)?;

@@ -227,7 +227,7 @@ fn calibration_is_that_worked_out_by_hand() {
     assert_eq!(score(&[]).calibration.confidence.ece_pct, None);
 }
 
-/// A pair that goes on keeps its match although another is nearer now.
+/// A continued pair keeps its match although another is nearer now.
 #[test]
 fn a_match_is_kept_while_it_is_near_enough() {
     let frames = [

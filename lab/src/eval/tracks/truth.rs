@@ -139,7 +139,8 @@ impl TrackTruth {
     /// The truth in files of a benchmark, with an empty frame for each that a file leaves out.
     ///
     /// # Errors
-    /// Naming sequence and frame where an identity occurs twice, or when there is no object at all.
+    /// Returns an error that names sequence and frame where an identity occurs twice, or when there
+    /// is no object at all.
     pub fn from_sequences(
         sequences: &[Sequence],
         frame_rate_hz: f64,

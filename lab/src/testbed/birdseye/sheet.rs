@@ -22,7 +22,7 @@ pub(super) struct Sheet {
 
 impl Sheet {
     pub(super) const MARGIN_PX: f64 = 24.0;
-    /// Beside the frame: the table to the left, the legend to the right.
+    /// Next to the frame: the table to the left, the legend to the right.
     const LEFT_PX: f64 = 300.0;
     const RIGHT_PX: f64 = 260.0;
     const TOP_PX: f64 = 96.0;

@@ -10,8 +10,8 @@ fn gray(image: &Mat, x: usize, y: usize) -> f64 {
     f64::from(image.data_bytes().unwrap()[3 * (y * columns + x)])
 }
 
-/// A camera at the origin that looks along +x at one placard, `x_in` ahead and facing `yaw_deg`, and at what stands
-/// before it.
+/// A camera at the origin that looks along +x at one placard, `x_in` ahead and facing `yaw_deg`,
+/// with the objects `before` in front of it.
 fn lot(x_in: f64, yaw_deg: f64, before: &str) -> Testbed {
     let (sin, cos) = yaw_deg.to_radians().sin_cos();
     let (x, y) = (x_in - 3.5 * cos, 1.0 - 3.5 * sin);
@@ -32,7 +32,7 @@ fn still(testbed: &Testbed) -> Mat {
         .clone()
 }
 
-/// Where the values cross half of the way between both ends.
+/// The position where the values cross the middle between both ends.
 fn edge(values: &[f64]) -> f64 {
     let half = (values[0] + values[values.len() - 1]) / 2.0;
     let at = values

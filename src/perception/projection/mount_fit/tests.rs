@@ -1,4 +1,5 @@
-//! A minute of people who walk before cameras of any height and tilt, as a detector boxes them.
+//! A minute of people walking in front of cameras of any height and tilt, with boxes as from a
+//! detector.
 
 use std::f64::consts::TAU;
 

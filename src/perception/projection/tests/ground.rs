@@ -75,7 +75,8 @@ fn projection(ranging: Ranging, mount: Mount, config: &ProjectionConfig) -> Proj
     )
 }
 
-/// The box around an upright cuboid on the ground, as far as it is in the image; `None` if its foot is not.
+/// The part in the image of the box around an upright cuboid on the ground; `None` if its foot is
+/// outside.
 fn seen(
     label: &str,
     size: &ObjectSize,

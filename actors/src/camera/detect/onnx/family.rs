@@ -38,7 +38,7 @@ pub enum Normalization {
     Unit,
     /// -1 to 1.
     Signed,
-    /// 0 to 1, less the mean of ImageNet, over its standard deviation.
+    /// 0 to 1, minus the mean of ImageNet, divided by its standard deviation.
     Imagenet,
 }
 
@@ -92,7 +92,7 @@ pub(super) struct Head {
     pub(super) is_tensorflow: bool,
 }
 
-/// Signs of a network's family beside its outputs.
+/// Evidence of a network's family in addition to its outputs.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clues<'a> {
     /// The configured family.
@@ -147,7 +147,7 @@ impl Head {
             return false;
         };
         let row = outputs[output].shape[2];
-        // Centres are within a few cells of their own; in pixels they reach the right edge.
+        // Centres are within a few cells of their own cell; in pixels they reach the right edge.
         outputs[output]
             .values
             .chunks_exact(row)
@@ -255,7 +255,7 @@ fn by_names(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layou
     Some((Family::Ssd, Layout::Priors { boxes, scores }))
 }
 
-/// Networks with one output, beside the grids that early exports of YOLOv5 also had.
+/// Networks with one output, apart from the grids that early exports of YOLOv5 also had.
 fn by_shape(clues: &Clues<'_>, outputs: &[NamedTensor]) -> Option<(Family, Layout)> {
     let (main, others) = outputs.split_first()?;
     let [1, rows, columns] = main.shape[..] else {

@@ -4,7 +4,7 @@ use ecod::model::names::{Label, is_label};
 
 use crate::camera::detect::coco::labels as coco;
 
-/// The numbers that a network gives classes.
+/// The numbers that a network assigns to classes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Classes {
     /// Scores of each box, if the network lists them.

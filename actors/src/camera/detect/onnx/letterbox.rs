@@ -18,7 +18,8 @@ pub(super) enum Fit {
     Stretched,
 }
 
-/// Gray level of the pixels beside the image, as in the training of all families that keep its shape.
+/// Gray level of the padding around the image, as in the training of all families that keep its
+/// shape.
 const PADDING: u8 = 114;
 
 /// An image's place in a network's input.

@@ -31,7 +31,8 @@ impl Authority {
     /// Makes a CA for a cell of this city.
     ///
     /// # Errors
-    /// [`AuthorityError`] when this is no city, there is a CA or a directory cannot be written.
+    /// Returns an [`AuthorityError`] if this is no city, there is a CA or a directory cannot be
+    /// written.
     pub fn init_cell(
         &mut self,
         directory: &Path,
@@ -79,7 +80,7 @@ impl Authority {
     /// True if this is the CA of a cell that a city has signed.
     ///
     /// # Errors
-    /// [`AuthorityError`] when its certificate cannot be read.
+    /// Returns an [`AuthorityError`] if its certificate cannot be read.
     pub(crate) fn is_of_city(&self) -> Result<bool, AuthorityError> {
         let unusable = |error: &dyn std::fmt::Display| AuthorityError::Crypto(error.to_string());
         let own = CertificateDer::from_pem_slice(read(&self.ca())?.as_bytes())

@@ -30,7 +30,7 @@ pub(in super::super) struct Issuers {
     names: Vec<DistinguishedName>,
 }
 
-/// A CA and what verifies its certificates.
+/// A CA and the verifiers of its certificates.
 #[derive(Debug)]
 struct Issuer {
     certificate: CertificateDer<'static>,
@@ -50,7 +50,7 @@ impl Issuers {
     /// CAs with their lists. While there is any list, certificates of a CA without one are refused.
     ///
     /// # Errors
-    /// [`CredentialsError::Unusable`] for a CA or list that cannot be used.
+    /// Returns [`CredentialsError::Unusable`] for a CA or list that cannot be used.
     pub(super) fn new(
         of_cell: Vec<CertificateDer<'static>>,
         of_city: Option<Vec<CertificateDer<'static>>>,
