@@ -63,7 +63,8 @@ pub struct Fused {
     pub round: u64,
     /// The map, if the cell runs PACE.
     pub map: Option<GlobalMap>,
-    /// The verdicts, if the cell runs VOTE; in `paper` mode only when a packet of frames is complete.
+    /// The verdicts, if the cell runs VOTE; in `paper` mode only when a packet of frames is
+    /// complete.
     pub verdicts: Option<Verdicts>,
     /// Votes and statements about tracked objects that have turned out to be right or wrong.
     pub evidence: Vec<Evidence>,
@@ -108,7 +109,8 @@ pub struct Aggregator {
     initial_votes: f64,
     vote: Option<Vote>,
     by_packets: bool,
-    /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty verdicts.
+    /// True if any vehicle has voted: until then a cell that runs both algorithms sends no empty
+    /// verdicts.
     voted: bool,
 }
 
@@ -155,7 +157,8 @@ impl Aggregator {
         }
     }
 
-    /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as valid.
+    /// An aggregator without evidence that leads as `name` in term `epoch`; `config` is taken as
+    /// valid.
     pub fn new(
         name: NodeName,
         epoch: u64,
@@ -502,7 +505,8 @@ impl Aggregator {
         at.shifted(self.cell_offset_us)
     }
 
-    /// The state of each place, as PACE and VOTE agree on it. Their `paper` modes stay as published.
+    /// The state of each place, as PACE and VOTE agree on it. Their `paper` modes stay as
+    /// published.
     fn agree(
         &self,
         places: Vec<LandmarkState>,

@@ -1,9 +1,10 @@
-//! One-to-one assignment with the greatest total benefit: the global nearest neighbour (Blackman, Popoli, "Design and
-//! Analysis of Modern Tracking Systems", 1999, chapter 6.4), by the algorithm of Kuhn and Munkres.
+//! One-to-one assignment with the greatest total benefit: the global nearest neighbour (Blackman,
+//! Popoli, "Design and Analysis of Modern Tracking Systems", 1999, chapter 6.4), by the algorithm
+//! of Kuhn and Munkres.
 //!
-//! PACE assigns objects to places, the tracker detections to tracks, the evaluation reported objects to true ones.
-//! Candidates that share a row or a column, directly or through others, form a cluster. Each cluster is solved alone;
-//! most have one candidate.
+//! PACE assigns objects to places, the tracker detections to tracks, the evaluation reported
+//! objects to true ones. Candidates that share a row or a column, directly or through others, form
+//! a cluster. Each cluster is solved alone; most have one candidate.
 
 use hashbrown::HashMap;
 use pathfinding::kuhn_munkres::kuhn_munkres;
@@ -11,15 +12,16 @@ use pathfinding::matrix::Matrix;
 
 /// A row and a column that may be assigned to each other.
 pub trait Candidate: Copy {
-    /// True if the matrix of a cluster has a spare column for each row. Only the choice between assignments of equal
-    /// benefit depends on it.
+    /// True if the matrix of a cluster has a spare column for each row. Only the choice between
+    /// assignments of equal benefit depends on it.
     const SPARE_COLUMNS: bool = false;
 
     /// Number of the row; a table has a place for each up to the highest.
     fn row(&self) -> u32;
     /// Number of the column.
     fn column(&self) -> u32;
-    /// Benefit of the assignment in fixed-point units of the caller, greater than 0. Integers add up exactly.
+    /// Benefit of the assignment in fixed-point units of the caller, greater than 0. Integers add
+    /// up exactly.
     fn benefit(&self) -> i64;
 }
 

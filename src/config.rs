@@ -1,4 +1,5 @@
-//! Sections of the configuration: defaults, allowed ranges, and errors that name key, value and range.
+//! Sections of the configuration: defaults, allowed ranges, and errors that name key, value and
+//! range.
 
 use std::fmt::Display;
 

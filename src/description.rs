@@ -41,13 +41,15 @@ use crate::wire::{CellDescription, ContentHash, DescriptionStamp, MAX_INTEGER, S
 use history::MAX_AUTHORS;
 pub use history::{AttributedDescription, DescriptionHistory};
 
-/// Largest rise of the version that one message may state. A cell uses one version for each change by a person.
+/// Largest rise of the version that one message may state. A cell uses one version for each change
+/// by a person.
 pub const MAX_VERSION_STEP: u64 = 1 << 20;
 
 /// Largest version that a node without a description accepts from nodes other than its leader.
 pub const MAX_FIRST_VERSION: u64 = 1 << 40;
 
-/// Minimum time between the first two publications of one description; it doubles with each further one.
+/// Minimum time between the first two publications of one description; it doubles with each further
+/// one.
 pub const PUBLISH_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Maximum number of doublings: a node that fails to get the description causes little traffic.

@@ -12,7 +12,8 @@ use crate::model::names::{MAX_NAME_BYTES, plain_text};
 use crate::model::time::Timestamp;
 use crate::wire::{MAX_TROUBLE_TEXT, MAX_TROUBLES, Trouble};
 
-/// Defines the kinds with their names on the wire, how long they count after they were last seen, and their remedies.
+/// Defines the kinds with their names on the wire, how long they count after they were last seen,
+/// and their remedies.
 macro_rules! trouble_kinds {
     ($($(#[$doc:meta])* $kind:ident = $name:literal, $lasts:expr, $remedy:literal;)*) => {
         /// A kind of trouble.
@@ -195,7 +196,8 @@ type Key = (Option<String>, TroubleKind);
 /// The current troubles of a node.
 #[derive(Debug, Clone, Default)]
 pub struct TroubleRegister {
-    /// A lapsed entry stays until its room is needed, so that a trouble that comes and goes is not logged each time.
+    /// A lapsed entry stays until its room is needed, so that a trouble that comes and goes is not
+    /// logged each time.
     entries: BTreeMap<Key, KnownTrouble>,
 }
 

@@ -43,7 +43,8 @@ use frame::FrameChange;
 /// in the middle may be 600 m across, at any position within the tile.
 pub const COVER_M: f64 = 300.0;
 
-/// Maximum maps per second of one cell that a receiver decodes, twice as many as a neighbour sends by default.
+/// Maximum maps per second of one cell that a receiver decodes, twice as many as a neighbour sends
+/// by default.
 pub const MAX_MAP_HZ: u32 = 20;
 
 /// Distance in metres from this cell's own area up to which objects of other cells are used: 7 s at

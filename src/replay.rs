@@ -46,8 +46,9 @@ pub const LOOKAHEAD: usize = 64;
 /// Maximum number of locations that an open cell adds for PACE; they are kept until the end.
 const MAX_LEARNT_LANDMARKS: usize = 4096;
 
-/// Default maximum number of locations that an open cell keeps for VOTE. It is large because a file is no attacker: labels
-/// are limited by [`MAX_LABELS`] only, the objects of a report by the length of its line.
+/// Default maximum number of locations that an open cell keeps for VOTE. It is large because a file
+/// is no attacker: labels are limited by [`MAX_LABELS`] only, the objects of a report by the length
+/// of its line.
 const MAX_VOTE_LANDMARKS: usize = 1_000_000;
 
 /// Maximum number of rejected lines of one reason whose flaws are kept.
@@ -152,7 +153,8 @@ impl Summary {
 pub struct Rejections {
     /// Their number.
     pub lines: u64,
-    /// The first ones, [`EXAMPLES`] at most, by line number; lines are counted from 1, blank ones included.
+    /// The first ones, [`EXAMPLES`] at most, by line number; lines are counted from 1, blank ones
+    /// included.
     pub examples: BTreeMap<u64, Flaw>,
 }
 
@@ -210,7 +212,8 @@ impl Replay {
         }
     }
 
-    /// Takes the next line, without its line end; returns the output that is ready. Blank lines are ignored.
+    /// Takes the next line, without its line end; returns the output that is ready. Blank lines are
+    /// ignored.
     pub fn line(&mut self, text: &[u8]) -> Vec<FusedLine> {
         self.number += 1;
         if text.trim_ascii().is_empty() {
@@ -248,8 +251,8 @@ impl Replay {
         self.reject(self.number, flaw::too_large(&self.config.limits));
     }
 
-    /// Takes the lines that were read ahead, closes the last round, and judges an incomplete packet of VOTE's `paper`
-    /// mode.
+    /// Takes the lines that were read ahead, closes the last round, and judges an incomplete packet
+    /// of VOTE's `paper` mode.
     pub fn finish(mut self) -> (Vec<FusedLine>, Summary) {
         let mut output = Vec::new();
         while !self.ahead.is_empty() {

@@ -43,7 +43,7 @@ pub struct Evidence {
     pub correct: bool,
 }
 
-/// Numbers of votes that agreed with the verdict and that did not.
+/// Numbers of votes that agreed and disagreed with the verdict.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Counts {
@@ -103,15 +103,16 @@ config_section! {
         /// Weight of the initial score in votes; default 10. A higher value reacts later to
         /// newcomers and to new false reports.
         pub initial_votes: f64 = 10.0, in 1e-3 to 1e6;
-        /// Number of the latest votes of a vehicle that count; default 500. Their beginning is interpolated between
-        /// marks. Less notices changed behaviour sooner.
+        /// Number of the latest votes of a vehicle that count; default 500. Their beginning is
+        /// interpolated between marks. A lower value notices changed behaviour sooner.
         pub memory_votes: f64 = 500.0, in 1.0 to 1e9;
     }
 }
 
 impl ReputationConfig {
-    /// The reputation of a vehicle with these numbers of votes: the mean of a Beta distribution (Jøsang & Ismail 2002).
-    /// Unlike there, the prior is not uniform but [`Self::initial`] with the weight [`Self::initial_votes`].
+    /// The reputation of a vehicle with these numbers of votes: the mean of a Beta distribution
+    /// (Jøsang & Ismail 2002). Unlike there, the prior is not uniform but [`Self::initial`] with
+    /// the weight [`Self::initial_votes`].
     pub fn mean(&self, correct: f64, incorrect: f64) -> f64 {
         self.mean_with(correct, incorrect, ForeignVotes::default())
     }
@@ -123,7 +124,7 @@ impl ReputationConfig {
     }
 }
 
-/// A vehicle's remembered votes, (correct, incorrect), by the label that it stated.
+/// A vehicle's kept votes, (correct, incorrect), by the label that it stated.
 pub type RememberedVotes = BTreeMap<Label, (f64, f64)>;
 
 #[cfg(test)]

@@ -16,16 +16,17 @@ use crate::model::names::NodeName;
 use crate::model::origin::{GeographicOrigin, GeographicPosition};
 use crate::model::time::Timestamp;
 
-/// Distance in metres by which the next cell must be nearer: more than localisation by satellites jumps on a road.
+/// Distance in metres by which the next cell must be nearer: more than localisation by satellites
+/// jumps on a road.
 pub const MARGIN_M: f64 = 20.0;
 
-/// Longest time in which a vehicle gets ready in the next cell.
+/// Maximum time for which a vehicle prepares in the next cell.
 pub const JOIN_TIMEOUT: Duration = Duration::from_secs(15);
 
 /// Time for which a cell that could not be joined is not tried again.
 pub const RETRY_AFTER: Duration = Duration::from_secs(30);
 
-/// Time for which a cell is not tried again from which the vehicle has turned away.
+/// Time for which a cell is not tried again after the vehicle has turned away from it.
 pub const TURN_PAUSE: Duration = Duration::from_secs(5);
 
 /// A cell in a vehicle's list.
@@ -35,12 +36,12 @@ pub struct KnownCell {
     pub name: NodeName,
     /// Its middle.
     pub origin: GeographicOrigin,
-    /// Distance in metres from the middle up to which it reaches.
+    /// Radius of the cell in metres.
     pub radius_m: f64,
 }
 
 impl KnownCell {
-    /// Distance in metres to the edge on the ground, whatever the height; negative inside.
+    /// Horizontal distance in metres to the edge, independent of the height; negative inside.
     fn outside_m(&self, place: &GeographicPosition) -> f64 {
         self.origin.to_map(place).coords.xy().norm() - self.radius_m
     }
@@ -60,9 +61,9 @@ pub enum CellMove {
 pub struct CellChoice {
     cells: Vec<KnownCell>,
     present: NodeName,
-    /// The cell in which the vehicle gets ready, and since when.
+    /// The cell in which the vehicle prepares, and since when.
     next: Option<(NodeName, Timestamp)>,
-    /// Cells that could not be joined, and until when they are left alone.
+    /// Cells that could not be joined, and the time until which they are not tried.
     failed: BTreeMap<NodeName, Timestamp>,
 }
 
@@ -197,7 +198,8 @@ mod tests {
         Timestamp::default() + Duration::from_secs_f64(seconds)
     }
 
-    /// Drives at 50 km/h; each cell follows 2 s after it is joined. Places and cells of all changes.
+    /// Drives at 50 km/h; each cell follows 2 s after it is joined. Returns the places and cells of
+    /// all changes.
     fn drive(path: impl Fn(f64) -> (f64, f64), seconds: f64) -> Vec<(f64, NodeName)> {
         let mut choice = CellChoice::new(cells(), name(0));
         let (mut changes, mut joined) = (Vec::new(), None);

@@ -54,7 +54,8 @@ use method::NewVote;
 /// The result of one round.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct VoteRound {
-    /// One verdict for every landmark of a closed cell; in an open cell, for every landmark with news.
+    /// One verdict for every landmark of a closed cell; in an open cell, for every landmark with
+    /// news.
     pub verdicts: Vec<Verdict>,
     /// Votes that have turned out to be right or wrong, for the ledger.
     pub evidence: Vec<Evidence>,
@@ -64,14 +65,16 @@ pub struct VoteRound {
 #[derive(Debug, Clone)]
 struct LastReport {
     received_at: Timestamp,
-    /// The last report of each part, such as a camera: their reports overtake one another. At most [`MAX_PARTS`].
+    /// The last report of each part, such as a camera: their reports overtake one another. At most
+    /// [`MAX_PARTS`].
     parts: BTreeMap<NodeName, PartReport>,
-    /// Reports since the last verdict.
+    /// Number of reports since the last verdict.
     frames: u32,
 }
 
-/// Largest step back in time of an overtaken report; a larger one means that the vehicle's clock was set back.
-/// [`crate::admission::report_window::ReportWindow`] admits reports for as long by default.
+/// Largest step back in time of an overtaken report; a larger one means that the vehicle's clock
+/// was set back. [`crate::admission::report_window::ReportWindow`] admits reports for as long by
+/// default.
 const MAX_OVERTAKEN: Duration = Duration::from_secs(3);
 /// Silence after which a vehicle may be replaced by another: unproven vehicles, proven vehicles.
 const RETENTION: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(600)];
@@ -114,7 +117,8 @@ pub struct Vote {
 }
 
 impl Vote {
-    /// A machine for `landmarks`; without any, the cell is open and takes landmarks from the reports as they appear.
+    /// A machine for `landmarks`; without any, the cell is open and takes landmarks from the
+    /// reports as they appear.
     pub fn new(config: VoteConfig, landmarks: Vec<Landmark>) -> Self {
         let mut method = ConfiguredMethod::new(&config);
         for landmark in &landmarks {
@@ -172,7 +176,8 @@ impl Vote {
         }
     }
 
-    /// True if a location of this id is listed; `None` without a list, where reports name the locations.
+    /// True if a location of this id is listed; `None` without a list, where reports name the
+    /// locations.
     pub fn knows_location(&self, id: &LandmarkId) -> Option<bool> {
         (!self.open).then(|| self.landmarks.contains_key(id))
     }
@@ -303,7 +308,7 @@ impl Vote {
         best.into_values().collect()
     }
 
-    /// Counts one object as a vote; false if it does not count as one.
+    /// Counts one object as a vote; returns false if it is not a vote.
     fn add_vote(
         &mut self,
         report: &ObjectReport,
@@ -356,7 +361,7 @@ impl Vote {
         true
     }
 
-    /// The label that a stated one counts as.
+    /// The label as which a stated label counts.
     fn voted_label<'a>(&'a self, landmark: Option<&'a Landmark>, stated: &'a Label) -> &'a Label {
         let synonym = landmark.and_then(|landmark| landmark.synonym(stated));
         synonym
@@ -435,7 +440,7 @@ impl Vote {
         self.landmarks.insert(landmark.clone(), None);
     }
 
-    /// Whether a vehicle has sent a packet's worth of frames since the last verdict (`paper` mode).
+    /// Whether a vehicle has sent a full packet of frames since the last verdict (`paper` mode).
     pub fn is_packet_complete(&self) -> bool {
         self.last_reports
             .values()
@@ -447,7 +452,7 @@ impl Vote {
         self.last_reports.values().any(|last| last.frames > 0)
     }
 
-    /// Ends the round: judges the landmarks that changed.
+    /// Ends the round: evaluates the landmarks that changed.
     pub fn close(&mut self, now: Timestamp) -> VoteRound {
         self.last_reports
             .values_mut()
@@ -493,7 +498,8 @@ impl Vote {
         self.method.get().reputations()
     }
 
-    /// Starts from a ledger, after a restart or a change of aggregator; without effect in `paper` mode.
+    /// Starts from a ledger, after a restart or a change of aggregator; has no effect in `paper`
+    /// mode.
     pub fn adopt(&mut self, ledger: &ReputationLedger) {
         self.method.get_mut().adopt(ledger, &self.config);
     }
@@ -504,8 +510,8 @@ impl Vote {
         self.method.get_mut().set_foreign(&votes_beside);
     }
 
-    /// Continues from published reputations, after a restart or a change of aggregator; without effect in `weighted`
-    /// mode, which rests on evidence.
+    /// Continues from published reputations, after a restart or a change of aggregator; has no
+    /// effect in `weighted` mode, which uses evidence instead.
     pub fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
         self.method.get_mut().resume(reputations);
     }

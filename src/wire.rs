@@ -14,9 +14,11 @@
 //! broker      -> nodes/<node>/clients     ClientRefusals retained, at that node's broker alone
 //! ```
 //!
-//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`], [`ReputationTopic`]).
+//! Beyond a cell, its leader publishes on a broker of the region ([`RegionTopic`],
+//! [`ReputationTopic`]).
 //!
-//! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU frame.
+//! All times are Unix microseconds, lengths metres, angles radians, positions in the cell's ENU
+//! frame.
 
 #![deny(clippy::indexing_slicing)]
 
@@ -69,7 +71,7 @@ use crate::model::names::{Label, LandmarkId, NodeName};
 use crate::model::time::Timestamp;
 use compact::{Form, Half, Millimetres, Single, Text, UuidBytes, skip_empty};
 
-/// Major version of every payload; others are rejected.
+/// Major version of every payload; payloads of other versions are rejected.
 pub const SCHEMA_VERSION: u32 = 1;
 
 /// The detections of one vehicle in one frame.
@@ -84,7 +86,8 @@ pub struct ObjectReport {
     /// Increases by one with every report of a node since it started.
     #[n(2)]
     pub seq: u64,
-    /// Capture time of the frame: in the cell's time with `clock_error_us`, otherwise by the sender's own clock.
+    /// Capture time of the frame: in the cell's time if `clock_error_us` is present, otherwise by
+    /// the sender's own clock.
     #[n(3)]
     pub captured_at_us: Timestamp,
     /// Pose of the camera; absent if it is unavailable.
@@ -113,7 +116,8 @@ pub struct ObjectReport {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cbor(n(9), with = "Single", has_nil)]
     pub frame_yaw_rate_radps: Option<f64>,
-    /// False if the reporter is a fixed camera, which is no object of the map; absent for a vehicle.
+    /// False if the reporter is a fixed camera, which is not an object of the map; absent for a
+    /// vehicle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(10)]
     pub moving: Option<bool>,
@@ -230,7 +234,7 @@ pub struct GlobalMap {
 }
 
 impl GlobalMap {
-    /// An empty map of a leadership's round that closed at `fused_at`.
+    /// An empty map of a round of a leadership that closed at `fused_at`.
     pub fn new(epoch: &Epoch, round: u64, fused_at: Timestamp) -> Self {
         Self {
             schema: SCHEMA_VERSION,
@@ -259,17 +263,17 @@ pub struct LandmarkState {
     /// Confidence in the label, 0 to 1; 0 without a label.
     #[cbor(n(2), with = "Half")]
     pub confidence: f64,
-    /// Fused east in metres, or the location's own.
+    /// Fused east in metres, or the location's own coordinate.
     #[cbor(n(3), with = "Millimetres")]
     pub x_m: f64,
-    /// Fused north in metres, or the location's own.
+    /// Fused north in metres, or the location's own coordinate.
     #[cbor(n(4), with = "Millimetres")]
     pub y_m: f64,
-    /// The nodes whose detections are in the entry.
+    /// The nodes whose detections were used for the entry.
     #[n(5)]
     pub contributors: Vec<NodeName>,
-    /// The nodes that had the location in view, with or without a detection. A null label with observers means that the
-    /// location is empty; without observers it is unknown.
+    /// The nodes that had the location in view, with or without a detection. A null label with
+    /// observers means that the location is empty; without observers it is unknown.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cbor(n(6), with = "skip_empty", has_nil)]
     pub observers: Vec<NodeName>,
@@ -314,7 +318,7 @@ pub struct Verdicts {
 }
 
 impl Verdicts {
-    /// The verdicts of a leadership's round that closed at `fused_at`.
+    /// The verdicts of a round of a leadership that closed at `fused_at`.
     pub fn new(epoch: &Epoch, round: u64, fused_at: Timestamp, verdicts: Vec<Verdict>) -> Self {
         Self {
             schema: SCHEMA_VERSION,
@@ -343,10 +347,10 @@ pub struct Verdict {
     /// label that does not lead.
     #[cbor(n(3), with = "Half")]
     pub margin: f64,
-    /// Score of every label that was voted for.
+    /// Score of every label with votes.
     #[cbor(n(4), with = "Half", has_nil)]
     pub votes: BTreeMap<Label, f64>,
-    /// The nodes whose votes are in the entry.
+    /// The nodes whose votes were used for the entry.
     #[n(5)]
     pub contributors: Vec<NodeName>,
 }
@@ -381,7 +385,7 @@ pub struct Reputation {
     /// Number of votes that agreed with the verdict.
     #[n(1)]
     pub correct: u64,
-    /// Number of votes that did not.
+    /// Number of votes that disagreed with the verdict.
     #[n(2)]
     pub incorrect: u64,
     /// Counts of other cells, as far as they are included in the score; absent without such counts.
@@ -390,7 +394,8 @@ pub struct Reputation {
     pub foreign: Option<ForeignVotes>,
 }
 
-/// A node's status, published by itself; the broker publishes the last will when the node goes silent.
+/// A node's status, published by itself; the broker publishes the last will when the node goes
+/// silent.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct NodeStatus {
     /// Major version of the payload, [`SCHEMA_VERSION`].
@@ -439,7 +444,7 @@ pub struct NodeStatus {
 }
 
 impl NodeStatus {
-    /// The status of a node that has just started and follows no aggregator yet.
+    /// The status of a node that has just started and does not follow an aggregator yet.
     pub fn starting(node: NodeName, id: Uuid, role: Role, version: &str) -> Self {
         Self {
             schema: SCHEMA_VERSION,
@@ -471,19 +476,19 @@ pub enum Role {
     /// Cannot become aggregator.
     #[n(1)]
     Cav,
-    /// Always the preferred aggregator, has no camera.
+    /// Always the preferred aggregator; has no camera.
     #[n(2)]
     Edge,
 }
 
-/// The present state of a node.
+/// The current state of a node.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, Encode, Decode, JsonSchema,
 )]
 #[serde(rename_all = "lowercase")]
 #[cbor(index_only)]
 pub enum NodeState {
-    /// Takes maps and verdicts from an aggregator.
+    /// Receives maps and verdicts from an aggregator.
     #[n(0)]
     Following,
     /// Makes maps and verdicts.

@@ -55,7 +55,8 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Try it on your own video, images or camera: starts a cell with a page, without a configuration
+    /// Try it on your own video, images or camera: starts a cell with a page, without a
+    /// configuration
     #[cfg(feature = "camera")]
     Try(trial::TryArguments),
     /// Check whether a node can run here: camera, broker, ports, key, clock, disk; suggest fixes

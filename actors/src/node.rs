@@ -384,7 +384,8 @@ impl Actor for Supervisor {
     ) -> Result<(), ActorProcessingErr> {
         let (actor, why) = match event {
             SupervisionEvent::ActorTerminated(actor, last, why) => {
-                // A killed part lives on in its state, such as the broker with its port; ending it may take a while.
+                // A killed part lives on in its state, such as the broker with its port; ending it
+                // may take a while.
                 tokio::task::spawn_blocking(|| drop(last));
                 (actor, why.unwrap_or_else(|| "stopped".into()))
             }

@@ -63,7 +63,8 @@ pub struct CpmCell {
 pub struct EncodedCpm {
     /// The message in UPER.
     pub bytes: Vec<u8>,
-    /// Objects that it has no room for: beyond 255, or more than 1310 m from the reference position.
+    /// Objects that it has no room for: beyond 255, or more than 1310 m from the reference
+    /// position.
     pub left_out: usize,
 }
 
@@ -74,12 +75,13 @@ pub struct ReceivedCpm {
     pub station_id: u32,
     /// Reference time of the message. All objects are moved to it by their velocities.
     pub captured_at: Timestamp,
-    /// Number of this segment and of all, if the station's objects are spread over several messages.
+    /// Number of this segment and of all, if the station's objects are spread over several
+    /// messages.
     pub segment: Option<(u8, u8)>,
     /// The objects in the cell's frame.
     pub objects: Vec<PerceivedObject>,
-    /// Objects without a usable place: a coordinate out of range, or a measurement more than a second from the reference
-    /// time.
+    /// Objects without a usable place: a coordinate out of range, or a measurement more than a
+    /// second from the reference time.
     pub left_out: usize,
 }
 
@@ -98,7 +100,8 @@ pub enum CpmError {
     /// Another version or kind of message.
     #[error("not a CPM of release 2")]
     OtherMessage,
-    /// A reference position that is unavailable, or has an error out of range: the standard calls it not valid.
+    /// A reference position that is unavailable, or has an error out of range: the standard calls
+    /// it not valid.
     #[error("no reference position")]
     NoPosition,
     /// A reference position more than 100 km from the cell's origin.

@@ -1,4 +1,5 @@
-//! Live topics of ROS 2, by DDS: a cell's messages for ROS, and a detector's messages from ROS as reports.
+//! Live topics of ROS 2, by DDS: a cell's messages for ROS, and a detector's messages from ROS as
+//! reports.
 //!
 //! ```text
 //! global_detections -> /ecod/map/detections, /ecod/map/markers

@@ -28,7 +28,8 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Maps and reports of the cell as ETSI CPM on `cpm/global` and `cpm/<node>`; CPMs on `cpm/received/<name>` as reports.
+    /// Maps and reports of the cell as ETSI CPM on `cpm/global` and `cpm/<node>`; CPMs on
+    /// `cpm/received/<name>` as reports.
     Cpm(Connection),
     /// A log as MCAP of profile ros2: detections, markers, poses of cameras, pictures.
     #[cfg(feature = "ros2")]
@@ -52,7 +53,8 @@ struct RosOptions {
     /// Domain of DDS, 0 to 232.
     #[arg(long, env = "ROS_DOMAIN_ID", default_value = "0", value_parser = domain)]
     domain: u16,
-    /// Address of this machine in a network in which to announce itself; may be given several times. Default: in all.
+    /// Address of this machine in a network in which to announce itself; may be given several
+    /// times. Default: in all.
     #[arg(long, value_name = "ADDRESS")]
     network: Vec<std::net::IpAddr>,
     /// Topic of vision_msgs/Detection3DArray, in the frame `map` or in the frame of a camera with a
@@ -68,7 +70,8 @@ struct RosOptions {
     /// Pose of the camera: metres east and north, degrees counter-clockwise from east.
     #[arg(long, value_name = "X,Y,HEADING", allow_hyphen_values = true, value_parser = pose, group = "camera_pose")]
     pose: Option<Pose>,
-    /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x ahead.
+    /// Topic of geometry_msgs/PoseStamped: poses in the frame `map` of a camera that moves, x
+    /// ahead.
     #[arg(
         long,
         value_name = "TOPIC",
@@ -82,7 +85,8 @@ struct RosOptions {
     /// Angle of the camera's axis below the horizon in degrees.
     #[arg(long, default_value_t = 0.0, allow_hyphen_values = true, value_parser = finite)]
     pitch_deg: f64,
-    /// File with the keys of `camera.projection` (TOML). Default: sizes of COCO's labels, and `pixel_sigma_px = 3`.
+    /// File with the keys of `camera.projection` (TOML). Default: sizes of COCO's labels, and
+    /// `pixel_sigma_px = 3`.
     #[arg(long, value_name = "FILE")]
     projection: Option<PathBuf>,
     /// Label of a class of the detector, such as 0=person; may be given several times.

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use ecod::model::names::Label;
 use ecod::wire::{FusedObject, LandmarkState, PerceivedObject};
 
-/// An object in the cell's frame: metres and radians, `covariance_m2` as `[xx, xy, yy]`, `size_m` as length and width.
+/// An object in the cell's frame: metres and radians, `covariance_m2` as `[xx, xy, yy]`, `size_m`
+/// as length and width.
 #[derive(Debug, Clone)]
 pub(crate) struct CellObject<'a> {
     pub(crate) label: &'a Label,

@@ -71,8 +71,8 @@ pub(crate) fn put_report<S: RosSink>(report: &ObjectReport, sink: &mut S) -> Res
     sink.put("/tf", &transforms)
 }
 
-/// A node's name as names in ROS allow it: letters and digits with single `_` between them, no digit first. A `_` in front would
-/// hide the topic, and `map` is the cell's.
+/// A node's name as names in ROS allow it: letters and digits with single `_` between them, no
+/// digit first. A `_` in front would hide the topic, and `map` is the cell's.
 fn ros_name(node: &NodeName) -> String {
     let words: Vec<_> = node
         .as_str()

@@ -34,9 +34,11 @@ struct Cli {
 enum Command {
     /// Run a whole cell on this machine, as separate processes, and print the results
     Demo(demo::DemoArguments),
-    /// Write the street that `ecod-node try` shows: a video and a configuration for each camera that stays where it is
+    /// Write the street that `ecod-node try` shows: a video and a configuration for each camera
+    /// that stays where it is
     Street(street::StreetArguments),
-    /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections were
+    /// Run recorded scenes in virtual time: parking lots are rendered and detected, intersections
+    /// were
     Testbed(testbed::TestbedArguments),
     /// Measure a live cell under simulated vehicles: latency compared to the bare broker, capacity,
     /// costs

@@ -163,7 +163,8 @@ impl Evaluation {
         }
     }
 
-    /// Names the location of objects whose report does not, and translates synonyms, as a node of the cell would.
+    /// Names the location of objects whose report does not, and translates synonyms, as a node of
+    /// the cell would.
     #[must_use]
     pub fn with_landmarks(mut self, landmarks: LandmarkIndex, gate: LandmarkGate) -> Self {
         self.cell = Some((landmarks, gate));

@@ -110,7 +110,8 @@ pub struct TownResult {
     pub refused: u64,
 }
 
-/// A town whose traffic is such that every cell has two or more roads each way, and borders run between roads.
+/// A town whose traffic is such that every cell has two or more roads each way, and borders run
+/// between roads.
 pub fn town_traffic(roads_a_cell: usize, duration_s: f64) -> TrafficConfig {
     let roads = CELLS_A_SIDE * roads_a_cell;
     let share = (roads * (roads - 1)) as f64 / 12.0;

@@ -1,4 +1,5 @@
-//! Rights of one cell on a region's broker: it writes below its own tile and name, and reads the tiles around.
+//! Rights of one cell on a region's broker: it writes below its own tile and name, and reads the
+//! tiles around.
 
 use std::fmt::Write;
 

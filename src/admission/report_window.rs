@@ -252,7 +252,8 @@ pub const MAX_PARTS: usize = 16;
 /// short.
 const RETENTION: Duration = Duration::from_secs(10);
 
-/// Time for which a vehicle's reports are rejected before it counts as untimely; a clock that stepped takes one second.
+/// Time for which a vehicle's reports are rejected before it counts as untimely; a clock that
+/// stepped takes one second.
 const UNTIMELY_TIME: Duration = Duration::from_secs(3);
 
 /// Time after a movement for which a sender that states that it does not move counts as having

@@ -39,8 +39,8 @@ impl Algorithms {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FusionConfig {
-    /// The algorithms that run: `pace`, `vote` or `both`, the default. With `both`, VOTE starts with the first vote.
-    /// Reports for an algorithm that does not run are rejected.
+    /// The algorithms that run: `pace`, `vote` or `both`, the default. With `both`, VOTE starts
+    /// with the first vote. Reports for an algorithm that does not run are rejected.
     pub algorithms: Algorithms,
     /// Admission of reports by age and clock.
     pub window: WindowConfig,

@@ -1,4 +1,5 @@
-//! The share of one vehicle in the map: objects that no other vehicle sees take a bounded part of it.
+//! The share of one vehicle in the map: objects that no other vehicle sees take a bounded part of
+//! it.
 
 use std::collections::BTreeMap;
 

@@ -266,7 +266,8 @@ fn settled_votes_become_evidence_that_another_aggregator_adopts() {
     );
 }
 
-/// All that the cell settles of votes from `from_ms` to `until_ms` and of silence for three seconds, by vehicle.
+/// All that the cell settles of votes from `from_ms` to `until_ms` and of silence for three
+/// seconds, by vehicle.
 fn settled(
     cell: &mut Aggregator,
     nodes: &[&str],

@@ -102,7 +102,8 @@ pub struct Merged {
 }
 
 impl LedgerResync {
-    /// As [`Self::new`], for a cell with certificates. The caller of [`Self::merge`] must verify signatures first.
+    /// As [`Self::new`], for a cell with certificates. The caller of [`Self::merge`] must verify
+    /// signatures first.
     pub fn signed(name: NodeName, ticks_per_snapshot: u32) -> Self {
         Self {
             is_signed: true,
@@ -110,7 +111,8 @@ impl LedgerResync {
         }
     }
 
-    /// The part of the node of this name; everything is shared each `ticks_per_snapshot` calls of [`Self::tick`].
+    /// The part of the node of this name; everything is shared each `ticks_per_snapshot` calls of
+    /// [`Self::tick`].
     pub fn new(name: NodeName, ticks_per_snapshot: u32) -> Self {
         Self {
             name,

@@ -1,7 +1,7 @@
 //! The brokers that a node keeps links to.
 //!
-//! Reports go out on every link, so that the standby gets them on its own broker. The leader publishes on its own broker
-//! and on the standby's. A link outlives its use by [`LINK_LINGER`].
+//! Reports go out on every link, so that the standby gets them on its own broker. The leader
+//! publishes on its own broker and on the standby's. A link outlives its use by [`LINK_LINGER`].
 
 use std::collections::BTreeSet;
 

@@ -577,7 +577,8 @@ impl LeadershipNode {
                 .is_some_and(|at| self.monitor.is_logged_in_at(challenger, &at))
     }
 
-    /// True if the members reach the broker that this node would lead with; the first time that they do not is logged.
+    /// True if the members reach the broker that this node would lead with; the first time that
+    /// they do not is logged.
     fn is_reached(&mut self, no_other: bool) -> bool {
         let is_private = self
             .own_broker

@@ -15,8 +15,8 @@ pub struct Rights {
     pub may_describe: bool,
 }
 
-/// Rights of a node that is issued a certificate for a role, with the priority that nodes have by default. The node is no
-/// operator's.
+/// Rights of a node that is issued a certificate for a role, with the priority that nodes have by
+/// default. The node is no operator's.
 impl From<Role> for Rights {
     fn from(role: Role) -> Self {
         Self {
@@ -71,7 +71,8 @@ impl Rights {
         }
     }
 
-    /// The message with role and priority lowered to these rights. `None` if only a node that may lead may send it.
+    /// The message with role and priority lowered to these rights. `None` if only a node that may
+    /// lead may send it.
     pub(crate) fn limit(self, mut message: ElectionMessage) -> Option<ElectionMessage> {
         let claims = matches!(
             message.body,

@@ -63,7 +63,8 @@ pub struct AcceptedRound {
     pub epoch: Epoch,
     /// Its number.
     pub round: u64,
-    /// True if it goes to [`crate::leadership::node::Input::RoundAccepted`]: verdicts do while no maps come.
+    /// True if it goes to [`crate::leadership::node::Input::RoundAccepted`]: verdicts do while no
+    /// maps come.
     pub is_sign_of_life: bool,
     /// True if a new leader may continue from this round. While the node has no leader, rounds of
     /// any term are accepted.

@@ -71,7 +71,8 @@ pub const LIVE_STREAM_TIME: Duration = Duration::from_millis(150);
 /// Time after its last round for which the delay of a leader's rounds is remembered.
 pub const LEADER_DELAY_MEMORY: Duration = Duration::from_secs(10);
 
-/// Time for which the newest round outranks rounds of lower epochs. It bounds how long a forged epoch silences a leader.
+/// Time for which the newest round outranks rounds of lower epochs. It bounds how long a forged
+/// epoch silences a leader.
 pub const EPOCH_MEMORY: Duration = Duration::from_secs(3);
 
 /// Silence after which a later epoch is accepted from a node other than the standby.
@@ -84,8 +85,8 @@ pub const SUCCESSOR_CREDIT: Duration = Duration::from_millis(500);
 /// Time after its last message for which a superseded leader may still publish at a broker.
 pub const FAREWELL_TIME: Duration = Duration::from_secs(1);
 
-/// Time for which a link outlives its use: vehicles that are not yet linked to the new leader's broker are served by the
-/// old one's.
+/// Time for which a link outlives its use: vehicles that are not yet linked to the new leader's
+/// broker are served by the old one's.
 pub const LINK_LINGER: Duration = Duration::from_secs(2);
 
 /// Time between two checks of the node's own parts.
@@ -107,11 +108,12 @@ pub const PART_TIMEOUT: Duration = Duration::from_secs(2);
 /// Steps for which readiness waits for a part's answer.
 pub const READINESS_STEPS: usize = 5;
 
-/// Time without an echo after which a broker counts as stalled. Six busy loops on two processors delay a broker by some
-/// tens of milliseconds.
+/// Time without an echo after which a broker counts as stalled. Six busy loops on two processors
+/// delay a broker by some tens of milliseconds.
 pub const ECHO_TIMEOUT: Duration = Duration::from_millis(800);
 
-/// Number of messages without an echo, sent over [`ECHO_TIMEOUT`], after which a broker counts as stalled.
+/// Number of messages without an echo, sent over [`ECHO_TIMEOUT`], after which a broker counts as
+/// stalled.
 pub const MIN_UNANSWERED: u32 = 6;
 
 /// Time given to vehicles to connect to the broker of a node that is about to be handed the lead.
@@ -127,7 +129,8 @@ pub const LEDGER_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time between two checks of the conditions for a handover.
 pub const PREPARATION_STEP: Duration = Duration::from_millis(50);
 
-/// Lateness of a wake-up that means that the process stalled: sockets are read for [`DRAIN_TIME`] first.
+/// Lateness of a wake-up that means that the process stalled: sockets are read for [`DRAIN_TIME`]
+/// first.
 pub const LATE_WAKE: Duration = Duration::from_millis(20);
 
 /// Time for which sockets are read after a late wake-up before timers run.
@@ -139,10 +142,12 @@ pub const DEPARTED_TIME: Duration = Duration::from_secs(5);
 /// Time for a restarted membership to find its members again.
 pub const REDISCOVERY_TIME: Duration = Duration::from_secs(2);
 
-/// Time for which a node waits for its disk: for its term before it leads, for reputations before it publishes them.
+/// Time for which a node waits for its disk: for its term before it leads, for reputations before
+/// it publishes them.
 pub const DISK_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Longest pause between two renewals of a leadership that followers refuse. The first is `given_up_timeout`.
+/// Longest pause between two renewals of a leadership that followers refuse. The first is
+/// `given_up_timeout`.
 pub const RENEWAL_PAUSE: Duration = Duration::from_secs(10);
 
 /// Time within which the highest seen term rises by
@@ -175,7 +180,8 @@ pub const MAX_RESET_AHEAD: Duration = Duration::from_secs(24 * 3600);
 /// Number of round intervals after the last round when rounds stop counting as regular.
 pub(crate) const REGULAR_GAPS: u32 = 8;
 
-/// Step in ms of the time that a leader states in its signs of life: it signs a hundred a second at most.
+/// Step in ms of the time that a leader states in its signs of life: it signs a hundred a second at
+/// most.
 pub(crate) const LIFE_SIGN_STEP_MS: u64 = 10;
 
 /// Maximum number of questions about the leader that wait for its next sign of life.
@@ -205,7 +211,8 @@ impl ElectionConfig {
         self.standby_silence() * 4
     }
 
-    /// Silence after which a node that the membership gave up is lost, and wait before a refused epoch is renewed.
+    /// Silence after which a node that the membership gave up is lost, and wait before a refused
+    /// epoch is renewed.
     pub(crate) fn given_up_timeout(&self) -> Duration {
         self.response_timeout() / 2
     }
@@ -230,7 +237,8 @@ impl ElectionConfig {
         (self.beat() * NEAR_BEATS).min(self.idle_beat())
     }
 
-    /// Time between two offers of the lead; after the last round between two messages that yield it, a quarter.
+    /// Time between two offers of the lead; after the last round between two messages that yield
+    /// it, a quarter.
     pub(crate) fn handover_retry(&self, has_yielded: bool) -> Duration {
         if has_yielded {
             self.beat() / 4

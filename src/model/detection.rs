@@ -82,7 +82,8 @@ pub struct Detection {
     pub confidence: f64,
     /// Bounds in the image, in pixels.
     pub bounding_box: BoundingBox,
-    /// Corners of a square target in pixels, as seen from its front: top left, top right, bottom right, bottom left.
+    /// Corners of a square target in pixels, as seen from its front: top left, top right, bottom
+    /// right, bottom left.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub corners: Option<[Point2<f64>; 4]>,
 }

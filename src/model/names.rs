@@ -59,7 +59,8 @@ impl NodeName {
         &self.0
     }
 
-    /// The node that this name belongs to: `euclid` for its part `euclid--lidar`, otherwise the name itself.
+    /// The node that this name belongs to: `euclid` for its part `euclid--lidar`, otherwise the
+    /// name itself.
     #[must_use]
     pub fn vehicle(&self) -> Self {
         match self.0.split_once(PART_MARK) {
@@ -117,7 +118,8 @@ pub type Label = SmolStr;
 /// The id of a landmark, such as `slot-0`. Cheap to clone.
 pub type LandmarkId = SmolStr;
 
-/// True if a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without control characters.
+/// True if a text can be a label or the name of a location: 1 to [`MAX_NAME_BYTES`] bytes without
+/// control characters.
 pub fn is_label(text: &str) -> bool {
     (1..=MAX_NAME_BYTES).contains(&text.len()) && is_plain_text(text)
 }
@@ -147,8 +149,8 @@ pub fn plain_text(text: &str, max_bytes: usize) -> String {
     kept
 }
 
-/// True if a character breaks lines or turns the direction of the text around it: a label with one would show another's
-/// text on pages and terminals (Unicode Technical Report 36, section 2.7).
+/// True if a character breaks lines or turns the direction of the text around it: a label with one
+/// would show another's text on pages and terminals (Unicode Technical Report 36, section 2.7).
 fn is_layout_control(c: char) -> bool {
     matches!(c, '\u{61C}' | '\u{200E}' | '\u{200F}' | '\u{2028}'..='\u{202E}' | '\u{2066}'..='\u{2069}')
 }

@@ -1,8 +1,8 @@
 //! The place of a cell's frame on Earth, and positions and poses in WGS 84.
 //!
-//! The frame is the tangent plane: it touches Earth's curve at the origin, x and y lie in it, and z is the height above
-//! it. Within 5 km of the origin x and y are distances along the ground to 1 mm, and the ground is s²/2R below the
-//! plane: 2 m at s = 5 km.
+//! The frame is the tangent plane: it touches Earth's curve at the origin, x and y lie in it, and z
+//! is the height above it. Within 5 km of the origin x and y are distances along the ground to 1
+//! mm, and the ground is s²/2R below the plane: 2 m at s = 5 km.
 
 use map_3d::{Ellipsoid, enu2geodetic, enu2uvw, geodetic2enu, uvw2enu};
 use minicbor::{Decode, Encode};
@@ -13,8 +13,8 @@ use serde::{Deserialize, Serialize};
 use crate::config::{ConfigError, check_range};
 use crate::model::geometry::{Pose, wrap_angle};
 
-/// Maximum distance of a pose from the origin in metres. Farther away x and y are no distances on the ground any more:
-/// 4 m less at this distance.
+/// Maximum distance of a pose from the origin in metres. Farther away x and y are no distances on
+/// the ground any more: 4 m less at this distance.
 const MAX_DISTANCE_M: f64 = 1e5;
 
 /// Geographic origin of the east-north frame, in WGS 84.

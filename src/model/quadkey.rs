@@ -1,7 +1,7 @@
 //! Tiles of Earth's surface, named by quadkeys.
 //!
-//! Source: Microsoft, "Bing Maps Tile System": Web Mercator, each digit 0 to 3 a quarter of the tile before it, x
-//! eastward and y southward.
+//! Source: Microsoft, "Bing Maps Tile System": Web Mercator, each digit 0 to 3 a quarter of the
+//! tile before it, x eastward and y southward.
 
 use std::f64::consts::PI;
 use std::fmt;
@@ -9,7 +9,8 @@ use std::str::FromStr;
 
 use crate::model::origin::{GeographicOrigin, GeographicPosition};
 
-/// Digits of the tile of a cell. Its side is 1.22 km at the equator, and 0.61 km at 60° of latitude.
+/// Digits of the tile of a cell. Its side is 1.22 km at the equator, and 0.61 km at 60° of
+/// latitude.
 pub const CELL_TILE_DIGITS: u8 = 15;
 
 /// Maximum latitude of the projection in degrees; places beyond it get the tile at this latitude.
@@ -18,7 +19,8 @@ const MAX_LATITUDE_DEG: f64 = 85.051_128_78;
 /// Maximum digits of a tile.
 const MAX_DIGITS: usize = 30;
 
-/// A tile, and all tiles in it. As text: one digit for each level, the largest tile first. Without digits: the whole map.
+/// A tile, and all tiles in it. As text: one digit for each level, the largest tile first. Without
+/// digits: the whole map.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Quadkey {
     digits: u8,

@@ -13,7 +13,8 @@ use crate::wire::{CellMap, RegionTopic, RegionTopicKind, RejectReason};
 /// Maximum age of a map, and of the objects in it. At 2 Hz it outlives the loss of one map.
 pub const MAX_AGE: Duration = Duration::from_millis(1500);
 
-/// Time without a shorter delay from which the least one counts. Delays of a burst of old maps get shorter and shorter.
+/// Time without a shorter delay from which the least one counts. Delays of a burst of old maps get
+/// shorter and shorter.
 const SETTLES_AFTER: Duration = Duration::from_secs(1);
 
 /// Differences of delays below this value, in microseconds, count as jitter.

@@ -248,7 +248,8 @@ fn a_jump_of_the_cells_time_costs_no_map() {
     }
 }
 
-/// A minute without a link, in which the lead moves; then all that was sent meanwhile comes within two seconds.
+/// A minute without a link, in which the lead moves; then all that was sent meanwhile comes within
+/// two seconds.
 #[test]
 fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
     for knows_before in [true, false] {
@@ -295,8 +296,8 @@ fn a_burst_of_old_maps_after_an_outage_reaches_nobody() {
     }
 }
 
-/// Maps of some cells at 2 Hz for seven minutes, from the 40th second on `late_ms` later, by the cell's number. Numbers of maps
-/// of each that counted in the second minute, and in the last one.
+/// Maps of some cells at 2 Hz for seven minutes, from the 40th second on `late_ms` later, by the
+/// cell's number. Numbers of maps of each that counted in the second minute, and in the last one.
 fn late_for_long(cells: u64, late_ms: impl Fn(u64) -> u64) -> [Vec<usize>; 2] {
     let mut filter = CellMapFilter::new(16);
     let mut counted = [0, 1].map(|_| vec![0; cells as usize]);

@@ -245,7 +245,8 @@ impl BayesPace {
         self.without_label(landmark, &beliefs)
     }
 
-    /// The label with the most evidence at one place, if there is any; `observers` had the landmark in view.
+    /// The label with the most evidence at one place, if there is any; `observers` had the landmark
+    /// in view.
     fn agree_on_label(
         &self,
         landmark: &Landmark,

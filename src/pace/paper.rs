@@ -1,8 +1,9 @@
 //! PACE as the paper prints it (Algorithm 2).
 //!
-//! For each location ρ, O_ρ holds every object of the vehicles' latest reports within δ of ρ. The label has the largest
-//! sum of confidences, the confidence is Σc²/Σc over O_ρ, and the position is the mean. An object within δ of two
-//! locations counts at both. Vacancy signs, covariances, `seen` and the order of frames are not used.
+//! For each location ρ, O_ρ holds every object of the vehicles' latest reports within δ of ρ. The
+//! label has the largest sum of confidences, the confidence is Σc²/Σc over O_ρ, and the position is
+//! the mean. An object within δ of two locations counts at both. Vacancy signs, covariances, `seen`
+//! and the order of frames are not used.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -37,7 +37,8 @@ impl Landmark {
     }
 }
 
-/// A fixed sign behind a location, such as a card that reads `EMPTY`; any object in front outweighs it.
+/// A fixed sign behind a location, such as a card that reads `EMPTY`; any object in front outweighs
+/// it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VacancySign {
     /// The text of the sign.

@@ -17,7 +17,8 @@ const MAX_POSES: usize = 512;
 
 /// A vehicle's latest poses, by the clock that stamps its frames.
 ///
-/// Between two poses it interpolates linearly and turns the shorter way; shortly after the newest it extrapolates.
+/// Between two poses it interpolates linearly and turns the shorter way; shortly after the newest
+/// it extrapolates.
 #[derive(Debug, Clone, Default)]
 pub struct PoseHistory {
     poses: VecDeque<(Timestamp, Pose)>,

@@ -4,8 +4,9 @@
 //! Detection --ranging--> forward, left of the camera --Pose--> PerceivedObject (east, north, covariance)
 //! ```
 //!
-//! Each [`Ranging`] finds the distance in its own way, in a file of its own. All but [`Ranging::Paper`] are exact for a
-//! pinhole camera, under the assumptions about the object that it states.
+//! Each [`Ranging`] finds the distance in its own way, in a file of its own. All but
+//! [`Ranging::Paper`] are exact for a pinhole camera, under the assumptions about the object that
+//! it states.
 
 mod auto;
 mod box_height;
@@ -113,8 +114,8 @@ impl Projection {
         &self.intrinsics
     }
 
-    /// The edges of the image that cut a box in the raw image, before distortion is removed. The corners of a target show
-    /// the whole of it.
+    /// The edges of the image that cut a box in the raw image, before distortion is removed. The
+    /// corners of a target show the whole of it.
     pub fn cut(&self, detection: &Detection) -> Cut {
         if detection.corners.is_some() && self.config.ranging.uses_corners() {
             return Cut::default();
@@ -215,8 +216,8 @@ impl Projection {
         }
     }
 
-    /// The line of sight to a point `forward_m` ahead of and `left_m` left of the camera, as judged by an extent in the
-    /// image.
+    /// The line of sight to a point `forward_m` ahead of and `left_m` left of the camera, as judged
+    /// by an extent in the image.
     fn line_of_sight(
         &self,
         forward_m: f64,
@@ -232,8 +233,9 @@ impl Projection {
         )
     }
 
-    /// A line of sight whose distance is judged by an extent in the image: d ∝ size / extent. σ_d/d is the root of the sum
-    /// of both squared relative errors, and both edges of the extent have pixel noise.
+    /// A line of sight whose distance is judged by an extent in the image: d ∝ size / extent. σ_d/d
+    /// is the root of the sum of both squared relative errors, and both edges of the extent have
+    /// pixel noise.
     fn sized(
         &self,
         bearing_rad: f64,
@@ -252,8 +254,8 @@ impl Projection {
         }
     }
 
-    /// First-order error propagation along and across the line of sight. The heading's error turns it; the errors of the
-    /// camera's position and the floor add to both.
+    /// First-order error propagation along and across the line of sight. The heading's error turns
+    /// it; the errors of the camera's position and the floor add to both.
     fn covariance(&self, sight: &LineOfSight, direction_rad: f64) -> Covariance {
         let ProjectionConfig {
             heading_sigma_rad,

@@ -26,17 +26,19 @@ config_section! {
         /// 21 modules at 1.7 pixels each. A lower value claims more locations, some of which the
         /// detector cannot read.
         pub min_target_px: f64 = 36.0, in 0.0 to 1e5;
-        /// Minimum distance in pixels of the target from the left and right edges of the image; default 8.
+        /// Minimum distance in pixels of the target from the left and right edges of the image;
+        /// default 8.
         pub margin_px: f64 = 8.0, in 0.0 to 1e5;
         /// Maximum distance of a location in metres; default 20.
         pub max_range_m: f64 = 20.0, in 1e-3 to 1e6;
-        /// Maximum angle in radians between the facing of the location and the direction to the camera; default 0.87
-        /// (50°).
+        /// Maximum angle in radians between the facing of the location and the direction to the
+        /// camera; default 0.87 (50°).
         pub max_yaw_rad: f64 = 0.87, in 0.0 to std::f64::consts::PI;
-        /// Width in metres of an occluding object whose label has no listed size; default the target's, at least 0.07.
+        /// Width in metres of an occluding object whose label has no listed size; default the
+        /// target's, at least 0.07.
         pub occluder_width_m: Option<f64> = None, checked by check_optional(0.0, 1e3);
-        /// Distance in metres by which an object must be nearer than a location to hide it; default 0.05. It must exceed
-        /// the error of a position, or an object hides its own location.
+        /// Distance in metres by which an object must be nearer than a location to hide it; default
+        /// 0.05. It must exceed the error of a position, or an object hides its own location.
         pub clearance_m: f64 = 0.05, in 0.0 to 1e3;
     }
 }
@@ -108,8 +110,8 @@ impl PosedCamera {
     }
 }
 
-/// The landmarks in view of `camera`, in their order. The perceived `objects` hide landmarks behind them, with the widths
-/// in `sizes` for listed labels.
+/// The landmarks in view of `camera`, in their order. The perceived `objects` hide landmarks behind
+/// them, with the widths in `sizes` for listed labels.
 pub fn landmarks_in_view(
     landmarks: &[Landmark],
     camera: &PosedCamera,
@@ -214,8 +216,8 @@ impl Occluder {
         }
     }
 
-    /// True if any part of a target at the given range and bearing is behind this object; `width_share` is the visible
-    /// share of its width.
+    /// True if any part of a target at the given range and bearing is behind this object;
+    /// `width_share` is the visible share of its width.
     fn hides(&self, range_m: f64, bearing_rad: f64, width_share: f64, widths: &Widths) -> bool {
         self.range_m + widths.config.clearance_m < range_m
             && wrap_angle(self.bearing_rad - bearing_rad).abs()

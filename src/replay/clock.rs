@@ -30,7 +30,8 @@ impl VirtualClock {
         self.now.unwrap_or_default()
     }
 
-    /// True if a line is ahead of the present, or of most lines that follow, by at most the tolerance.
+    /// True if a line is ahead of the present, or of most lines that follow, by at most the
+    /// tolerance.
     pub(super) fn is_plausible(
         &self,
         at: Timestamp,

@@ -62,7 +62,8 @@ pub enum JournalEvent {
 pub struct JournalSummary {
     /// Reports in it.
     pub reports: u64,
-    /// Rejected reports by reason; many where a live aggregator gets the same report over two links.
+    /// Rejected reports by reason; many where a live aggregator gets the same report over two
+    /// links.
     pub rejected: BTreeMap<RejectReason, u64>,
     /// Entries and reports that were lost.
     pub missing: u64,

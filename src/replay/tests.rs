@@ -458,8 +458,8 @@ fn drive() -> (Vec<Landmark>, Vec<(ReportKind, ObjectReport, Timestamp)>) {
     (landmarks.collect(), reports)
 }
 
-/// Output of a live node until the round of the last report: reports as they come, timers at their deadlines. It closes its
-/// first round when all reports of the first time have come.
+/// Output of a live node until the round of the last report: reports as they come, timers at their
+/// deadlines. It closes its first round when all reports of the first time have come.
 fn live(
     config: &ReplayConfig,
     reports: &[(ReportKind, ObjectReport, Timestamp)],

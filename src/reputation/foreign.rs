@@ -37,7 +37,8 @@ const MIN_OWN_VOTES: u64 = 20;
 /// Minimum number of kept votes of another cell about a vehicle for checking that cell's counts.
 const MIN_JUDGED_VOTES: u64 = 5;
 
-/// Difference of the shares of right votes from which two cells contradict each other about a vehicle.
+/// Difference of the shares of right votes from which two cells contradict each other about a
+/// vehicle.
 const CONTRADICTION: f64 = 0.35;
 
 /// Minimum trust in a cell's counts. Vehicles that report falsely in one cell only make that cell's

@@ -1,4 +1,5 @@
-//! The ledger: settled votes by epoch, vehicle and label, and the reputations that follow from them.
+//! The ledger: settled votes by epoch, vehicle and label, and the reputations that follow from
+//! them.
 
 use std::collections::BTreeMap;
 
@@ -23,7 +24,7 @@ pub struct ReputationLedger {
     pub(super) sizes: BTreeMap<NodeName, usize>,
     /// Signed shares of aggregators, by lane. They are not serialised with the counts.
     pub(super) statements: BTreeMap<Epoch, Statements>,
-    /// Signed shares on trial, by lane, and when the trial ends.
+    /// Signed shares on probation, by lane, and when the probation ends.
     pub(super) on_trial: BTreeMap<Epoch, (Statements, Timestamp)>,
     /// Time of the last reset, in cells without certificates; 0 without a reset.
     pub(super) reset_at: Timestamp,
@@ -162,8 +163,8 @@ impl ReputationLedger {
             .collect()
     }
 
-    /// The reputations to publish: scores from the remembered votes by [`ReputationConfig::mean`], 0.30 to 1.00, and
-    /// the counts of all votes.
+    /// The reputations to publish: scores from the kept votes by [`ReputationConfig::mean`], 0.30
+    /// to 1.00, and the counts of all votes.
     pub fn reputations(&self, config: &ReputationConfig) -> BTreeMap<NodeName, Reputation> {
         self.reputations_beside(config, &BTreeMap::new())
     }

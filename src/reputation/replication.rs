@@ -1,4 +1,5 @@
-//! Replication: counts and marks of the ledger in pieces that fit into messages, how they are merged, and their bounds.
+//! Replication: counts and marks of the ledger in pieces that fit into messages, how they are
+//! merged, and their bounds.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -228,7 +229,8 @@ impl ReputationLedger {
         self.lanes.len()
     }
 
-    /// The record of a vehicle in a lane. `None` if it lacks `label` and there is no room for one more count.
+    /// The record of a vehicle in a lane. `None` if it lacks `label` and there is no room for one
+    /// more count.
     pub(super) fn record_mut(
         &mut self,
         lane: &Epoch,

@@ -32,7 +32,7 @@ impl ReputationLedger {
         changed
     }
 
-    /// As [`Self::merge_statement`], on trial until `ends_at`.
+    /// As [`Self::merge_statement`], on probation until `ends_at`.
     pub fn merge_on_trial(
         &mut self,
         share: &Arc<LedgerShare>,
@@ -82,7 +82,7 @@ impl ReputationLedger {
         ended
     }
 
-    /// The signed shares behind the lanes of other aggregators, without those on trial.
+    /// The signed shares of other aggregators' lanes, without those on probation.
     pub fn statements(&self) -> impl Iterator<Item = &Arc<LedgerShare>> {
         self.statements.values().flat_map(|lane| &lane.signed)
     }

@@ -9,8 +9,8 @@ use crate::wire::{LedgerShare, MAX_SHARE_ENTRIES};
 /// cleared again.
 const MAX_NEW: usize = 16;
 
-/// Maximum size of a lane's statements, in multiples of the lane's own. An aggregator that signs each vehicle's counts
-/// apart in full statements is kept in part only.
+/// Maximum size of a lane's statements, in multiples of the lane's own size. If an aggregator signs
+/// each vehicle's counts in a separate full statement, only a part of the statements is kept.
 const MAX_COPIES: usize = 4;
 
 /// The statements behind one lane.
@@ -23,8 +23,8 @@ pub(super) struct Statements {
 }
 
 impl Statements {
-    /// Adds a share to a lane that has `lane_size` counts and marks. `adds` merges a statement into evidence that is empty at
-    /// first, the latest statement first: true if that changed anything.
+    /// Adds a share to a lane that has `lane_size` counts and marks. `adds` merges a statement into
+    /// initially empty evidence, the latest statement first, and returns true if that changed any.
     pub(super) fn push(
         &mut self,
         share: Arc<LedgerShare>,

@@ -84,7 +84,7 @@ fn partitions_that_counted_apart_merge_to_their_sum() {
     assert_eq!(left.totals()[&name("euclid")], (3, 0));
 }
 
-/// 10,000 right votes, and then wrong ones, in one lane.
+/// 10,000 right votes, followed by wrong ones, in one lane.
 fn turncoat(wrong: u64) -> ReputationLedger {
     let mut ledger = ReputationLedger::default();
     for number in 0..10_000 + wrong {

@@ -11,8 +11,8 @@ const BINS: usize = 20;
 const RANK_PRIOR_VOTES: f64 = 5.0;
 /// Weight, in votes, of the overall rate of agreement against a band's own.
 const BAND_PRIOR_VOTES: f64 = 100.0;
-/// Spread of pooled bands, in variances of one vote, that is taken for noise: three times the chance spread of ten equal
-/// bands, 1/2 + … + 1/10 (Barlow et al. 1972).
+/// Spread of pooled bands, in variances of one vote, that is taken for noise: three times the
+/// chance spread of ten equal bands, 1/2 + … + 1/10 (Barlow et al. 1972).
 const NOISE: f64 = 6.0;
 /// Votes over which settled agreement fades to 1/e.
 const MEMORY_VOTES: f64 = 20_000.0;
@@ -49,7 +49,7 @@ struct ConfidenceHistogram {
 
 /// Weights of confidences.
 ///
-/// A detector's confidence orders its detections but is no probability: one vehicle's 0.6 may be
+/// A detector's confidence orders its detections but is not a probability: one vehicle's 0.6 may be
 /// another's 0.9. A vehicle's overall quality is its reputation; its confidence ranks its votes by
 /// quality.
 ///
@@ -72,7 +72,8 @@ pub(super) struct ConfidenceCalibration {
 }
 
 impl ConfidenceCalibration {
-    /// No evidence yet; `prior_votes` is the weight of a stated confidence against evidence, in votes.
+    /// No evidence yet; `prior_votes` is the weight of a stated confidence against evidence, in
+    /// votes.
     pub(super) fn new(prior_votes: f64) -> Self {
         Self {
             prior_votes,
@@ -119,7 +120,8 @@ impl ConfidenceCalibration {
         ((rank * BANDS as f64) as usize).min(BANDS - 1)
     }
 
-    /// Counts a live vote that the others support with probability `agreement`; `sign` −1 takes it back.
+    /// Counts a live vote that the others support with probability `agreement`; with `sign` −1
+    /// subtracts it.
     pub(super) fn count(&mut self, band: usize, agreement: f64, sign: f64) {
         self.live.add(band, agreement, sign);
     }
@@ -192,13 +194,14 @@ fn pool_adjacent_violators(bands: &BandCounts) -> Vec<(f64, f64, usize)> {
     pools
 }
 
-/// Kept part of the difference between pools: positive-part James–Stein shrinkage towards one rate for all.
+/// Kept part of the difference between pools: positive-part James–Stein shrinkage towards one rate
+/// for all.
 fn shrinkage(pools: &[(f64, f64, usize)]) -> f64 {
     let with_votes = || pools.iter().filter(|(_, votes, _)| *votes > 0.0);
     let (agreed, votes) = with_votes().fold((0.0, 0.0), |(a, n), (agreed, votes, _)| {
         (a + agreed, n + votes)
     });
-    // Counts that are taken back leave rounding errors: more votes may seem to have agreed than there are.
+    // Subtracted counts leave rounding errors: more votes may seem to have agreed than there are.
     let rate = (agreed / f64::max(votes, 1e-9)).clamp(0.0, 1.0);
     let spread: f64 = with_votes()
         .map(|(agreed, votes, _)| votes * (agreed / votes - rate).powi(2))

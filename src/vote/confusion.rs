@@ -32,7 +32,7 @@ impl Default for Confusion {
 }
 
 impl Confusion {
-    /// Adds `weight`; a negative one takes evidence back.
+    /// Adds `weight`; a negative weight removes evidence.
     pub(super) fn add(&mut self, truth: LabelIndex, stated: LabelIndex, weight: f64) {
         self.add_scaled(truth, stated, weight / self.scale);
     }

@@ -1,4 +1,5 @@
-//! Probability of each label given the votes: the model of Dawid & Skene (1979) with hierarchical priors.
+//! Probability of each label given the votes: the model of Dawid & Skene (1979) with hierarchical
+//! priors.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,7 +15,7 @@ use crate::wire::ForeignVotes;
 /// Evidence about one vehicle.
 #[derive(Debug, Clone, Default)]
 pub(super) struct VehicleEvidence {
-    /// Evidence of fresh votes, which may be judged again.
+    /// Evidence of fresh votes, which may be re-evaluated.
     pub(super) live: Confusion,
     /// Fading evidence of votes that went stale.
     pub(super) settled: Confusion,
@@ -29,12 +30,13 @@ pub(super) struct VehicleEvidence {
     advantage: [f64; 2],
 }
 
-/// How the probabilities of the classes hang together.
+/// The relation between the probabilities of the classes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Coupling {
-    /// Each class has its own, with priors.
+    /// Each class has its own probabilities, with priors.
     Free,
-    /// A vehicle is right equally often on every class, and wrong labels are equally likely: the one-coin model.
+    /// A vehicle is right equally often on every class, and wrong labels are equally likely: the
+    /// one-coin model.
     Tied,
 }
 
@@ -88,7 +90,8 @@ pub(super) struct DawidSkene {
     /// Expected number of landmarks of each label.
     shares: Vec<f64>,
     log_shares: Vec<f64>,
-    /// Fading log loss that [`Coupling::Free`] saved in the prediction of votes, in nats, and number of these votes.
+    /// Fading log loss that [`Coupling::Free`] saved in the prediction of votes, in nats, and
+    /// number of these votes.
     saving: (f64, f64),
     /// The same saving, by the ledger of other aggregators.
     inherited_saving: (f64, f64),
@@ -96,8 +99,8 @@ pub(super) struct DawidSkene {
 
 /// Weight, in votes, of the assumed accuracy against the fleet's record of a class.
 const FLEET_PRIOR_VOTES: f64 = 1.0;
-/// The same against the fleet's record, as a share of all its votes: a class that few votes are about keeps close to the
-/// accuracy of all.
+/// Weight against the fleet's record, as a share of all its votes: a class with few votes stays
+/// close to the accuracy of all.
 const FLEET_PRIOR_SHARE: f64 = 0.05;
 /// Factor on the weight of the fleet's reliability while the classes are tied.
 const TIED_PRIOR_FACTOR: f64 = 4.0;
@@ -105,15 +108,17 @@ const TIED_PRIOR_FACTOR: f64 = 4.0;
 /// respect, for example about items that are hard for all vehicles, produces smaller apparent
 /// savings (Miller & Dunson 2019).
 const MIN_SAVING: f64 = 0.01;
-/// Saving in all, in nats, that may be chance.
+/// Total saving, in nats, that may be chance.
 const CHANCE_SAVING: f64 = 5.0;
-/// Probability at least that a vote is wrong, or right, before rates by label in a ledger are compared with it.
+/// Probability at least that a vote is wrong, or right, before rates by label in a ledger are
+/// compared with it.
 const MIN_WRONG: f64 = 0.01;
 /// Votes over which savings fade to 1/e.
 const SAVING_MEMORY_VOTES: f64 = 20_000.0;
 /// Drop in the rate of right votes that is tolerated.
 const SHORTFALL_SLACK: f64 = 0.2;
-/// Cumulative drop beyond it, in votes, that is a change: about seven wrong votes of a vehicle with 80 % right ones.
+/// Cumulative drop beyond it, in votes, that is a change: about seven wrong votes of a vehicle with
+/// 80 % right ones.
 const SHORTFALL_ALARM: f64 = 4.0;
 /// Part of a vehicle's past that still counts after a change.
 const KEPT_AFTER_ALARM: f64 = 0.1;
@@ -238,7 +243,8 @@ impl DawidSkene {
         }
     }
 
-    /// Judges votes that the model does not contain; newcomers together are limited to their share.
+    /// Evaluates votes that the model does not contain; newcomers together are limited to their
+    /// share.
     pub(super) fn judge(
         &self,
         votes: &[WeightedVote],
@@ -297,10 +303,11 @@ impl DawidSkene {
         judged
     }
 
-    /// Replaces the evidence on the coupling that comes from a ledger. It counts right and wrong votes of each vehicle by
-    /// stated label. Under equal accuracy on all classes, Bayes' rule still makes a rare label right less often than a
-    /// frequent one. Rates by label count as far as they explain more than that, and more than chance does: the Bayes factor
-    /// by Laplace's approximation (Kass & Raftery 1995).
+    /// Replaces the evidence on the coupling that comes from a ledger. It counts right and wrong
+    /// votes of each vehicle by stated label. Under equal accuracy on all classes, Bayes' rule
+    /// still makes a rare label right less often than a frequent one. Rates by label count as far
+    /// as they explain more than that, and more than chance does: the Bayes factor by Laplace's
+    /// approximation (Kass & Raftery 1995).
     pub(super) fn inherit_coupling<'a>(
         &mut self,
         vehicles: impl Iterator<Item = &'a RememberedVotes> + Clone,
@@ -343,8 +350,8 @@ impl DawidSkene {
         self.saving = (0.0, 0.0);
     }
 
-    /// Recomputes the shares of the classes and the advantages of `vehicles`; call it before [`Self::judge`] when
-    /// evidence has changed.
+    /// Recomputes the shares of the classes and the advantages of `vehicles`; call it before
+    /// [`Self::judge`] when evidence has changed.
     pub(super) fn refresh(&mut self, vehicles: impl Iterator<Item = usize>) {
         self.refresh_shares();
         let accuracy = self.fleet_accuracy();
@@ -379,8 +386,9 @@ impl DawidSkene {
         }
     }
 
-    /// James–Stein shrinkage of the shares towards equal ones (Hausser & Strimmer 2009). The number of draws is capped
-    /// at `class_share_verdicts`, because confusion and not sampling limits the accuracy of the shares.
+    /// James–Stein shrinkage of the shares towards equal ones (Hausser & Strimmer 2009). The number
+    /// of draws is capped at `class_share_verdicts`, because confusion and not sampling limits the
+    /// accuracy of the shares.
     fn refresh_shares(&mut self) {
         let total: f64 = self.shares.iter().map(|s| s.max(0.0) + 1.0).sum();
         let equal = 1.0 / self.labels.max(1) as f64;
@@ -504,8 +512,8 @@ impl DawidSkene {
         evidence.settled.total() + evidence.inherited.total() < self.config.probation_votes
     }
 
-    /// Factor that limits the summed weight of newcomers to `newcomer_share` of the proven vehicles'; 1 where no vehicle
-    /// is proven.
+    /// Factor that limits the summed weight of newcomers to `newcomer_share` of the proven
+    /// vehicles'; 1 where no vehicle is proven.
     pub(super) fn newcomer_factor(&self, votes: &[WeightedVote]) -> f64 {
         let (mut newcomers, mut proven) = (0.0, 0.0);
         for vote in votes {
@@ -523,7 +531,8 @@ impl DawidSkene {
         }
     }
 
-    /// Adds the votes as live evidence; `sign` −1 takes them back. A single vote is no evidence about its vehicle.
+    /// Adds the votes as live evidence; with `sign` −1 removes them. A single vote is not evidence
+    /// about its vehicle.
     pub(super) fn add_live(
         &mut self,
         votes: &[WeightedVote],

@@ -16,21 +16,24 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::confusion::LabelIndex;
 
-/// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost of a vote.
+/// Maximum distance in the order of a landmark's votes at which two are compared; bounds the cost
+/// of a vote.
 const MAX_COMPARED: usize = 8;
-/// The same over stored votes.
+/// The same distance for stored votes.
 const MAX_COMPARED_STORED: usize = 32;
 /// Standard deviations by which agreement must exceed the expected agreement.
 const SIGNIFICANCE: f64 = 4.0;
 /// The same threshold for stored votes, where many pairs are tested at once: one in 3 million
 /// exceeds it by chance.
 const SIGNIFICANCE_STORED: f64 = 5.0;
-/// Agreement κ of two vehicles that surely belong to one group; closer agreement earns no more influence.
+/// Agreement κ of two vehicles that surely belong to one group; closer agreement earns no more
+/// influence.
 const SAME_GROUP: f64 = 0.3;
-/// Weight, in comparisons, of the priors: no agreement between two vehicles, and a vehicle as reliable as others.
+/// Weight, in comparisons, of the priors: no agreement between two vehicles, and a vehicle as
+/// reliable as others.
 const PRIOR_COMPARISONS: f64 = 10.0;
-/// Votes after which a vehicle has half of its final influence on the choice of the main group; bounds the gain of
-/// attackers who rejoin under new names.
+/// Votes after which a vehicle has half of its final influence on the choice of the main group;
+/// bounds the gain of attackers who rejoin under new names.
 const TENURE_VOTES: f64 = 50.0;
 const GROUPING_STEPS: u32 = 30;
 const FACTOR_STEPS: u32 = 15;
@@ -51,7 +54,7 @@ impl Pair {
         ((self.agreed - self.chance) / (self.compared - self.chance).max(1e-9)).clamp(-1.0, 1.0)
     }
 
-    /// The part ρ of a vote that is not its own, where κ = `explained` is expected of independent vehicles.
+    /// The dependent part ρ of a vote, where κ = `explained` is expected of independent vehicles.
     fn excess(&self, explained: f64, significance: f64) -> f64 {
         let expected = self.chance + (self.compared - self.chance) * explained;
         let deviation = (expected * (1.0 - expected / self.compared).max(0.0) + 1.0).sqrt();
@@ -151,7 +154,8 @@ impl Dependence {
         }
     }
 
-    /// Compares the votes (vehicle, label, is new) on a landmark in pairs of which one is new; their order is fixed.
+    /// Compares the votes (vehicle, label, is new) on a landmark in pairs of which one is new;
+    /// their order is fixed.
     pub(super) fn compare(&mut self, votes: &[(usize, LabelIndex, bool)]) {
         for &(vehicle, _, is_new) in votes {
             if self.tenure.len() <= vehicle {
@@ -201,8 +205,8 @@ impl Dependence {
         self.total += 1.0;
     }
 
-    /// Part of a vote that is the vehicle's own where the others that `agrees` selects state the same label: 1 / (1 +
-    /// Σ ρ), the design effect of correlated answers (Kish 1965).
+    /// Part of a vote that is the vehicle's own where the others that `agrees` selects state the
+    /// same label: 1 / (1 + Σ ρ), the design effect of correlated answers (Kish 1965).
     pub(super) fn independence(&self, vehicle: usize, agrees: impl Fn(usize) -> bool) -> f64 {
         let partners = self.partners.get(vehicle).map_or(&[][..], Vec::as_slice);
         let shared: f64 = partners
@@ -265,8 +269,8 @@ impl Dependence {
     }
 }
 
-/// Membership of each vehicle, 0 to 1, in the largest group that agrees: a dominant set (Pavan & Pelillo 2007). It is
-/// found by power iteration that drops negative parts.
+/// Membership of each vehicle, 0 to 1, in the largest group that agrees: a dominant set (Pavan &
+/// Pelillo 2007). It is found by power iteration that drops negative parts.
 fn main_group(influences: &[f64], pairs: &[(usize, usize, Pair)]) -> Vec<f64> {
     let mut belonging = influences.to_vec();
     for _ in 0..GROUPING_STEPS {
@@ -300,8 +304,8 @@ fn typical_agreement(belonging: &[f64], pairs: &[(usize, usize, Pair)]) -> f64 {
     (agreed / weights.max(1e-9)).clamp(0.0, 0.99)
 }
 
-/// One step of alternating least squares for κ = r_i · r_j. Agreement counts as far as it is with the main group and not
-/// excessive.
+/// One step of alternating least squares for κ = r_i · r_j. Agreement counts if it is with the main
+/// group and not excessive.
 fn next_factors(
     factors: &[f64],
     belonging: &[f64],

@@ -20,7 +20,8 @@ struct LabelEntry {
     stated_at: Option<Timestamp>,
 }
 
-/// Labels, numbered in order of first appearance; a label that leaves makes its index free for another.
+/// Labels, numbered in order of first appearance; a label that leaves makes its index free for
+/// another.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LabelTable {
     entries: Vec<LabelEntry>,
@@ -83,10 +84,12 @@ impl LabelTable {
         }
     }
 
-    /// Evicts the least useful labels and returns their indices; `support` is the number of correct votes of each.
+    /// Evicts the least useful labels and returns their indices; `support` is the number of correct
+    /// votes of each.
     ///
-    /// Unsupported labels go first, of these the labels of the vehicle that introduced most (longest queue drop, as in
-    /// fair queueing, McKenney 1990), the longest unseen first. A vehicle that invents labels loses its own.
+    /// Unsupported labels are evicted first. Among these, the labels of the vehicle that introduced
+    /// most are evicted first (longest queue drop, as in fair queueing, McKenney 1990), the longest
+    /// unseen first. A vehicle that invents labels therefore loses its own labels.
     pub(super) fn make_room(&mut self, support: &[f64]) -> BTreeSet<LabelIndex> {
         let is_supported = |index: LabelIndex| support[usize::from(index)] >= SUPPORTED_VOTES;
         let mut latest: Vec<_> = self

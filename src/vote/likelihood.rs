@@ -2,7 +2,7 @@
 
 use super::confusion::LabelIndex;
 
-/// A vote as the model takes it.
+/// A vote in the form for the model.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct WeightedVote {
     /// Index of the vehicle.
@@ -18,7 +18,7 @@ pub(super) struct WeightedVote {
 /// Probabilities of labels.
 pub(super) type Posterior = Vec<(LabelIndex, f64)>;
 
-/// Judgement of a landmark by all its votes.
+/// Evaluation of a landmark by all its votes.
 pub(super) struct LandmarkPosterior {
     pub(super) labels: Posterior,
     /// Probability of each vote's label given the other votes.

@@ -49,7 +49,7 @@ pub(super) trait VotingMethod {
     /// The verdict at a landmark.
     fn verdict(&self, landmark: &LandmarkId) -> Option<Verdict>;
 
-    /// The labels of the present votes on a landmark, and their vehicles.
+    /// The labels of the current votes on a landmark, and their vehicles.
     fn readings(&self, _landmark: &LandmarkId) -> BTreeMap<Label, Vec<NodeName>> {
         BTreeMap::new()
     }
@@ -57,7 +57,8 @@ pub(super) trait VotingMethod {
     /// The reputation of each vehicle.
     fn reputations(&self) -> BTreeMap<NodeName, Reputation>;
 
-    /// Whether a vehicle has voted often enough to be judged, and was right more often than wrong.
+    /// Whether a vehicle has voted often enough to be evaluated, and was right more often than
+    /// wrong.
     fn is_proven(&self, _node: &NodeName) -> bool {
         false
     }
@@ -83,7 +84,8 @@ pub(super) trait VotingMethod {
     fn resume(&mut self, _reputations: &BTreeMap<NodeName, Reputation>) {}
 }
 
-/// A verdict with `published` or else the label of the highest score, the first in alphabetical order on a tie.
+/// A verdict with `published` or, if absent, the label of the highest score, the first in
+/// alphabetical order on a tie.
 ///
 /// With hysteresis the published label may not be the highest for a while; its margin is 0 then.
 pub(super) fn verdict(

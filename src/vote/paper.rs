@@ -1,4 +1,4 @@
-//! The paper's voting, to the letter.
+//! The paper's voting without changes.
 //!
 //! S(ρ,l) = Σ_v Σ_ω [l_ω = l] r_v c_ω k(ρ,v), without clearing; the label is λ_ρ = argmax_l S(ρ,l);
 //! r_v += Δr_v after each verdict.
@@ -33,7 +33,7 @@ struct VehicleScore {
 struct LandmarkScores {
     scores: BTreeMap<Label, f64>,
     contributors: BTreeSet<NodeName>,
-    /// Whether it was voted on in this round.
+    /// Whether it has votes in this round.
     has_new_votes: bool,
 }
 
@@ -120,8 +120,8 @@ impl VotingMethod for PaperVoting {
         }
     }
 
-    /// Ends a round: changes every vehicle's reputation by step · (correct − incorrect) / objects over its votes since
-    /// the last verdict.
+    /// Ends a round: changes every vehicle's reputation by step · (correct − incorrect) / objects
+    /// over its votes since the last verdict.
     fn close(&mut self, _now: Timestamp) -> (BTreeSet<LandmarkId>, Vec<Evidence>) {
         let changed = std::mem::take(&mut self.changed);
         let mut labels: HashMap<&LandmarkId, Option<Label>> = HashMap::with_capacity(changed.len());
@@ -171,7 +171,7 @@ impl VotingMethod for PaperVoting {
             .collect()
     }
 
-    /// Reputations of vehicles that are not named stay.
+    /// Reputations of vehicles that are not listed are kept.
     fn resume(&mut self, reputations: &BTreeMap<NodeName, Reputation>) {
         let (low, high) = REPUTATION_RANGE;
         for (node, reputation) in reputations {

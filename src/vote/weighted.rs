@@ -26,11 +26,11 @@ use crate::model::time::Timestamp;
 use crate::reputation::{Counts, Evidence, ReputationLedger};
 use crate::wire::{ForeignVotes, Reputation, Verdict};
 
-/// Least weight of a statement among the vehicle's own.
+/// Minimum weight of a statement among the vehicle's own statements.
 const MIN_WEIGHT: f64 = 0.01;
-/// Share of the present vehicles from which dependent ones can have decided verdicts.
+/// Share of dependent vehicles among the present ones from which they may have decided verdicts.
 const MANY_DEPENDENT: f64 = 0.2;
-/// Times that all landmarks are judged in turn where learning starts again.
+/// Number of times that all landmarks are evaluated in turn when learning starts again.
 const START_SWEEPS: u32 = 3;
 
 /// Incremental expectation maximisation (Neal & Hinton 1998) over the fresh votes.
@@ -52,16 +52,16 @@ pub(super) struct WeightedVoting {
     foreign: BTreeMap<NodeName, ForeignVotes>,
     labels: LabelTable,
     landmarks: BTreeMap<LandmarkId, LandmarkVotes>,
-    /// Landmarks to judge when the round closes.
+    /// Landmarks to evaluate when the round closes.
     changed: BTreeSet<LandmarkId>,
     /// The next expiry of each landmark that has votes.
     expiries: BTreeSet<(Timestamp, LandmarkId)>,
-    /// The landmark that was judged again last.
+    /// The landmark that was re-evaluated last.
     revisit_after: Option<LandmarkId>,
     /// Votes since the last round.
     fresh_votes: usize,
     evidence: Vec<Evidence>,
-    /// Votes from then on become evidence.
+    /// Time from which on votes become evidence.
     recorded_from: Timestamp,
     /// Number of dependent vehicles when learning last started again because of them.
     known_dependent: usize,
@@ -101,7 +101,7 @@ impl WeightedVoting {
         vehicle
     }
 
-    /// Judges a landmark's votes from scratch.
+    /// Evaluates a landmark's votes from scratch.
     fn judge(&mut self, landmark: &LandmarkId, weights: &Weights) {
         self.remove_live(landmark);
         let Some(landmark_votes) = self.landmarks.get_mut(landmark) else {
@@ -132,9 +132,10 @@ impl WeightedVoting {
 
     /// Finds the vehicles that depend on each other.
     ///
-    /// If the main group is thought wrong more often than right and its copies right, then verdicts that the copies
-    /// made themselves taught that. Such evidence is void: learning starts again. It also does where many vehicles turn out
-    /// to be dependent, whose agreement has passed for reliability.
+    /// If the main group counts as wrong more often than right and its copies as right, this was
+    /// derived from verdicts that the copies themselves decided. Such evidence is void, and
+    /// learning starts again. Learning also starts again if many vehicles turn out to be dependent,
+    /// because their agreement was mistaken for reliability.
     fn fit_dependence(&mut self) {
         let mut present = vec![false; self.names.len()];
         self.landmarks
@@ -161,8 +162,8 @@ impl WeightedVoting {
         }
     }
 
-    /// Judges older landmarks in turn, as far as the budget for this round's fresh votes goes; adds those whose
-    /// published label changed to `changed`.
+    /// Re-evaluates older landmarks in turn, within the budget for this round's fresh votes; adds
+    /// those whose published label changed to `changed`.
     fn revisit(&mut self, weights: &Weights, changed: &mut BTreeSet<LandmarkId>) {
         let mut budget =
             (self.config.revisit_votes * std::mem::take(&mut self.fresh_votes) as f64) as usize;
@@ -236,7 +237,7 @@ impl VotingMethod for WeightedVoting {
         Some(self.evict_labels_for(vote.label, max_labels))
     }
 
-    /// Takes a vote in the place of the vehicle's earlier one on the landmark.
+    /// Adds a vote in place of the vehicle's earlier vote on the landmark.
     fn add_vote(&mut self, vote: &NewVote<'_>) {
         let &NewVote {
             landmark,

@@ -10,7 +10,7 @@ use crate::model::names::NodeName;
 use crate::model::origin::GeographicOrigin;
 use crate::model::time::Timestamp;
 
-/// A cell's map for those outside of the cell.
+/// A cell's map for receivers outside of the cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct CellMap {
     /// Major version of the payload, [`super::SCHEMA_VERSION`].
@@ -19,7 +19,8 @@ pub struct CellMap {
     /// The cell; equals the level of the topic.
     #[n(1)]
     pub cell: NodeName,
-    /// When it was sent, by the sender's own clock. Receivers judge age by how long messages of this cell take at least.
+    /// Time of sending by the sender's own clock. Receivers derive the age of a message from the
+    /// minimum transit time of this cell's messages.
     #[n(2)]
     pub sent_at_us: Timestamp,
     /// The place on Earth of the map's frame.

@@ -13,7 +13,7 @@ use crate::model::names::NodeName;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Encoding {
-    /// Text that people and all languages can read; the default.
+    /// Text that people and all programming languages can read; the default.
     #[default]
     Json,
     /// RFC 8949 with the same field names.
@@ -50,10 +50,11 @@ pub fn decode<T: Payload>(bytes: &[u8], limits: &Limits) -> Result<T, RejectReas
     decode_entries(bytes, limits).map(|(payload, _)| payload)
 }
 
-/// Reads and checks a payload as [`decode`] does, and returns with it the entries that were left out.
+/// Decodes and checks a payload as [`decode`] does, and also returns the entries that were left
+/// out.
 ///
 /// # Errors
-/// The first reason found; see [`RejectReason`].
+/// Returns the first reason found; see [`RejectReason`].
 pub fn decode_entries<T: Payload>(
     bytes: &[u8],
     limits: &Limits,
@@ -73,10 +74,10 @@ pub fn decode_entries<T: Payload>(
     Ok((payload, invalid))
 }
 
-/// Reads a report and checks every value in it; `topic_node` is the node named by its topic.
+/// Decodes a report and checks every value in it; `topic_node` is the node named by its topic.
 ///
 /// # Errors
-/// The first reason found; see [`RejectReason`].
+/// Returns the first reason found; see [`RejectReason`].
 pub fn decode_report(
     bytes: &[u8],
     topic_node: &NodeName,
@@ -87,10 +88,10 @@ pub fn decode_report(
     })
 }
 
-/// Reads a share and checks every value in it; `topic_node` is the node named by its topic.
+/// Decodes a share and checks every value in it; `topic_node` is the node named by its topic.
 ///
 /// # Errors
-/// The first reason found; see [`RejectReason`].
+/// Returns the first reason found; see [`RejectReason`].
 pub fn decode_share(
     bytes: &[u8],
     topic_node: &NodeName,
@@ -154,7 +155,8 @@ fn read_named<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, RejectReason> {
     }
 }
 
-/// True if the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not finite.
+/// True if the syntax error is at `NaN` or `Infinity`, which Python writes for numbers that are not
+/// finite.
 fn is_at_non_finite_word(bytes: &[u8], error: &serde_json::Error) -> bool {
     let line = bytes
         .split(|byte| *byte == b'\n')

@@ -44,7 +44,7 @@ pub(super) fn read<T: for<'b> Decode<'b, ()>>(bytes: &[u8]) -> Result<T, RejectR
     }
 }
 
-/// The `schema` of a payload that may be of a later version: it stays the first.
+/// The `schema` of a payload that may be of a later version; it is always the first field.
 pub(super) fn schema(bytes: &[u8]) -> Option<u32> {
     let mut decoder = Decoder::new(bytes);
     decoder.array().ok()?;

@@ -30,7 +30,7 @@ use crate::model::names::NodeName;
 #[schemars(with = "String", extend("pattern" = "^[0-9a-f]{64}$"))]
 pub struct ContentHash(#[cbor(n(0), with = "minicbor::bytes")] pub [u8; 32]);
 
-/// A text that is no [`ContentHash`].
+/// Error for a text that is not a [`ContentHash`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("a hash has 64 hexadecimal digits")]
 pub struct InvalidHash;
@@ -86,7 +86,8 @@ impl From<ContentHash> for String {
     }
 }
 
-/// Version and hash of a description. The later version counts; of two equal ones, the greater hash.
+/// Version and hash of a description. The later version wins; between equal versions, the greater
+/// hash.
 #[derive(
     Debug,
     Clone,

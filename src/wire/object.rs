@@ -71,7 +71,8 @@ impl PerceivedObject {
     }
 }
 
-/// The field of view of a camera or scanner, from the pose of its report and centred on its heading.
+/// The field of view of a camera or scanner, from the pose of its report and centred on its
+/// heading.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct FieldOfView {
     /// Range in metres within which objects are usually detected.
@@ -103,7 +104,7 @@ pub struct FusedObject {
     /// Position covariance `[xx, xy, yy]` in m².
     #[cbor(n(5), with = "CovarianceForm")]
     pub covariance_m2: [f64; 3],
-    /// The nodes whose detections are in the entry.
+    /// The nodes whose detections were used for the entry.
     #[n(6)]
     pub contributors: Vec<NodeName>,
     /// Probability that the object exists and is still there.
@@ -134,7 +135,7 @@ pub struct FusedObject {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(12)]
     pub first_seen_us: Option<Timestamp>,
-    /// The node that this object is, by the node's own report.
+    /// The node whose vehicle this object is, by the node's own report.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[n(13)]
     pub vehicle: Option<NodeName>,
@@ -169,10 +170,12 @@ impl FusedObject {
 
 /// The estimated error of a vehicle's positions, from objects that several vehicles detect.
 ///
-/// A reported position p is corrected to R(`dheading_rad`)·(p − `about_m`) + `about_m` + (`dx_m`, `dy_m`).
+/// A reported position p is corrected to R(`dheading_rad`)·(p − `about_m`) + `about_m` + (`dx_m`,
+/// `dy_m`).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Encode, Decode, JsonSchema)]
 pub struct PoseCorrection {
-    /// Centre of the rotation `[east, north]` in metres: the reported pose, or the middle of the vehicle's detections.
+    /// Centre of the rotation `[east, north]` in metres: the reported pose, or the middle of the
+    /// vehicle's detections.
     #[cbor(n(0), with = "Millimetres")]
     pub about_m: [f64; 2],
     /// East in metres.

@@ -73,7 +73,7 @@ impl RegionTopic {
         }
     }
 
-    /// Content of a full topic; `None` for others.
+    /// Content of a full topic; `None` for other topics.
     pub fn parse(path: &str) -> Option<Self> {
         let rest = path.strip_prefix(ROOT)?.strip_prefix('/')?;
         let (rest, kind) = rest.rsplit_once('/')?;

@@ -35,7 +35,7 @@ impl ReputationTopic {
         format!("{ROOT}/+/+")
     }
 
-    /// Content of a full topic; `None` for others.
+    /// Content of a full topic; `None` for other topics.
     pub fn parse(path: &str) -> Option<Self> {
         let (vehicle, cell) = path
             .strip_prefix(ROOT)?

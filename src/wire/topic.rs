@@ -56,7 +56,7 @@ impl ReportKind {
     }
 }
 
-/// Builds and takes apart the topics below `ecod/v1/<cell>`.
+/// Builds and parses the topics below `ecod/v1/<cell>`.
 #[derive(Debug, Clone)]
 pub struct Topics {
     root: String,

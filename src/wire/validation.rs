@@ -18,7 +18,8 @@ use crate::model::names::{Label, NodeName, is_label, is_plain_text};
 use crate::model::origin::GeographicOrigin;
 use crate::model::time::Timestamp;
 
-/// Maximum length of the text of a cell's description in bytes; all vehicles get it with each connection to a broker.
+/// Maximum length of the text of a cell's description in bytes; all vehicles get it with each
+/// connection to a broker.
 pub const MAX_DESCRIPTION_BYTES: usize = 256 * 1024;
 
 /// Bounds of a payload; one beyond them is not decoded.
@@ -42,17 +43,19 @@ impl Default for Limits {
     }
 }
 
-/// Largest epoch, round, count or time: every JSON reader keeps integers up to 2⁵³ − 1 exact (RFC 8259, section 6).
+/// Largest epoch, round, count or time: every JSON reader keeps integers up to 2⁵³ − 1 exact (RFC
+/// 8259, section 6).
 pub const MAX_INTEGER: u64 = (1 << 53) - 1;
 
-/// Maximum lead in seconds of a round's time of fusion over the receiver's clock. Maps do not need synchronised clocks;
-/// this only rejects rounds that would look fresh for hours.
+/// Maximum lead in seconds of a round's time of fusion over the receiver's clock. Maps do not need
+/// synchronised clocks; this only rejects rounds that would look fresh for hours.
 pub const MAX_FUSED_AHEAD_S: u64 = 3600;
 
 /// Maximum length of a certificate or signature in base64, in bytes.
 const MAX_TEXT: usize = 4096;
 
-/// Maximum number of counts, and of marks, in one share: it stays below the default of [`Limits::payload_bytes`].
+/// Maximum number of counts, and of marks, in one share: it stays below the default of
+/// [`Limits::payload_bytes`].
 pub const MAX_SHARE_ENTRIES: usize = 512;
 
 /// Largest coordinate of a position on Earth in metres.
@@ -61,15 +64,17 @@ const WORLD_BOUND_M: f64 = 1e8;
 /// Fastest object in metres per second.
 const SPEED_BOUND_MPS: f64 = 1e4;
 
-/// Largest size of an object and largest range of a sensor in metres. A number of 11 significant bits: the compact
-/// encoding rounds no smaller size beyond it.
+/// Largest size of an object and largest range of a sensor in metres. A number of 11 significant
+/// bits: the compact encoding rounds no smaller size beyond it.
 const SIZE_BOUND_M: f64 = 102_400.0;
 
-/// Largest variance of a position in m²: far more than the square of [`WORLD_BOUND_M`], and little enough for sums and products
-/// of covariances to stay finite. A power of two, 7.4e19, which no encoding rounds up.
+/// Largest variance of a position in m²: far more than the square of [`WORLD_BOUND_M`], and little
+/// enough for sums and products of covariances to stay finite. A power of two, 7.4e19, which no
+/// encoding rounds up.
 const VARIANCE_BOUND_M2: f64 = (1u128 << 66) as f64;
 
-/// Largest age in seconds and largest number of pairs of detections; a power of two, which no encoding rounds up.
+/// Largest age in seconds and largest number of pairs of detections; a power of two, which no
+/// encoding rounds up.
 const COUNT_BOUND: f64 = (1u64 << 52) as f64;
 
 /// Largest angle in radians: headings may count full turns.

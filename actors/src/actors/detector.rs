@@ -6,7 +6,8 @@
 //!                                         └── permit, when done ──┘
 //! ```
 //!
-//! The pump takes the latest frame only when the detector is done with the previous one, so frames never queue.
+//! The pump takes the latest frame only when the detector is done with the previous one, so frames
+//! never queue.
 
 use std::pin::pin;
 use std::sync::Arc;

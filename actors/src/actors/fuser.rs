@@ -500,7 +500,8 @@ impl FuserState {
         self.tell_uplink(now);
     }
 
-    /// Counts entries that this node left out of its map or verdicts, by the vehicles whose statements are in them.
+    /// Counts entries that this node left out of its map or verdicts, by the vehicles whose
+    /// statements are in them.
     fn report_left_out(&self, left_out: &[InvalidEntry]) {
         for InvalidEntry {
             reason,

@@ -1,4 +1,5 @@
-//! The actor that owns the gossip socket: liveness of nodes, independent of MQTT, and small datagrams between nodes.
+//! The actor that owns the gossip socket: liveness of nodes, independent of MQTT, and small
+//! datagrams between nodes.
 //!
 //! ```text
 //! LeaderElection ── Send ──> Membership <──── UDP ────> other nodes
@@ -218,7 +219,8 @@ impl Actor for Membership {
 }
 
 impl MembershipState {
-    /// Processes waiting datagrams before due timers: after a stall, signs of life come before suspicions.
+    /// Processes waiting datagrams before due timers: after a stall, signs of life come before
+    /// suspicions.
     fn wake(&mut self) {
         let mut buffer = [0; 2 * MAX_PAYLOAD_BYTES];
         for _ in 0..MAX_DATAGRAMS_PER_WAKE {

@@ -50,7 +50,8 @@ pub struct Calibration {
     pub cy: f64,
     /// OpenCV's k1, k2, p1, p2, k3.
     pub distortion: [f64; 5],
-    /// Root mean square distance in pixels between found and reprojected corners; good is below 0.5.
+    /// Root mean square distance in pixels between found and reprojected corners; good is below
+    /// 0.5.
     pub rms_px: f64,
     /// Photographs used.
     pub images: Vec<PathBuf>,

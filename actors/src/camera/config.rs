@@ -29,8 +29,8 @@ pub struct CameraConfig {
     /// Stall timeout and retries of the source.
     #[serde(default)]
     pub capture: CaptureConfig,
-    /// Image size and field of view. Frames of the same aspect ratio are scaled. Others are rejected, unless only a field
-    /// of view is given: it then holds for frames of any shape.
+    /// Image size and field of view. Frames of the same aspect ratio are scaled. Others are
+    /// rejected, unless only a field of view is given: it then holds for frames of any shape.
     #[serde(default)]
     pub optics: OpticsConfig,
     /// Position and attitude of the camera on the vehicle.

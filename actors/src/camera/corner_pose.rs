@@ -38,8 +38,8 @@ pub fn locate_target(
     }
 }
 
-/// Corners with one moved by a thousandth of a pixel. OpenCV finds no finite pose for many symmetric squares, which
-/// whole-pixel corners often form.
+/// Corners with one moved by a thousandth of a pixel. OpenCV finds no finite pose for many
+/// symmetric squares, which whole-pixel corners often form.
 fn perturbed(corners: &[Point2<f64>; 4]) -> [Point2<f64>; 4] {
     let [first, second, third, fourth] = *corners;
     [

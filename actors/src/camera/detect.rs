@@ -20,7 +20,8 @@ use crate::camera::frame::CameraFrame;
 
 /// Detector of objects in images.
 ///
-/// A detector may keep state between frames and may take tens of milliseconds: call it off the async threads.
+/// A detector may keep state between frames and may take tens of milliseconds: call it off the
+/// async threads.
 pub trait Detect: Send {
     /// Objects in the frame in any order, in pixels of `frame.image`.
     ///

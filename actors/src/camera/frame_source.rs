@@ -73,7 +73,8 @@ pub enum SourceConfig {
         /// Device file. Default `/dev/video0`.
         #[serde(default = "default_device")]
         device: PathBuf,
-        /// Requested image width in pixels. Default 640. The camera takes the nearest size that it has.
+        /// Requested image width in pixels. Default 640. The camera takes the nearest size that it
+        /// has.
         #[serde(default)]
         width: Option<u32>,
         /// Requested image height in pixels. Default 480.

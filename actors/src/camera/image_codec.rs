@@ -1,4 +1,5 @@
-//! Image files and JPEG pictures. OpenCV's `imgcodecs` is left out: with it, Debian loads a hundred libraries into a node.
+//! Image files and JPEG pictures. OpenCV's `imgcodecs` is left out: with it, Debian loads a hundred
+//! libraries into a node.
 
 use std::io::Cursor;
 use std::path::Path;

@@ -28,7 +28,8 @@ pub struct SizeMismatch {
     pub optics: ImageSize,
 }
 
-/// Maximum relative difference between horizontal and vertical scale, which rounding to whole pixels explains.
+/// Maximum relative difference between horizontal and vertical scale, which rounding to whole
+/// pixels explains.
 const ASPECT_TOLERANCE: f64 = 0.01;
 
 impl ImageSize {

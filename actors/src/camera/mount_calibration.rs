@@ -1,4 +1,5 @@
-//! The mount of a configured camera: found from points that a person measured, and written for the configuration.
+//! The mount of a configured camera: found from points that a person measured, and written for the
+//! configuration.
 
 use ecod::model::geometry::Pose;
 use ecod::perception::camera::Mount;

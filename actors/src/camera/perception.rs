@@ -1,4 +1,5 @@
-//! Processing of one vehicle's detections into a report: undistortion, ranging, placing, field of view.
+//! Processing of one vehicle's detections into a report: undistortion, ranging, placing, field of
+//! view.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;

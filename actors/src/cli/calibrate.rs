@@ -1,4 +1,5 @@
-//! `ecod-node calibrate`: a calibration file from photographs of a chessboard, and the mount of a camera.
+//! `ecod-node calibrate`: a calibration file from photographs of a chessboard, and the mount of a
+//! camera.
 
 mod mount;
 

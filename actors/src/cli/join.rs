@@ -61,7 +61,8 @@ pub(super) struct InviteArguments {
     /// Hours for which this command waits for them
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=720))]
     hours: u32,
-    /// Address at which they reach this command. Default: a free port at all addresses of this machine
+    /// Address at which they reach this command. Default: a free port at all addresses of this
+    /// machine
     #[arg(long, value_name = "IP:PORT")]
     listen: Option<SocketAddr>,
     /// Node through which they find the cell where multicast does not work; may be given several

@@ -62,8 +62,9 @@ const ENDPOINT: &str = "OTEL_EXPORTER_OTLP_ENDPOINT";
 /// Prefix of event fields in the journal, followed by `_`.
 const JOURNAL_PREFIX: &str = "ECOD";
 
-/// Starts the log. A service's log is read by machines, a tool's by people. `RUST_LOG` overrides `level`. Spans are not
-/// logged: a line has the fields of its event only. Keep the result until the program ends.
+/// Starts the log. A service's log is read by machines, a tool's by people. `RUST_LOG` overrides
+/// `level`. Spans are not logged: a line has the fields of its event only. Keep the result until
+/// the program ends.
 pub fn start(format: LogFormat, is_service: bool, level: &str) -> Option<Export> {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
     let (layer, problem) = match resolved(format, is_service) {
@@ -114,7 +115,8 @@ fn resolved(format: LogFormat, is_service: bool) -> LogFormat {
     }
 }
 
-/// True if standard error is connected to the journal. The variable alone may be inherited from another process.
+/// True if standard error is connected to the journal. The variable alone may be inherited from
+/// another process.
 fn stderr_is_journal() -> bool {
     let Some(stream) = std::env::var("JOURNAL_STREAM").ok() else {
         return false;

@@ -26,7 +26,8 @@ pub(super) struct Logs {
 }
 
 impl Logs {
-    /// Finds the log files of one node among files and directories. Files without a node's name belong to the only node.
+    /// Finds the log files of one node among files and directories. Files without a node's name
+    /// belong to the only node.
     pub(super) fn find(
         inputs: &[PathBuf],
         LogsNodeArguments { node }: &LogsNodeArguments,

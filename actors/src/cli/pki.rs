@@ -25,7 +25,8 @@ pub(super) enum PkiCommand {
         /// Name of the cell
         #[arg(long)]
         cell: NodeName,
-        /// Directory of the CA of the city that signs the cell's CA; by default the cell stands alone
+        /// Directory of the CA of the city that signs the cell's CA; by default the cell stands
+        /// alone
         #[arg(long, value_name = "DIR")]
         city: Option<PathBuf>,
     },

@@ -28,8 +28,8 @@ pub(super) struct ReplayArguments {
     /// log; for reports, the defaults and the locations that the reports name
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// A log (MCAP), a directory of logs, or reports, one JSON object per line in order of arrival; `-` for standard
-    /// input; may be given several times for logs
+    /// A log (MCAP), a directory of logs, or reports, one JSON object per line in order of arrival;
+    /// `-` for standard input; may be given several times for logs
     #[arg(long, value_name = "FILE", required = true)]
     input: Vec<PathBuf>,
     #[command(flatten)]

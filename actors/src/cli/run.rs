@@ -49,8 +49,8 @@ pub(super) struct RunArguments {
     /// Append every accepted map with its time of receipt to this file, one JSON object per line
     #[arg(long, value_name = "FILE")]
     map_log: Option<String>,
-    /// Address of the web page, metrics and health. Default 127.0.0.1:8080, or a free port if that is in use. Addresses
-    /// other than loopback need `dashboard.token`
+    /// Address of the web page, metrics and health. Default 127.0.0.1:8080, or a free port if that
+    /// is in use. Addresses other than loopback need `dashboard.token`
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port, num_args = 0..=1)]
     dashboard: Option<Option<SocketAddr>>,
     /// Disable page, metrics and health

@@ -48,7 +48,8 @@ pub(super) struct TryArguments {
     /// node-2.toml
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
-    /// Address of the first vehicle's page. Default 127.0.0.1:8080, or a free port if that is in use
+    /// Address of the first vehicle's page. Default 127.0.0.1:8080, or a free port if that is in
+    /// use
     #[arg(long, value_name = "IP:PORT", value_parser = ip_and_port)]
     dashboard: Option<SocketAddr>,
     /// Stop when standard input ends, for example when the parent process ends

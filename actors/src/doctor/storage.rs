@@ -13,7 +13,8 @@ use crate::transport::gossip::{KeyError, check_key};
 /// Minimum free bytes for state and map log.
 const MIN_FREE_BYTES: u64 = 100_000_000;
 
-/// Configuration directory of the packaged service, and the only directory that its unit lets it write by default.
+/// Configuration directory of the packaged service, and the only directory that its unit lets it
+/// write by default.
 const SERVICE_CONFIGURATION: &str = "/etc/ecod";
 const SERVICE_STATE: &str = "/var/lib/ecod";
 

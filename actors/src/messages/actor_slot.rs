@@ -8,8 +8,8 @@ use ractor::rpc::CallResult;
 use ractor::{ActorRef, Message, RpcReplyPort};
 use tokio::time::timeout;
 
-/// Address of an actor that survives the actor's restarts. The supervisor sets each new run. A message to an empty
-/// slot is dropped, as it would be by an actor that has just ended.
+/// Address of an actor that survives the actor's restarts. The supervisor sets each new run. A
+/// message to an empty slot is dropped, as it would be by an actor that has just ended.
 pub struct ActorSlot<M> {
     actor: Arc<RwLock<Option<ActorRef<M>>>>,
 }

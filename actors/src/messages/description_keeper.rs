@@ -1,4 +1,5 @@
-//! Requests to the actor `DescriptionKeeper`, from the election, the gateway and the node's local broker.
+//! Requests to the actor `DescriptionKeeper`, from the election, the gateway and the node's local
+//! broker.
 
 use std::sync::Arc;
 

@@ -74,8 +74,8 @@ pub fn algorithms(config: &NodeConfig, camera: &CameraConfig) -> Algorithms {
     }
 }
 
-/// Time in which a frame source opens: less than the stall timeout, so that OpenCV gives up first and no reader is
-/// abandoned.
+/// Time in which a frame source opens: less than the stall timeout, so that OpenCV gives up first
+/// and no reader is abandoned.
 pub fn open_timeout(camera: &CameraConfig) -> Duration {
     Duration::from_secs_f64(0.8 * camera.capture.stall_timeout_s)
 }

@@ -1,6 +1,8 @@
-//! The configuration of a node: defaults, then a TOML file, then `ECOD_…` in the environment, then flags.
+//! The configuration of a node: defaults, then a TOML file, then `ECOD_…` in the environment, then
+//! flags.
 //!
-//! Environment variables name a key with two underscores between its levels: `ECOD_MQTT__BROKER=10.0.0.2:1883`.
+//! Environment variables name a key with two underscores between its levels:
+//! `ECOD_MQTT__BROKER=10.0.0.2:1883`.
 
 mod cameras;
 mod cells;
@@ -44,7 +46,8 @@ use crate::transport::pki::TlsConfig;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NodeConfig {
-    /// Name of the node, unique in its cell. Default `edge` for an edge, the machine's host name for others.
+    /// Name of the node, unique in its cell. Default `edge` for an edge, the machine's host name
+    /// for others.
     pub name: Option<NodeName>,
     /// Name of the cell; messages of nodes of other cells are ignored. Default `cell`.
     pub cell: NodeName,
@@ -418,7 +421,8 @@ impl NodeConfig {
         self.serves_nodes() || self.broker.door
     }
 
-    /// True if the broker takes a free port where the usual one is in use: only programs of this machine need it.
+    /// True if the broker takes a free port where the usual one is in use: only programs of this
+    /// machine need it.
     pub fn may_listen_at_any_port(&self) -> bool {
         self.listen.is_none() && !self.serves_nodes()
     }

@@ -8,7 +8,8 @@ use std::path::Path;
 
 use rustix::fs::OFlags;
 
-/// Maximum size of a text file in bytes: configurations, keys, certificates, labels, recorded detections.
+/// Maximum size of a text file in bytes: configurations, keys, certificates, labels, recorded
+/// detections.
 const MAX_TEXT_BYTES: u64 = 256 * 1024 * 1024;
 
 /// Some editors begin a text with it.

@@ -1,4 +1,5 @@
-//! The node's clocks: a steady one for everything that happens inside the node, and the machine's wall clock.
+//! The node's clocks: a steady one for everything that happens inside the node, and the machine's
+//! wall clock.
 
 use std::sync::OnceLock;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -15,7 +16,8 @@ pub fn now() -> Timestamp {
     at(since_boot())
 }
 
-/// The steady clock's time in microseconds when the machine had run for `since_boot`. All processes share that time.
+/// The steady clock's time in microseconds when the machine had run for `since_boot`. All processes
+/// share that time.
 pub fn at(since_boot: Duration) -> Timestamp {
     static ANCHOR: OnceLock<(Duration, Timestamp)> = OnceLock::new();
     let (started, wall) = ANCHOR.get_or_init(|| (self::since_boot(), wall()));

@@ -35,7 +35,8 @@ const MAX_BYTES: u64 = 64 * 1024 * 1024;
 const HEADER: &str = "ecod-state 1 ";
 
 impl StateFile {
-    /// The file `<cell>.<node>.<what>.json` in `directory`, so that the nodes of a machine can share a directory.
+    /// The file `<cell>.<node>.<what>.json` in `directory`, so that the nodes of a machine can
+    /// share a directory.
     pub fn new(directory: &Path, cell: &NodeName, node: &NodeName, what: &str) -> Self {
         Self {
             path: directory.join(format!("{cell}.{node}.{what}.json")),

@@ -114,8 +114,8 @@ impl<K: Ord + Clone> KeyedThrottle<K> {
     }
 }
 
-/// Address under which a host is counted: its IPv4 address, or its IPv6 /64 network, which has 2⁶⁴ addresses to choose
-/// from.
+/// Address under which a host is counted: its IPv4 address, or its IPv6 /64 network, which has 2⁶⁴
+/// addresses to choose from.
 pub(crate) fn host_network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V4(v4) => IpAddr::V4(v4),

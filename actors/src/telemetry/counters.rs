@@ -55,7 +55,8 @@ pub enum Event {
     ReportLate,
     /// A new object was not tracked: there are too many tracks, or too many near it.
     ObjectRefused,
-    /// An entry of a map, of verdicts or of reputations was left out, because a value in it is out of bounds.
+    /// An entry of a map, of verdicts or of reputations was left out, because a value in it is out
+    /// of bounds.
     EntryLeftOut,
     /// Verdicts newer than all before were accepted.
     VerdictsAccepted,
@@ -97,7 +98,8 @@ pub enum Event {
     PoseRejected,
     /// A frame of a moving vehicle was not reported: there is no pose near its time.
     FrameWithoutPose,
-    /// The embedded broker refused a client: its address connects too often, or too many connections wait.
+    /// The embedded broker refused a client: its address connects too often, or too many
+    /// connections wait.
     ClientThrottled,
     /// A client of the embedded broker did not log in in time.
     ClientTimedOut,
@@ -105,13 +107,16 @@ pub enum Event {
     ClientUntrusted,
     /// A client of the embedded broker did not begin with a login, or left during it.
     ClientMalformed,
-    /// The embedded broker refused a client: as many as allowed are connected, in all or of its certificate or address.
+    /// The embedded broker refused a client: as many as allowed are connected, in all or of its
+    /// certificate or address.
     ClientsFull,
-    /// The embedded broker refused a login, message or filter: another's name or topic, or beyond a limit.
+    /// The embedded broker refused a login, message or filter: another's name or topic, or beyond a
+    /// limit.
     ClientDenied,
     /// Another node declared more in the election than its certificate allows.
     Overreached,
-    /// The embedded broker cut off a client that did not read for 15 s, or for whose bytes there was no room.
+    /// The embedded broker cut off a client that did not read for 15 s, or for whose bytes there
+    /// was no room.
     ClientStalled,
     /// The embedded broker cut off a client whose certificate was revoked or expired.
     ClientExpelled,

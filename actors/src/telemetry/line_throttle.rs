@@ -14,7 +14,8 @@ use tracing_subscriber::layer::{Context, Filter};
 use crate::platform::clock;
 use crate::platform::throttle::TokenBucket;
 
-/// Lines that one place in this project may write at once, and the time after which it may write one more.
+/// Lines that one place in this project may write at once, and the time after which it may write
+/// one more.
 const OWN_BURST: u32 = 200;
 const OWN_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -40,7 +41,8 @@ pub(crate) struct LineThrottle {
     places: Mutex<HashMap<CodePlace, TokenBucket>>,
 }
 
-/// A place in the code: target and line. The code of a program is finite, and so is the number of places.
+/// A place in the code: target and line. The code of a program is finite, and so is the number of
+/// places.
 type CodePlace = (String, u64);
 
 impl LineThrottle {

@@ -85,8 +85,8 @@ impl Spans {
         }
     }
 
-    /// A round that has just been closed, from its first report on; the root of its trace. Each of its reports gets a
-    /// span in the trace of its frame.
+    /// A round that has just been closed, from its first report on; the root of its trace. Each of
+    /// its reports gets a span in the trace of its frame.
     pub fn round(&self, fused: &Fused, reports: &RoundReports) -> Span {
         let of_map = fused.map.as_ref().map(RoundId::from);
         let Some(round) = of_map.or_else(|| fused.verdicts.as_ref().map(RoundId::from)) else {

@@ -1,4 +1,5 @@
-//! The embedded MQTT broker behind a front end that authenticates, limits and authorises its clients.
+//! The embedded MQTT broker behind a front end that authenticates, limits and authorises its
+//! clients.
 
 #![deny(clippy::indexing_slicing)]
 

@@ -31,13 +31,15 @@ pub use credentials::{Credentials, CredentialsError, LoadedCredentials, external
 pub use evidence::{EvidenceError, EvidenceSigner};
 pub use subject::{CertificateSubject, InvalidCertificate};
 
-/// DNS name in the certificate of every node that may lead, below a domain reserved for private use.
+/// DNS name in the certificate of every node that may lead, below a domain reserved for private
+/// use.
 pub const BROKER_NAME: &str = "broker.ecod.internal";
 
 /// Name by which programs verify a node's local broker. Nodes do not accept it as a broker's name.
 pub const DOOR_NAME: &str = "door.ecod.internal";
 
-/// Scheme of the URI in a node's certificate that holds its rights, such as `ecod:role=auto;priority=100`.
+/// Scheme of the URI in a node's certificate that holds its rights, such as
+/// `ecod:role=auto;priority=100`.
 const RIGHTS_SCHEME: &str = "ecod:";
 
 /// Separator between a node's name and the rest in the names of observers that use its certificate.

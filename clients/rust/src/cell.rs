@@ -232,7 +232,8 @@ impl Cell {
         self.read("detections/+", |streams| &streams.reports, false)
     }
 
-    /// The collective perception messages (CPM) of other stations, from now on: of each receiver the newest.
+    /// The collective perception messages (CPM) of other stations, from now on: of each receiver
+    /// the newest.
     pub fn received_cpms(&self) -> Messages<ForeignMessage> {
         self.read(&format!("{RECEIVED}/+"), |streams| &streams.foreign, false)
     }

@@ -594,7 +594,8 @@ fn example(name: &str) -> PathBuf {
     build.join("examples").join(name)
 }
 
-/// The program that a page of the documentation shows, if it is this example but for its first lines.
+/// The program that a page of the documentation shows, if it is this example but for its first
+/// lines.
 fn is_shown(page: &str, example: &str) -> bool {
     let read = |path: &str| {
         std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()

@@ -63,7 +63,8 @@ pub(super) fn label(class: &ObjectClass) -> &'static str {
             LightVehicle(profile),
         )) => {
             match profile {
-                // Wheelchair user, roller skater, e-scooter, personal transporter: detectors see the person.
+                // Wheelchair user, roller skater, e-scooter, personal transporter: detectors see
+                // the person.
                 2 | 4..=6 => "person",
                 // Horse and rider.
                 3 => "animal",

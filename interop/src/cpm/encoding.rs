@@ -26,7 +26,8 @@ use crate::object::CellObject;
 /// Maximum number of objects in a message.
 const MAX_OBJECTS: usize = 255;
 
-/// Width of a tile in metres: from its centre to the far corner of the next is less than a message can state.
+/// Width of a tile in metres: from its centre to the far corner of the next is less than a message
+/// can state.
 const TILE_M: f64 = 600.0;
 
 /// Greatest age that a message states, in milliseconds: at least so old.
@@ -248,7 +249,8 @@ impl<'a> CpmObject<'a> {
         ))
     }
 
-    /// The eight most probable classes, or the only one without a confidence. Labels of one class add up.
+    /// The eight most probable classes, or the only one without a confidence. Labels of one class
+    /// add up.
     fn classification(&self) -> cdd::ObjectClassDescription {
         let mut classes: Vec<(cdd::ObjectClass, f64)> = Vec::new();
         for (label, score) in self.object.scores {
@@ -326,8 +328,8 @@ fn uper<T: rasn::Encode>(value: &T) -> Result<Vec<u8>, CpmError> {
     rasn::uper::encode(value).map_err(|_| CpmError::Unencodable)
 }
 
-/// The centre of the tile that, with its neighbours, holds most objects; of several, the nearest to the origin. All objects of
-/// these nine tiles are near enough for a message.
+/// The centre of the tile that, with its neighbours, holds most objects; of several, the nearest to
+/// the origin. All objects of these nine tiles are near enough for a message.
 fn centre(sources: &[CpmObject<'_>]) -> (f64, f64) {
     let mut counts: BTreeMap<(i64, i64), usize> = BTreeMap::new();
     for [x_m, y_m] in sources.iter().map(|source| source.object.position_m) {

@@ -21,7 +21,8 @@ const UNSTATED_AXIS: u16 = 4095;
 /// Code of an ellipse's direction that is unavailable.
 const NO_DIRECTION: u16 = 3601;
 
-/// Standard deviations in a semi-axis of an ellipse of 95 %: the root of the quantile of chi-squared with two degrees.
+/// Standard deviations in a semi-axis of an ellipse of 95 %: the root of the quantile of
+/// chi-squared with two degrees.
 const ELLIPSE_SIGMAS: f64 = 2.4477;
 
 /// Semi-axis in metres if the station states none: usual for satellite positioning without
@@ -32,7 +33,8 @@ const UNSTATED_AXIS_M: f64 = 5.0;
 pub(super) struct MessageFrame {
     cell: GeographicOrigin,
     reference: GeographicOrigin,
-    /// Direction of the cell's x axis in the message's frame, in radians counter-clockwise from east.
+    /// Direction of the cell's x axis in the message's frame, in radians counter-clockwise from
+    /// east.
     rotation_rad: f64,
 }
 

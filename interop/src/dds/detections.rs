@@ -301,7 +301,8 @@ pub(super) fn pose_in_map(stamped: &PoseStamped) -> Result<(Timestamp, Pose), Re
     }
 }
 
-/// Places boxes in pictures of which the distortion has been removed, by the rules of [`RosCamera::place`].
+/// Places boxes in pictures of which the distortion has been removed, by the rules of
+/// [`RosCamera::place`].
 pub(super) fn place_in_pictures(
     camera: &RosCamera,
     detections: &Detection2DArray,

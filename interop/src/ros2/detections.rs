@@ -66,7 +66,8 @@ pub(super) fn size(object: &CellObject<'_>) -> RosVector {
     RosVector { x, y, z: HEIGHT_M }
 }
 
-/// A detection. Scores of classes are weighted by `existence`, the probability that there is an object at all.
+/// A detection. Scores of classes are weighted by `existence`, the probability that there is an
+/// object at all.
 fn detection(object: &CellObject<'_>, existence: f64, header: &Header, id: String) -> Detection3D {
     let mut covariance = [[0.0; 6]; 6];
     for (index, row) in covariance.iter_mut().enumerate() {

@@ -284,7 +284,8 @@ impl<W: Write + Seek> TimedOutput<'_, W> {
         Ok(true)
     }
 
-    /// The header of a picture in the frame of a log, which earlier versions named by the node alone.
+    /// The header of a picture in the frame of a log, which earlier versions named by the node
+    /// alone.
     fn header(&self, frame: &str) -> Option<Header> {
         let node = NodeName::new(frame.strip_suffix("/optical").unwrap_or(frame)).ok()?;
         let stamp = RosTime::of(Timestamp(self.at.publish / 1000));

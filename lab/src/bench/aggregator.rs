@@ -20,7 +20,8 @@ use crate::node_process::{NodeProcess, free_address};
 /// All vehicles of the largest load vote.
 const MAX_VOTERS: usize = 1000;
 
-/// A running aggregator; killed when dropped, though only [`OwnAggregator::stop`] removes its files.
+/// A running aggregator; killed when dropped, though only [`OwnAggregator::stop`] removes its
+/// files.
 #[derive(Debug)]
 pub struct OwnAggregator {
     process: NodeProcess,

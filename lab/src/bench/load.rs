@@ -14,7 +14,8 @@ pub struct Load {
     pub vehicles: usize,
     /// Time from one report of a vehicle to its next.
     pub period: Duration,
-    /// Time from the first vehicle's report to the last one's, evenly spaced; less than half a period.
+    /// Time from the first vehicle's report to the last one's, evenly spaced; less than half a
+    /// period.
     pub spread: Duration,
     /// Time for which reports are sent; the first tenth warms up and is not counted.
     pub duration: Duration,

@@ -13,7 +13,8 @@ use tokio::net::TcpStream;
 pub struct PageFigures {
     /// Bytes of all its files as they are sent, uncompressed.
     pub bytes: usize,
-    /// From the first request to the first picture of the cell, the files one after another, without drawing.
+    /// From the first request to the first picture of the cell, the files one after another,
+    /// without drawing.
     pub first_picture: Duration,
 }
 

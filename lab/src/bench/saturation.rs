@@ -221,7 +221,8 @@ impl Shares {
 
 const BROKER_THREAD: &str = "mqtt-broker";
 
-/// From here on a core counts as used up: the scheduler and the kernel's own work on packets take the rest.
+/// From here on a core counts as used up: the scheduler and the kernel's own work on packets take
+/// the rest.
 const BUSY_PERCENT: f64 = 80.0;
 
 /// Lateness of sending in milliseconds from which the sender itself is overloaded.

@@ -65,7 +65,8 @@ pub(super) struct BenchArguments {
     /// leader's broker; fails if a goal is missed
     #[arg(long, conflicts_with_all = ["cavs", "spread_ms", "connect", "config", "cell", "no_saturate", "up_to", "costs"])]
     doors: bool,
-    /// Write the figures to this file as JSON, in the section `cell`, `costs` or `doors`; other sections stay
+    /// Write the figures to this file as JSON, in the section `cell`, `costs` or `doors`; other
+    /// sections stay
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
 }

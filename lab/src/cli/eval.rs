@@ -27,11 +27,12 @@ use crate::report::tracks::percent;
 /// Flags of `eval`.
 #[derive(Debug, Args)]
 pub(super) struct EvalArguments {
-    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), the places of all objects (JSON), or
-    /// a file of --format
+    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), the places of
+    /// all objects (JSON), or a file of --format
     #[arg(long, value_name = "FILE")]
     truth: PathBuf,
-    /// Output of `replay`, or the map log of a node, `-` for standard input; with --format also a file of that form
+    /// Output of `replay`, or the map log of a node, `-` for standard input; with --format also a
+    /// file of that form
     #[arg(long, value_name = "FILE")]
     input: PathBuf,
     /// The reports that were replayed, for majority vote and every vehicle alone

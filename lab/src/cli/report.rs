@@ -17,7 +17,8 @@ use crate::report::{judged_by, judged_by_tracks};
 pub(super) struct LogReportArguments {
     #[command(flatten)]
     page: PageArguments,
-    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), or the places of all objects (JSON)
+    /// Truth: the object at each location (JSON, or CSV with the columns item,truth), or the places
+    /// of all objects (JSON)
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
 }

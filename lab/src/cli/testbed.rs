@@ -1,4 +1,5 @@
-//! `ecod-lab testbed`: the scenes of a file, rendered, detected and fused in virtual time; or a recorded intersection.
+//! `ecod-lab testbed`: the scenes of a file, rendered, detected and fused in virtual time; or a
+//! recorded intersection.
 
 mod intersection;
 
@@ -43,8 +44,9 @@ pub(super) struct TestbedArguments {
     /// Write the vehicles' reports on recorded detections to this file, as `replay` reads them
     #[arg(long, value_name = "FILE")]
     pub(super) reports: Option<PathBuf>,
-    /// Fail if fewer spots than this percentage are right in any scene, fused; of recorded detections, fewer verdicts
-    /// of the recording, or of the generated scenes if only they are chosen
+    /// Fail if fewer spots than this percentage are right in any scene, fused; of recorded
+    /// detections, fewer verdicts of the recording, or of the generated scenes if only they are
+    /// chosen
     #[arg(long, value_name = "PCT", value_parser = percent)]
     pub(super) at_least: Option<f64>,
     /// The same limit for the occupied spots alone; default: the value of `--at-least`

@@ -1,4 +1,5 @@
-//! The processes of a demo: started, watched, the edge killed half-way and started again, and stopped.
+//! The processes of a demo: started, watched, the edge killed half-way and started again, and
+//! stopped.
 
 use std::fs;
 use std::net::SocketAddr;
@@ -107,8 +108,8 @@ impl<'a> Stage<'a> {
         self.addresses[node].poses
     }
 
-    /// Runs the nodes, of which the first is the edge; the others may lead, and the first of them serves its page at `dashboard`.
-    /// All are stopped in any case.
+    /// Runs the nodes, of which the first is the edge; the others may lead, and the first of them
+    /// serves its page at `dashboard`. All are stopped in any case.
     pub(super) async fn play(
         &self,
         configs: Vec<NodeConfig>,

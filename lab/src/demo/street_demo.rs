@@ -82,7 +82,8 @@ pub struct StreetResult {
     pub leaders: Vec<NodeName>,
     /// The node that led after the edge was killed; null if there was no such node.
     pub took_over: Option<NodeName>,
-    /// Longest time that a node waited for its first map then, in ms; null also when that node led before.
+    /// Longest time that a node waited for its first map then, in ms; null also when that node led
+    /// before.
     pub failover_gap_ms: Option<u64>,
     /// People whom only a single node reported to the cell, at least once: these nodes, each with
     /// the number of such people.

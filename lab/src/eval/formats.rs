@@ -34,11 +34,14 @@ const SEQUENCE_US: u64 = 1_000_000_000;
 /// The form of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum FileFormat {
-    /// KITTI tracking: label_02 and results, or AB3DMOT's detections; the frame of the vehicle, x forward, y left
+    /// KITTI tracking: label_02 and results, or AB3DMOT's detections; the frame of the vehicle, x
+    /// forward, y left
     Kitti,
-    /// MOTChallenge: positions on the ground (columns 8 and 9), as 3D MOT 2015 has them, or boxes of the camera in --config
+    /// MOTChallenge: positions on the ground (columns 8 and 9), as 3D MOT 2015 has them, or boxes
+    /// of the camera in --config
     Mot,
-    /// COCO: a dataset with annotations, or results; image n is frame n, with boxes of the camera in --config
+    /// COCO: a dataset with annotations, or results; image n is frame n, with boxes of the camera
+    /// in --config
     Coco,
 }
 
@@ -265,7 +268,8 @@ impl FileFormat {
     }
 }
 
-/// The number of a frame, if it is plausible. All frames up to the last make a report, also those without objects.
+/// The number of a frame, if it is plausible. All frames up to the last make a report, also those
+/// without objects.
 fn frame_number(number: i64) -> Option<u64> {
     (0..1_000_000).contains(&number).then_some(number as u64)
 }

@@ -132,8 +132,8 @@ pub struct TrackScores {
     pub calibration: ReliabilityBins,
 }
 
-/// Figures of the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all classes
-/// together.
+/// Figures of the objects whose confidence is at or above a threshold, at [`MATCH_DISTANCE_M`], all
+/// classes together.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThresholdScores {
     /// The threshold.

@@ -150,7 +150,8 @@ struct Shooting {
 }
 
 impl Shooting {
-    /// Each picture is rendered before its time and sent at its time, so that no vehicle takes the time of rendering for a delay.
+    /// Each picture is rendered before its time and sent at its time, so that no vehicle takes the
+    /// time of rendering for a delay.
     fn run(self, ended: &AtomicBool, kept: &Mutex<Vec<KeptPicture>>) -> anyhow::Result<()> {
         let camera: &StreetCamera = &self.street.cameras[self.number];
         let mut sensor = None;

@@ -3,7 +3,8 @@
 use ecod::model::geometry::Pose;
 use nalgebra::Point2;
 
-/// Half of the chord in metres along which something on a loop is headed, so that it does not turn at once.
+/// Half of the chord in metres along which something on a loop is headed, so that it does not turn
+/// at once.
 const HALF_CHORD_M: f64 = 0.4;
 
 /// Where something is at every time.
@@ -27,8 +28,9 @@ impl Route {
         Self::Stands(Pose::new(x_m, y_m, heading_deg.to_radians()))
     }
 
-    /// Along a lane, around its end, back on the other lane and around: `half_m` is half of a lane, `radius_m` the distance of a
-    /// lane from the middle of the road. Counter-clockwise, from the west end of the south lane.
+    /// Along a lane, around its end, back on the other lane and around: `half_m` is half of a lane,
+    /// `radius_m` the distance of a lane from the middle of the road. Counter-clockwise, from the
+    /// west end of the south lane.
     pub(super) fn road(half_m: f64, radius_m: f64, speed_mps: f64, start_m: f64) -> Self {
         const TURN: u32 = 16;
         let turn = |x_m: f64, from_rad: f64| {

@@ -11,7 +11,8 @@ use super::network_camera::FRAMES_PER_S;
 use super::view::StreetView;
 use super::{Street, StreetCamera};
 
-/// Frames of a video: as long as a car takes to come back, so that no car jumps when the video starts again.
+/// Frames of a video: as long as a car takes to come back, so that no car jumps when the video
+/// starts again.
 const FRAMES: u32 = 100;
 
 /// Writes a camera's pictures as H.264.

@@ -337,7 +337,8 @@ impl Canvas<'_> {
     }
 }
 
-/// The part of a polygon that is at least [`NEAR_M`] before the camera (Sutherland and Hodgman 1974).
+/// The part of a polygon that is at least [`NEAR_M`] before the camera (Sutherland and Hodgman
+/// 1974).
 fn clip(corners: &[Point3<f64>]) -> Vec<Point3<f64>> {
     let mut kept = Vec::with_capacity(corners.len() + 1);
     for (from, to) in corners.iter().zip(corners.iter().cycle().skip(1)) {

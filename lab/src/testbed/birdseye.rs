@@ -231,7 +231,8 @@ impl BirdseyePicture<'_> {
         bodies.fold(group, Group::add)
     }
 
-    /// Cards in the scene: plates of parked vehicles thick, `EMPTY` placards thin, each with a tick towards its front.
+    /// Cards in the scene: plates of parked vehicles thick, `EMPTY` placards thin, each with a tick
+    /// towards its front.
     fn placards(&self) -> Group {
         let placard = |place: &Point2<f64>, facing_rad: f64, weight: f64| {
             let pose = Pose {

@@ -15,7 +15,8 @@ use serde_json::Value;
 use super::{Camera, Cav, Placard, RecordedRun, Scene, Spot, Testbed};
 
 const METRES_PER_INCH: f64 = 0.0254;
-/// Bounds of the intervals in seconds: no camera takes 10,000 frames a second, and each is rendered.
+/// Bounds of the intervals in seconds: no camera takes 10,000 frames a second, and each is
+/// rendered.
 const MIN_INTERVAL_S: f64 = 1e-4;
 const MAX_INTERVAL_S: f64 = 3600.0;
 /// Most frames that are rendered for one submission.

@@ -242,7 +242,8 @@ pub fn line(report: &ObjectReport, kind: ReportKind) -> serde_json::Result<Strin
     serde_json::to_string(&line)
 }
 
-/// The maps or verdicts of these algorithms and how right they are, each frame by itself; of both, the maps are judged.
+/// The maps or verdicts of these algorithms and how right they are, each frame by itself; of both,
+/// the maps are judged.
 fn fuse(
     recording: &IntersectionRecording,
     reports: &[ObjectReport],
@@ -337,7 +338,8 @@ fn captured_at(frame: usize) -> Timestamp {
     START + FRAME_INTERVAL * u32::try_from(frame).unwrap_or(u32::MAX)
 }
 
-/// A round closes with the last vehicle's report of a frame, at the latest within the time of the next.
+/// A round closes with the last vehicle's report of a frame, at the latest within the time of the
+/// next.
 fn fusion(algorithms: Algorithms, mode: VoteMode) -> FusionConfig {
     let mut vote = VoteConfig {
         mode,

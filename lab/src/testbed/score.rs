@@ -99,7 +99,8 @@ pub struct SceneResult {
     pub single_cav_accuracy_pct: BTreeMap<NodeName, f64>,
     /// Right spots in percent of always guessing that a spot is empty.
     pub always_empty_pct: f64,
-    /// Mean fused accuracy recorded on the physical testbed in percent; null when there is no recording.
+    /// Mean fused accuracy recorded on the physical testbed in percent; null when there is no
+    /// recording.
     pub recorded_pace_accuracy_pct: Option<f64>,
     /// Mean accuracy of every vehicle alone recorded on the physical testbed in percent.
     pub recorded_single_cav_accuracy_pct: BTreeMap<NodeName, f64>,

@@ -28,7 +28,8 @@ use ecod_actors::transport::gossip::{MembershipConfig, MulticastConfig};
 
 use crate::testbed::{Cav, Placard, Scene, Testbed};
 
-/// The paper's δ in metres, an inch and a quarter: less than half the least distance between neighbouring spots.
+/// The paper's δ in metres, an inch and a quarter: less than half the least distance between
+/// neighbouring spots.
 const GATE_M: f64 = 0.032;
 
 /// Minimum number of frames for which a report counts, as far as [`MAX_AGE_S`] allows.

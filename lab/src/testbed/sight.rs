@@ -13,8 +13,8 @@ const PROBES: u32 = 41;
 /// Minimum width in pixels of a legible code in the image: slightly more than a pixel for each of
 /// the 21 modules of the smallest code. With fewer pixels the modules cannot be distinguished.
 const LEGIBLE_PX: f64 = 25.0;
-/// Part of a code that must be shown: error correction level M restores 15 % of the code words, but a finder pattern
-/// that is cut is not restored.
+/// Part of a code that must be shown: error correction level M restores 15 % of the code words, but
+/// a finder pattern that is cut is not restored.
 const CLEAR: f64 = 0.9;
 
 /// Intersection of a line of sight with the plane of a card.
@@ -46,7 +46,8 @@ impl Card {
         })
     }
 
-    /// The slope of the line of sight to a point of the card, `right_m` from its middle; `None` behind the camera.
+    /// The slope of the line of sight to a point of the card, `right_m` from its middle; `None`
+    /// behind the camera.
     fn slope(&self, camera: &Pose, right_m: f64) -> Option<f64> {
         let (sin, cos) = self.facing_rad.sin_cos();
         let point = self.position + Vector2::new(-sin, cos) * right_m;
@@ -60,7 +61,8 @@ impl Card {
 pub struct Sighting {
     /// Distance of the card in metres.
     pub range_m: f64,
-    /// Angle between the direction that the card faces and the line to the camera, 0 to π/2 radians.
+    /// Angle between the direction that the card faces and the line to the camera, 0 to π/2
+    /// radians.
     pub yaw_rad: f64,
     /// Width of the code in the image, in pixels.
     pub width_px: f64,

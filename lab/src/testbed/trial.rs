@@ -1,5 +1,5 @@
-//! A scene from its first frame to its last map, in virtual time: rendered, detected, projected and fused by the parts
-//! that a live node runs.
+//! A scene from its first frame to its last map, in virtual time: rendered, detected, projected and
+//! fused by the parts that a live node runs.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -182,7 +182,8 @@ impl Trial<'_> {
     }
 }
 
-/// Fuses one verdict's reports in the order of capture, each for the algorithms that run, and returns the last round.
+/// Fuses one verdict's reports in the order of capture, each for the algorithms that run, and
+/// returns the last round.
 fn fuse(aggregator: &mut Aggregator, mut reports: Vec<ObjectReport>) -> Option<Fused> {
     reports.sort_by(|a, b| {
         a.captured_at_us

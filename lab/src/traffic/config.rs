@@ -5,7 +5,8 @@ use std::f64::consts::TAU;
 use ecod::config::{ConfigError, check_range};
 use serde::{Deserialize, Serialize};
 
-/// Parameters of the traffic and of its observers. The default is a quarter of a town with eight observers.
+/// Parameters of the traffic and of its observers. The default is a quarter of a town with eight
+/// observers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrafficConfig {
@@ -31,7 +32,8 @@ pub struct TrafficConfig {
     pub warm_up_s: f64,
     /// The observers drive one behind the other and on the same route. Default false.
     pub convoy: bool,
-    /// The observers are cameras on posts, four about a crossing, whose pose errors stay. Default false.
+    /// The observers are cameras on posts, four about a crossing, whose pose errors stay. Default
+    /// false.
     pub fixed: bool,
     /// All observers capture at the same moments and reports arrive at once. Default false: each
     /// observer has its own phase, and reports are delayed.
@@ -68,7 +70,8 @@ pub struct SensorConfig {
     pub ghosts_per_s: f64,
     /// Places per block that look like an object to all passing vehicles. Default 0.7.
     pub lures: f64,
-    /// Standard deviation of an observer's own position in metres; changes within half a minute. Default 0.35.
+    /// Standard deviation of an observer's own position in metres; changes within half a minute.
+    /// Default 0.35.
     pub pose_m: f64,
     /// Standard deviation of its heading in radians. Default 0.01.
     pub pose_rad: f64,
@@ -90,7 +93,8 @@ pub struct SaidConfig {
     pub covariances: bool,
     /// Area that their sensors cover; needs poses. Default true.
     pub views: bool,
-    /// Velocities, with such a standard deviation in metres per second in each direction; absent by default.
+    /// Velocities, with such a standard deviation in metres per second in each direction; absent by
+    /// default.
     pub velocities_mps: Option<f64>,
     /// Headings, with such a standard deviation in radians; absent by default.
     pub headings_rad: Option<f64>,
@@ -156,8 +160,8 @@ impl Default for SaidConfig {
 }
 
 impl TrafficConfig {
-    /// Like a recording of two vehicles with scanners on one route: cars only, captured together, no poses, no
-    /// covariances, some tens of metres of range.
+    /// Like a recording of two vehicles with scanners on one route: cars only, captured together,
+    /// no poses, no covariances, some tens of metres of range.
     pub fn two_vehicle_recording() -> Self {
         Self {
             observers: 2,

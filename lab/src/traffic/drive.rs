@@ -33,7 +33,8 @@ pub(super) struct MovingVehicle {
     crossed: usize,
 }
 
-/// Vehicles at random places on random routes; in a convoy, the first `convoy` are one behind the other.
+/// Vehicles at random places on random routes; in a convoy, the first `convoy` are one behind the
+/// other.
 pub(super) fn vehicles(
     roads: &Roads,
     count: usize,

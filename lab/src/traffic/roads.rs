@@ -1,4 +1,5 @@
-//! A square grid of roads with a lane each way, crossings with signals, and a building on every block.
+//! A square grid of roads with a lane each way, crossings with signals, and a building on every
+//! block.
 
 use nalgebra::{Point2, Vector2};
 

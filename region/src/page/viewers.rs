@@ -107,7 +107,8 @@ impl Viewers {
         Ok(())
     }
 
-    /// The view that makes room for a new one: the oldest idle one, or the oldest of the host with the most.
+    /// The view that makes room for a new one: the oldest idle one, or the oldest of the host with
+    /// the most.
     fn replaced_by(&self, viewer: &ViewerId, now: Timestamp) -> Option<ViewerId> {
         let oldest = self.views.iter().min_by_key(|(_, view)| view.looked_at)?;
         if now.since(oldest.1.looked_at) >= IDLE_AFTER {

@@ -16,7 +16,8 @@ pub(super) struct VehicleClock {
     pub(super) base: TimeBase,
     last_captured: Timestamp,
     last_seq: Option<u64>,
-    /// Capture time and `seq` of the latest admitted reports, ascending, at most [`MAX_REMEMBERED`].
+    /// Capture time and `seq` of the latest admitted reports, ascending, at most
+    /// [`MAX_REMEMBERED`].
     recent: VecDeque<(Timestamp, u64)>,
     pub(super) last_received: Timestamp,
     delay: MinimumDelay,
@@ -119,7 +120,8 @@ impl VehicleClock {
         }
     }
 
-    /// True if two senders use the name: the numbers of the reports go back and forth, and their times do not.
+    /// True if two senders use the name: the numbers of the reports go back and forth, and their
+    /// times do not.
     pub(super) fn is_shared(&self) -> bool {
         self.back_and_forth >= MIN_BACK_AND_FORTH
     }
@@ -315,7 +317,8 @@ impl VehicleClock {
             && delay.saturating_sub(least) > bounds.slack()
     }
 
-    /// True if the timestamp is too far ahead of all before, and the previous report does not confirm it.
+    /// True if the timestamp is too far ahead of all before, and the previous report does not
+    /// confirm it.
     fn is_suspect(&mut self, captured: Timestamp, delay_us: i64, slack_us: i64) -> bool {
         let before = self.suspect.take();
         let least = self.delay.least();

@@ -1,4 +1,5 @@
-//! Offset between two steady clocks from exchanged stamps: NTP's clock filter (RFC 5905, section 10).
+//! Offset between two steady clocks from exchanged stamps: NTP's clock filter (RFC 5905, section
+//! 10).
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -9,7 +10,8 @@ use crate::model::time::Timestamp;
 #[derive(Debug, Clone, Default)]
 pub struct OffsetFilter(VecDeque<OffsetSample>);
 
-/// The four stamps of an exchange: this node sends, the other receives, the other sends, this node receives.
+/// The four stamps of an exchange: this node sends, the other receives, the other sends, this node
+/// receives.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Exchange {
     pub(super) t1: Timestamp,
@@ -69,7 +71,8 @@ impl OffsetFilter {
 /// Number of exchanges kept (RFC 5905, figure 17: `NSTAGE`).
 const SAMPLES: usize = 8;
 
-/// Largest drift between two clocks in parts per million; cheap quartz at the ends of its temperature range.
+/// Largest drift between two clocks in parts per million; cheap quartz at the ends of its
+/// temperature range.
 const DRIFT: u64 = 100;
 
 /// Maximum error of an offset that is used.

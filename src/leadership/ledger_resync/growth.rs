@@ -12,7 +12,8 @@ use crate::wire::{LedgerEntry, LedgerMark, LedgerShare, Limits, Payload};
 /// the count: 100 million, which is three years at one vote per second.
 pub(super) const MAX_FIRST_VOTES: u64 = 100_000_000;
 
-/// Maximum number of votes of a vehicle for one label in a second, from then on: 1024 objects in ten reports.
+/// Maximum number of votes of a vehicle for one label in a second, from then on: 1024 objects in
+/// ten reports.
 const MAX_VOTES_PER_S: u64 = 10_240;
 
 /// Votes by which a count may be ahead of [`MAX_VOTES_PER_S`].

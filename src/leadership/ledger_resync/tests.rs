@@ -351,7 +351,8 @@ fn what_a_leader_learnt_that_died_during_a_split_reaches_the_leader_that_remains
     b2.hear(&b1.wait(1));
     drop(b1);
     b2.lead(3);
-    // The loser's messages when the sides heal are lost: it is not yet linked to the winner's broker.
+    // The loser's messages when the sides heal are lost: it is not yet linked to the winner's
+    // broker.
     b2.resync.step_down();
     drop(b2.resync.snapshot(&b2.ledger));
     a.lead(4);
@@ -706,7 +707,8 @@ fn the_votes_after_a_heal_are_the_latest() {
     assert!(edge.ledger.reputations(&config)[&name("euclid")].score < before);
 }
 
-/// A follower that claims a higher term makes the leader renew its own: that costs no older evidence.
+/// A follower that claims a higher term makes the leader renew its own: that costs no older
+/// evidence.
 #[test]
 fn a_leadership_counts_in_one_lane_however_often_its_term_is_renewed() {
     let (mut edge, mut gauss) = (Candidate::new("edge"), Candidate::new("gauss"));

@@ -81,7 +81,8 @@ pub enum Input {
         /// Its address.
         address: Option<SocketAddr>,
     },
-    /// A broker has shown the certificate of a node in its last handshake. It comes before the link's new state.
+    /// A broker has shown the certificate of a node in its last handshake. It comes before the
+    /// link's new state.
     BrokerProven {
         /// The broker.
         broker: BrokerAddress,
@@ -100,7 +101,8 @@ pub enum Input {
         /// The status.
         status: NodeStatus,
     },
-    /// A round was accepted by the node's [`RoundFilter`](crate::leadership::round_filter::RoundFilter).
+    /// A round was accepted by the node's
+    /// [`RoundFilter`](crate::leadership::round_filter::RoundFilter).
     RoundAccepted {
         /// The epoch it was published in.
         epoch: Epoch,
@@ -153,9 +155,11 @@ pub enum Input {
 /// Something that the actors of a node must do, in the order given.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Effect {
-    /// Hand a term to the disk, without waiting for it. It is mostly on disk long before it is needed.
+    /// Hand a term to the disk, without waiting for it. It is mostly on disk long before it is
+    /// needed.
     PersistTerm {
-        /// To be given to [`LeadershipNode::new`](crate::leadership::node::LeadershipNode::new) after a restart.
+        /// To be given to [`LeadershipNode::new`](crate::leadership::node::LeadershipNode::new)
+        /// after a restart.
         term: u64,
     },
     /// Send a message once, without waiting.
@@ -172,11 +176,12 @@ pub enum Effect {
         /// The leadership.
         leadership: Leadership,
     },
-    /// Publish from now on in this epoch. It comes again, with a new epoch, when a leader has to renew its own.
+    /// Publish from now on in this epoch. It comes again, with a new epoch, when a leader has to
+    /// renew its own.
     ///
     /// This effect and all later ones wait until the disk has answered for the epoch's term, or for
-    /// [`DISK_TIMEOUT`](crate::leadership::timers::DISK_TIMEOUT). A disk that fails or hangs stops no leader: availability
-    /// comes before the uniqueness of epochs.
+    /// [`DISK_TIMEOUT`](crate::leadership::timers::DISK_TIMEOUT). A disk that fails or hangs stops
+    /// no leader: availability comes before the uniqueness of epochs.
     Lead {
         /// The node's leadership.
         epoch: Epoch,
@@ -185,7 +190,8 @@ pub enum Effect {
         /// Time at which it is due.
         first: FirstRound,
     },
-    /// Let the present round last its whole length: another node is about to lead from the next one on.
+    /// Let the present round last its whole length: another node is about to lead from the next one
+    /// on.
     HoldRound,
     /// Stop publishing in this epoch.
     StopPublishing {

@@ -285,7 +285,8 @@ mod tests {
         );
         let made = |n: u64| ms(100 * n).shifted(if n < 30 { 0 } else { -5_000_000 });
         assert!((0..20).all(|n| filter.is_fresh(&epoch, made(n), ms(100 * n + 2))));
-        // Stopped for three seconds, the node finds thirty rounds; the clock was set in the midst of them.
+        // Stopped for three seconds, the node finds thirty rounds; the clock was set in the midst
+        // of them.
         let fresh: Vec<_> = (20..50)
             .filter(|n| filter.is_fresh(&epoch, made(*n), ms(5002)))
             .collect();
@@ -379,7 +380,8 @@ mod tests {
             StalenessFilter::new(ms(0)),
         );
         assert!((0..20).all(|round| filter.is_fresh(&old, ms(100 * round), ms(100 * round + 2))));
-        // Stopped until 5 s, for a moment, and until 6.1 s: of the moment, the older rounds alone passed other checks.
+        // Stopped until 5 s, for a moment, and until 6.1 s: of the moment, the older rounds alone
+        // passed other checks.
         assert!((20..41).all(|round| !filter.is_fresh(&new, ms(100 * round), ms(5000))));
         assert!(
             !filter.is_fresh(&new, ms(5060), ms(6100)),

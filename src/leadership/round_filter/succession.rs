@@ -316,7 +316,8 @@ mod tests {
         Timestamp(ms * 1000)
     }
 
-    /// A vehicle joins a cell whose reputations have not changed for minutes; its own arrival changes them.
+    /// A vehicle joins a cell whose reputations have not changed for minutes; its own arrival
+    /// changes them.
     #[test]
     fn a_retained_message_may_be_much_older_than_the_next_and_no_other_may() {
         let elected = epoch(7, "edge");

@@ -19,8 +19,8 @@ pub struct LandmarkConfig {
     pub x_m: f64,
     /// Position of an object in metres north.
     pub y_m: f64,
-    /// Direction in degrees, counter-clockwise from east, from which an object here can be read. Default: from all
-    /// around.
+    /// Direction in degrees, counter-clockwise from east, from which an object here can be read.
+    /// Default: from all around.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub facing_deg: Option<f64>,
     /// A fixed sign that is in view while the location is empty. Default: no sign.
@@ -61,7 +61,8 @@ pub struct VacancyConfig {
 }
 
 impl LandmarkConfig {
-    /// A location that can be read from all around, without a sign or other labels; `x_m` east and `y_m` north.
+    /// A location that can be read from all around, without a sign or other labels; `x_m` east and
+    /// `y_m` north.
     pub fn at(id: impl Into<LandmarkId>, x_m: f64, y_m: f64) -> Self {
         Self {
             id: id.into(),

@@ -9,7 +9,8 @@ use super::level_sight::LevelSight;
 use super::{LineOfSight, ObjectSize, Projection};
 use crate::model::detection::BoundingBox;
 
-/// Similar triangles on the height. Of a level camera it is parallel to the image's columns: z = f_y · height / box height.
+/// Similar triangles on the height. Of a level camera it is parallel to the image's columns: z =
+/// f_y · height / box height.
 pub(super) fn line_of_sight(
     bounds: &BoundingBox,
     size: &ObjectSize,

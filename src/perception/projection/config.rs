@@ -12,12 +12,13 @@ use crate::model::names::Label;
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Ranging {
-    /// [`Ranging::Corners`] where a detection has corners. Otherwise [`Ranging::Ground`] and [`Ranging::BoxHeight`],
-    /// weighted by their covariance where both hold; without the height of the camera, the latter alone.
+    /// [`Ranging::Corners`] where a detection has corners. Otherwise [`Ranging::Ground`] and
+    /// [`Ranging::BoxHeight`], weighted by their covariance where both hold; without the height of
+    /// the camera, the latter alone.
     #[default]
     Auto,
-    /// From the four corners of a square target, at any yaw; the most exact. Detections without corners are ranged by
-    /// [`Ranging::BoxHeight`].
+    /// From the four corners of a square target, at any yaw; the most exact. Detections without
+    /// corners are ranged by [`Ranging::BoxHeight`].
     Corners,
     /// z = f_y · height / box height: exact for an upright object at any yaw.
     BoxHeight,
@@ -27,8 +28,9 @@ pub enum Ranging {
     /// From the intersection of the foot of the box with the ground: for objects on level ground
     /// and a camera of configured height.
     Ground,
-    /// The paper's formulas (PACE client, Algorithm 1) to the letter, with their errors: d = s / tan α with α spread
-    /// evenly over the columns, and bearings from the left edge of the image. `projection/paper.rs` explains them.
+    /// The paper's formulas (PACE client, Algorithm 1) to the letter, with their errors: d = s /
+    /// tan α with α spread evenly over the columns, and bearings from the left edge of the image.
+    /// `projection/paper.rs` explains them.
     Paper,
 }
 
@@ -51,8 +53,9 @@ pub struct ObjectSize {
     /// the ground gives the distance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub length_m: Option<f64>,
-    /// Relative standard deviation of sizes of this kind and of the focal length together; default 0.02. Too small
-    /// makes positions over-confident along the line of sight; too large makes them count less in fusion.
+    /// Relative standard deviation of sizes of this kind and of the focal length together; default
+    /// 0.02. Too small makes positions over-confident along the line of sight; too large makes them
+    /// count less in fusion.
     #[serde(default = "default_relative_sigma")]
     pub relative_sigma: f64,
 }
@@ -123,19 +126,21 @@ config_section! {
         pub ranging: Ranging = Ranging::default();
         /// True sizes of objects; by default only the usual sizes of COCO's labels.
         pub sizes: ObjectSizes = ObjectSizes::default(), checked by ObjectSizes::validate;
-        /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach 0.5, neural
-        /// detectors 3 and more.
+        /// Standard deviation of a box edge or corner in pixels; default 1.0. Placard corners reach
+        /// 0.5, neural detectors 3 and more.
         pub pixel_sigma_px: f64 = 1.0, in 0.0 to 1e3;
         /// Standard deviation of the camera's heading in radians; default 0.01.
         pub heading_sigma_rad: f64 = 0.01, in 0.0 to std::f64::consts::PI;
-        /// Standard deviation of the camera's pitch and roll in radians; default 0.0175 (1°). It covers a mount that was
-        /// measured by hand and a road that is not level.
+        /// Standard deviation of the camera's pitch and roll in radians; default 0.0175 (1°). It
+        /// covers a mount that was measured by hand and a road that is not level.
         pub tilt_sigma_rad: f64 = 0.0175, in 0.0 to 1.0;
-        /// Standard deviation of the camera's height above the ground at the object in metres; default 0.02. Bumps count.
+        /// Standard deviation of the camera's height above the ground at the object in metres;
+        /// default 0.02. Bumps count.
         pub height_sigma_m: f64 = 0.02, in 0.0 to 1e3;
         /// Standard deviation of the camera's position in metres, each axis; default 0.005.
         pub position_sigma_m: f64 = 0.005, in 0.0 to 1e3;
-        /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps covariances away from zero.
+        /// Added to every standard deviation in quadrature, in metres; default 0.005. Keeps
+        /// covariances away from zero.
         pub floor_m: f64 = 0.005, in 1e-6 to 1e3;
     }
 }

@@ -22,8 +22,8 @@ impl Estimate {
         (self.distance_m > 0.0 && self.distance_m.is_finite()).then_some(self)
     }
 
-    /// The combination of least variance with another estimate of correlated errors (Bar-Shalom, Campo 1986, equation 8);
-    /// `None` if the two contradict each other.
+    /// The combination of least variance with another estimate of correlated errors (Bar-Shalom,
+    /// Campo 1986, equation 8); `None` if the two contradict each other.
     pub(super) fn combined_with(&self, other: &Self) -> Option<Self> {
         let difference = self.errors - other.errors;
         let variance = difference.norm_squared();
@@ -41,8 +41,8 @@ impl Estimate {
         })
     }
 
-    /// The line of sight at this distance, in the direction of `sight`; `middle_m` is the standard deviation of the middle
-    /// of the box from the middle of the object.
+    /// The line of sight at this distance, in the direction of `sight`; `middle_m` is the standard
+    /// deviation of the middle of the box from the middle of the object.
     pub(super) fn along(&self, sight: &LevelSight, middle_m: f64) -> LineOfSight {
         LineOfSight {
             bearing_rad: sight.bearing_rad,

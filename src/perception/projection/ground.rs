@@ -54,8 +54,9 @@ impl HalfDepth {
         }
     }
 
-    /// Standard deviation in metres of the middle of a box from the middle of its object at this distance: the nearer side
-    /// looks larger. Of an object whose footprint the upper edge of the image cuts, any part may be in view.
+    /// Standard deviation in metres of the middle of a box from the middle of its object at this
+    /// distance: the nearer side looks larger. Of an object whose footprint the upper edge of the
+    /// image cuts, any part may be in view.
     pub(super) fn middle_sigma_m(
         &self,
         distance_m: f64,
@@ -77,7 +78,8 @@ impl HalfDepth {
         }
     }
 
-    /// The size of the object with the width that is seen at an unknown yaw, which is distributed as its depth is.
+    /// The size of the object with the width that is seen at an unknown yaw, which is distributed
+    /// as its depth is.
     pub(super) fn seen_width(&self, size: &ObjectSize) -> ObjectSize {
         ObjectSize {
             width_m: 2.0 * self.mean_m,
@@ -95,7 +97,8 @@ impl HalfDepth {
     }
 }
 
-/// The middle of the object whose foot is on the ground; `None` without a foot clearly below the horizon.
+/// The middle of the object whose foot is on the ground; `None` without a foot clearly below the
+/// horizon.
 pub(super) fn from_foot(
     foot: &LevelSight,
     half: HalfDepth,
@@ -108,7 +111,8 @@ pub(super) fn from_foot(
     estimate.in_front()
 }
 
-/// The middle of the object whose head is as high as objects of its kind are; `None` for a head near the horizon.
+/// The middle of the object whose head is as high as objects of its kind are; `None` for a head
+/// near the horizon.
 pub(super) fn from_head(
     head: &LevelSight,
     size: &ObjectSize,

@@ -14,7 +14,8 @@ pub(super) struct LevelSight {
     pub(super) turn_rad: f64,
     /// Tangent of the angle below the horizon.
     pub(super) slope: f64,
-    /// Distance along the line of sight that an object's half depth across the image's row takes on the ground.
+    /// Distance along the line of sight that an object's half depth across the image's row takes on
+    /// the ground.
     pub(super) depth_factor: f64,
     /// Changes of the slope.
     pub(super) errors: Errors,

@@ -23,8 +23,8 @@ const MIN_TIME: Duration = Duration::from_secs(10);
 /// Labels of COCO that stand on the ground. Labels with a configured size count as well; other
 /// objects may hang or lie on something.
 const STANDING: [&str; 6] = ["person", "bicycle", "car", "motorcycle", "bus", "truck"];
-/// Least ratio of near feet's slopes to far ones', of which a tenth each are beyond. At one distance, a camera that has turned
-/// looks like objects that do not stand on the ground.
+/// Least ratio of near feet's slopes to far ones', of which a tenth each are beyond. At one
+/// distance, a camera that has turned looks like objects that do not stand on the ground.
 const MIN_SLOPE_RATIO: f64 = 1.25;
 /// Least share of the boxes that agree about the angle within two standard deviations.
 const MIN_AGREEMENT: f64 = 2.0 / 3.0;

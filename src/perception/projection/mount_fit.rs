@@ -50,7 +50,8 @@ pub enum MountFitError {
 
 /// Minimum number of boxes.
 pub const MIN_BOXES: usize = 40;
-/// Least ratio of large boxes to small ones, of which a tenth each are beyond. Errors of the edges alone make small ones.
+/// Least ratio of large boxes to small ones, of which a tenth each are beyond. Errors of the edges
+/// alone make small ones.
 const MIN_HEIGHT_RATIO: f64 = 1.15;
 /// Boxes beyond are thinned out evenly.
 const MAX_BOXES: usize = 3000;
@@ -60,7 +61,8 @@ const MIN_OVERLAP: f64 = 0.2;
 const FREEDOM: f64 = 4.0;
 /// Standard deviation of the height of one person who walks, relative to the mean.
 const GAIT_SIGMA: f64 = 0.02;
-/// Standard deviation of the nearest foot from the edge of a person's footprint, relative to the height.
+/// Standard deviation of the nearest foot from the edge of a person's footprint, relative to the
+/// height.
 const STEP_SIGMA: f64 = 0.06;
 /// Standard deviation in radians of the prior of the roll, for boxes that contain no information
 /// about it.
@@ -68,8 +70,8 @@ const ROLL_PRIOR_RAD: f64 = 0.17;
 /// Pitches and rolls in degrees from which the search starts.
 const PITCHES_DEG: std::ops::RangeInclusive<i32> = -20..=80;
 const ROLLS_DEG: [f64; 3] = [0.0, -12.0, 12.0];
-/// Standard deviations of the tilt in radians and of the height, relative, because people are no boxes and detectors cut
-/// legs off: the errors in the tests.
+/// Standard deviations of the tilt in radians and of the height, relative, because people are no
+/// boxes and detectors cut legs off: the errors in the tests.
 const MODEL_TILT_RAD: f64 = 0.007;
 const MODEL_HEIGHT: f64 = 0.02;
 /// Maximum standard deviation in degrees of a pitch that is worth reporting.
@@ -292,8 +294,8 @@ impl HeightFit {
             + at.y * at.y / (2.0 * ROLL_PRIOR_RAD * ROLL_PRIOR_RAD)
     }
 
-    /// The head's error of each box, `None` if its foot is above the horizon; `grown` are the heights of the people relative
-    /// to the mean.
+    /// The head's error of each box, `None` if its foot is above the horizon; `grown` are the
+    /// heights of the people relative to the mean.
     fn errors(&self, at: &Vector3<f64>, grown: &[f64]) -> Vec<Option<HeadError>> {
         let (projection, height_m, half) = (
             self.projection(at),
@@ -327,8 +329,8 @@ impl HeightFit {
         self.boxes.iter().map(error).collect()
     }
 
-    /// The likeliest values near `start` with their covariance: iteratively reweighted least squares, from which the heights of
-    /// the people are eliminated (Schur complement).
+    /// The likeliest values near `start` with their covariance: iteratively reweighted least
+    /// squares, from which the heights of the people are eliminated (Schur complement).
     fn improved(
         &self,
         (mut at, mut grown): (Vector3<f64>, Vec<f64>),
@@ -413,7 +415,8 @@ const MIN_SPREAD: f64 = 1e-3;
 const NORMAL_MEDIAN: f64 = 1.4826;
 /// Least scale of the errors.
 const MIN_SCALE: f64 = 0.2;
-/// Tuning of Welsch's weights, which makes them 95 % as good as least squares for normal errors (Holland, Welsch 1977).
+/// Tuning of Welsch's weights, which makes them 95 % as good as least squares for normal errors
+/// (Holland, Welsch 1977).
 const WELSCH: f64 = 2.985;
 const MAX_STEPS: usize = 60;
 const MAX_STEP: f64 = 0.1;

@@ -39,7 +39,7 @@ impl WeightedVoting {
             .collect()
     }
 
-    /// The index of a label; `stated` is the vehicle that stated it and when.
+    /// The index of a label; `stated` is the vehicle that stated it and the time.
     pub(super) fn label(
         &mut self,
         label: &Label,

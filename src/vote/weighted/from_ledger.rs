@@ -70,7 +70,7 @@ impl WeightedVoting {
     fn take_over_labels(&mut self, known: &[(NodeName, RememberedVotes)], max_labels: usize) {
         let mut votes: BTreeMap<&Label, f64> = BTreeMap::new();
         for (label, (correct, incorrect)) in known.iter().flat_map(|(_, labels)| labels) {
-            // A label that is mostly wrong is of use only where there is room.
+            // A label that is mostly wrong is only useful if there is room.
             *votes.entry(label).or_default() += correct + 1e-3 * incorrect;
         }
         let mut labels: Vec<_> = votes.into_iter().collect();

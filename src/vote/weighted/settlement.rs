@@ -57,7 +57,7 @@ impl WeightedVoting {
         }
     }
 
-    /// Takes a landmark's votes out of the live evidence until it is judged again.
+    /// Removes a landmark's votes from the live evidence until it is evaluated again.
     pub(super) fn remove_live(&mut self, landmark: &LandmarkId) {
         if let Some(landmark_votes) = self.landmarks.get_mut(landmark)
             && std::mem::take(&mut landmark_votes.counted)
@@ -86,7 +86,8 @@ impl WeightedVoting {
             return;
         };
         if landmark_votes.has_several_voters() {
-            // The model judges a vote by the others: a vehicle that decides alone must not prove itself right to it.
+            // The model evaluates a vote by the others: a vehicle that decides alone must not
+            // confirm itself.
             let judged = landmark_votes.votes.iter().filter(|vote| vote.judged);
             let settled: Vec<_> = judged
                 .map(|vote| {

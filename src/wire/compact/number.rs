@@ -15,11 +15,12 @@ pub(crate) struct Half;
 /// A number with 24 significant bits, such as the direction of a camera.
 pub(crate) struct Single;
 
-/// A covariance `[xx, xy, yy]` with 11 significant bits. Variances are rounded up and the covariance towards zero, so
-/// that no certainty is gained and the matrix stays positive semi-definite.
+/// A covariance `[xx, xy, yy]` with 11 significant bits. Variances are rounded up and the
+/// covariance towards zero, so that the certainty does not increase and the matrix stays positive
+/// semi-definite.
 pub(crate) struct CovarianceForm;
 
-/// Largest number of millimetres that is written as an integer; no position is beyond.
+/// Largest number of millimetres that is written as an integer; all positions are below.
 const MAX_MILLIMETRES: f64 = (1u64 << 53) as f64;
 
 /// Magnitudes of normal half-precision numbers.

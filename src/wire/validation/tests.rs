@@ -152,8 +152,8 @@ fn status() -> NodeStatus {
     }
 }
 
-/// Spoils an entry of a sound payload in every listed way and sends it: that entry alone is left out, and its contributor
-/// named.
+/// Spoils an entry of a sound payload in every listed way and sends it: that entry alone is left
+/// out, and its contributor named.
 fn each_flawed_entry_is_left_out<T: Payload + PartialEq + std::fmt::Debug>(
     sound: impl Fn() -> T,
     without: impl Fn(&T) -> usize,

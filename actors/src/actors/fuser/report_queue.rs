@@ -1,4 +1,5 @@
-//! Queue of reports before the fuser: the latest of each vehicle and kind, and of each vehicle a bounded number of objects.
+//! Queue of reports before the fuser: the latest of each vehicle and kind, and of each vehicle a
+//! bounded number of objects.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

@@ -189,7 +189,8 @@ fn a_time_in_seconds_is_told_from_a_clock_that_is_off() {
     );
 }
 
-/// Where objects are tracked, they may be anywhere near the locations: three metres, but not three hundred.
+/// Where objects are tracked, they may be anywhere near the locations: three metres, but not three
+/// hundred.
 #[test]
 fn a_vehicle_in_centimetres_is_named_where_objects_are_tracked() {
     let mut fuser = standby();

@@ -10,7 +10,8 @@ const NEIGHBOUR_TIMEOUT: Duration = Duration::from_secs(5);
 /// Factor on the rate while a neighbour is present.
 const NEIGHBOUR_FACTOR: f64 = 5.0;
 
-/// Share of the interval by which a map may be early. Rounds close a little before or after due times.
+/// Share of the interval by which a map may be early. Rounds close a little before or after due
+/// times.
 const MAX_EARLY_SHARE: f64 = 0.25;
 
 /// The times at which maps are due. They stay on a fixed grid independent of when maps arrive, so
@@ -64,7 +65,8 @@ impl MapPace {
 mod tests {
     use super::*;
 
-    /// Number of maps in ten seconds of rounds about every 100 ms, up to 10 ms early or late, from this time on.
+    /// Number of maps in ten seconds of rounds about every 100 ms, up to 10 ms early or late, from
+    /// this time on.
     fn count(pace: &mut MapPace, from_ms: u64) -> usize {
         let rounds = (0..100).map(|round| from_ms + 100 * round + 7 * round % 20 - 10);
         let due = rounds.filter(|ms| {

@@ -22,7 +22,8 @@ use crate::transport::mqtt::link::{Link, LinkChange, LinkId, LinkSetup, LinkSink
 use crate::transport::mqtt::packet_sink::PacketSink;
 use crate::transport::mqtt::{MqttConfig, Security};
 
-/// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node that stops waits for it.
+/// Time limit for sending the DISCONNECT, after which the broker publishes the last will. A node
+/// that stops waits for it.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Time until a full queue may have room.
@@ -207,7 +208,8 @@ impl RegionLink {
         is_sent
     }
 
-    /// Publishes the node's status, now if there is a connection, and as the last will of later ones.
+    /// Publishes the node's status, now if there is a connection, and as the last will of later
+    /// ones.
     pub(super) fn publish_status(&mut self, status: &NodeStatus) {
         let encoding = self.setup.config.encoding;
         self.setup

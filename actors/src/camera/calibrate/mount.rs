@@ -207,7 +207,8 @@ fn solve(
     Ok(Some((pose, mount, inliers)))
 }
 
-/// Pose and mount from the rotation from the ground to the camera and the ground's origin in the camera.
+/// Pose and mount from the rotation from the ground to the camera and the ground's origin in the
+/// camera.
 fn from_extrinsics(from_ground: &Matrix3<f64>, origin: &Vector3<f64>) -> (Pose, Mount) {
     let to_ground = from_ground.transpose();
     let position = -(to_ground * origin);

@@ -35,8 +35,8 @@ impl ScoredBox {
     }
 }
 
-/// The best boxes of each class: of two that overlap by more than `max_overlap`, intersection over union, the lower score
-/// goes.
+/// The best boxes of each class: of two that overlap by more than `max_overlap`, intersection over
+/// union, the lower score goes.
 pub(super) fn suppress(
     mut candidates: Vec<ScoredBox>,
     max_overlap: f64,

@@ -1,7 +1,7 @@
 //! Detector of the 80 COCO classes: SSDLite-MobileNetV2 run by OpenCV.
 //!
-//! Feature `coco-weights` compiles the weights into the program; see `models/README.md` for their source, inputs and
-//! outputs.
+//! Feature `coco-weights` compiles the weights into the program; see `models/README.md` for their
+//! source, inputs and outputs.
 
 mod anchors;
 pub mod labels;
@@ -29,7 +29,8 @@ pub struct CocoConfig {
     /// ONNX file with the inputs and outputs of the built-in model. Default: not set, the built-in
     /// model.
     pub model: Option<PathBuf>,
-    /// Minimum confidence of a detection. Default 0.4. Trade-off: lower values find more objects and more false ones.
+    /// Minimum confidence of a detection. Default 0.4. Trade-off: lower values find more objects
+    /// and more false ones.
     pub threshold: f64,
     /// Intersection over union above which two boxes of one class are merged. Default 0.5.
     pub max_overlap: f64,
@@ -103,9 +104,11 @@ const PACKAGED: &str = "share/ecod-node/models/ssdlite_mobilenet_v2_coco.onnx";
 
 /// Side of the network's input in pixels.
 const INPUT_PX: i32 = 300;
-/// Side of a tile as a share of the image's side: neighbouring tiles overlap by a fifth of the image.
+/// Side of a tile as a share of the image's side: neighbouring tiles overlap by a fifth of the
+/// image.
 const TILE_SHARE: f64 = 0.6;
-/// Distance from a tile's inner edge, as a share of the tile's side, below which a box counts as cut.
+/// Distance from a tile's inner edge, as a share of the tile's side, below which a box counts as
+/// cut.
 const CUT_SHARE: f64 = 0.02;
 
 /// Detector of COCO objects.

@@ -1,11 +1,12 @@
-//! Runs a source on its own threads: the latest frame wins, and a source that fails or stalls is reopened.
+//! Runs a source on its own threads: the latest frame wins, and a source that fails or stalls is
+//! reopened.
 //!
 //! ```text
 //! reader thread (one per opening) --frames, errors--> capture thread --latest frame--> slot --> detector
 //! ```
 //!
-//! A driver or a file system may block forever. The capture thread then abandons the reader, which ends when that returns, and
-//! reopens the source on a new one.
+//! A driver or a file system may block forever. The capture thread then abandons the reader, which
+//! ends when that returns, and reopens the source on a new one.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender};
@@ -25,7 +26,8 @@ use crate::platform::latest_slot::LatestSlot;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CaptureConfig {
-    /// Seconds without a frame after which a source is reopened. Default 5. Must exceed the start time of the camera.
+    /// Seconds without a frame after which a source is reopened. Default 5. Must exceed the start
+    /// time of the camera.
     pub stall_timeout_s: f64,
     /// Seconds before the first retry. Default 0.5. Doubles with each failure in a row.
     pub retry_min_s: f64,
@@ -134,7 +136,8 @@ impl Capture {
         })
     }
 
-    /// Waits for the latest frame; `None` once the source ended. Numbers continue when the source is reopened.
+    /// Waits for the latest frame; `None` once the source ended. Numbers continue when the source
+    /// is reopened.
     pub async fn next_frame(&self) -> Option<CameraFrame> {
         self.slot.take().await
     }
@@ -172,7 +175,8 @@ impl Drop for Capture {
     }
 }
 
-/// Number of running readers. They may be inside OpenCV, which must not be in use while the process ends.
+/// Number of running readers. They may be inside OpenCV, which must not be in use while the process
+/// ends.
 #[derive(Debug, Clone, Default)]
 pub struct Readers(Arc<AtomicUsize>);
 

@@ -1,4 +1,5 @@
-//! Cameras of the kernel (Video4Linux), such as USB cameras: buffers that the driver fills, converted to BGR.
+//! Cameras of the kernel (Video4Linux), such as USB cameras: buffers that the driver fills,
+//! converted to BGR.
 
 mod pixels;
 

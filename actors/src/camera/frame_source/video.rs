@@ -35,7 +35,8 @@ use crate::platform::{clock, installed};
 /// Name of the program.
 const PROGRAM: &str = "ecod-video";
 
-/// Minimum time for opening a source: GStreamer may first look through all of its plugins, once on a machine.
+/// Minimum time for opening a source: GStreamer may first look through all of its plugins, once on
+/// a machine.
 const MIN_OPEN_TIME: Duration = Duration::from_secs(30);
 
 /// Maximum number of pixels of a frame: 8K.

@@ -61,10 +61,12 @@ struct MountArguments {
 pub(super) struct PointsArguments {
     #[command(flatten)]
     node: MountArguments,
-    /// A point: column and row in pixels, metres ahead and to the left of the vehicle's reference point
+    /// A point: column and row in pixels, metres ahead and to the left of the vehicle's reference
+    /// point
     #[arg(long = "point", value_name = "COLUMN,ROW=AHEAD,LEFT", value_parser = measured_point)]
     points: Vec<MeasuredPoint>,
-    /// The picture in which the points were measured, whose size counts. Default the size of `camera.optics`
+    /// The picture in which the points were measured, whose size counts. Default the size of
+    /// `camera.optics`
     #[arg(long, value_name = "IMAGE")]
     image: Option<PathBuf>,
     /// Places are metres east and north in the cell's frame; the vehicle's position is `pose` in

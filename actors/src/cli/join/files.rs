@@ -30,7 +30,8 @@ const CITY_LIST: &str = "city-revoked.pem";
 /// files of the CA.
 pub(super) struct NodeDirectory {
     path: PathBuf,
-    /// Directory of the service's state, if these are the service's files; its owner is the service's user.
+    /// Directory of the service's state, if these are the service's files; its owner is the
+    /// service's user.
     state_of_service: Option<PathBuf>,
 }
 

@@ -1,4 +1,5 @@
-//! The file of cells between which a vehicle moves by its position, and its configuration in each of them.
+//! The file of cells between which a vehicle moves by its position, and its configuration in each
+//! of them.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

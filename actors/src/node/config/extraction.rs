@@ -8,8 +8,8 @@ use super::{LoadError, NodeConfig};
 
 const ENVIRONMENT_PREFIX: &str = "ECOD_";
 
-/// `ECOD_…`, two underscores between the levels of a key. `ECOD_BROKER` is the clients': the address of a node, not
-/// the table of the same name.
+/// `ECOD_…`, two underscores between the levels of a key. `ECOD_BROKER` is the clients': the
+/// address of a node, not the table of the same name.
 pub(super) fn environment() -> Env {
     Env::prefixed(ENVIRONMENT_PREFIX)
         .ignore(&["broker"])

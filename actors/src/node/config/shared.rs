@@ -63,7 +63,8 @@ const MAX_DESCRIBED_BYTES_PER_S: f64 = 4e6;
 /// Round periods in seconds that a description may set.
 const DESCRIBED_PERIODS_S: std::ops::RangeInclusive<f64> = 0.02..=2.0;
 
-/// Names of ordinary length, and the number of vehicles at each location, by which the cost is computed.
+/// Names of ordinary length, and the number of vehicles at each location, by which the cost is
+/// computed.
 const COST_NODE: NodeName = NodeName::from_static("vehicle1");
 const COST_LABEL: Label = Label::new_static("ABCD1234");
 const COST_CONTRIBUTORS: usize = 3;
@@ -181,8 +182,8 @@ impl SharedConfig {
         }
     }
 
-    /// Checks that every link carries a map in the time of a round, and that rounds come often enough for followers to
-    /// notice a silent leader.
+    /// Checks that every link carries a map in the time of a round, and that rounds come often
+    /// enough for followers to notice a silent leader.
     fn check_cost(&self) -> Result<(), DescriptionError> {
         let period_s = self.fusion.round.period_s;
         if !DESCRIBED_PERIODS_S.contains(&period_s) {

@@ -30,8 +30,8 @@ pub struct DashboardConfig {
     /// Maximum snapshots per second for each browser. Default 10. Trade-off: more snapshots show a
     /// fast cell better, fewer cost less.
     pub max_rate_hz: f64,
-    /// Maximum number of connections. Default 64. A visible browser tab keeps one and opens others briefly; at most
-    /// half of them carry live snapshots.
+    /// Maximum number of connections. Default 64. A visible browser tab keeps one and opens others
+    /// briefly; at most half of them carry live snapshots.
     pub max_connections: usize,
 }
 

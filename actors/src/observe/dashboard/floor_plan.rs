@@ -43,7 +43,8 @@ pub struct FloorPlan {
 pub struct FloorPlanFacts {
     /// Path of the image.
     path: &'static str,
-    /// The map `[a, b, c, d, e, f]` from pixels to metres: east is a·column + c·row + e, north is b·column + d·row + f.
+    /// The map `[a, b, c, d, e, f]` from pixels to metres: east is a·column + c·row + e, north is
+    /// b·column + d·row + f.
     metres: [f64; 6],
 }
 
@@ -149,7 +150,8 @@ impl FloorPlanConfig {
         })
     }
 
-    /// The similarity through both points. With rows counted upwards it is the complex function m = s·p + t.
+    /// The similarity through both points. With rows counted upwards it is the complex function m =
+    /// s·p + t.
     fn metres(&self) -> [f64; 6] {
         let [(p1, m1), (p2, m2)] = self.points.map(|FloorPlanPoint { pixel, position_m }| {
             (

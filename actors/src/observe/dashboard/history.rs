@@ -36,7 +36,8 @@ struct VitalsSample<'a> {
     at_us: Timestamp,
     /// Rounds accepted.
     rounds: u32,
-    /// Median milliseconds from the oldest capture in a map to its receipt; absent without such a map.
+    /// Median milliseconds from the oldest capture in a map to its receipt; absent without such a
+    /// map.
     latency_p50_ms: Option<f64>,
     /// Maximum of the same.
     latency_max_ms: Option<f64>,
@@ -56,7 +57,8 @@ pub(crate) struct History {
     /// Changes of the leader since the node started.
     pub failovers: u64,
     last_round: Option<(Epoch, Timestamp)>,
-    /// Gap before the last epoch's first round. The round may arrive before the election names the leader.
+    /// Gap before the last epoch's first round. The round may arrive before the election names the
+    /// leader.
     last_gap: Option<(Epoch, u64)>,
     latencies_ms: Vec<f64>,
     rounds: u32,
@@ -164,7 +166,8 @@ impl History {
         );
     }
 
-    /// Takes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's clock.
+    /// Takes an accepted round; `captured_at` is the oldest capture in it, on the aggregator's
+    /// clock.
     pub(crate) fn add_round(
         &mut self,
         epoch: &Epoch,

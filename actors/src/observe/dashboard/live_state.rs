@@ -55,8 +55,9 @@ pub struct LatestReport {
     pub report: Arc<ObjectReport>,
 }
 
-/// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or long silent nodes. Of
-/// the parts of one node [`MAX_PARTS`] are kept: further ones replace parts of the same node.
+/// Maximum number of vehicles, and of nodes. Further ones replace silent vehicles and offline or
+/// long silent nodes. Of the parts of one node [`MAX_PARTS`] are kept: further ones replace parts
+/// of the same node.
 pub const MAX_SHOWN: usize = 256;
 
 /// Maximum number of troubles that are shown, and number of troubles that one member other than the

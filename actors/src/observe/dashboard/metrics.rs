@@ -1,7 +1,8 @@
 //! Metrics of the node for Prometheus, in the OpenMetrics text format.
 //!
-//! All values are read on request; only counters that the node has anyway are kept. The number of label values is
-//! bounded: reasons and states are fixed sets, vehicles are the first [`MAX_VEHICLES`] by name.
+//! All values are read on request; only counters that the node has anyway are kept. The number of
+//! label values is bounded: reasons and states are fixed sets, vehicles are the first
+//! [`MAX_VEHICLES`] by name.
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -98,7 +98,8 @@ pub(crate) struct NodeEntry {
     pub fit: Option<bool>,
     /// Version of its software.
     pub version: Option<String>,
-    /// Address and port of its page, where this node's users may reach it. Its own page is left out.
+    /// Address and port of its page, where this node's users may reach it. Its own page is left
+    /// out.
     pub page: Option<SocketAddr>,
 }
 
@@ -111,7 +112,8 @@ pub(crate) fn json(value: &impl Serialize) -> Vec<u8> {
     text
 }
 
-/// This node and the others by name. `met` holds the nodes that have ever answered; `links` is absent if unknown.
+/// This node and the others by name. `met` holds the nodes that have ever answered; `links` is
+/// absent if unknown.
 pub(crate) fn nodes(
     sources: &NodeSources,
     met: &BTreeSet<NodeName>,
@@ -189,7 +191,8 @@ fn others(
     nodes
 }
 
-/// Address of the page of a node whose datagrams come from `host`. One on loopback serves its own machine only.
+/// Address of the page of a node whose datagrams come from `host`. One on loopback serves its own
+/// machine only.
 fn page(status: &NodeStatus, host: IpAddr) -> Option<SocketAddr> {
     let page: SocketAddr = status.page.as_ref()?.parse().ok()?;
     match page.ip() {

@@ -174,7 +174,8 @@ impl Timeline {
         self.events.push_back(TimelineEvent { at_us, kind, text });
     }
 
-    /// The fields `events` and `frames` of a JSON object: events after `time`, and the times of all maps, in order.
+    /// The fields `events` and `frames` of a JSON object: events after `time`, and the times of all
+    /// maps, in order.
     pub(crate) fn json_since(&self, time: Timestamp) -> Vec<u8> {
         let mut events: Vec<_> = self
             .events
@@ -331,7 +332,8 @@ mod tests {
         assert_eq!(told, expected.map(Some), "a score that varies is no news");
     }
 
-    /// Ten minutes of a small cell are held second by second, an hour of the largest maps within the bound.
+    /// Ten minutes of a small cell are held second by second, an hour of the largest maps within
+    /// the bound.
     #[test]
     fn ten_minutes_are_held_in_bounded_memory() {
         let span = 600 * SECOND;

@@ -17,7 +17,8 @@ use tokio_io_timeout::TimeoutStream;
 use super::connection_limit::{AdmittedConnection, ConnectionLimit, ConnectionSlot};
 use crate::platform::throttle::host_network;
 
-/// The host of a browser, as hosts are counted: an IPv4 address or an IPv6 /64 network. Every request has it as an extension.
+/// The host of a browser, as hosts are counted: an IPv4 address or an IPv6 /64 network. Every
+/// request has it as an extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BrowserHost(pub IpAddr);
 

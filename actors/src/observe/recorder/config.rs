@@ -20,14 +20,16 @@ pub struct RecordConfig {
     /// differ in every process.
     #[serde(skip)]
     pub name: Option<NodeName>,
-    /// Maximum size of a file in megabytes. Default 256. Trade-off: smaller files lose less to a broken disk and copy
-    /// faster; larger ones are fewer.
+    /// Maximum size of a file in megabytes. Default 256. Trade-off: smaller files lose less to a
+    /// broken disk and copy faster; larger ones are fewer.
     pub max_file_mb: u64,
     /// Maximum age of a file in seconds. Default 3600.
     pub max_file_s: u64,
-    /// Maximum megabytes of this node's files in the directory. Default 4096. The oldest are deleted first.
+    /// Maximum megabytes of this node's files in the directory. Default 4096. The oldest are
+    /// deleted first.
     pub max_total_mb: u64,
-    /// Megabytes that must stay free on the disk. Default 256. With less, recording pauses and losses are counted.
+    /// Megabytes that must stay free on the disk. Default 256. With less, recording pauses and
+    /// losses are counted.
     pub min_free_mb: u64,
     /// Maximum entries queued for the disk. Default 4096. Further entries are dropped and counted.
     pub queue: usize,

@@ -109,7 +109,8 @@ pub(crate) fn prune(dir: &Path, node: &NodeName, max_bytes: u64) -> io::Result<u
     Ok(deleted)
 }
 
-/// True if a file belongs to the node: exactly a time and a number follow, as one name may begin with another.
+/// True if a file belongs to the node: exactly a time and a number follow, as one name may begin
+/// with another.
 fn is_of(path: &Path, node: &NodeName) -> bool {
     let name = path.file_stem().and_then(|stem| stem.to_str());
     let rest = name.and_then(|name| name.strip_prefix(node.as_str())?.strip_prefix('-'));

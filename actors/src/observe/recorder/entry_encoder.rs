@@ -1,4 +1,5 @@
-//! Encoding of log entries as JSON messages: the payloads themselves, and drawings of them for viewers.
+//! Encoding of log entries as JSON messages: the payloads themselves, and drawings of them for
+//! viewers.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;

@@ -1,8 +1,9 @@
-//! Drawings for Foxglove and Lichtblick, with the names and fields of their published schemas. Unused list fields are
-//! written as empty lists.
+//! Drawings for Foxglove and Lichtblick, with the names and fields of their published schemas.
+//! Unused list fields are written as empty lists.
 //!
-//! The fixed frame is `map`: east, north, up in metres. Each camera with a pose has a frame of the name under which it
-//! reports, x along its axis and z up, and below it `<name>/optical`, z along the axis and x to the right.
+//! The fixed frame is `map`: east, north, up in metres. Each camera with a pose has a frame of the
+//! name under which it reports, x along its axis and z up, and below it `<name>/optical`, z along
+//! the axis and x to the right.
 
 pub(crate) mod picture;
 pub(crate) mod scene;

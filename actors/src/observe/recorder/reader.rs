@@ -44,7 +44,8 @@ pub struct LogMessage {
     pub json: Vec<u8>,
 }
 
-/// An unusable part of a log. After all errors but [`LogError::Unreadable`] the rest remains usable.
+/// An unusable part of a log. After all errors but [`LogError::Unreadable`] the rest remains
+/// usable.
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
     /// The file cannot be read.

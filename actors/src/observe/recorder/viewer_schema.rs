@@ -1,8 +1,8 @@
 //! JSON Schemas in the form that Foxglove and Lichtblick read.
 //!
-//! They drop a channel whose schema has a field that they do not understand. A field needs one `type`, an array needs
-//! `items`, alternatives are named numbers, and references are not followed. Optional fields are `nullable`, as in
-//! OpenAPI 3.0. Alternatives below `anyOf` are ignored.
+//! They drop a channel whose schema has a field that they do not understand. A field needs one
+//! `type`, an array needs `items`, alternatives are named numbers, and references are not followed.
+//! Optional fields are `nullable`, as in OpenAPI 3.0. Alternatives below `anyOf` are ignored.
 
 use schemars::generate::SchemaSettings;
 use schemars::transform::transform_subschemas;

@@ -145,7 +145,8 @@ impl LogWriter {
     fn begin(&mut self, entry: &LogEntry) -> McapResult<LogFile> {
         let (dir, node) = (&self.config.dir, &self.identity.node);
         std::fs::create_dir_all(dir)?;
-        // Deletion comes first, since it may free the space that is needed. Its failure does not end the log.
+        // Deletion comes first, since it may free the space that is needed. Its failure does not
+        // end the log.
         if let Err(error) = disk::prune(dir, node, self.config.max_old_bytes()) {
             tracing::warn!(dir = %dir.display(), %error, "cannot delete old logs");
         }
@@ -166,7 +167,8 @@ impl LogWriter {
         Ok(file)
     }
 
-    /// Follows the state and settings of the aggregator, for files that begin in the middle of its run.
+    /// Follows the state and settings of the aggregator, for files that begin in the middle of its
+    /// run.
     fn track_aggregator(&mut self, item: &LogItem) {
         let mut aggregator_state = self.recording.aggregator_state();
         match item {

@@ -47,7 +47,8 @@ pub(super) struct RecordedPicture {
     data: String,
 }
 
-/// Name under which a camera reports, of the frame of its pictures; earlier versions wrote the name alone.
+/// Name under which a camera reports, of the frame of its pictures; earlier versions wrote the name
+/// alone.
 fn reporter<'de, D: Deserializer<'de>>(frame: D) -> Result<NodeName, D::Error> {
     let frame = String::deserialize(frame)?;
     NodeName::new(frame.strip_suffix(OPTICAL_FRAME).unwrap_or(&frame)).map_err(D::Error::custom)
@@ -197,7 +198,8 @@ impl LogTimeline {
         });
     }
 
-    /// Map, timeline and pictures as HTML, with the scripts that draw them; empty if the log has no leader.
+    /// Map, timeline and pictures as HTML, with the scripts that draw them; empty if the log has no
+    /// leader.
     pub(super) fn html(&self, leaders: &[LeaderRounds]) -> String {
         if leaders.is_empty() {
             return String::new();

@@ -39,7 +39,8 @@ struct Holding {
     cut: Option<oneshot::Sender<()>>,
 }
 
-/// Maximum bytes held for one principal, and in total, where packets are not larger than maps by default.
+/// Maximum bytes held for one principal, and in total, where packets are not larger than maps by
+/// default.
 const MAX_BYTES_EACH: usize = 10 * 1024 * 1024;
 const MAX_BYTES: usize = 32 * 1024 * 1024;
 

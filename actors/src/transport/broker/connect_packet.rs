@@ -58,7 +58,8 @@ pub(super) async fn read(
     })
 }
 
-/// Length of the first packet in received bytes, if it is complete. Only built for the fuzz targets.
+/// Length of the first packet in received bytes, if it is complete. Only built for the fuzz
+/// targets.
 #[cfg(fuzzing)]
 pub fn read_connect_packet(sent: &[u8]) -> Option<usize> {
     use futures_util::FutureExt;

@@ -21,7 +21,8 @@ struct AddressTable {
     by_address: HashMap<IpAddr, AddressEntry>,
     /// Throttle shared by all addresses beyond [`MAX_ADDRESSES`].
     overflow: TokenBucket,
-    /// Connections without a login by order of arrival: the source, and a sender whose drop evicts the connection.
+    /// Connections without a login by order of arrival: the source, and a sender whose drop evicts
+    /// the connection.
     pending: BTreeMap<u64, (IpAddr, oneshot::Sender<()>)>,
     next_number: u64,
     pruned_at: Timestamp,
@@ -123,7 +124,8 @@ impl ConnectionThrottle {
 }
 
 impl AddressTable {
-    /// Adds a waiting connection and evicts the oldest if there are too many, of its source or in total.
+    /// Adds a waiting connection and evicts the oldest if there are too many, of its source or in
+    /// total.
     fn insert(&mut self, source: IpAddr, limit: usize) -> (u64, oneshot::Receiver<()>) {
         let mut of_source = self
             .pending

@@ -106,19 +106,21 @@ pub struct BrokerConfig {
     /// the oldest is dropped. A higher value bridges longer pauses of a client, but the client then
     /// gets old messages.
     pub max_waiting: usize,
-    /// Maximum topics with a retained message; default 8192: one for each node's status and one for the reputations.
+    /// Maximum topics with a retained message; default 8192: one for each node's status and one for
+    /// the reputations.
     pub max_retained: usize,
-    /// Maximum bytes of all retained messages together; default 67108864. A status has some hundred bytes, reputations
-    /// some hundred for each vehicle. Messages beyond it are forwarded and not retained.
+    /// Maximum bytes of all retained messages together; default 67108864. A status has some hundred
+    /// bytes, reputations some hundred for each vehicle. Messages beyond it are forwarded and not
+    /// retained.
     pub max_retained_bytes: usize,
-    /// True if the broker may listen on other than loopback addresses without `[tls]`; default false. Every host that
-    /// reaches it can then read everything and publish in any name.
+    /// True if the broker may listen on other than loopback addresses without `[tls]`; default
+    /// false. Every host that reaches it can then read everything and publish in any name.
     pub allow_plaintext: bool,
-    /// Time limit of the TLS handshake and login in ms; default 5000. Trade-off: shorter frees places sooner, longer
-    /// admits slow boards and lossy networks.
+    /// Time limit of the TLS handshake and login in ms; default 5000. Trade-off: shorter frees
+    /// places sooner, longer admits slow boards and lossy networks.
     pub handshake_timeout_ms: u64,
-    /// Burst of connections of one address; default 64. A cell behind address translation needs two or more for each
-    /// node.
+    /// Burst of connections of one address; default 64. A cell behind address translation needs two
+    /// or more for each node.
     pub connect_burst: u32,
     /// Connections per second of one address after the burst; default 10.
     pub connects_per_s: u32,
@@ -331,7 +333,8 @@ impl Drop for EmbeddedBroker {
     }
 }
 
-/// Body of the broker's thread. It owns the tokio runtime, which must not be dropped within the caller's async code.
+/// Body of the broker's thread. It owns the tokio runtime, which must not be dropped within the
+/// caller's async code.
 fn serve(
     address: SocketAddr,
     config: &BrokerConfig,
@@ -399,7 +402,8 @@ async fn prepare(
 )> {
     let listener = Builder::new()
         .name("ecod")
-        // Without it a restart would wait for the last connections' TIME_WAIT; a live listener still wins.
+        // Without it a restart would wait for the last connections' TIME_WAIT; a live listener
+        // still wins.
         .reuseaddr(Some(true))
         .nodelay(true)
         .max_packet_size(config.packet_bytes())

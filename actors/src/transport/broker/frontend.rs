@@ -5,8 +5,8 @@
 //!                    by source     certificate of the cell                within its principal's limits
 //! ```
 //!
-//! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore listens on a free
-//! loopback port, and accepts only connections that the frontend has registered.
+//! rmqtt accepts connections only on a socket of its own, and has no revocation lists. It therefore
+//! listens on a free loopback port, and accepts only connections that the frontend has registered.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::pin::Pin;

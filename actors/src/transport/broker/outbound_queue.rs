@@ -92,7 +92,8 @@ impl OutboundQueue {
         Ok(dropped)
     }
 
-    /// A long queue grows by an eighth: doubled, queues of clients that do not read would hold twice their bytes.
+    /// A long queue grows by an eighth: doubled, queues of clients that do not read would hold
+    /// twice their bytes.
     fn append(&mut self, more: &[u8]) {
         let length = self.bytes.len() + more.len();
         if length > self.bytes.capacity() && length > KEPT_BYTES {

@@ -36,7 +36,8 @@ use crate::transport::pki::{CertificateSubject, Credentials};
 /// Rules of access to an embedded broker.
 #[derive(Clone)]
 pub struct AccessPolicy {
-    /// The node's certificates. Without them every client may log in and publish anything, within limits.
+    /// The node's certificates. Without them every client may log in and publish anything, within
+    /// limits.
     pub credentials: Option<Arc<Credentials>>,
     /// The cell's topics.
     pub topics: Topics,
@@ -118,8 +119,8 @@ impl Permissions {
         is_allowed.then_some(()).ok_or_else(refused)
     }
 
-    /// True if a principal may publish on a topic. Without certificates every topic is allowed, within its limits of size
-    /// and retention.
+    /// True if a principal may publish on a topic. Without certificates every topic is allowed,
+    /// within its limits of size and retention.
     fn allows(&self, principal: &Principal, topic: &str, retain: bool, bytes: usize) -> bool {
         let may_publish = |identity: &Arc<CertificateSubject>| {
             let topic = self.policy.topics.parse(topic);
@@ -181,7 +182,8 @@ impl Permissions {
     }
 }
 
-/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its stack.
+/// Maximum levels of a topic or filter. rmqtt recurses once for each level and would overflow its
+/// stack.
 pub(super) const MAX_TOPIC_LEVELS: usize = 32;
 
 /// Maximum payload of a status in bytes. A typical status has some hundred; statuses are retained,

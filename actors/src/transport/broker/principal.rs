@@ -23,8 +23,8 @@ pub type LeaderCheck = Arc<dyn Fn(&NodeName) -> bool + Send + Sync>;
 pub(super) struct Principal {
     /// Absent without certificates.
     pub(super) identity: Option<Arc<CertificateSubject>>,
-    /// Key under which its connections and messages count together. Absent for local clients without certificates: a
-    /// whole cell may run on this machine.
+    /// Key under which its connections and messages count together. Absent for local clients
+    /// without certificates: a whole cell may run on this machine.
     quota_key: Option<Arc<str>>,
     /// Name under which its bytes count together, also for local clients.
     source: Arc<str>,
@@ -67,7 +67,8 @@ impl Principal {
         }
     }
 
-    /// True if it is the node itself by its certificate; without certificates, a client of this machine.
+    /// True if it is the node itself by its certificate; without certificates, a client of this
+    /// machine.
     pub(super) fn is_of(&self, node: &NodeName) -> bool {
         self.identity
             .as_ref()

@@ -40,7 +40,8 @@ const IN_FLIGHT_PAUSE: Duration = Duration::from_millis(2);
 
 const BUFFER_BYTES: usize = 8 * 1024;
 
-/// Maximum length of a SUBSCRIBE or UNSUBSCRIBE. rmqtt holds some hundred bytes for each of its filters at once.
+/// Maximum length of a SUBSCRIBE or UNSUBSCRIBE. rmqtt holds some hundred bytes for each of its
+/// filters at once.
 const MAX_FILTERS_BYTES: usize = MAX_SUBSCRIPTIONS * 256;
 
 /// Packet types, in the upper half of the first byte.

@@ -34,7 +34,8 @@ const REQUEST_BUFFER_BYTES: usize = 1024;
 const NO_PAGE: &str = "no page is here: programs speak MQTT at this port, and pages MQTT over WebSocket. The node's own page is at \
                        `dashboard.listen`, http://127.0.0.1:8080/ by default\n";
 
-/// Maximum bytes of one WebSocket message: it is held until it is complete. An MQTT packet may be spread over several.
+/// Maximum bytes of one WebSocket message: it is held until it is complete. An MQTT packet may be
+/// spread over several.
 const MAX_MESSAGE_BYTES: usize = 64 * 1024;
 
 /// Maximum bytes of a message to the client, and of the buffers in each direction.
@@ -56,7 +57,8 @@ pub(super) struct WebSocketBytes<S> {
     content_at: usize,
 }
 
-/// Answers the handshake of a client whose first byte was taken. All bytes that it sends are added to `wire_bytes`.
+/// Answers the handshake of a client whose first byte was taken. All bytes that it sends are added
+/// to `wire_bytes`.
 pub(super) async fn accept<S: AsyncRead + AsyncWrite + Send + 'static>(
     stream: S,
     wire_bytes: Arc<AtomicUsize>,

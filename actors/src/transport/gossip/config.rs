@@ -12,7 +12,8 @@ use crate::platform::secret::Secret;
 /// Default UDP port for gossip.
 pub const DEFAULT_PORT: u16 = 17_884;
 
-/// Gossip address, discovery and timings of failure detection; `[membership]` in the configuration file.
+/// Gossip address, discovery and timings of failure detection; `[membership]` in the configuration
+/// file.
 ///
 /// Key, multicast group and timings must be the same on every node of a cell.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -39,15 +40,15 @@ pub struct MembershipConfig {
     pub seeds: Vec<String>,
     /// Discovery by multicast.
     pub multicast: MulticastConfig,
-    /// Time between two probes of one other node, in ms. Default 100. Trade-off: shorter detects failures sooner and costs
-    /// packets.
+    /// Time between two probes of one other node, in ms. Default 100. Trade-off: shorter detects
+    /// failures sooner and costs packets.
     pub probe_ms: u64,
     /// Time within which a probed node must answer before other nodes probe it on this node's
     /// behalf, in ms. Default 30; must be less than half of `probe_ms`. A longer time suits slower
     /// networks.
     pub reply_ms: u64,
-    /// Time in ms within which a suspected node must show that it is alive. Default 200. Trade-off: longer declares fewer
-    /// living nodes down and detects failures later.
+    /// Time in ms within which a suspected node must show that it is alive. Default 200. Trade-off:
+    /// longer declares fewer living nodes down and detects failures later.
     pub suspect_ms: u64,
     /// Time between two rounds of gossip, in ms. Default 50; rounds without news send no packets.
     pub gossip_ms: u64,

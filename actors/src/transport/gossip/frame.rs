@@ -5,8 +5,8 @@
 //! | ec 0d | version | kind | cell | sender's session | counter | sealed body ... | seal (16) |
 //! ```
 //!
-//! All integers are big-endian. The seal is ChaCha20-Poly1305 with the head as associated data, the counter as nonce,
-//! and a key of its own for every pair of sessions and direction.
+//! All integers are big-endian. The seal is ChaCha20-Poly1305 with the head as associated data, the
+//! counter as nonce, and a key of its own for every pair of sessions and direction.
 
 use std::net::SocketAddr;
 
@@ -27,7 +27,8 @@ pub(crate) const MAX_FRAME_BYTES: usize = HEADER_BYTES + MAX_PAYLOAD_BYTES + SEA
 const SEAL_BYTES: usize = 16;
 const MAGIC: [u8; 2] = [0xec, 0x0d];
 
-/// Version of a frame. A cell has one: nodes with certificates and nodes without do not admit each other.
+/// Version of a frame. A cell has one: nodes with certificates and nodes without do not admit each
+/// other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Version {
     /// Sessions prove the cell's key.

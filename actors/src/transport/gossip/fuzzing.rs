@@ -51,7 +51,8 @@ pub struct Listener {
     prover: Option<Prover>,
     /// The last cookie that the node sent the peer in a challenge.
     challenge: Option<Cookie>,
-    /// The node's last proof to the peer: its cookie, and the transcript that an accept is bound to.
+    /// The node's last proof to the peer: its cookie, and the transcript that an accept is bound
+    /// to.
     proof: Option<(Cookie, Transcript)>,
 }
 

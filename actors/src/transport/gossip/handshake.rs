@@ -55,7 +55,8 @@ pub(crate) struct Attestation {
 /// Hash of all that one side signs.
 pub(crate) type Transcript = [u8; 32];
 
-/// Side of a handshake. Its label is in the signed text, so that no signature can be returned to its maker.
+/// Side of a handshake. Its label is in the signed text, so that no signature can be returned to
+/// its maker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Side {
     Prover,
@@ -93,7 +94,8 @@ pub(crate) struct Prover {
     notices: Notices,
 }
 
-/// Session, address and cookie of a challenger: a forged challenge does not replace an honest one's proof.
+/// Session, address and cookie of a challenger: a forged challenge does not replace an honest one's
+/// proof.
 pub(crate) type PendingKey = (SessionId, SocketAddr, Cookie);
 
 /// A proof that was sent and not yet accepted.
@@ -331,7 +333,8 @@ impl SignedMessage<'_> {
     }
 }
 
-/// The keys of a handshake: a function of the cell's key, the ephemeral keys and the accepter's transcript.
+/// The keys of a handshake: a function of the cell's key, the ephemeral keys and the accepter's
+/// transcript.
 pub(crate) fn agree(
     cell: &CellKey,
     (private, theirs): (EphemeralPrivateKey, &[u8; 32]),

@@ -15,7 +15,8 @@ pub(crate) type SessionId = [u8; 16];
 /// Random number that makes the session unique for each run, in a cell with certificates.
 pub(crate) type SessionNonce = [u8; 16];
 
-/// The session of a node in a cell with certificates. Only a node of this name can show the nonce of it.
+/// The session of a node in a cell with certificates. Only a node of this name can show the nonce
+/// of it.
 pub(crate) fn session_of(name: &NodeName, nonce: &SessionNonce) -> SessionId {
     let text: [&[u8]; 3] = [b"ecod session 2", nonce, name.as_str().as_bytes()];
     let hash = digest::digest(&digest::SHA256, &text.concat());

@@ -579,7 +579,8 @@ impl GossipMachine {
     }
 }
 
-/// Delay of a timer above which the process was stalled. Only this much of the delay counts as time.
+/// Delay of a timer above which the process was stalled. Only this much of the delay counts as
+/// time.
 const STALL: Duration = Duration::from_millis(40);
 
 /// Time for which frames wait for a session before they are dropped.

@@ -1,4 +1,5 @@
-//! Sockets of the membership: the node's own, and the multicast socket that all nodes of a machine share.
+//! Sockets of the membership: the node's own, and the multicast socket that all nodes of a machine
+//! share.
 
 use std::io::{self, ErrorKind};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};

@@ -269,7 +269,8 @@ impl Host {
     }
 }
 
-/// The key that is to be certified, in DER, of a guest's message that is complete. Only built for the fuzz targets.
+/// The key that is to be certified, in DER, of a guest's message that is complete. Only built for
+/// the fuzz targets.
 #[cfg(fuzzing)]
 pub fn read_request(sent: &[u8]) -> Option<Vec<u8>> {
     use futures_util::FutureExt;

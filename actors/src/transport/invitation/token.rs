@@ -76,7 +76,8 @@ impl FromStr for Token {
     }
 }
 
-/// True if a token with this content, if it is one, is read as it is written. Only built for the fuzz targets.
+/// True if a token with this content, if it is one, is read as it is written. Only built for the
+/// fuzz targets.
 #[cfg(fuzzing)]
 pub fn token_is_read_as_written(content: &[u8]) -> bool {
     let token: Result<Token, _> = text_of(content.to_vec()).parse();

@@ -21,7 +21,8 @@ pub struct MqttConfig {
     /// Trade-off: the cell survives the loss of the external broker, and every message is sent
     /// twice while it is available.
     pub fallback_to_embedded: bool,
-    /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized packets away).
+    /// Protocol version, `"3.1.1"` (default, every broker) or `"5"` (the broker keeps oversized
+    /// packets away).
     pub version: MqttVersion,
     /// User name; default: not set. Needs `password`.
     pub user: Option<String>,
@@ -35,22 +36,25 @@ pub struct MqttConfig {
     /// For an external broker that other parties use too. Must be equal on every node. Other
     /// subscribers have to skip the signature.
     pub sign: bool,
-    /// Encoding of sent payloads: `"json"` (default, readable), `"cbor"` (no text parsing of numbers) or `"compact"` (a
-    /// quarter of the bytes, rounded to millimetres and 0.05 %).
+    /// Encoding of sent payloads: `"json"` (default, readable), `"cbor"` (no text parsing of
+    /// numbers) or `"compact"` (a quarter of the bytes, rounded to millimetres and 0.05 %).
     pub encoding: Encoding,
-    /// Keep-alive in seconds: silence after which the broker is pinged; default 5. Trade-off: shorter notices a dead
-    /// network path sooner and costs packets. Not the failure detector, which is the gossip.
+    /// Keep-alive in seconds: silence after which the broker is pinged; default 5. Trade-off:
+    /// shorter notices a dead network path sooner and costs packets. Not the failure detector,
+    /// which is the gossip.
     pub keep_alive_s: u16,
     /// Milliseconds within which a broker must accept a connection; default 2000.
     pub connect_timeout_ms: u64,
     /// Milliseconds before the first attempt to reconnect, doubled with every failure; default 50.
     pub retry_min_ms: u64,
-    /// Maximum milliseconds between attempts to reconnect; default 2000. A random part of up to half is taken off each
-    /// wait, so that a cell's vehicles do not return all at once.
+    /// Maximum milliseconds between attempts to reconnect; default 2000. A random part of up to
+    /// half is taken off each wait, so that a cell's vehicles do not return all at once.
     pub retry_max_ms: u64,
-    /// Maximum messages that wait to be sent on one link; default 64. When full, new ones are refused and counted.
+    /// Maximum messages that wait to be sent on one link; default 64. When full, new ones are
+    /// refused and counted.
     pub send_queue: usize,
-    /// Maximum decoded messages that wait for their receivers; default 1024. When full, new ones are dropped and counted.
+    /// Maximum decoded messages that wait for their receivers; default 1024. When full, new ones
+    /// are dropped and counted.
     pub inbox: usize,
     /// Maximum reports per second of one vehicle and kind, shares of evidence of one candidate, and
     /// statuses of one node; default 100. The same number is the burst. Further ones are not
@@ -165,7 +169,8 @@ impl MqttConfig {
         }
     }
 
-    /// Largest packet in bytes that carries a payload within the limits. A larger one cuts the link.
+    /// Largest packet in bytes that carries a payload within the limits. A larger one cuts the
+    /// link.
     pub fn max_packet_bytes(&self) -> usize {
         self.max_payload_bytes.max(self.max_map_bytes) + PACKET_OVERHEAD_BYTES
     }

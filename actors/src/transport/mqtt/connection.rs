@@ -311,7 +311,8 @@ impl Client {
         })
     }
 
-    /// Queues DISCONNECT, after which the broker publishes no last will; false when there is no room.
+    /// Queues DISCONNECT, after which the broker publishes no last will; false when there is no
+    /// room.
     pub(crate) fn disconnect(&self) -> bool {
         match self {
             Self::V311(client) => client.try_disconnect().is_ok(),

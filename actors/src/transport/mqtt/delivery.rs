@@ -15,8 +15,9 @@ use tokio::sync::OwnedSemaphorePermit;
 
 /// A checked message of the cell, or news about a link.
 ///
-/// The same message may arrive over several links. The report window drops the second report by node and capture time.
-/// Receivers of maps, verdicts and reputations drop it by epoch and round. A repeated status does no harm.
+/// The same message may arrive over several links. The report window drops the second report by
+/// node and capture time. Receivers of maps, verdicts and reputations drop it by epoch and round. A
+/// repeated status does no harm.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Incoming {
     /// A vehicle's report; for candidates and observers only.
@@ -69,8 +70,8 @@ pub struct Delivery<T = Incoming> {
     pub received_at: Timestamp,
     /// Proof of a round's aggregator; other messages need no such proof.
     pub origin: Origin,
-    /// The node whose certificate the broker has proven, of a link in its last handshake; `None` without certificates, and
-    /// for messages of this node.
+    /// The node whose certificate the broker has proven, of a link in its last handshake; `None`
+    /// without certificates, and for messages of this node.
     pub broker: Option<NodeName>,
     pub(super) _place: Option<OwnedSemaphorePermit>,
 }

@@ -217,7 +217,8 @@ impl Inbox {
         Ok(self.deliver(via, message, origin, received_at))
     }
 
-    /// Decodes a map, verdicts or reputations. Entries out of bounds are left out and counted; the rest is used.
+    /// Decodes a map, verdicts or reputations. Entries out of bounds are left out and counted; the
+    /// rest is used.
     fn decode_entries<T: Payload>(
         &self,
         payload: &[u8],

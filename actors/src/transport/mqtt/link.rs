@@ -128,7 +128,8 @@ impl Link {
             .is_some_and(|client| client.publish(topic, payload, retention))
     }
 
-    /// Records a message whose echo is expected, even if there was no room to send it; true when the broker is stalled.
+    /// Records a message whose echo is expected, even if there was no room to send it; true when
+    /// the broker is stalled.
     pub(crate) fn misses_echo(&mut self, now: Timestamp) -> bool {
         let is_stalled = self.echo.note_sent(self.hearing.packets(), now);
         if is_stalled {
@@ -163,8 +164,8 @@ const FIRST_RETRIES: [Duration; 3] = [
     Duration::from_millis(10),
 ];
 
-/// Minimum length of a session that is followed by [`FIRST_RETRIES`]. Without it, a broker that ends every session would
-/// be tried without pause.
+/// Minimum length of a session that is followed by [`FIRST_RETRIES`]. Without it, a broker that
+/// ends every session would be tried without pause.
 const MIN_SESSION: Duration = Duration::from_millis(200);
 
 struct LinkTask {

@@ -62,7 +62,8 @@ const CAPACITY: usize = 32;
 /// messages about the present vehicles arrive at once.
 const REPUTATION_CAPACITY: usize = 1024;
 
-/// Maximum messages about vehicles per second of one cell that are decoded: one about each vehicle of a large cell.
+/// Maximum messages about vehicles per second of one cell that are decoded: one about each vehicle
+/// of a large cell.
 const MAX_REPUTATION_HZ: u32 = 512;
 
 impl RegionInbox {
@@ -191,7 +192,8 @@ impl RegionInbox {
 }
 
 impl PacketSink for RegionInbox {
-    /// Processes one packet of the region's broker. A payload that cannot be used is counted by its reason and cell.
+    /// Processes one packet of the region's broker. A payload that cannot be used is counted by its
+    /// reason and cell.
     fn accept(
         &self,
         via: Via<'_>,

@@ -220,7 +220,8 @@ impl Security {
         }
     }
 
-    /// True if arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz targets.
+    /// True if arbitrary bytes do not verify, and a signed payload does. Only built for the fuzz
+    /// targets.
     #[cfg(fuzzing)]
     pub fn rejects_forgery(&self, topic: &str, bytes: &[u8]) -> bool {
         let Some(key) = &self.signing else {

@@ -1,4 +1,5 @@
-//! Proof of a node's certificate outside TLS: the membership's handshake uses the same files, CA and revocation list.
+//! Proof of a node's certificate outside TLS: the membership's handshake uses the same files, CA
+//! and revocation list.
 
 use std::time::Duration;
 
@@ -40,7 +41,8 @@ impl LoadedCredentials {
         self.signer.sign(message)
     }
 
-    /// Verifies that a certificate is directly signed by the cell's CA, valid at this time and not revoked.
+    /// Verifies that a certificate is directly signed by the cell's CA, valid at this time and not
+    /// revoked.
     pub(crate) fn verify_node(
         &self,
         certificate: &[u8],

@@ -1,4 +1,5 @@
-//! The certificate authority of a cell or city: a directory on one machine, which need not belong to the cell.
+//! The certificate authority of a cell or city: a directory on one machine, which need not belong
+//! to the cell.
 
 mod city;
 
@@ -29,7 +30,8 @@ pub const DEFAULT_DAYS: u32 = 365;
 /// Days for which a CA is valid.
 const CA_DAYS: u32 = 3650;
 
-/// Time by which the validity of a certificate begins in the past, as clocks of the cell may be behind.
+/// Time by which the validity of a certificate begins in the past, as clocks of the cell may be
+/// behind.
 const CLOCK_ALLOWANCE: Duration = Duration::from_secs(3600);
 
 /// The CA of one cell, or of a city above cells, and its register of certificates.
@@ -173,7 +175,8 @@ impl Authority {
         })
     }
 
-    /// Lock of the directory for a change, with the register as it is now: another command may have changed it.
+    /// Lock of the directory for a change, with the register as it is now: another command may have
+    /// changed it.
     fn lock(&mut self) -> Result<File, AuthorityError> {
         let path = self.directory.join(LOCK);
         let locked = File::create(&path).and_then(|file| file.lock().map(|()| file));
@@ -257,7 +260,8 @@ impl Authority {
         Ok((certificate.pem(), serial))
     }
 
-    /// Registers a certificate before anyone has it, so that every valid certificate can be revoked.
+    /// Registers a certificate before anyone has it, so that every valid certificate can be
+    /// revoked.
     fn record(
         &mut self,
         issued: IssuedCertificate,

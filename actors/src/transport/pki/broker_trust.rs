@@ -1,4 +1,5 @@
-//! Verification of a broker's certificate for as long as a connection lasts, not only in the handshake.
+//! Verification of a broker's certificate for as long as a connection lasts, not only in the
+//! handshake.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};

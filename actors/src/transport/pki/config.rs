@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use ecod::config::ConfigError;
 use serde::{Deserialize, Serialize};
 
-/// The files that `ecod-node pki` made for a node, in PEM. They are read again when they change, without a restart.
+/// The files that `ecod-node pki` made for a node, in PEM. They are read again when they change,
+/// without a restart.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TlsConfig {

@@ -56,8 +56,8 @@ struct CachedCredentials {
 pub struct LoadedCredentials {
     /// The node's own certificate.
     pub identity: CertificateSubject,
-    /// TLS of the node's own broker: version 1.3, client certificates of the cell, no resumption. A resumed session would
-    /// not be checked against the revocation list.
+    /// TLS of the node's own broker: version 1.3, client certificates of the cell, no resumption. A
+    /// resumed session would not be checked against the revocation list.
     pub server: Arc<ServerConfig>,
     /// TLS of connections to brokers of the cell.
     pub client: Arc<ClientConfig>,
@@ -181,7 +181,8 @@ impl Credentials {
         })
     }
 
-    /// True if the node's certificate is an operator's, so that the cell's description may be set here.
+    /// True if the node's certificate is an operator's, so that the cell's description may be set
+    /// here.
     pub fn may_describe(&self) -> bool {
         self.current().identity.rights_of(&self.node).may_describe
     }

@@ -180,8 +180,8 @@ impl EvidenceSigner {
     }
 }
 
-/// The holder of a certificate, if the cell's CA issued it and has not revoked it. The caller checks that it has not
-/// expired.
+/// The holder of a certificate, if the cell's CA issued it and has not revoked it. The caller
+/// checks that it has not expired.
 fn signatory(certificate: &str, loaded: &LoadedCredentials) -> Option<Signatory> {
     let certificate = CertificateDer::from(BASE64.decode(certificate).ok()?);
     let subject = loaded.subject_of(&certificate).ok()?;

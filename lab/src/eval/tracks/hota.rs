@@ -1,8 +1,9 @@
-//! HOTA (Luiten et al., IJCV 2021): detection and association in one figure, averaged over how near is near enough.
+//! HOTA (Luiten et al., IJCV 2021): detection and association in one figure, averaged over how near
+//! is near enough.
 //!
-//! Similarity is 1 − d/d₀, zero from d₀ on, and for unequal labels. Matches of a frame maximise the sum of similarity times
-//! how much of their lives the two identities share; thresholds from 0.05 to 0.95 are applied to the result. Equal to
-//! `trackeval.metrics.HOTA`.
+//! Similarity is 1 − d/d₀, zero from d₀ on, and for unequal labels. Matches of a frame maximise the
+//! sum of similarity times how much of their lives the two identities share; thresholds from 0.05
+//! to 0.95 are applied to the result. Equal to `trackeval.metrics.HOTA`.
 
 use hashbrown::HashMap;
 

@@ -1,7 +1,9 @@
-//! IDF1 (Ristani et al., ECCV workshops 2016): how long each true object bears the one identity that suits it best.
+//! IDF1 (Ristani et al., ECCV workshops 2016): how long each true object bears the one identity
+//! that suits it best.
 //!
-//! True and given identities are matched once for the whole sequence, so that the number of frames in which matched
-//! ones are near enough is greatest. Equal to `trackeval.metrics.Identity` at a threshold of 0.5.
+//! True and given identities are matched once for the whole sequence, so that the number of frames
+//! in which matched ones are near enough is greatest. Equal to `trackeval.metrics.Identity` at a
+//! threshold of 0.5.
 
 use hashbrown::HashMap;
 

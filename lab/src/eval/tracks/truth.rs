@@ -211,7 +211,8 @@ impl TrackTruth {
             .unwrap_or(USUAL_PERIOD_US)
     }
 
-    /// The objects of a frame, where they were at a time near it: on a straight line to the frame before or after.
+    /// The objects of a frame, where they were at a time near it: on a straight line to the frame
+    /// before or after.
     pub(super) fn at(&self, number: usize, time: Timestamp) -> Vec<TrueObject> {
         let frame = &self.frames[number];
         let ahead = time.micros_from(frame.at);

@@ -1,4 +1,5 @@
-//! The undisturbed view: one ray per sample, four by four samples per pixel. Cards stand upright on the floor.
+//! The undisturbed view: one ray per sample, four by four samples per pixel. Cards stand upright on
+//! the floor.
 
 use std::ops::Range;
 
@@ -115,7 +116,8 @@ impl<'a> Face<'a> {
         })
     }
 
-    /// True if ink is printed at a point, in metres to the right of and above the middle of the code.
+    /// True if ink is printed at a point, in metres to the right of and above the middle of the
+    /// code.
     fn is_ink(&self, right_m: f64, up_m: f64, placard: &Placard) -> bool {
         let module = |from_edge_m: f64| {
             let at = (from_edge_m / placard.qr_width_m * self.side as f64).floor();

@@ -50,8 +50,8 @@ fn the_corners_of_a_code_are_where_the_pinhole_camera_puts_them() {
         let camera = &testbed.camera.intrinsics;
         let card = &testbed.cards(&testbed.scenes[0])[1];
         let half_m = testbed.placard.qr_width_m / 2.0;
-        // Finder patterns are dark at the upper corners and lower left; each edge is met in the middle of the outer
-        // ring.
+        // Finder patterns are dark at the upper corners and lower left; each edge is met in the
+        // middle of the outer ring.
         for (right, up) in [(-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0)] {
             let project = |right_m: f64, up_m: f64| {
                 let (sin, cos) = card.facing_rad.sin_cos();

@@ -1,4 +1,5 @@
-//! Boxes around objects on the ground, projected exactly, as cameras of any height and pitch see them.
+//! Boxes around objects on the ground, projected exactly, as cameras of any height and pitch see
+//! them.
 
 use std::f64::consts::PI;
 use std::time::Duration;
@@ -158,7 +159,8 @@ impl Street {
         (-2.0 * (1.0 - u).ln()).sqrt() * (2.0 * PI * v).cos()
     }
 
-    /// An object in view of a camera with this mount, its sizes varied as `spread` times its kind's.
+    /// An object in view of a camera with this mount, its sizes varied as `spread` times its
+    /// kind's.
     fn next(&mut self, mount: &Mount, spread: f64, max_range: f64) -> (Detection, Point2<f64>) {
         let kinds = kinds(self.height_m);
         loop {

@@ -73,7 +73,8 @@ pub(super) enum Layout {
     Picked(usize),
     /// `[1, boxes, 4]` and `[1, boxes, classes]`: centre and size in shares, logits.
     Queries { boxes: usize, logits: usize },
-    /// `[1, boxes, 4]` and `[1, boxes, 1 + classes]`: corners in shares, scores with the background first.
+    /// `[1, boxes, 4]` and `[1, boxes, 1 + classes]`: corners in shares, scores with the background
+    /// first.
     Priors { boxes: usize, scores: usize },
     /// `[…, boxes, 4]`, `[…, boxes]` and `[…, boxes]`: corners, score, class.
     Listed {
@@ -141,7 +142,8 @@ impl Head {
         }
     }
 
-    /// True if the network has turned the cells of YOLOX into pixels itself, for which [`Layout::Cells`] does not hold.
+    /// True if the network has turned the cells of YOLOX into pixels itself, for which
+    /// [`Layout::Cells`] does not hold.
     pub(super) fn is_in_pixels(&self, outputs: &[NamedTensor], input: ImageSize) -> bool {
         let Layout::Cells(output) = self.layout else {
             return false;

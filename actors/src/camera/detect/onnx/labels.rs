@@ -57,7 +57,8 @@ fn by_id(id: usize) -> Option<Label> {
     coco::name(id).map(Label::from)
 }
 
-/// The names in a file: one on each line, without empty lines and without a background before the others.
+/// The names in a file: one on each line, without empty lines and without a background before the
+/// others.
 pub(super) fn read(text: &str) -> Vec<String> {
     let mut names: Vec<String> = text
         .lines()
@@ -74,7 +75,8 @@ pub(super) fn read(text: &str) -> Vec<String> {
     names
 }
 
-/// The names in the metadata of a model, a list or map as Python or JSON writes it: `{0: 'person', 1: "car"}`.
+/// The names in the metadata of a model, a list or map as Python or JSON writes it:
+/// `{0: 'person', 1: "car"}`.
 pub(super) fn parse(text: &str) -> Vec<String> {
     let mut names = Vec::new();
     let mut rest = text.chars().peekable();

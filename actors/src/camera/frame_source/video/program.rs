@@ -1,4 +1,5 @@
-//! The program `ecod-video`: opens a source by OpenCV's `VideoCapture`, and writes its frames to standard output.
+//! The program `ecod-video`: opens a source by OpenCV's `VideoCapture`, and writes its frames to
+//! standard output.
 
 use std::fs::File;
 use std::io::{self, BufRead, Write};

@@ -1,4 +1,5 @@
-//! Messages between the node and the program `ecod-video`, each a line of JSON. Both are of one build.
+//! Messages between the node and the program `ecod-video`, each a line of JSON. Both are of one
+//! build.
 
 use std::io::{self, Write};
 use std::time::Duration;

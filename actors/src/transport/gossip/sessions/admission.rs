@@ -187,7 +187,8 @@ impl Sessions {
         }
     }
 
-    /// Checks that a cookie was issued to this session at this address a moment ago, and that the introduction is plausible.
+    /// Checks that a cookie was issued to this session at this address a moment ago, and that the
+    /// introduction is plausible.
     fn check_freshness(
         &self,
         session: &SessionId,
@@ -207,7 +208,8 @@ impl Sessions {
         }
     }
 
-    /// A proof of this node's certificate to a challenger; `None` while the one before may still be answered.
+    /// A proof of this node's certificate to a challenger; `None` while the one before may still be
+    /// answered.
     fn prove(
         &mut self,
         to: &SessionId,
@@ -404,7 +406,8 @@ impl Sessions {
                 .is_some_and(|speaker| speaker.address != from)
     }
 
-    /// Stores a session that has just proven its reachability, and decides whether it is accepted for its name.
+    /// Stores a session that has just proven its reachability, and decides whether it is accepted
+    /// for its name.
     fn admit(
         &mut self,
         head: &FrameHeader,

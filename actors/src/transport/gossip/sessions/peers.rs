@@ -42,10 +42,12 @@ pub(super) struct PeerSession {
     pub(super) superseded: Option<Timestamp>,
 }
 
-/// Maximum sessions by one certificate: a node, its former run, and observers that share its certificate.
+/// Maximum sessions by one certificate: a node, its former run, and observers that share its
+/// certificate.
 const MAX_SESSIONS_EACH: usize = 16;
 
-/// Number of frames that a session may send at once. A leader in an election sends about 100 a second.
+/// Number of frames that a session may send at once. A leader in an election sends about 100 a
+/// second.
 const FRAMES: u32 = 1000;
 
 /// Time after which a session may send one more.

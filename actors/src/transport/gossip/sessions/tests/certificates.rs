@@ -1,4 +1,5 @@
-//! Handshakes that prove certificates, and attacks on them by a holder of the cell's key or of another certificate.
+//! Handshakes that prove certificates, and attacks on them by a holder of the cell's key or of
+//! another certificate.
 
 use rustls::pki_types::UnixTime;
 
